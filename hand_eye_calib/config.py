@@ -1,0 +1,181 @@
+"""Every option of the package, once: name, unit, range, default and meaning.
+
+The node's parameters, the command line's options, ``config/calibrator.yaml`` and the README's tables are made from these
+dataclasses or tested against them.
+"""
+
+import dataclasses
+import math
+import re
+from dataclasses import dataclass
+
+from hand_eye_calib.errors import ConfigError
+
+METHODS = ("dnlo", "dnl", "park", "taylor", "zhuang", "ali")
+BACKENDS = ("fast", "ipopt")
+REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]*|C([2-9]|[1-9][0-9]+)"
+POSE_TYPES = (
+    "auto",
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+
+
+def option(
+    default, doc, *, unit="", minimum=None, maximum=None, choices=None, pattern=None, words=(), name=None, read_only=False
+):
+    """A dataclass field that knows all there is to know about an option.
+
+    Parameters
+    ----------
+    default
+        Its type is the option's type.
+    doc : str
+        One line for a person who is about to set it.
+    unit : str
+        Unit of the value, empty for none.
+    minimum, maximum : float, optional
+        Bounds, both allowed values.
+    choices : tuple of str, optional
+        The allowed values.
+    pattern : str, optional
+        Regular expression that the whole value must match.
+    words : tuple of str
+        Words that a number may be replaced by, such as "none".
+    name : str, optional
+        Public name where it differs from the attribute's, such as ``keyframe.min_translation``.
+    read_only : bool
+        The node cannot change it while it runs.
+    """
+    metadata = dict(
+        doc=doc, unit=unit, minimum=minimum, maximum=maximum, choices=choices, pattern=pattern, words=words, name=name,
+        read_only=read_only,
+    )  # fmt: skip
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def option_name(field):
+    """Public name of an option: the ROS parameter, the YAML key."""
+    return field.metadata["name"] or field.name
+
+
+def check_value(field, value):
+    """The value in the option's own type.
+
+    Raises
+    ------
+    ConfigError
+        Where the value is of the wrong type, out of range or not among the choices; one line that says what is allowed.
+    """
+    meta, name, kind = field.metadata, option_name(field), type(field.default)
+    if isinstance(value, str) and value in meta["words"]:
+        return value
+    if meta["words"] and kind is str:
+        value = _number(name, value, meta)
+        kind = float
+    if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = float(value)
+        if not math.isfinite(value):
+            raise ConfigError(f"{name} must be a finite number; got {value}")
+    elif kind is not type(value):
+        raise ConfigError(f"{name} must be of type {kind.__name__}; got {value!r}")
+    unit = f" {meta['unit']}" if meta["unit"] else ""
+    if meta["minimum"] is not None and value < meta["minimum"]:
+        raise ConfigError(f"{name} must be at least {meta['minimum']}{unit}; got {value}")
+    if meta["maximum"] is not None and value > meta["maximum"]:
+        raise ConfigError(f"{name} must be at most {meta['maximum']}{unit}; got {value}")
+    if meta["choices"] is not None and value not in meta["choices"]:
+        raise ConfigError(f"{name} must be one of {', '.join(meta['choices'])}; got {value!r}")
+    if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
+        raise ConfigError(f"{name} must match {meta['pattern']}; got {value!r}")
+    return value
+
+
+def _number(name, value, meta):
+    if isinstance(value, bool):
+        raise ConfigError(f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}")
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}") from None
+
+
+class _Checked:
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
+
+    @classmethod
+    def from_options(cls, options):
+        """Build from a mapping of public names; unknown names are an error that lists the known ones."""
+        known = {option_name(field): field.name for field in dataclasses.fields(cls)}
+        unknown = [name for name in options if name not in known]
+        if unknown:
+            raise ConfigError(f"unknown option {unknown[0]!r}; known are {', '.join(sorted(known))}")
+        return cls(**{known[name]: value for name, value in options.items()})
+
+    def to_options(self):
+        """Mapping of public names to values."""
+        return {option_name(field): getattr(self, field.name) for field in dataclasses.fields(self)}
+
+
+@dataclass(frozen=True)
+class CalibratorConfig(_Checked):
+    """Options of the engine: the same for the node, the replay of bags, files and Python."""
+
+    method: str = option("dnlo", "Solver; dnlo rejects outliers, the others use every pair.", choices=METHODS)
+    reference: str = option(
+        "auto",
+        "Which poses form motion pairs: A (all against the first), B<n> (against the n-th before), C<n> (segments of n), or auto "
+        "(the one with the smallest predicted translation error).",
+        pattern=REFERENCE_PATTERN,
+    )
+    backend: str = option(
+        "fast", "fast is the quadratic-form solver; ipopt the paper's CasADi + Ipopt formulation.", choices=BACKENDS
+    )
+    threshold: float = option(
+        0.01, "DNLO: pairs whose cost exceeds this are outliers (c of eq. 5).", unit="m^2", minimum=1e-12, maximum=1e6
+    )
+    min_inlier_fraction: float = option(
+        0.5, "DNLO: share of the pairs that always counts as inliers (d of eq. 5 over the pairs).", minimum=0.0, maximum=1.0
+    )
+    min_pairs: int = option(10, "Fewest synchronised pose pairs to solve with.", minimum=3, maximum=1_000_000)
+    max_pairs: int = option(5000, "Most synchronised pose pairs kept.", minimum=10, maximum=1_000_000)
+    keyframe_min_translation: float = option(
+        0.0, "Keep a pose pair when the parent sensor has moved this far since the last one kept, or turned min_rotation.",
+        unit="m", minimum=0.0, maximum=100.0, name="keyframe.min_translation",
+    )  # fmt: skip
+    keyframe_min_rotation: float = option(
+        0.0, "Keep a pose pair when the parent sensor has turned this far since the last one kept, or moved min_translation.",
+        unit="rad", minimum=0.0, maximum=math.pi, name="keyframe.min_rotation",
+    )  # fmt: skip
+    keyframe_min_interval: float = option(
+        0.0, "Time between pose pairs that are kept.", unit="s", minimum=0.0, maximum=60.0, name="keyframe.min_interval"
+    )
+    max_gap: float = option(
+        0.5, "Longest time between two poses of a stream that interpolation may bridge.", unit="s", minimum=1e-3, maximum=60.0
+    )
+    time_offset: float = option(
+        0.0, "Added to the child's stamps to get the parent's clock.", unit="s", minimum=-1e9, maximum=1e9
+    )
+    scale: str | float = option(
+        "none", "Factor from the child's length unit to metres, or none.", words=("none",), minimum=1e-6, maximum=1e6
+    )
+    parent_frame: str = option("", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True)
+    child_frame: str = option("", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True)
+
+
+@dataclass(frozen=True)
+class NodeConfig(_Checked):
+    """Options that only the node has."""
+
+    solve_period: float = option(2.0, "Time between solves.", unit="s", minimum=0.05, maximum=3600.0)
+    parent_type: str = option(
+        "auto", "Message type of parent_odom; auto looks at the publisher.", choices=POSE_TYPES, read_only=True
+    )
+    child_type: str = option(
+        "auto", "Message type of child_odom; auto looks at the publisher.", choices=POSE_TYPES, read_only=True
+    )
+    output_directory: str = option("", "Where ~/save writes the result files; empty for nowhere.")

@@ -1,0 +1,198 @@
+"""Batched rigid transforms.
+
+Transforms are ``(..., 4, 4)`` arrays named ``T_target_source``: they map coordinates of ``source`` into ``target``. Tangent
+vectors are ``(..., 6)`` arrays ``(rho, phi)``, translation (m) before rotation (rad), acting on the right:
+``T_target_source @ exp(xi_in_source)``. Rotation conversions are SciPy's.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# Below this angle the coefficients of exp and log come from their Taylor series. At 1e-2 rad the first term left out is
+# of order angle^6, about 1e-16 relative, whereas the closed forms lose digits to cancellation.
+_SERIES_ANGLE = 1e-2
+
+
+def skew(vectors):
+    """Cross-product matrices.
+
+    Parameters
+    ----------
+    vectors : (..., 3) array
+
+    Returns
+    -------
+    (..., 3, 3) array ``S`` with ``S @ v == cross(vector, v)``
+    """
+    vectors = np.asarray(vectors, dtype=float)
+    matrices = np.zeros(vectors.shape + (3,))
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
+    matrices[..., 1, 0], matrices[..., 2, 0], matrices[..., 2, 1] = z, -y, x
+    return matrices
+
+
+def from_rotation_translation(rotation, translation):
+    """Transforms from rotation matrices (..., 3, 3) and translations (..., 3) in metres; returns (..., 4, 4)."""
+    rotation, translation = np.asarray(rotation, dtype=float), np.asarray(translation, dtype=float)
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    transforms = np.zeros(shape + (4, 4))
+    transforms[..., :3, :3] = rotation
+    transforms[..., :3, 3] = translation
+    transforms[..., 3, 3] = 1.0
+    return transforms
+
+
+def from_quat_xyzw(translation, quat_xyzw):
+    """Transforms from translations (..., 3) in metres and quaternions (..., 4), scalar last; returns (..., 4, 4).
+
+    Quaternions are normalised; whether they were close enough to unit length is for the caller to judge.
+    """
+    quat_xyzw = np.asarray(quat_xyzw, dtype=float)
+    rotation = Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix().reshape(quat_xyzw.shape[:-1] + (3, 3))
+    return from_rotation_translation(rotation, translation)
+
+
+def to_quat_xyzw(transforms):
+    """Quaternions (..., 4), scalar last and not negative, of the rotations of transforms (..., 4, 4)."""
+    transforms = np.asarray(transforms, dtype=float)
+    quat_xyzw = Rotation.from_matrix(transforms[..., :3, :3].reshape(-1, 3, 3)).as_quat()
+    quat_xyzw[quat_xyzw[:, 3] < 0] *= -1.0
+    return quat_xyzw.reshape(transforms.shape[:-2] + (4,))
+
+
+def rotation_log(rotation):
+    """Rotation vectors (..., 3), in rad and of length at most pi, of rotation matrices (..., 3, 3)."""
+    rotation = np.asarray(rotation, dtype=float)
+    return Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(rotation.shape[:-1])
+
+
+def rotation_exp(rotation_vector):
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad."""
+    rotation_vector = np.asarray(rotation_vector, dtype=float)
+    matrices = Rotation.from_rotvec(rotation_vector.reshape(-1, 3)).as_matrix()
+    return matrices.reshape(rotation_vector.shape + (3,))
+
+
+def inverse(transforms):
+    """Inverses of transforms (..., 4, 4): ``T_source_target`` of ``T_target_source``."""
+    transforms = np.asarray(transforms, dtype=float)
+    rotation_inverse = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    return from_rotation_translation(rotation_inverse, -(rotation_inverse @ transforms[..., :3, 3:])[..., 0])
+
+
+def exp(xi):
+    """Exponential map of SE(3).
+
+    Parameters
+    ----------
+    xi : (..., 6) array
+        Tangent vectors (rho in m, phi in rad).
+
+    Returns
+    -------
+    (..., 4, 4) array
+
+    Notes
+    -----
+    ``t = V rho`` with ``V = I + (1 - cos a)/a^2 [phi] + (a - sin a)/a^3 [phi]^2`` and ``a = |phi|``; Sola, Deray,
+    Atchuthan, *A micro Lie theory for state estimation in robotics*, 2018, eqs 172-174.
+    """
+    xi = np.asarray(xi, dtype=float)
+    rho, phi = xi[..., :3], xi[..., 3:]
+    angle = np.linalg.norm(phi, axis=-1)
+    safe = np.where(angle < _SERIES_ANGLE, 1.0, angle)
+    squared = angle**2
+    first = np.where(
+        angle < _SERIES_ANGLE,
+        0.5 - squared / 24 + squared**2 / 720,
+        (1 - np.cos(safe)) / safe**2,
+    )
+    second = np.where(
+        angle < _SERIES_ANGLE,
+        1 / 6 - squared / 120 + squared**2 / 5040,
+        (safe - np.sin(safe)) / safe**3,
+    )
+    cross_once = np.cross(phi, rho)
+    translation = rho + first[..., None] * cross_once + second[..., None] * np.cross(phi, cross_once)
+    return from_rotation_translation(rotation_exp(phi), translation)
+
+
+def log(transforms):
+    """Logarithm of SE(3), the inverse of :func:`exp`.
+
+    Parameters
+    ----------
+    transforms : (..., 4, 4) array
+
+    Returns
+    -------
+    (..., 6) array
+        (rho in m, phi in rad), with ``|phi| <= pi``.
+
+    Notes
+    -----
+    ``rho = V^-1 t`` with ``V^-1 = I - [phi]/2 + (1/a^2 - (1 + cos a) / (2 a sin a)) [phi]^2``; written with the half angle the
+    last coefficient is ``(1 - (a/2) cot(a/2)) / a^2``, finite up to a = pi.
+    """
+    transforms = np.asarray(transforms, dtype=float)
+    phi = rotation_log(transforms[..., :3, :3])
+    translation = transforms[..., :3, 3]
+    angle = np.linalg.norm(phi, axis=-1)
+    safe = np.where(angle < _SERIES_ANGLE, 1.0, angle)
+    squared = angle**2
+    coefficient = np.where(
+        angle < _SERIES_ANGLE,
+        1 / 12 + squared / 720 + squared**2 / 30240,
+        (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2,
+    )
+    cross_once = np.cross(phi, translation)
+    rho = translation - 0.5 * cross_once + coefficient[..., None] * np.cross(phi, cross_once)
+    return np.concatenate([rho, phi], axis=-1)
+
+
+def adjoint(transforms):
+    """Adjoint matrices (..., 6, 6) of transforms (..., 4, 4).
+
+    ``T @ exp(xi) == exp(adjoint(T) @ xi) @ T``: moves a tangent vector (rho, phi) from the source frame to the target frame.
+    """
+    transforms = np.asarray(transforms, dtype=float)
+    rotation = transforms[..., :3, :3]
+    matrices = np.zeros(transforms.shape[:-2] + (6, 6))
+    matrices[..., :3, :3] = rotation
+    matrices[..., 3:, 3:] = rotation
+    matrices[..., :3, 3:] = skew(transforms[..., :3, 3]) @ rotation
+    return matrices
+
+
+def rotation_angle(rotation):
+    """Angles (...) in rad, from 0 to pi, of rotation matrices (..., 3, 3).
+
+    Taken from sine and cosine together, so that neither small angles nor angles near pi lose digits.
+    """
+    rotation = np.asarray(rotation, dtype=float)
+    twice_sine = np.sqrt(
+        (rotation[..., 2, 1] - rotation[..., 1, 2]) ** 2
+        + (rotation[..., 0, 2] - rotation[..., 2, 0]) ** 2
+        + (rotation[..., 1, 0] - rotation[..., 0, 1]) ** 2
+    )
+    twice_cosine = np.trace(rotation, axis1=-2, axis2=-1) - 1.0
+    return np.arctan2(twice_sine, twice_cosine)
+
+
+def interpolate(start, end, fraction):
+    """Poses along the geodesic of SE(3) from ``start`` to ``end`` (constant twist).
+
+    Parameters
+    ----------
+    start, end : (..., 4, 4) arrays
+        ``T_world_sensor`` at both ends.
+    fraction : (...) array
+        0 gives ``start``, 1 gives ``end``; values outside [0, 1] extend the same twist.
+
+    Returns
+    -------
+    (..., 4, 4) array
+    """
+    step = log(inverse(start) @ end)
+    return start @ exp(np.asarray(fraction, dtype=float)[..., None] * step)

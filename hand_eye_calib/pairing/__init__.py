@@ -1,0 +1,1 @@
+"""From two streams of poses to pairs of relative motions."""

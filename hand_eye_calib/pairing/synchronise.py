@@ -1,0 +1,94 @@
+"""Two streams with stamps of their own, brought to common instants by interpolation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.geometry.trajectory import Trajectory
+
+# Streams whose intervals differ by less than this factor count as equally fast: the child's stamps are then used.
+_EQUALLY_FAST = 1.2
+
+
+@dataclass(frozen=True)
+class PosePairs:
+    """Poses of both sensors at common instants.
+
+    Attributes
+    ----------
+    stamps_ns : (N,) int64 array
+        Parent clock, strictly increasing.
+    Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
+        Pose of each sensor in its own world.
+    """
+
+    stamps_ns: np.ndarray
+    Ts_pw_p: np.ndarray
+    Ts_cw_c: np.ndarray
+
+    def __len__(self):
+        return len(self.stamps_ns)
+
+    def __getitem__(self, index):
+        return PosePairs(self.stamps_ns[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
+
+    @classmethod
+    def empty(cls):
+        return cls(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)))
+
+    @classmethod
+    def concatenate(cls, first, second):
+        return cls(
+            np.concatenate([first.stamps_ns, second.stamps_ns]),
+            np.concatenate([first.Ts_pw_p, second.Ts_pw_p]),
+            np.concatenate([first.Ts_cw_c, second.Ts_cw_c]),
+        )
+
+
+def slower_stream(parent: Trajectory, child: Trajectory):
+    """ "parent" or "child": whose stamps to pair at. The child's where both are about equally fast.
+
+    The typical interval is the median, so that a gap or a late start does not make a stream slow.
+    """
+    if len(parent) < 2 or len(child) < 2:
+        return "child"
+    interval_parent, interval_child = np.median(np.diff(parent.stamps_ns)), np.median(np.diff(child.stamps_ns))
+    return "parent" if interval_parent > _EQUALLY_FAST * interval_child else "child"
+
+
+def synchronise(parent: Trajectory, child: Trajectory, max_gap_s, at=None) -> PosePairs:
+    """Poses of both sensors at the slower stream's stamps.
+
+    The faster stream is interpolated along the geodesic of SE(3). An instant outside it, or between two of its poses that lie
+    more than ``max_gap_s`` apart, is left out; an instant at which it has a pose of its own is always kept.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+        On one clock.
+    max_gap_s : float
+        Seconds.
+    at : {"parent", "child"}, optional
+        Whose stamps to use; the slower stream's by default.
+    """
+    if len(parent) == 0 or len(child) == 0:
+        return PosePairs.empty()
+    at = at or slower_stream(parent, child)
+    slow, fast = (parent, child) if at == "parent" else (child, parent)
+    keep = _interpolable(fast.stamps_ns, slow.stamps_ns, max_gap_s)
+    stamps_ns = slow.stamps_ns[keep]
+    fast_poses = np.repeat(fast.poses, len(stamps_ns), axis=0) if len(fast) == 1 else fast.at(stamps_ns)
+    if at == "parent":
+        return PosePairs(stamps_ns, slow.poses[keep], fast_poses)
+    return PosePairs(stamps_ns, fast_poses, slow.poses[keep])
+
+
+def _interpolable(available_ns, wanted_ns, max_gap_s):
+    """Mask of the wanted stamps at which a stream with the available stamps has a pose or may be interpolated."""
+    after = np.searchsorted(available_ns, wanted_ns)
+    inside = after < len(available_ns)
+    after = np.minimum(after, len(available_ns) - 1)
+    exact = available_ns[after] == wanted_ns
+    before = np.maximum(after - 1, 0)
+    gap_ns = available_ns[after] - available_ns[before]
+    return inside & (exact | ((after > 0) & (gap_ns <= max_gap_s * 1e9)))

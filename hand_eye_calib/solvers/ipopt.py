@@ -1,0 +1,88 @@
+"""DNL and DNLO as the paper states them: CasADi expressions minimised by Ipopt (Välimäki et al. 2023, section 3.2).
+
+The reference that the fast solvers are tested against. Unknowns are the rotation vector, the translation and, for DNLO, one
+weight per pair.
+"""
+
+import numpy as np
+
+from hand_eye_calib.errors import MissingDependencyError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.solvers import dnl, dnlo
+from hand_eye_calib.solvers.solution import Solution
+
+try:
+    import casadi
+except ImportError as error:
+    raise MissingDependencyError("backend ipopt needs CasADi, which is not installed: pip install casadi") from error
+
+_IPOPT_OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+_IDENTITY_START = 1e-6  # rad; at exactly zero the derivative of the rotation angle does not exist
+
+
+def solve_dnl(pairs):
+    """Minimise eq. (4) from the identity; see :func:`hand_eye_calib.solvers.dnl.solve`."""
+    pose = casadi.MX.sym("pose", 6)
+    solver = casadi.nlpsol("dnl", "ipopt", {"x": pose, "f": casadi.sum2(_cost_expressions(pairs, pose))}, _IPOPT_OPTIONS)
+    answer = solver(x0=np.r_[np.full(3, _IDENTITY_START), np.zeros(3)])
+    T_parent_child = _transform(answer["x"])
+    objective = float(dnl.pair_costs(pairs, T_parent_child).sum())
+    return _solution(solver, T_parent_child, objective, np.ones(len(pairs)))
+
+
+def solve_dnlo(pairs, threshold=0.01, min_inlier_fraction=0.5):
+    """Minimise eq. (5) from the identity with all weights 1; see :func:`hand_eye_calib.solvers.dnlo.solve`."""
+    n_pairs = len(pairs)
+    pose, alpha = casadi.MX.sym("pose", 6), casadi.MX.sym("alpha", n_pairs)
+    costs = _cost_expressions(pairs, pose).T
+    floor = min_inlier_fraction * n_pairs
+    problem = {
+        "x": casadi.vertcat(pose, alpha),
+        "f": casadi.dot(alpha, costs) + threshold * casadi.sum1(1 - alpha),
+        "g": casadi.sum1(alpha),
+    }
+    solver = casadi.nlpsol("dnlo", "ipopt", problem, _IPOPT_OPTIONS)
+    answer = solver(
+        x0=np.r_[np.full(3, _IDENTITY_START), np.zeros(3), np.ones(n_pairs)],
+        lbx=np.r_[np.full(6, -np.inf), np.zeros(n_pairs)],
+        ubx=np.r_[np.full(6, np.inf), np.ones(n_pairs)],
+        lbg=floor,
+        ubg=np.inf,
+    )
+    T_parent_child = _transform(answer["x"])
+    weights, objective = dnlo.truncate(dnl.pair_costs(pairs, T_parent_child), threshold, floor)
+    return _solution(solver, T_parent_child, float(objective), weights)
+
+
+def _cost_expressions(pairs, pose):
+    """(1, K) expression: each pair's ``|A X - X B|_F^2``, mapped over the pairs so that the expression graph stays small."""
+    motion_a, motion_b = casadi.SX.sym("A", 3, 4), casadi.SX.sym("B", 3, 4)
+    x = casadi.SX.sym("x", 6)
+    rotation, translation = _rodrigues(x[:3]), x[3:]
+    rotation_residual = motion_a[:, :3] @ rotation - rotation @ motion_b[:, :3]
+    translation_residual = motion_a[:, :3] @ translation + motion_a[:, 3] - rotation @ motion_b[:, 3] - translation
+    cost = casadi.sumsqr(rotation_residual) + casadi.sumsqr(translation_residual)
+    columns_a, columns_b = casadi.vec(motion_a), casadi.vec(motion_b)
+    function = casadi.Function("cost", [x, columns_a, columns_b], [cost])
+    return function.map(len(pairs))(pose, _columns(pairs.Ts_parenti_parentj), _columns(pairs.Ts_childi_childj))
+
+
+def _columns(transforms):
+    """(12, K) array: the top three rows of each transform, column-major as CasADi stores them."""
+    return np.ascontiguousarray(np.swapaxes(transforms[:, :3], 1, 2).reshape(len(transforms), 12).T)
+
+
+def _rodrigues(rotation_vector):
+    angle = casadi.norm_2(rotation_vector)
+    cross = casadi.skew(rotation_vector / angle)
+    return casadi.SX.eye(3) + casadi.sin(angle) * cross + (1 - casadi.cos(angle)) * cross @ cross
+
+
+def _transform(x):
+    pose = np.array(x).ravel()[:6]
+    return se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
+
+
+def _solution(solver, T_parent_child, objective, weights):
+    statistics = solver.stats()
+    return Solution(T_parent_child, objective, bool(statistics["success"]), int(statistics["iter_count"]), weights)

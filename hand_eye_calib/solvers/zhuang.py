@@ -1,0 +1,92 @@
+"""Zhuang: rotation and translation together, by Gauss-Newton on the identification Jacobian.
+
+H. Zhuang, Z. Qu, *A new identification Jacobian for robotic hand/eye calibration*, IEEE Transactions on Systems, Man, and
+Cybernetics 24(8), 1994, eqs 14-16.
+
+With ``z = tan(w/2) k`` for the rotation by w about k, Cayley's formula ``R = (I - [z])^-1 (I + [z])`` makes both halves of AX = XB
+polynomial once they are multiplied by ``I - [z]``:
+
+    f = [k_A + k_B] z + k_A - k_B                              (rotation axes: k_A = R k_B)
+    g = (I - [z]) ((R_A - I) t + t_A) - (I + [z]) t_B          (translations)
+
+Both are linear in the sixteen products of (1, z) with (1, t), so the pairs are condensed once, by a QR decomposition, and an iteration costs
+the same however many there are.
+
+The axes enter with unit length however small the turn, and g grows with X's own rotation: where rotations are noisy or X turns far, the answer
+is biased. A child turned by half a turn against the parent has no finite z and is never found.
+"""
+
+import numpy as np
+
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.solvers.solution import Solution
+
+_MAX_ITERATIONS = 500
+_STEP_TOLERANCE = 1e-8
+
+# Singular values of the Jacobian below this share of the largest are directions the motion does not show: left where they are.
+_RANK_TOLERANCE = 1e-12
+
+
+def solve(pairs):
+    """Solve AX = XB by Gauss-Newton from the identity.
+
+    Parameters
+    ----------
+    pairs : MotionPairs
+        K pairs, K >= 1.
+
+    Returns
+    -------
+    Solution
+        ``objective`` is the sum of ``|f|^2 + |g|^2``.
+    """
+    residual_of_products = _condense(pairs)
+    parameters = np.zeros(6)
+    converged, iterations = False, 0
+    while iterations < _MAX_ITERATIONS and not converged:
+        iterations += 1
+        products, derivative = _products(parameters)
+        step = np.linalg.lstsq(residual_of_products @ derivative, -residual_of_products @ products, rcond=_RANK_TOLERANCE)[0]
+        parameters = parameters + step
+        converged = bool((np.abs(step) < _STEP_TOLERANCE).all())
+    residuals = residual_of_products @ _products(parameters)[0]
+    T_parent_child = se3.from_rotation_translation(_rotation(parameters[:3]), parameters[3:])
+    return Solution(T_parent_child, float(residuals @ residuals), converged, iterations, np.ones(len(pairs)))
+
+
+def _condense(pairs):
+    """Matrix (at most 20, 16) that turns the products into residuals with the same squared length as all f and g together."""
+    rotation_parent, translation_parent = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_parenti_parentj[:, :3, 3]
+    translation_child = pairs.Ts_childi_childj[:, :3, 3]
+    axes_parent, axes_child = _axes(rotation_parent), _axes(pairs.Ts_childi_childj[:, :3, :3])
+    f = np.concatenate([(axes_parent - axes_child)[:, :, None], se3.skew(axes_parent + axes_child)], axis=2)
+    g = np.zeros((len(pairs), 3, 4, 4))
+    g[..., 1:] = (rotation_parent - np.eye(3))[:, :, None]
+    g[:, :, 0, 0] = translation_parent - translation_child
+    g[:, :, 1:, 0] = (translation_parent + translation_child)[:, :, None]
+    g[:, :, 1:] = -np.einsum("zij,njzt->nizt", se3.skew(np.eye(3)), g[:, :, 1:])
+    f_of_products = np.kron(np.linalg.qr(f.reshape(-1, 4), mode="r"), [1.0, 0.0, 0.0, 0.0])
+    return np.concatenate([f_of_products, np.linalg.qr(g.reshape(-1, 16), mode="r")])
+
+
+def _products(parameters):
+    """The products (16,) of (1, z) and (1, t), z slowest, and their derivatives (16, 6) by (z, t)."""
+    one_z, one_t = np.append(1.0, parameters[:3]), np.append(1.0, parameters[3:])
+    derivative = np.zeros((4, 4, 6))
+    derivative[1:, :, :3] = one_t[:, None] * np.eye(3)[:, None]
+    derivative[:, 1:, 3:] = one_z[:, None, None] * np.eye(3)
+    return np.outer(one_z, one_t).ravel(), derivative.reshape(16, 6)
+
+
+def _axes(rotation):
+    """Unit rotation axes (K, 3); (0, 0, 1) where there is no rotation."""
+    rotvec = se3.rotation_log(rotation)
+    angle = np.linalg.norm(rotvec, axis=1, keepdims=True)
+    return np.where(angle > 0.0, rotvec / np.where(angle > 0.0, angle, 1.0), [0.0, 0.0, 1.0])
+
+
+def _rotation(z):
+    """Rotation matrix (3, 3) of ``z = tan(w/2) k``."""
+    length = np.linalg.norm(z)
+    return se3.rotation_exp(z * (2 * np.arctan(length) / length if length > 0.0 else 2.0))

@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering_poses
+
+from hand_eye_calib.assessment.covariance import assess, jackknife_covariance, larger_by_direction, model_covariance
+from hand_eye_calib.calibration import DofVerdict
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.solvers.registry import Method
+
+DNL = Method("dnl")
+
+
+def solve_and_assess(parent, child, reference="B1", method=DNL):
+    pairs = motion_pairs(parent, child, reference)
+    solution = method.solve(pairs)
+    return solution, assess(pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out))
+
+
+def errors_and_covariances(n_runs, estimate):
+    """Errors xi against the truth (R, 6) and covariances (R, 6, 6) over independent noise."""
+    parent = wandering_poses(120)
+    child = child_of(parent)
+    errors, covariances = [], []
+    for run in range(n_runs):
+        solution, covariance = estimate(disturbed(parent, 2 * run, 0.005, 0.005), disturbed(child, 2 * run + 1, 0.005, 0.005))
+        errors.append(se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD))
+        covariances.append(covariance)
+    return np.array(errors), np.array(covariances)
+
+
+def test_the_stated_sigma_is_the_scatter_that_is_found():
+    def estimate(parent, child):
+        solution, assessment = solve_and_assess(parent, child, "B10")
+        return solution, assessment.cov_parent_child_in_child
+
+    errors, covariances = errors_and_covariances(60, estimate)
+    found = np.sqrt((errors**2).mean(axis=0))
+    stated = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
+    assert (stated > 0.7 * found).all()
+    assert (stated < 2.5 * found).all()
+
+
+def test_the_model_alone_is_right_for_independent_pairs():
+    rng = np.random.default_rng(0)
+    parent = wandering_poses(120)
+    pairs = motion_pairs(parent, child_of(parent), "B5")
+    errors, sigmas = [], []
+    for _ in range(80):
+        noise = se3.exp(rng.normal(0, 0.004, (len(pairs), 6)))
+        noisy = type(pairs)(pairs.Ts_parenti_parentj, pairs.Ts_childi_childj @ noise, pairs.i, pairs.j)
+        solution = DNL.solve(noisy)
+        errors.append(se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD))
+        sigmas.append(np.sqrt(np.diag(model_covariance(noisy, solution)[0])))
+    ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / np.mean(sigmas, axis=0)
+    assert (ratio > 0.75).all()
+    assert (ratio < 1.3).all()
+
+
+def test_jackknife_of_a_mean_is_its_standard_error():
+    values = np.random.default_rng(1).normal(size=1000)
+
+    def mean_without(left_out):
+        means = [values[~row].mean() for row in left_out]
+        return se3.exp(np.c_[means, np.zeros((len(means), 5))])
+
+    covariance = jackknife_covariance(1000, se3.exp(np.r_[values.mean(), np.zeros(5)]), mean_without)
+    assert np.sqrt(covariance[0, 0]) == pytest.approx(values.std() / np.sqrt(1000), rel=0.5)
+
+
+def test_too_few_pairs_for_blocks_leave_the_model():
+    assert jackknife_covariance(9, np.eye(4), None) is None
+
+
+def test_the_larger_covariance_covers_both_in_every_direction():
+    rng = np.random.default_rng(2)
+    first, second = (root @ root.T for root in rng.normal(size=(2, 6, 6)))
+    larger = larger_by_direction(first, second)
+    for direction in rng.normal(size=(200, 6)):
+        needed = max(direction @ first @ direction, direction @ second @ direction)
+        assert direction @ larger @ direction >= needed * (1 - 1e-9)
+    np.testing.assert_allclose(larger_by_direction(first, 0.5 * first), first, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_flat_ground_hides_the_height_and_only_that(noise):
+    parent = planar_poses(200)
+    child = child_of(parent)
+    _, assessment = solve_and_assess(disturbed(parent, 1, noise, noise), disturbed(child, 2, noise, noise), "B10")
+    verdicts = {dof.name: dof.verdict for dof in assessment.observability}
+    assert verdicts.pop("z") is DofVerdict.UNOBSERVABLE
+    assert set(verdicts.values()) == {DofVerdict.OBSERVED}
+    assert np.isfinite(assessment.cov_parent_child_in_child).all()
+
+
+def test_turning_about_one_axis_in_place_hides_shift_and_turn_along_it():
+    angles = 0.3 * np.sin(np.arange(100) / 5)
+    axis = np.array([0.0, 1.0, 0.0])
+    parent = se3.from_rotation_translation(se3.rotation_exp(angles[:, None] * axis), np.zeros((100, 3)))
+    _, assessment = solve_and_assess(parent, child_of(parent), "B5")
+    hidden = [dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
+    assert "y" in hidden
+    assert "pitch" in hidden or len(hidden) > 2
+
+
+def test_good_motion_shows_everything():
+    parent = wandering_poses(200)
+    _, assessment = solve_and_assess(disturbed(parent, 1, 1e-3, 1e-3), disturbed(child_of(parent), 2, 1e-3, 1e-3), "B5")
+    assert {dof.verdict for dof in assessment.observability} == {DofVerdict.OBSERVED}

@@ -1,0 +1,273 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, feed, planar_poses, wandering_poses
+
+import hand_eye_calib as hec
+from hand_eye_calib import calibrator as engine
+from hand_eye_calib.calibration import SolveStatus
+from hand_eye_calib.calibrator import Calibrator, calibrate
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
+
+IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+
+
+def drive(n_poses=200, seed=0):
+    """Parent at 10 Hz, child at 50 Hz, 13 ms apart; smooth enough that interpolation costs little."""
+    from hand_eye_calib.geometry import se3
+
+    coarse = wandering_poses(n_poses, seed)
+    fine = as_trajectory(coarse, 10).at(
+        np.sort(np.r_[as_trajectory(coarse, 10).stamps_ns[:-1, None] + np.arange(5) * 2 * 10**7].ravel())
+    )
+    parent = as_trajectory(coarse, 10)
+    child = as_trajectory(child_of(fine), 50)
+    assert np.allclose(se3.inverse(coarse[0]) @ coarse[0], np.eye(4))
+    return parent, child
+
+
+def test_python_function_finds_the_truth_at_different_rates():
+    parent, child = drive()
+    result = calibrate(parent, child, reference="B3")
+    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert result.status is SolveStatus.OK
+    assert (result.method, result.reference, result.backend) == ("dnlo", "B3", "fast")
+    assert result.n_pairs == result.n_poses - 3 == result.n_inliers
+    np.testing.assert_allclose(result.T_parent_child @ result.T_child_parent, np.eye(4), atol=1e-12)
+
+
+def test_the_engine_and_the_function_agree_to_the_last_bit():
+    parent, child = drive()
+    calibrator = Calibrator(CalibratorConfig(reference="B3"))
+    feed(calibrator, "child", child)
+    feed(calibrator, "parent", parent)
+    fed = calibrator.estimate()
+    from hand_eye_calib.geometry import se3
+    from hand_eye_calib.geometry.trajectory import Trajectory
+
+    through_quaternions = [
+        Trajectory.from_quat_xyzw(t.stamps_ns, t.poses[:, :3, 3], se3.to_quat_xyzw(t.poses)) for t in (parent, child)
+    ]
+    assert np.array_equal(fed.T_parent_child, calibrate(*through_quaternions, reference="B3").T_parent_child)
+
+
+def test_auto_names_the_reference_it_chose():
+    parent, child = drive()
+    result = calibrate(parent, disturb(child))
+    assert result.reference in ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
+
+
+def disturb(trajectory):
+    return dataclasses.replace(trajectory, poses=disturbed(trajectory.poses, 1, 0.002, 0.002))
+
+
+def test_time_offset_and_scale_are_applied_to_the_child():
+    parent, child = drive()
+    late = dataclasses.replace(child.shifted(-12.5), poses=child.scaled(1 / 2.5).poses)
+    result = calibrate(parent, late, reference="B3", time_offset=12.5, scale=2.5)
+    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert (result.time_offset_s, result.scale) == (12.5, 2.5)
+
+
+def test_flat_ground_is_a_status_not_a_number():
+    poses = planar_poses(150)
+    result = calibrate(as_trajectory(poses), as_trajectory(child_of(poses)), reference="B10")
+    assert result.status is SolveStatus.UNOBSERVABLE
+    assert result.unobservable() == ["z"]
+    assert "does not reveal z" in result.warnings[0]
+    assert result.to_dict()["observability"][2]["sigma"] is None
+
+
+@pytest.mark.parametrize("method", ["park", "taylor", "zhuang", "ali", "dnl"])
+def test_every_method_is_available(method):
+    parent, child = drive(60)
+    result = calibrate(parent, child, method=method, reference="B5")
+    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"methods": "dnlo"}, "unknown option 'methods'"),
+        ({"method": "tsai"}, "method must be one of dnlo, dnl, park"),
+        ({"reference": "B0"}, "reference must match"),
+        ({"threshold": -1.0}, "threshold must be at least"),
+        ({"min_inlier_fraction": 1.5}, "min_inlier_fraction must be at most 1"),
+        ({"min_pairs": 2.5}, "min_pairs must be of type int"),
+        ({"scale": "big"}, "scale must be none or a number"),
+        ({"time_offset": float("nan")}, "time_offset must be a finite number"),
+        ({"method": "park", "backend": "ipopt"}, "park has no ipopt backend"),
+    ],
+)
+def test_impossible_options_are_refused(options, message):
+    parent, child = drive(30)
+    with pytest.raises(ConfigError, match=message):
+        calibrate(parent, child, **{"reference": "B1", **options})
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("position", "quat", "message"),
+        [
+            ((0, np.nan, 0), (0, 0, 0, 1), r"position \(0, nan, 0\) is not finite"),
+            ((np.inf, 0, 0), (0, 0, 0, 1), "is not finite"),
+            ((0, 0, 0), (0, 0, 0, 0), "has length 0, expected 1"),
+            ((0, 0, 0), (0.5, 0.5, 0.5, 0.6), "has length 1.05"),
+            ((0, 0, 0), (0, 0, np.nan, 1), "has length nan"),
+        ],
+    )
+    def test_impossible_poses(self, position, quat, message):
+        calibrator = Calibrator()
+        with pytest.raises(InputError, match=message):
+            calibrator.add_pose("parent", 0, position, quat)
+        assert calibrator.statistics("parent").received == 0
+
+    def test_repeated_stamps(self):
+        calibrator = Calibrator()
+        assert calibrator.add_pose("child", 5, *IDENTITY)
+        assert calibrator.add_pose("child", 3, *IDENTITY)
+        assert not calibrator.add_pose("child", 5, *IDENTITY)
+        assert not calibrator.add_pose("child", 3, *IDENTITY)
+        statistics = calibrator.statistics("child")
+        assert (statistics.received, statistics.refused_duplicate) == (2, 2)
+        assert (statistics.first_stamp_ns, statistics.last_stamp_ns) == (3, 5)
+
+    def test_frames(self):
+        calibrator = Calibrator()
+        with pytest.raises(InputError, match="parent stream's sensor frame is empty"):
+            calibrator.set_frame("parent", "")
+        calibrator.set_frame("parent", "lidar")
+        calibrator.set_frame("parent", "lidar")
+        with pytest.raises(InputError, match="changed from 'lidar' to 'camera'"):
+            calibrator.set_frame("parent", "camera")
+        calibrator.set_frame("child", "lidar")
+        with pytest.raises(InputError, match="both streams name 'lidar'"):
+            calibrator.estimate()
+
+    def test_named_frames_win_over_the_messages(self):
+        calibrator = Calibrator(CalibratorConfig(child_frame="camera"))
+        calibrator.set_frame("child", "")
+        calibrator.set_frame("child", "base_link")
+        assert calibrator.snapshot().child_frame == "camera"
+
+    def test_unnamed_frames_are_said(self):
+        snapshot = Calibrator().snapshot()
+        assert (snapshot.parent_frame, snapshot.child_frame) == ("parent_sensor", "child_sensor")
+        assert "parent stream does not name" in snapshot.warnings[0]
+
+
+class TestMissingData:
+    def test_nothing(self):
+        with pytest.raises(NotEnoughDataError, match="no poses on the parent stream"):
+            Calibrator().estimate()
+
+    def test_no_overlap(self):
+        parent, child = drive(30)
+        with pytest.raises(NotEnoughDataError, match=r"do not overlap in time .* 97\.\d+ s apart"):
+            calibrate(parent, child.shifted(100))
+
+    def test_too_few(self):
+        parent, child = drive(8)
+        with pytest.raises(NotEnoughDataError, match="10 synchronised pose pairs are needed, found 7"):
+            calibrate(parent, child)
+
+    def test_too_few_for_the_reference(self):
+        parent, child = drive(12)
+        with pytest.raises(NotEnoughDataError, match="too few common poses for the chosen reference"):
+            calibrate(parent, child, reference="B50")
+
+    def test_gaps(self):
+        parent, child = drive(40)
+        with pytest.raises(NotEnoughDataError, match="raise max_gap"):
+            calibrate(parent.shifted(0.005), child, max_gap=0.01)
+
+
+class TestLongSessions:
+    """The waiting room made small, so that a short drive fills it many times."""
+
+    @pytest.fixture(autouse=True)
+    def small_waiting_room(self, monkeypatch):
+        monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 100)
+
+    @staticmethod
+    def interleaved(calibrator, parent, child):
+        from hand_eye_calib.geometry import se3
+
+        messages = [
+            (stamp_ns, stream, pose[:3, 3], quat)
+            for stream, trajectory in (("parent", parent), ("child", child))
+            for stamp_ns, pose, quat in zip(
+                trajectory.stamps_ns.tolist(), trajectory.poses, se3.to_quat_xyzw(trajectory.poses), strict=True
+            )
+        ]
+        for stamp_ns, stream, position, quat in sorted(messages, key=lambda message: message[:2]):
+            calibrator.add_pose(stream, stamp_ns, position, quat)
+
+    def test_every_pose_is_paired_once_however_often_the_room_was_cleared(self):
+        parent, child = drive(400)
+        calibrator = Calibrator(CalibratorConfig(reference="B3"))
+        self.interleaved(calibrator, parent, child)
+        pairs = calibrator.snapshot().pose_pairs()
+        inside = parent.stamps_ns <= child.stamps_ns[-1]
+        assert np.array_equal(pairs.stamps_ns, parent.stamps_ns[inside])
+        np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
+
+    def test_latecomers_are_counted(self):
+        parent, child = drive(400)
+        calibrator = Calibrator()
+        self.interleaved(calibrator, parent, child)
+        assert not calibrator.add_pose("parent", int(parent.stamps_ns[0]) + 1, *IDENTITY)
+        assert calibrator.statistics("parent").refused_late == 1
+
+    def test_pairs_are_bounded_and_turns_survive(self):
+        parent, child = drive(400)
+        calibrator = Calibrator(CalibratorConfig(max_pairs=100, reference="B3"))
+        self.interleaved(calibrator, parent, child)
+        pairs = calibrator.snapshot().pose_pairs()
+        assert 50 <= len(pairs) <= 100
+        assert pairs.stamps_ns[-1] - pairs.stamps_ns[0] > 0.9 * (parent.stamps_ns[-1] - parent.stamps_ns[0])
+        np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
+
+    def test_a_stream_on_its_own_does_not_fill_the_memory(self):
+        parent, child = drive(400)
+        calibrator = Calibrator(CalibratorConfig(reference="B3"))
+        feed(calibrator, "parent", parent)
+        assert calibrator.statistics("parent").dropped_unpaired > 0
+        assert len(calibrator.snapshot().parent) <= 100
+        feed(calibrator, "child", child)
+        assert len(calibrator.snapshot().pose_pairs()) > 20
+
+    def test_reset_forgets_and_reconfigure_keeps(self):
+        parent, child = drive(400)
+        calibrator = Calibrator(CalibratorConfig(reference="B3"))
+        self.interleaved(calibrator, parent, child)
+        calibrator.reconfigure(dataclasses.replace(calibrator.config, reference="B5"))
+        assert calibrator.estimate().reference == "B5"
+        before = len(calibrator.snapshot().pose_pairs())
+        calibrator.reconfigure(dataclasses.replace(calibrator.config, time_offset=0.01))
+        assert 0 < len(calibrator.snapshot().pose_pairs()) < before
+        calibrator.reset()
+        assert calibrator.statistics("parent").received == 0
+        with pytest.raises(NotEnoughDataError):
+            calibrator.estimate()
+
+
+def test_a_snapshot_does_not_change_when_poses_come_in():
+    parent, child = drive(60)
+    calibrator = Calibrator(CalibratorConfig(reference="B3"))
+    feed(calibrator, "child", child)
+    feed(calibrator, "parent", parent[:40])
+    snapshot = calibrator.snapshot()
+    before = snapshot.estimate()
+    feed(calibrator, "parent", parent[40:])
+    assert np.array_equal(snapshot.estimate().T_parent_child, before.T_parent_child)
+    assert calibrator.estimate().n_poses > before.n_poses
+
+
+def test_public_names_exist():
+    for name in hec.__all__:
+        assert callable(getattr(hec, name))
+    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+        hec.calibrat  # noqa: B018

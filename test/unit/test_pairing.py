@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.keyframes import select_keyframes
+from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.references import reference_indices
+from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream, synchronise
+
+
+def as_lists(pairs):
+    return list(zip(*(indices.tolist() for indices in pairs), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("reference", "n_poses", "expected"),
+    [
+        ("A", 4, [(0, 1), (0, 2), (0, 3)]),
+        ("B1", 4, [(0, 1), (1, 2), (2, 3)]),
+        ("B3", 5, [(0, 3), (1, 4)]),
+        ("B3", 3, []),
+        # keyframes 0 and 3 are below 7 - 3 = 4; the one at 6 is not
+        ("C3", 7, [(0, 1), (0, 2), (3, 4), (3, 5)]),
+        # with 6 poses the keyframe at 3 is no longer strictly below 6 - 3
+        ("C3", 6, [(0, 1), (0, 2)]),
+        ("C5", 5, []),
+        ("A", 1, []),
+        ("A", 0, []),
+    ],
+)
+def test_references_are_those_of_the_paper(reference, n_poses, expected):
+    assert as_lists(reference_indices(reference, n_poses)) == expected
+
+
+@pytest.mark.parametrize("reference", ["", "D", "B0", "B", "C1", "B-1", "b1", "A1", "B01", "auto", None, "B1 "])
+def test_anything_else_is_not_a_reference(reference):
+    with pytest.raises(ConfigError, match="is not one of A, B<n>"):
+        reference_indices(reference, 10)
+
+
+def test_every_motion_pair_fulfils_ax_xb():
+    parent = wandering_poses(40)
+    pairs = motion_pairs(parent, child_of(parent), "C10")
+    np.testing.assert_allclose(pairs.Ts_parenti_parentj @ T_PARENT_CHILD, T_PARENT_CHILD @ pairs.Ts_childi_childj, atol=1e-12)
+    np.testing.assert_allclose(parent[pairs.i] @ pairs.Ts_parenti_parentj, parent[pairs.j], atol=1e-12)
+
+
+def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
+    near = wandering_poses(20)
+    far = near.copy()
+    far[:, :3, 3] += np.array([456_789.0, 4_567_890.0, 120.0])
+    near_motion = motion_pairs(near, near).Ts_parenti_parentj
+    np.testing.assert_allclose(motion_pairs(far, far).Ts_parenti_parentj, near_motion, atol=4e-9)  # 1 ulp of 4.5e6 is 9e-10
+
+
+def test_different_numbers_of_poses_are_refused():
+    with pytest.raises(InputError, match="found 3 and 4"):
+        motion_pairs(wandering_poses(3), wandering_poses(4))
+
+
+def test_the_slower_stream_gives_the_stamps():
+    slow, fast = as_trajectory(wandering_poses(20), rate_hz=10), as_trajectory(wandering_poses(100), rate_hz=50)
+    assert (slower_stream(slow, fast), slower_stream(fast, slow), slower_stream(slow, slow)) == ("parent", "child", "child")
+    assert np.array_equal(synchronise(slow, fast, 0.5).stamps_ns, slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]])
+    paired = synchronise(fast, slow, 0.5)
+    assert np.array_equal(paired.stamps_ns, slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]])
+    assert np.array_equal(paired.Ts_cw_c, slow.poses[: len(paired)])
+
+
+def test_nothing_is_extrapolated_and_no_gap_is_bridged():
+    child = as_trajectory(wandering_poses(30), rate_hz=10)
+    holes = np.ones(300, dtype=bool)
+    holes[100:170] = False  # the 0.7 s after 1.0 s
+    parent = as_trajectory(wandering_poses(300), rate_hz=100)[holes].shifted(0.25)
+    paired = synchronise(parent, child, max_gap_s=0.5)
+    seconds = (paired.stamps_ns - child.stamps_ns[0]) * 1e-9
+    # the parent runs from 0.25 s to 3.24 s, with nothing between 1.24 s and 1.95 s
+    np.testing.assert_allclose(seconds, np.r_[np.arange(0.3, 1.25, 0.1), np.arange(2.0, 2.95, 0.1)], atol=1e-9)
+    assert len(synchronise(parent, child, max_gap_s=0.8)) == 27
+
+
+def test_a_stamp_both_have_needs_no_interpolation_even_inside_a_gap():
+    stamps = np.array([0, 1, 5, 6]) * 10**9
+    trajectory = Trajectory(stamps, wandering_poses(4))
+    paired = synchronise(trajectory, trajectory, max_gap_s=0.1)
+    assert np.array_equal(paired.stamps_ns, stamps)
+    assert np.array_equal(paired.Ts_pw_p, trajectory.poses)
+
+
+def test_streams_that_do_not_meet_give_no_pairs():
+    trajectory = as_trajectory(wandering_poses(5))
+    assert len(synchronise(trajectory, trajectory.shifted(100.0), 0.5)) == 0
+    assert len(synchronise(trajectory, trajectory[:0], 0.5)) == 0
+
+
+class TestKeyframes:
+    @staticmethod
+    def straight_then_turning():
+        steps = np.zeros((10, 6))
+        steps[1:5, 0] = 0.1
+        steps[5:, 5] = 0.2
+        poses = [np.eye(4)]
+        for step in se3.exp(steps[1:]):
+            poses.append(poses[-1] @ step)
+        poses = np.array(poses)
+        return PosePairs(np.arange(10) * 10**8, poses, poses)
+
+    def test_no_threshold_keeps_everything(self):
+        assert select_keyframes(self.straight_then_turning(), 0, 0, 0).tolist() == list(range(10))
+
+    def test_each_criterion_works_alone(self):
+        poses = self.straight_then_turning()
+        assert select_keyframes(poses, 0.199, 0, 0).tolist() == [0, 2, 4]
+        assert select_keyframes(poses, 0, 0.399, 0).tolist() == [0, 6, 8]
+        assert select_keyframes(poses, 0, 0, 0.3).tolist() == [0, 3, 6, 9]
+
+    def test_moving_or_turning_is_enough_but_the_interval_must_pass(self):
+        poses = self.straight_then_turning()
+        assert select_keyframes(poses, 0.199, 0.399, 0).tolist() == [0, 2, 4, 6, 8]
+        assert select_keyframes(poses, 0.199, 0.399, 0.4).tolist() == [0, 4, 8]
+
+    def test_selection_goes_on_where_it_stopped(self):
+        poses = self.straight_then_turning()
+        whole = select_keyframes(poses, 0.199, 0.399, 0)
+        rest = select_keyframes(poses[3:], 0.199, 0.399, 0, previous=poses[2:3])
+        assert (rest + 3).tolist() == whole[whole > 2].tolist()
