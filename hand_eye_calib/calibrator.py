@@ -8,17 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.assessment.covariance import Assessment, assess
-from hand_eye_calib.assessment.reference_selection import select_reference
-from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.estimation import estimate_extrinsic
 from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream, synchronise
-from hand_eye_calib.solvers.registry import Method
-from hand_eye_calib.solvers.solution import Solution
 
 STREAMS = ("parent", "child")
 
@@ -129,14 +124,6 @@ class _Stream:
         self._poses[:rest] = self._poses[split : self._count].copy()
         self._count = rest
         self._let_go_until_ns = until_ns
-
-
-@dataclass(frozen=True)
-class _Evaluation:
-    reference: str
-    pairs: MotionPairs
-    solution: Solution
-    assessment: Assessment
 
 
 @dataclass(frozen=True)
@@ -296,26 +283,9 @@ class Calibrator:
 
     def snapshot(self):
         """What is known now, for an estimate in this or another thread."""
-        config, parent, child = self._config, self._streams["parent"], self._streams["child"]
-        frames, warnings = {}, []
-        for stream in STREAMS:
-            frames[stream] = getattr(config, f"{stream}_frame") or self._streams[stream].frame
-            if not frames[stream]:
-                frames[stream] = f"{stream}_sensor"
-                warnings.append(
-                    f"the {stream} stream does not name its sensor's frame; it is called {frames[stream]!r} here "
-                    f"(name it with {stream}_frame)"
-                )
-        return Snapshot(
-            config,
-            self._kept,
-            parent.trajectory(),
-            child.trajectory(),
-            self._base_stream,
-            frames["parent"],
-            frames["child"],
-            tuple(warnings),
-        )
+        parent, child = self._streams["parent"], self._streams["child"]
+        frames, warnings = _name_frames(self._config, {"parent": parent.frame, "child": child.frame})
+        return Snapshot(self._config, self._kept, parent.trajectory(), child.trajectory(), self._base_stream, *frames, warnings)
 
     def estimate(self):
         """Solve for the extrinsic from all poses so far.
@@ -380,52 +350,28 @@ def calibrate(parent, child, **options):
     NotEnoughDataError
         Where too few poses could be paired.
     """
-    options = {"max_pairs": max(len(parent), len(child), 10), **options}
-    config = CalibratorConfig.from_options(options)
-    return Snapshot(
-        config,
-        PosePairs.empty(),
-        parent,
-        child,
-        None,
-        config.parent_frame or parent.sensor_frame or "parent_sensor",
-        config.child_frame or child.sensor_frame or "child_sensor",
-    ).estimate()
+    config = offline_config(parent, child, options)
+    frames, warnings = _name_frames(config, {"parent": parent.sensor_frame, "child": child.sensor_frame})
+    return Snapshot(config, PosePairs.empty(), parent, child, None, *frames, warnings).estimate()
 
 
-def estimate_extrinsic(pose_pairs, config):
-    """Solve and assess synchronised poses (a :class:`PosePairs`) under a configuration; returns a Calibration without frames."""
-    scale = 1.0 if config.scale == "none" else config.scale
-    Ts_cw_c = pose_pairs.Ts_cw_c.copy()
-    Ts_cw_c[:, :3, 3] *= scale
-    method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
+def offline_config(parent, child, options):
+    """The CalibratorConfig for two whole trajectories: no limit on the pairs unless the options set one."""
+    return CalibratorConfig.from_options({"max_pairs": max(len(parent), len(child), 10), **options})
 
-    def evaluate(reference):
-        pairs = motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, reference)
-        solution = method.solve(pairs)
-        assessment = assess(pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out))
-        return _Evaluation(reference, pairs, solution, assessment)
 
-    evaluation = select_reference(evaluate, len(pose_pairs)) if config.reference == "auto" else evaluate(config.reference)
-    solution, assessment = evaluation.solution, evaluation.assessment
-    status, warnings = _judge(solution, assessment)
-    return Calibration(
-        T_parent_child=solution.T_parent_child,
-        covariance=assessment.cov_parent_child_in_child,
-        status=status,
-        observability=assessment.observability,
-        objective=solution.objective,
-        method=config.method,
-        reference=evaluation.reference,
-        backend=config.backend,
-        n_poses=len(pose_pairs),
-        n_pairs=len(evaluation.pairs),
-        n_inliers=int((solution.weights > 0.5).sum()),
-        time_offset_s=config.time_offset,
-        scale=scale,
-        stamp_ns=int(pose_pairs.stamps_ns[-1]),
-        warnings=warnings,
-    )
+def _name_frames(config, known):
+    """Names of the parent's and the child's sensor frame, and a warning for each that nobody named."""
+    names, warnings = [], []
+    for stream in STREAMS:
+        name = getattr(config, f"{stream}_frame") or known[stream]
+        if not name:
+            name = f"{stream}_sensor"
+            warnings.append(
+                f"the {stream} stream does not name its sensor's frame; it is called {name!r} here (name it with {stream}_frame)"
+            )
+        names.append(name)
+    return names, tuple(warnings)
 
 
 def thin(pose_pairs, max_pairs):
@@ -458,17 +404,3 @@ def _synchronised(config, parent, child, base_stream, kept):
             previous=kept[-1:],
         )
     ]
-
-
-def _judge(solution, assessment):
-    warnings = []
-    unobservable = [dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
-    if unobservable:
-        warnings.append(
-            f"the motion does not reveal {', '.join(unobservable)} of the child sensor in the parent sensor's frame: do not use "
-            "these values; drive curves over slopes, or measure them by hand"
-        )
-    if not solution.converged:
-        warnings.append("the solver did not converge: do not use this result")
-        return SolveStatus.NOT_CONVERGED, tuple(warnings)
-    return (SolveStatus.UNOBSERVABLE if unobservable else SolveStatus.OK), tuple(warnings)

@@ -102,7 +102,9 @@ def _number(name, value, meta):
         raise ConfigError(f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}") from None
 
 
-class _Checked:
+class OptionSet:
+    """Base of dataclasses made of options: checks every value, and knows the options by their public names."""
+
     def __post_init__(self):
         for field in dataclasses.fields(self):
             object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
@@ -122,7 +124,7 @@ class _Checked:
 
 
 @dataclass(frozen=True)
-class CalibratorConfig(_Checked):
+class CalibratorConfig(OptionSet):
     """Options of the engine: the same for the node, the replay of bags, files and Python."""
 
     method: str = option("dnlo", "Solver; dnlo rejects outliers, the others use every pair.", choices=METHODS)
@@ -142,7 +144,7 @@ class CalibratorConfig(_Checked):
         0.5, "DNLO: share of the pairs that always counts as inliers (d of eq. 5 over the pairs).", minimum=0.0, maximum=1.0
     )
     min_pairs: int = option(10, "Fewest synchronised pose pairs to solve with.", minimum=3, maximum=1_000_000)
-    max_pairs: int = option(5000, "Most synchronised pose pairs kept.", minimum=10, maximum=1_000_000)
+    max_pairs: int = option(5000, "Most synchronised pose pairs kept.", minimum=10, maximum=100_000_000)
     keyframe_min_translation: float = option(
         0.0, "Keep a pose pair when the parent sensor has moved this far since the last one kept, or turned min_rotation.",
         unit="m", minimum=0.0, maximum=100.0, name="keyframe.min_translation",
@@ -168,7 +170,7 @@ class CalibratorConfig(_Checked):
 
 
 @dataclass(frozen=True)
-class NodeConfig(_Checked):
+class NodeConfig(OptionSet):
     """Options that only the node has."""
 
     solve_period: float = option(2.0, "Time between solves.", unit="s", minimum=0.05, maximum=3600.0)

@@ -49,14 +49,15 @@ def from_quat_xyzw(translation, quat_xyzw):
     Quaternions are normalised; whether they were close enough to unit length is for the caller to judge.
     """
     quat_xyzw = np.asarray(quat_xyzw, dtype=float)
-    rotation = Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix().reshape(quat_xyzw.shape[:-1] + (3, 3))
-    return from_rotation_translation(rotation, translation)
+    matrices = _converted(lambda quats: Rotation.from_quat(quats).as_matrix(), quat_xyzw.reshape(-1, 4), (3, 3))
+    return from_rotation_translation(matrices.reshape(quat_xyzw.shape[:-1] + (3, 3)), translation)
 
 
 def to_quat_xyzw(transforms):
     """Quaternions (..., 4), scalar last and not negative, of the rotations of transforms (..., 4, 4)."""
     transforms = np.asarray(transforms, dtype=float)
-    quat_xyzw = Rotation.from_matrix(transforms[..., :3, :3].reshape(-1, 3, 3)).as_quat()
+    rotations = transforms[..., :3, :3].reshape(-1, 3, 3)
+    quat_xyzw = _converted(lambda matrices: Rotation.from_matrix(matrices).as_quat(), rotations, (4,))
     quat_xyzw[quat_xyzw[:, 3] < 0] *= -1.0
     return quat_xyzw.reshape(transforms.shape[:-2] + (4,))
 
@@ -64,14 +65,20 @@ def to_quat_xyzw(transforms):
 def rotation_log(rotation):
     """Rotation vectors (..., 3), in rad and of length at most pi, of rotation matrices (..., 3, 3)."""
     rotation = np.asarray(rotation, dtype=float)
-    return Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(rotation.shape[:-1])
+    vectors = _converted(lambda matrices: Rotation.from_matrix(matrices).as_rotvec(), rotation.reshape(-1, 3, 3), (3,))
+    return vectors.reshape(rotation.shape[:-1])
 
 
 def rotation_exp(rotation_vector):
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad."""
     rotation_vector = np.asarray(rotation_vector, dtype=float)
-    matrices = Rotation.from_rotvec(rotation_vector.reshape(-1, 3)).as_matrix()
+    matrices = _converted(lambda vectors: Rotation.from_rotvec(vectors).as_matrix(), rotation_vector.reshape(-1, 3), (3, 3))
     return matrices.reshape(rotation_vector.shape + (3,))
+
+
+def _converted(convert, rotations, shape):
+    """A stack of rotations in another form of the given shape. Older SciPy (1.11) refuses an empty stack."""
+    return convert(rotations) if len(rotations) else np.empty((0, *shape))
 
 
 def inverse(transforms):

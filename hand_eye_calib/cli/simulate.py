@@ -1,0 +1,138 @@
+"""``simulate``: drives with known truth, as trajectory files and bags."""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+from hand_eye_calib.cli.options import add_json_argument
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.simulation.drive import HILLY_DRIVE, PUBLISHED_DRIVE, simulate_drive
+from hand_eye_calib.simulation.noise import MIXTURE, NoiseConfig
+
+# The layout of the published simulations: sensor 1 is the parent.
+PARENT_FILE, CHILD_FILE, TRUTH_FILE = "T_S1_W1.txt", "T_S2_W2.txt", "T_S2_S1.txt"
+PARENT_TOPIC, CHILD_TOPIC = "/parent/odometry", "/child/odometry"
+
+_DRIVES = {"published": PUBLISHED_DRIVE, "hilly": HILLY_DRIVE}
+_NOISE_OPTIONS = {"noise": "gaussian", "outliers": "outliers", "drift": "drift"}
+_FILES = f"""\
+DIR/run_01, run_02, ... are laid out as the published simulations of Valimaki et al. 2023, in TUM format:
+  {PARENT_FILE}  trajectory of sensor 1, the parent, in its own world
+  {CHILD_FILE}  trajectory of sensor 2, the child, in its own world
+  {TRUTH_FILE}  the true extrinsic, one pose: the child sensor in the parent sensor's frame
+  bag, bag.bag   with --bag: topics {PARENT_TOPIC} and {CHILD_TOPIC} (nav_msgs/msg/Odometry)"""
+
+
+def add_arguments(parser):
+    """Declare the command's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _FILES
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, required=True, help="directory to make; it must be empty or not exist"
+    )
+    parser.add_argument("--runs", type=_positive, default=1, metavar="N", help="number of drives. Default: 1")
+    parser.add_argument("--seed", type=_not_negative, default=0, help="the same seed gives the same drives. Default: 0")
+    parser.add_argument(
+        "--drive",
+        choices=tuple(_DRIVES),
+        default="published",
+        help="published: 10 s at 0.5 m/s, both sensors at 10 Hz with equal stamps, as in the article. hilly: two minutes at 1.5 m/s, "
+        "10 and 20 Hz, no common stamps. Default: published",
+    )
+    parser.add_argument(
+        "--poses", type=int, metavar="N", help="poses of the parent sensor. Default: 100 (published), 1200 (hilly)"
+    )
+    fields = {field.name: field for field in dataclasses.fields(NoiseConfig)}
+    for option, name in _NOISE_OPTIONS.items():
+        meta = fields[name].metadata
+        unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
+        parser.add_argument(f"--{option}", type=float, metavar=option.upper(), help=f"{meta['doc']}{unit} Default: 0.")
+    parser.add_argument(
+        "--mixture",
+        action="store_true",
+        help=f"the article's mixture: --noise {MIXTURE.gaussian} --outliers {MIXTURE.outliers} --drift {MIXTURE.drift}, where not given",
+    )
+    parser.add_argument("--bag", choices=("mcap", "sqlite3", "rosbag1"), help="write a bag of every drive too")
+    add_json_argument(parser)
+
+
+def run(arguments):
+    """Simulate and write; returns the exit code."""
+    config, noise = _configs(arguments)
+    _make_empty(arguments.out)
+    digits = max(2, len(str(arguments.runs)))
+    folders = [arguments.out / f"run_{number:0{digits}}" for number in range(1, arguments.runs + 1)]
+    for number, folder in enumerate(folders):
+        write_drive(folder, simulate_drive((arguments.seed, number), config, noise), arguments.bag)
+    if arguments.json:
+        settings = {"seed": arguments.seed, "drive": config.to_options(), "noise": noise.to_options()}
+        print(json.dumps({"runs": [str(folder) for folder in folders], **settings}, indent=2))
+    else:
+        print(f"{len(folders)} drive{'s' * (len(folders) != 1)} written to {arguments.out}")
+    return 0
+
+
+def write_drive(folder, drive, bag=None):
+    """Write a SimulatedDrive into a new folder.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+    drive : SimulatedDrive
+    bag : str, optional
+        Storage of a bag to write as well: mcap, sqlite3 or rosbag1.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be written.
+    """
+    _make_empty(folder)
+    write_trajectory(folder / PARENT_FILE, drive.parent)
+    write_trajectory(folder / CHILD_FILE, drive.child)
+    write_trajectory(folder / TRUTH_FILE, Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None]))
+    if bag:
+        from hand_eye_calib.io.bags import write_bag
+
+        streams = {
+            topic: (stream, "nav_msgs/msg/Odometry")
+            for topic, stream in ((PARENT_TOPIC, drive.parent), (CHILD_TOPIC, drive.child))
+        }
+        write_bag(folder / ("bag.bag" if bag == "rosbag1" else "bag"), streams, bag)
+
+
+def _configs(arguments):
+    config = _DRIVES[arguments.drive]
+    if arguments.poses is not None:
+        config = dataclasses.replace(config, poses=arguments.poses)
+    given = {
+        name: getattr(arguments, option) for option, name in _NOISE_OPTIONS.items() if getattr(arguments, option) is not None
+    }
+    return config, dataclasses.replace(MIXTURE if arguments.mixture else NoiseConfig(), **given)
+
+
+def _make_empty(folder):
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        occupied = any(folder.iterdir())
+    except OSError as error:
+        raise InputError(f"cannot make directory {folder}: {error.strerror}; choose another with --out") from None
+    if occupied:
+        raise InputError(f"{folder} is not empty, and nothing in it is overwritten; remove it or choose another with --out")
+
+
+def _positive(text):
+    return _at_least(1, text)
+
+
+def _not_negative(text):
+    return _at_least(0, text)
+
+
+def _at_least(minimum, text):
+    if not text.isdecimal() or int(text) < minimum:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least {minimum}, got {text!r}")
+    return int(text)

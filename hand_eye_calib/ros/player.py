@@ -1,0 +1,149 @@
+"""Plays poses to a node ``calibrator`` in another process and waits for its answer: the far end of the middleware."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
+
+from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.ros.conversions import to_ns, to_time
+
+# Nothing is lost on the way to a subscription that is reliable too.
+_LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_SPIN_S = 0.02
+
+
+@dataclass(frozen=True)
+class LiveExtrinsic:
+    """What the node published on ``~/extrinsic``: the (4, 4) extrinsic, its frames, the stamp of the newest pose used."""
+
+    T_parent_child: np.ndarray
+    parent_frame: str
+    child_frame: str
+    stamp_ns: int
+
+
+class Player:
+    """Publishes nav_msgs/Odometry and listens to the node; a context manager.
+
+    Parameters
+    ----------
+    topics : mapping
+        "parent" and "child" to the names of their topics.
+    check : callable
+        Called while waiting; raises where waiting has become pointless, such as when the node has died.
+    patience_s : float
+        How long to wait for the node at each step.
+
+    Raises
+    ------
+    HandEyeCalibError
+        Where ROS cannot start; from the methods, where the node does not do its part in time.
+    """
+
+    def __init__(self, topics, check=lambda: None, patience_s=30.0):
+        self._check, self._patience_s = check, patience_s
+        self._context = rclpy.Context()
+        _init(self._context)
+        self._node = rclpy.create_node("hand_eye_calib_player", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._publishers = {stream: self._node.create_publisher(Odometry, topic, _LOSSLESS) for stream, topic in topics.items()}
+        self._solve = self._node.create_client(Trigger, "calibrator/solve")
+        self._answer = "no answer"
+        self._extrinsic = None
+        self._node.create_subscription(TransformStamped, "calibrator/extrinsic", self._on_extrinsic, _LATCHED)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def play(self, poses, speed):
+        """Publish poses ``speed`` times as fast as they were recorded, once the node listens to both topics.
+
+        Parameters
+        ----------
+        poses : iterable of StampedPose
+        speed : float
+        """
+        self._wait(lambda: all(publisher.get_subscription_count() for publisher in self._publishers.values()), "to subscribe")
+        start, first_stamp_ns = time.monotonic(), None
+        for pose in poses:
+            first_stamp_ns = pose.stamp_ns if first_stamp_ns is None else first_stamp_ns
+            due = start + (pose.stamp_ns - first_stamp_ns) * 1e-9 / speed
+            while (remaining := due - time.monotonic()) > 0:
+                self._executor.spin_once(timeout_sec=remaining)
+            self._publishers[pose.stream].publish(_odometry(pose))
+        self._check()
+
+    def wait_for_extrinsic(self, stamp_ns):
+        """Have the node solve until the newest pose in its result has this stamp or a later one.
+
+        Poses and service calls share no order, so one call of ``~/solve`` would not be enough.
+
+        Returns
+        -------
+        LiveExtrinsic
+        """
+        self._wait(self._solve.service_is_ready, "to serve ~/solve")
+        pending = None
+
+        def is_covered():
+            nonlocal pending
+            if self._extrinsic is not None and self._extrinsic.stamp_ns >= stamp_ns:
+                return True
+            if pending is None or pending.done():
+                self._answer = pending.result().message if pending else self._answer
+                pending = self._solve.call_async(Trigger.Request())
+            return False
+
+        self._wait(is_covered, "for a result with all poses", lambda: f"; its last answer was: {self._answer}")
+        return self._extrinsic
+
+    def _wait(self, condition, purpose, details=lambda: ""):
+        end = time.monotonic() + self._patience_s
+        while not condition():
+            self._check()
+            if time.monotonic() > end:
+                raise HandEyeCalibError(f"waited {self._patience_s:g} s for the node {purpose}{details()}")
+            self._executor.spin_once(timeout_sec=_SPIN_S)
+
+    def _on_extrinsic(self, message):
+        t, q = message.transform.translation, message.transform.rotation
+        self._extrinsic = LiveExtrinsic(
+            se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w]),
+            message.header.frame_id,
+            message.child_frame_id,
+            to_ns(message.header.stamp),
+        )
+
+
+def _init(context):
+    try:
+        rclpy.init(args=[], context=context)
+    except RCLError as error:
+        raise HandEyeCalibError(f"cannot start ROS: {' '.join(str(error).split())}") from None
+
+
+def _odometry(pose):
+    message = Odometry()
+    message.header.stamp = to_time(pose.stamp_ns)
+    message.header.frame_id = pose.world_frame
+    message.child_frame_id = pose.sensor_frame or ""
+    position, orientation = message.pose.pose.position, message.pose.pose.orientation
+    position.x, position.y, position.z = pose.position
+    orientation.x, orientation.y, orientation.z, orientation.w = pose.quat_xyzw
+    return message

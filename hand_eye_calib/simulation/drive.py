@@ -1,0 +1,190 @@
+"""A ground vehicle with two sensors drives over hills (Välimäki et al. 2023, section 4.1)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.config import OptionSet, option
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.simulation.noise import NoiseConfig, add_noise
+from hand_eye_calib.simulation.terrain import surface
+
+# Where the published drives begin, heading along x; in units of the surface's arguments.
+_START = np.array([0.0, 0.5])
+
+
+@dataclass(frozen=True)
+class DriveConfig(OptionSet):
+    """Vehicle, terrain and sensors; the defaults are the published trajectories' but for the attitude."""
+
+    poses: int = option(100, "Number of poses of the parent sensor.", minimum=2, maximum=10_000_000)
+    parent_rate: float = option(10.0, "Poses of the parent sensor per second.", unit="Hz", minimum=0.01, maximum=10_000.0)
+    child_rate: float = option(10.0, "Poses of the child sensor per second.", unit="Hz", minimum=0.01, maximum=10_000.0)
+    child_delay: float = option(
+        0.0, "Time from the first pose of the parent to that of the child.", unit="s", minimum=0.0, maximum=60.0
+    )
+    start_time: float = option(0.0, "Stamp of the first pose of the parent.", unit="s", minimum=0.0, maximum=4e9)
+    speed: float = option(0.5, "Horizontal speed.", unit="m/s", minimum=0.0, maximum=100.0)
+    max_yaw_rate: float = option(
+        2.0, "Yaw rates are drawn between plus and minus this.", unit="rad/s", minimum=0.0, maximum=100.0
+    )
+    hold_time: float = option(0.5, "Time for which a yaw rate is held.", unit="s", minimum=1e-3, maximum=1e4)
+    first_hold_time: float = option(0.4, "Time for which the first yaw rate is held.", unit="s", minimum=1e-3, maximum=1e4)
+    lead_time: float = option(
+        0.1, "Time from the start of the drive to the first pose of the parent.", unit="s", minimum=0.0, maximum=1e4
+    )
+    terrain_height: float = option(0.1, "Height of the terrain per unit of peaks.", unit="m", minimum=0.0, maximum=100.0)
+    terrain_scale: float = option(
+        1.0, "Horizontal size of the terrain per unit of peaks' arguments.", unit="m", minimum=0.01, maximum=1e4
+    )
+    terrain_limit: float = option(
+        5.0, "Beyond this argument of peaks the terrain continues mirrored.", minimum=1.0, maximum=1e6
+    )
+    attitude: str = option(
+        "vehicle",
+        "vehicle: x ahead, z along the surface's normal. published: as in the published trajectories, whose orientations are "
+        "those of no vehicle (transposed, slopes not turned with the heading).",
+        choices=("published", "vehicle"),
+    )
+    max_offset: float = option(
+        0.5, "Offset of the child sensor along each axis of the parent, at most.", unit="m", minimum=0.0, maximum=100.0
+    )
+    parent_frame: str = option("parent", "Frame of the parent sensor.")
+    child_frame: str = option("child", "Frame of the child sensor.")
+
+
+# The article's drives, as published.
+PUBLISHED_DRIVE = DriveConfig(attitude="published")
+
+# Two minutes of a robot or forklift outdoors: hills steep enough to reveal all six degrees of freedom, sensors at different
+# rates that never share a stamp.
+HILLY_DRIVE = DriveConfig(
+    poses=1200, parent_rate=10.0, child_rate=20.0, child_delay=0.0137, start_time=1.7e9, speed=1.5, max_yaw_rate=1.0, hold_time=1.5,
+    terrain_height=0.15, terrain_scale=2.5, terrain_limit=3.0,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SimulatedDrive:
+    """What both sensors report, and the truth.
+
+    Attributes
+    ----------
+    parent, child : Trajectory
+        With noise, each sensor in its own world.
+    T_parent_child : (4, 4) array
+        The extrinsic.
+    T_pw_cw : (4, 4) array
+        The child's world in the parent's.
+    """
+
+    parent: Trajectory
+    child: Trajectory
+    T_parent_child: np.ndarray
+    T_pw_cw: np.ndarray
+
+
+def simulate_drive(seed, config=PUBLISHED_DRIVE, noise=NoiseConfig()):  # noqa: B008 - frozen
+    """Simulate one drive.
+
+    Parameters
+    ----------
+    seed : int or sequence of int
+        The same seed gives the same drive, whatever the noise, and the same noise.
+    config : DriveConfig
+    noise : NoiseConfig
+
+    Returns
+    -------
+    SimulatedDrive
+    """
+    motion_rng, extrinsic_rng, noise_rng = np.random.default_rng(seed).spawn(3)
+    n_child = max(2, round(config.poses * config.child_rate / config.parent_rate))
+    parent_times_s = np.arange(config.poses) / config.parent_rate
+    child_times_s = config.child_delay + np.arange(n_child) / config.child_rate
+    Ts_pw_p, Ts_pw_p_at_child = _vehicle_poses(
+        config, motion_rng, config.lead_time + parent_times_s, config.lead_time + child_times_s
+    )
+    T_parent_child = _random_extrinsic(extrinsic_rng, config.max_offset)
+    T_pw_cw = _random_world(extrinsic_rng)
+    Ts_pw_p, Ts_cw_c = add_noise(Ts_pw_p, se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child, noise, noise_rng)
+    return SimulatedDrive(
+        Trajectory(_stamps_ns(config, parent_times_s), Ts_pw_p, config.parent_frame, f"{config.parent_frame}_odom"),
+        Trajectory(_stamps_ns(config, child_times_s), Ts_cw_c, config.child_frame, f"{config.child_frame}_odom"),
+        T_parent_child,
+        T_pw_cw,
+    )
+
+
+def _stamps_ns(config, times_s):
+    return round(config.start_time * 1e9) + np.round(times_s * 1e9).astype(np.int64)
+
+
+def _random_extrinsic(rng, max_offset):
+    rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    return se3.from_rotation_translation(rotation, rng.uniform(-max_offset, max_offset, 3))
+
+
+def _random_world(rng):
+    """Euler angles (rad) and translation (m), each the difference of two uniforms between 0 and 1."""
+    angles, translation = rng.uniform(size=(2, 3)) - rng.uniform(size=(2, 3))
+    return se3.from_rotation_translation(Rotation.from_euler("ZYX", angles).as_matrix(), translation)
+
+
+def _vehicle_poses(config, rng, *times_s):
+    """Poses (N, 4, 4) of the vehicle on one drive, for each of several arrays of times since its start."""
+    duration = max(times[-1] for times in times_s)
+    holds = np.full(int(duration // config.hold_time) + 2, config.hold_time)
+    holds[0] = config.first_hold_time
+    yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds))
+    return [_poses_on_terrain(config, *_ground_track(config, yaw_rates, holds, times)) for times in times_s]
+
+
+def _ground_track(config, yaw_rates, holds, times_s):
+    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time; each yaw rate is held for its time."""
+    starts = _sums_before(holds)
+    headings = _sums_before(yaw_rates * holds)
+    corners = _START * config.terrain_scale + _sums_before(_arc(config.speed, headings, yaw_rates, holds))
+    k = np.searchsorted(starts, times_s, side="right") - 1
+    elapsed = times_s - starts[k]
+    return corners[k] + _arc(config.speed, headings[k], yaw_rates[k], elapsed), headings[k] + yaw_rates[k] * elapsed
+
+
+def _sums_before(values):
+    """For each value the sum of those before it."""
+    return np.cumsum(values, axis=0) - values
+
+
+def _arc(speed, heading, yaw_rate, duration):
+    """Displacement (N, 2) along an arc: its chord points half-way between the headings at its ends."""
+    half_turn = 0.5 * yaw_rate * duration
+    chord = speed * duration * np.sinc(half_turn / np.pi)
+    return np.stack([chord * np.cos(heading + half_turn), chord * np.sin(heading + half_turn)], axis=-1)
+
+
+def _poses_on_terrain(config, positions, headings):
+    z, slope_x, slope_y = surface(
+        positions[:, 0], positions[:, 1], config.terrain_height, config.terrain_scale, config.terrain_limit
+    )
+    normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    attitude = _published_attitude if config.attitude == "published" else _vehicle_attitude
+    return se3.from_rotation_translation(attitude(headings, normals), np.column_stack([positions, z]))
+
+
+def _vehicle_attitude(headings, normals):
+    """z along the normal, x in the vertical plane of the heading."""
+    left = np.cross(normals, np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1))
+    left /= np.linalg.norm(left, axis=-1, keepdims=True)
+    return np.stack([np.cross(left, normals), left, normals], axis=-1)
+
+
+def _published_attitude(headings, normals):
+    """The published trajectories' orientation, found by fitting it to their noise-free poses (to 0.01 rad, heading exactly).
+
+    Yaw is the heading, pitch and roll are the arc sines of the normal's x and y in the world, and the matrix is transposed.
+    """
+    angles = np.stack([headings, np.arcsin(normals[:, 0]), np.arcsin(normals[:, 1])], axis=-1)
+    return np.swapaxes(Rotation.from_euler("ZYX", angles).as_matrix(), -1, -2)

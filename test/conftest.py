@@ -1,0 +1,18 @@
+"""What every test may use."""
+
+import pytest
+from hypothesis import settings
+
+# Tests never time anything, and CI must not differ from run to run.
+settings.register_profile("hand_eye_calib", deadline=None, derandomize=True, print_blob=True)
+settings.load_profile("hand_eye_calib")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _ros_stays_here(tmp_path_factory):
+    """ROS talks on this machine only and logs into pytest's temporary folder; subprocesses inherit it."""
+    patch = pytest.MonkeyPatch()
+    patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
+    yield
+    patch.undo()

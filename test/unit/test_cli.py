@@ -1,0 +1,612 @@
+"""The command line: what it prints where, its exit codes, and one line for everything that is wrong with the input."""
+
+import dataclasses
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hand_eye_calib.calibration import DofVerdict, SolveStatus
+from hand_eye_calib.cli import main as cli
+from hand_eye_calib.cli.console import waiting_for, with_progress
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.cli.present import as_text, static_transform_command
+from hand_eye_calib.config import CalibratorConfig, option_name
+from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.results import load_result
+from hand_eye_calib.io.trajectory_files import write_trajectory
+
+ROOT = Path(__file__).resolve().parents[2]
+ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+PARENT_TOPIC, CHILD_TOPIC = "/lidar/odom", "/camera/odom"
+TOPICS = ["--parent-topic", PARENT_TOPIC, "--child-topic", CHILD_TOPIC]
+START_NS = 1_700_000_000_000_000_000
+TRUTH = se3.exp(np.array([0.4, -0.1, 0.25, 0.3, -0.2, 1.1]))
+OTHER_WORLD = se3.exp(np.array([5.0, -3.0, 1.0, 0.1, 0.4, -2.0]))
+
+
+def drive(count=120, planar=False, first_ns=START_NS):
+    """Noise-free trajectories of two sensors whose extrinsic is TRUTH, 10 Hz."""
+    time = 0.1 * np.arange(count)
+    twists = np.zeros((count, 6))
+    twists[:, 0], twists[:, 5] = 0.1, 0.08 * np.sin(0.9 * time)
+    if not planar:
+        twists[:, 3], twists[:, 4] = 0.05 * np.sin(1.7 * time), 0.06 * np.cos(1.3 * time)
+    poses = [np.eye(4)]
+    for step in se3.exp(twists[1:]):
+        poses.append(poses[-1] @ step)
+    stamps_ns = first_ns + 100_000_000 * np.arange(count)
+    parent = Trajectory(stamps_ns, np.array(poses), "lidar", "map")
+    return parent, Trajectory(stamps_ns, OTHER_WORLD @ parent.poses @ TRUTH, "camera", "odom")
+
+
+@pytest.fixture
+def new_bag(tmp_path):
+    """Writes a bag with both trajectories and returns its path."""
+
+    def write(parent=None, child=None, storage="mcap", types=(ODOMETRY, ODOMETRY)):
+        good_parent, good_child = drive()
+        parent, child = good_parent if parent is None else parent, good_child if child is None else child
+        path = tmp_path / ("drive.bag" if storage == "rosbag1" else "drive")
+        streams = {PARENT_TOPIC: (parent, types[0]), CHILD_TOPIC: (child, types[1])}
+        write_bag(path, streams, storage)
+        return str(path)
+
+    return write
+
+
+@pytest.fixture
+def run(capsys):
+    """Runs a command in this process; returns exit code, stdout and stderr."""
+
+    def call(*arguments):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def refused(run):
+    """Runs a command that must end in one line on stderr and nothing on stdout; returns that line."""
+
+    def call(*arguments, code=1):
+        found, out, err = run(*arguments)
+        assert (found, out) == (code, "")
+        lines = [line for line in err.splitlines() if not line.startswith("hand_eye_calib: note: ")]
+        assert len(lines) == 1, err
+        assert lines[0].startswith("hand_eye_calib: error: ")
+        return lines[0]
+
+    return call
+
+
+def with_pose(trajectory, index, **fields):
+    """A trajectory whose one pose is not checked, for writing bad messages."""
+    poses = trajectory.poses.copy()
+    poses[index] = fields["pose"]
+    spoiled = object.__new__(Trajectory)
+    for field in dataclasses.fields(Trajectory):
+        object.__setattr__(spoiled, field.name, getattr(trajectory, field.name))
+    object.__setattr__(spoiled, "poses", poses)
+    return spoiled
+
+
+# ---- replay and calibrate on good input
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "rosbag1"])
+def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag, storage):
+    code, out, err = run("replay", new_bag(storage=storage), *TOPICS)
+    assert (code, err) == (0, "")
+    assert "Pose of camera (child) in lidar (parent)\n  coordinates of camera into lidar\n" in out
+    assert "Pose of lidar (parent) in camera (child)\n  coordinates of lidar into camera\n" in out
+    rows = re.findall(r"translation x +(\S+) +y +(\S+) +z +(\S+)  m", out)
+    np.testing.assert_allclose(np.array(rows, dtype=float), [TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]], atol=2e-6)
+    assert re.search(r"^  yaw +0\.\d+ deg +observed$", out, flags=re.MULTILINE)
+    assert "Status: ok\n" in out
+
+
+def test_json_is_one_document_on_stdout(run, new_bag):
+    bag = new_bag()
+    code, out, err = run("replay", bag, *TOPICS, "--json", "--method", "dnl", "--reference", "B2")
+    document = json.loads(out)
+    assert (code, err) == (0, "")
+    np.testing.assert_allclose(document["T_parent_child"]["matrix"], TRUTH, atol=1e-6)
+    assert (document["method"], document["reference"], document["status"]) == ("dnl", "B2", "ok")
+    assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
+    assert document["inputs"]["bag"] == bag
+    assert document["inputs"]["parent"] == {
+        "topic": PARENT_TOPIC, "messages": 120, "refused_duplicate": 0, "refused_late": 0,
+        "first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000,
+    }  # fmt: skip
+    assert document["inputs"]["options"]["method"] == "dnl"
+
+
+def test_topics_may_be_left_out_where_there_are_only_two(run, new_bag):
+    code, out, err = run("replay", new_bag(), "--json")
+    assert code == 0
+    assert err == (
+        f"hand_eye_calib: note: parent is {CHILD_TOPIC}, child is {PARENT_TOPIC}; --parent-topic and --child-topic say otherwise\n"
+    )
+    np.testing.assert_allclose(json.loads(out)["T_child_parent"]["matrix"], TRUTH, atol=1e-6)
+
+
+def test_pose_stamped_takes_its_frames_from_the_options(run, new_bag):
+    bag = new_bag(types=(ODOMETRY, POSE_STAMPED))
+    document = json.loads(run("replay", bag, *TOPICS, "--json", "--child-frame", "cam0")[1])
+    assert (document["parent_frame"], document["child_frame"], document["warnings"]) == ("lidar", "cam0", [])
+    document = json.loads(run("replay", bag, *TOPICS, "--json")[1])
+    assert document["child_frame"] == "child_sensor"
+    assert any("child_sensor" in warning for warning in document["warnings"])
+
+
+def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
+    parent, child = drive()
+    files = [tmp_path / "parent.txt", tmp_path / "child.txt"]
+    for path, trajectory in zip(files, (parent, child), strict=True):
+        write_trajectory(path, trajectory)
+    options = ["--json", "--reference", "B5", "--parent-frame", "lidar", "--child-frame", "camera"]
+    code, out, err = run("calibrate", *files, *options)
+    assert (code, err) == (0, "")
+    from_files, from_bag = json.loads(out), json.loads(run("replay", new_bag(), *TOPICS, *options)[1])
+    np.testing.assert_allclose(from_files["T_parent_child"]["matrix"], from_bag["T_parent_child"]["matrix"], atol=1e-12)
+    assert from_files["inputs"]["child"] == {
+        "file": str(files[1]), "poses": 120, "first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000,
+    }  # fmt: skip
+    inputs = (from_files.pop("inputs"), from_bag.pop("inputs"))
+    # two files are used whole, a stream is bounded
+    bounds = [options.pop("max_pairs") for options in (inputs[0]["options"], inputs[1]["options"])]
+    assert bounds == [120, 5000]
+    assert inputs[0]["options"] == inputs[1]["options"]
+    assert from_files.keys() == from_bag.keys()
+
+
+def test_out_saves_what_info_shows(run, new_bag, tmp_path):
+    out_dir = tmp_path / "result"
+    code, text, err = run("replay", new_bag(), *TOPICS, "--out", out_dir)
+    assert (code, err) == (0, f"hand_eye_calib: note: wrote {out_dir / 'extrinsic.yaml'}\n")
+    assert run("info", out_dir) == (0, text, "")
+    document = json.loads(run("info", out_dir / "extrinsic.yaml", "--json")[1])
+    assert document == load_result(out_dir).to_dict()
+    assert yaml.safe_load((out_dir / "extrinsic.yaml").read_text())["provenance"]["inputs"]["child"]["topic"] == CHILD_TOPIC
+
+
+def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
+    parent, child = drive(planar=True)
+    code, out, err = run("replay", new_bag(parent, child), *TOPICS)
+    assert (code, err) == (3, "")
+    assert re.search(r"^  z +- +unobservable$", out, flags=re.MULTILINE)
+    assert re.search(r"^Status: unobservable: this motion does not reveal .*\bz\b", out, flags=re.MULTILINE)
+
+
+# ---- what is printed
+
+
+def some_calibration(run, new_bag, tmp_path, **changes):
+    assert run("replay", new_bag(), *TOPICS, "--out", tmp_path / "result")[0] == 0
+    return dataclasses.replace(load_result(tmp_path / "result"), **changes)
+
+
+def test_static_transform_command_carries_the_extrinsic(run, new_bag, tmp_path):
+    calibration = some_calibration(run, new_bag, tmp_path, child_frame="left camera")
+    words = shlex.split(static_transform_command(calibration))
+    assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+    options = dict(zip(words[4::2], words[5::2], strict=True))
+    assert (options.pop("--frame-id"), options.pop("--child-frame-id")) == ("lidar", "left camera")
+    values = [float(options.pop(f"--{name}")) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    assert not options
+    np.testing.assert_allclose(se3.from_quat_xyzw(values[:3], values[3:]), calibration.T_parent_child, atol=2e-9)
+
+
+def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_bag, tmp_path):
+    calibration = some_calibration(run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED, warnings=("look here",))
+    text = as_text(calibration)
+    assert "Status: not converged: do not use this result\nWarning: look here\n" in text
+    assert all(dof.verdict is DofVerdict.OBSERVED for dof in calibration.observability)
+    assert "unobservable" not in text
+
+
+def test_a_solve_that_did_not_converge_fails(run, new_bag, tmp_path, monkeypatch, capsys):
+    from hand_eye_calib import calibrator
+
+    calibration = some_calibration(run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED)
+    monkeypatch.setattr(calibrator.Calibrator, "estimate", lambda self: calibration)
+    code, out, err = run("replay", tmp_path / "drive", *TOPICS, "--json")
+    assert (code, json.loads(out)["status"]) == (1, "not_converged")
+    assert err.startswith("hand_eye_calib: error: the solver did not converge")
+
+
+# ---- bad input: one line, exit code 1
+
+
+def test_missing_bag(refused, tmp_path):
+    assert f"no bag at {tmp_path / 'absent'}" in refused("replay", tmp_path / "absent", *TOPICS)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "rosbag1"])
+def test_bag_cut_in_half(refused, new_bag, storage):
+    path = Path(new_bag(storage=storage))
+    file = path if path.is_file() else next(part for part in path.iterdir() if part.suffix != ".yaml")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    assert f"cannot read bag {path}" in refused("replay", path, *TOPICS)
+
+
+def test_missing_topic_lists_those_that_are_there(refused, new_bag):
+    line = refused("replay", new_bag(), "--parent-topic", "/odom", "--child-topic", CHILD_TOPIC)
+    assert "no topic /odom in " in line
+    assert f"{CHILD_TOPIC} ({ODOMETRY}, 120 messages), {PARENT_TOPIC} ({ODOMETRY}, 120 messages)" in line
+
+
+def test_topic_of_a_wrong_type(refused, tmp_path):
+    from rosbags import rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
+        connection = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=typestore)
+        message = typestore.types["std_msgs/msg/String"]("hello")
+        writer.write(connection, 1, typestore.serialize_cdr(message, "std_msgs/msg/String"))
+    line = refused("replay", tmp_path / "bag", "--parent-topic", "/chatter", "--child-topic", "/b")
+    assert "topic /chatter of " in line
+    assert f"is of type std_msgs/msg/String; accepted are {ODOMETRY}, {POSE_STAMPED}" in line
+
+
+def test_too_few_poses(refused, new_bag):
+    parent, child = drive(count=5)
+    assert "10 synchronised pose pairs are needed, found 5" in refused("replay", new_bag(parent, child), *TOPICS)
+
+
+def test_no_overlap_in_time(refused, new_bag):
+    line = refused("replay", new_bag(child=drive(first_ns=START_NS + 10**12)[1]), *TOPICS)
+    assert "the streams do not overlap in time" in line
+
+
+def test_no_messages_on_a_topic(refused, new_bag):
+    assert "no poses on the child stream" in refused("replay", new_bag(child=drive()[1][:0]), *TOPICS)
+
+
+def test_nan_is_named_with_topic_message_and_stamp(refused, new_bag):
+    parent, child = drive()
+    pose = child.poses[7].copy()
+    pose[1, 3] = np.nan
+    line = refused("replay", new_bag(parent, with_pose(child, 7, pose=pose)), *TOPICS)
+    assert f"error: {CHILD_TOPIC}, message 8, stamp 1700000000.700000000: " in line
+    assert "not finite" in line
+
+
+def test_quaternion_that_is_not_of_unit_length(refused, new_bag, monkeypatch):
+    parent, child = drive()
+    exact = se3.to_quat_xyzw
+
+    def spoiled(transforms):
+        quats_xyzw = exact(transforms)
+        quats_xyzw[3] *= 1.2
+        return quats_xyzw
+
+    monkeypatch.setattr("hand_eye_calib.io.bags.se3.to_quat_xyzw", spoiled)
+    bag = new_bag(parent, child)
+    monkeypatch.undo()
+    line = refused("replay", bag, *TOPICS)
+    assert re.search(r"message 4, stamp 1700000000\.300000000: .*quaternion.*1\.2", line)
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        ("", f"{CHILD_TOPIC}, message 1, stamp 1700000000.000000000: the child stream's sensor frame is empty"),
+        ("lidar", "both streams name 'lidar' as their sensor frame"),
+    ],
+)
+def test_sensor_frames_that_are_empty_or_the_same(refused, new_bag, frame, message):
+    child = dataclasses.replace(drive()[1], sensor_frame=frame)
+    assert message in refused("replay", new_bag(child=child), *TOPICS)
+
+
+def test_files_that_cannot_be_used(refused, tmp_path):
+    assert "absent.txt: No such file" in refused("calibrate", tmp_path / "absent.txt", tmp_path / "absent.txt")
+    (tmp_path / "bad.txt").write_text("1 2 3\n")
+    assert "bad.txt, line 1: expected 8 numbers" in refused("calibrate", tmp_path / "bad.txt", tmp_path / "bad.txt")
+    assert "No such file" in refused("info", tmp_path / "absent")
+    assert "expected format" in refused("info", tmp_path / "bad.txt")
+
+
+def test_results_that_cannot_be_saved(refused, new_bag, tmp_path):
+    (tmp_path / "file").touch()
+    assert "cannot write" in refused("replay", new_bag(), *TOPICS, "--out", tmp_path / "file")
+
+
+# ---- options
+
+
+@pytest.mark.parametrize("command", ["replay", "calibrate"])
+def test_help_lists_every_option_with_its_default(run, command):
+    code, out, _ = run(command, "--help")
+    assert code == 0
+    words = " ".join(out.split())
+    for field in dataclasses.fields(CalibratorConfig):
+        name = f"--{option_name(field).replace('.', '-').replace('_', '-')}"
+        entry = words[words.rindex(f" {name} ") :].replace("- ", "-")
+        entry = entry[: entry.find(" --", 1)]
+        assert field.metadata["doc"] in entry, name
+        assert f"Unit: {field.metadata['unit']}." in entry or not field.metadata["unit"], name
+        assert f"Default: {field.default}." in entry or field.default == "", name
+
+
+@pytest.mark.parametrize(
+    ("options", "changed"),
+    [
+        (["--keyframe-min-translation", "0.5"], {"keyframe_min_translation": 0.5}),
+        (["--time-offset", "-0.25"], {"time_offset": -0.25}),
+        (["--time-offset=-1e-3"], {"time_offset": -1e-3}),
+        (["--scale", "2"], {"scale": 2.0}),
+        (["--scale", "none"], {}),
+        (
+            ["--min-pairs", "20", "--reference", "C5", "--backend", "ipopt"],
+            {"min_pairs": 20, "reference": "C5", "backend": "ipopt"},
+        ),
+    ],
+)
+def test_options_reach_the_engine(options, changed):
+    assert parsed(options) == dataclasses.replace(CalibratorConfig(), **changed)
+
+
+def parsed(options):
+    """The configuration that ``calibrate`` makes of its options."""
+    import argparse
+
+    from hand_eye_calib.cli.options import add_config_arguments, config_from
+
+    parser = argparse.ArgumentParser()
+    add_config_arguments(parser)
+    return config_from(parser.parse_args(options))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["fly"], "invalid choice: 'fly'"),
+        (["replay"], "the following arguments are required: BAG"),
+        (["replay", "bag", "--methd", "dnl"], "unrecognized arguments: --methd dnl"),
+        (["replay", "bag", "--meth", "dnl"], "unrecognized arguments: --meth dnl"),
+        (["replay", "bag", "--method", "magic"], "argument --method: method must be one of dnlo, dnl"),
+        (["replay", "bag", "--threshold", "-1"], "argument --threshold: threshold must be at least 1e-12 m^2; got -1.0"),
+        (["replay", "bag", "--threshold", "big"], "argument --threshold: threshold must be of type float; got 'big'"),
+        (["replay", "bag", "--min-pairs", "3.5"], "argument --min-pairs: min_pairs must be of type int; got '3.5'"),
+        (["replay", "bag", "--scale", "0"], "argument --scale: scale must be at least"),
+        (["replay", "bag", "--reference", "D4"], "argument --reference: reference must match"),
+        (["info"], "the following arguments are required: RESULT"),
+    ],
+)
+def test_wrong_usage(run, arguments, message):
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+
+
+@pytest.fixture
+def config_file(tmp_path):
+    """Writes text into a file and returns the option that names it."""
+
+    def write(text):
+        path = tmp_path / "config.yaml"
+        path.write_text(text)
+        return ["--config", str(path)]
+
+    return write
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{method: dnl, threshold: 1e-3, keyframe.min_interval: 1}",
+        "{method: dnl, threshold: 0.001, keyframe: {min_interval: 1.0}}",
+        "/**: {ros__parameters: {method: dnl, threshold: 0.001, keyframe: {min_interval: 1.0}}}",
+        "calibrator: {ros__parameters: {method: dnl, threshold: 0.001, keyframe.min_interval: 1.0}}",
+        "/**: {ros__parameters: {method: dnlo, threshold: 0.001}}\n"
+        "robot: {calibrator: {ros__parameters: {method: dnl, keyframe.min_interval: 1.0}}}\n"
+        "/camera_driver: {ros__parameters: {exposure: 3}}",
+    ],
+)
+def test_config_file_plain_or_for_ros(config_file, text):
+    expected = CalibratorConfig(method="dnl", threshold=1e-3, keyframe_min_interval=1.0)
+    assert parsed(config_file(text)) == expected
+    assert parsed([*config_file(text), "--method", "dnlo"]) == dataclasses.replace(expected, method="dnlo")
+
+
+def test_the_config_file_of_the_package_holds_the_defaults(capsys):
+    assert parsed(["--config", str(ROOT / "config" / "calibrator.yaml")]) == CalibratorConfig()
+    assert "only the node uses solve_period" in capsys.readouterr().err
+
+
+def test_an_empty_config_file_changes_nothing(config_file):
+    assert parsed(config_file("# nothing yet\n")) == CalibratorConfig()
+    assert parsed(config_file("/**: {ros__parameters: }")) == CalibratorConfig()
+
+
+def test_options_of_the_node_are_ignored_and_named(config_file, capsys):
+    config = parsed(config_file("/**: {ros__parameters: {solve_period: 1.0, use_sim_time: true, method: dnl}}"))
+    assert config == CalibratorConfig(method="dnl")
+    assert capsys.readouterr().err.endswith("only the node uses solve_period, use_sim_time; ignored here\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; known are backend, child_frame"),
+        ("/**: {ros__parameters: {keyframe: {minimum: 1}}}", r"config\.yaml: unknown option 'keyframe.minimum'"),
+        ("{threshold: -1.0}", r"config\.yaml: threshold must be at least"),
+        ("{min_pairs: 12.5}", r"config\.yaml: min_pairs must be of type int; got 12.5"),
+        ("{method: 3}", r"config\.yaml: method must be of type str; got 3"),
+        ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
+        ("/slam: {ros__parameters: {a: 1}}", r"no parameters for a node named calibrator; found some for /slam"),
+    ],
+)
+def test_config_files_that_are_wrong_end_with_usage_error(refused, config_file, text, message):
+    line = refused("calibrate", "a", "b", *config_file(text), code=2)
+    assert re.search(message, line)
+
+
+def test_config_files_that_cannot_be_read(refused, config_file, tmp_path):
+    assert "No such file" in refused("replay", "bag", "--config", tmp_path / "absent.yaml")
+    assert "is not YAML" in refused("replay", "bag", *config_file("a: [1"))
+
+
+# ---- the program around the commands
+
+
+def test_top_level_help_lists_all_commands_and_imports_none(run):
+    code, out, _ = run("--help")
+    assert code == 0
+    assert all(re.search(rf"^ +{name}\b", out, flags=re.MULTILINE) for name in cli.COMMANDS)
+    check = (
+        "import sys; from hand_eye_calib.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+        "print([name for name in sys.modules if name in ('numpy', 'scipy', 'yaml')], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stderr == "[]\n"
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_is_there_and_explains_itself(run, name):
+    code, out, err = run(name, "--help")
+    assert (code, err) == (0, "")
+    assert f"usage: hand_eye_calib {name} " in out
+    assert cli.COMMANDS[name] in " ".join(out.split())
+
+
+def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
+    seen = []
+    monkeypatch.setattr("hand_eye_calib.ros.node.main", lambda args: seen.append(args) or 5)
+    arguments = ["--ros-args", "-p", "method:=dnl", "--params-file", "a.yaml", "-r", "parent_odom:=/lidar/odom"]
+    assert main(["calibrator", *arguments]) == 5
+    assert main(["calibrator"]) == 5
+    assert seen == [arguments, []]
+
+
+def test_entry_points_put_their_command_first(monkeypatch):
+    seen = []
+    monkeypatch.setattr(cli, "main", lambda argv: seen.append(argv) or 0)
+    monkeypatch.setattr(sys, "argv", ["replay", "bag", "--json"])
+    assert cli.replay() == 0
+    monkeypatch.setattr(sys, "argv", ["calibrator", "--ros-args", "-p", "method:=dnl"])
+    assert cli.calibrator() == 0
+    assert seen == [["replay", "bag", "--json"], ["calibrator", "--ros-args", "-p", "method:=dnl"]]
+
+
+def test_a_missing_optional_package_breaks_only_its_command(refused, run, new_bag, tmp_path, monkeypatch):
+    bag = new_bag()
+    assert run("replay", bag, *TOPICS, "--out", tmp_path / "result")[0] == 0
+    monkeypatch.delitem(sys.modules, "hand_eye_calib.io.bags", raising=False)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    assert "needs the Python package 'rosbags', which is not installed" in refused("replay", bag, *TOPICS)
+    assert run("info", tmp_path / "result")[0] == 0
+
+
+def test_a_defect_keeps_its_traceback(new_bag, monkeypatch):
+    from hand_eye_calib import calibrator
+
+    def defect(self):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(calibrator.Calibrator, "estimate", defect)
+    with pytest.raises(ZeroDivisionError):
+        main(["replay", new_bag(), *TOPICS])
+
+
+def test_a_configuration_that_the_engine_refuses_is_wrong_usage(refused, new_bag, monkeypatch):
+    from hand_eye_calib import calibrator
+
+    def refuse(self):
+        raise ConfigError("these options do not go together")
+
+    monkeypatch.setattr(calibrator.Calibrator, "estimate", refuse)
+    assert "these options do not go together" in refused("replay", new_bag(), *TOPICS, code=2)
+
+
+def start(*arguments, **options):
+    return subprocess.Popen(
+        [sys.executable, "-m", "hand_eye_calib", *map(str, arguments)], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, **options,
+    )  # fmt: skip
+
+
+def test_process_exit_codes_and_streams(new_bag, tmp_path):
+    process = start("replay", new_bag(), *TOPICS, "--json")
+    out, err = process.communicate()
+    assert (process.returncode, err) == (0, "")
+    assert json.loads(out)["status"] == "ok"
+    for arguments, code in ((["replay", tmp_path / "absent"], 1), (["replay"], 2)):
+        process = start(*arguments)
+        out, err = process.communicate()
+        assert (process.returncode, out) == (code, "")
+        assert "Traceback" not in err
+
+
+def open_for_a_reader(fifo, process):
+    """Open the writing end as soon as the process has opened the reading end."""
+    while process.poll() is None:
+        try:
+            return os.open(fifo, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:
+            time.sleep(0.01)
+    raise AssertionError(process.communicate())
+
+
+def test_interrupt_ends_quietly(tmp_path):
+    fifo = tmp_path / "parent.txt"
+    os.mkfifo(fifo)
+    process = start("calibrate", fifo, fifo)
+    writer = open_for_a_reader(fifo, process)  # that reader now waits for what will never come
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    os.close(writer)
+    assert (process.returncode, out, err) == (130, "", "")
+
+
+def test_a_reader_that_goes_away_is_no_error(run, new_bag, tmp_path):
+    assert run("replay", new_bag(), *TOPICS, "--out", tmp_path)[0] == 0
+    readable, writable = os.pipe()
+    os.close(readable)
+    done = subprocess.run(
+        [sys.executable, "-m", "hand_eye_calib", "info", str(tmp_path)], cwd=ROOT, stdout=writable, stderr=subprocess.PIPE,
+        text=True, check=False,
+    )  # fmt: skip
+    os.close(writable)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_what_takes_a_while_is_shown_on_a_terminal_and_wiped_out(monkeypatch, capsys):
+    with waiting_for("solving"):
+        assert capsys.readouterr().err == ""
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with waiting_for("solving"):
+        assert capsys.readouterr().err == "solving ..."
+    assert capsys.readouterr().err == "\r\033[K"
+
+
+def test_progress_is_silent_at_first_and_cleans_up_after_itself(monkeypatch, capsys):
+    assert list(with_progress(range(3), 3, "reading")) == [0, 1, 2]
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    clock = iter([0.0, 1.9, 2.0, 2.0, 2.1, 2.3, 2.3])
+    monkeypatch.setattr("hand_eye_calib.cli.console.time.monotonic", lambda: next(clock))
+    assert list(with_progress(range(4), 4, "reading")) == [0, 1, 2, 3]
+    assert capsys.readouterr().err == "\rreading:  25%\rreading:  75%\r\033[K"

@@ -1,0 +1,165 @@
+"""Saved calibrations come back to the last bit, and what cannot be one is refused."""
+
+import dataclasses
+import json
+import os
+import stat
+
+import numpy as np
+import pytest
+import yaml
+
+from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.results import load_result, save_result
+
+NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def calibration(**changes):
+    random = np.random.default_rng(11)
+    root = random.normal(size=(6, 6)) * 1e-3
+    covariance = root @ root.T
+    covariance[2, 2] = np.inf
+    verdicts = [DofVerdict.UNOBSERVABLE if name == "z" else DofVerdict.OBSERVED for name in NAMES]
+    sigmas = np.where([name == "z" for name in NAMES], np.inf, random.uniform(1e-7, 1e-2, 6))
+    values = {
+        "T_parent_child": se3.exp(random.normal(size=6)),
+        "covariance": covariance,
+        "status": SolveStatus.UNOBSERVABLE,
+        "observability": tuple(map(DofObservability, NAMES, verdicts, sigmas.tolist())),
+        "objective": 1 / 3,
+        "method": "dnlo",
+        "reference": "B10",
+        "backend": "fast",
+        "n_poses": 448,
+        "n_pairs": 438,
+        "n_inliers": 400,
+        "time_offset_s": -0.1,
+        "scale": 1e-05,
+        "stamp_ns": 1317375625661736123,
+        "parent_frame": "lidar",
+        "child_frame": "caméra: links",
+        "warnings": ("z is not observable: 'no'", "second\nline"),
+    }
+    return Calibration(**(values | changes))
+
+
+def assert_same(found, expected):
+    for field in dataclasses.fields(Calibration):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name), err_msg=field.name)
+
+
+def test_a_saved_calibration_loads_bit_by_bit_from_file_and_directory(tmp_path):
+    written = calibration()
+    path = save_result(written, tmp_path / "new" / "results")
+    assert path == tmp_path / "new" / "results" / "extrinsic.yaml"
+    for source in (path, path.parent, str(path)):
+        assert_same(load_result(source), written)
+
+
+def test_calibration_saves_itself(tmp_path):
+    assert_same(load_result(calibration().save(tmp_path)), calibration())
+
+
+def test_a_calibration_survives_its_dictionary_and_json():
+    written = calibration()
+    assert_same(Calibration.from_dict(json.loads(json.dumps(written.to_dict(), allow_nan=False))), written)
+
+
+def test_numpy_numbers_can_be_saved(tmp_path):
+    save_result(calibration(objective=np.float64(0.25)), tmp_path)
+    assert load_result(tmp_path).objective == 0.25
+
+
+def test_the_file_says_where_it_came_from(tmp_path):
+    document = yaml.safe_load(save_result(calibration(), tmp_path, {"bag": "drive", "messages": 7}).read_text(encoding="utf-8"))
+    assert (document["format"], document["version"]) == ("hand_eye_calib/extrinsic", 1)
+    provenance = document["provenance"]
+    assert provenance["inputs"] == {"bag": "drive", "messages": 7}
+    assert provenance["package"] == "hand_eye_calib"
+    assert provenance["package_version"]
+    assert provenance["created"].endswith("+00:00")
+
+
+def test_both_directions_are_in_the_file_by_name(tmp_path):
+    document = yaml.safe_load(save_result(calibration(), tmp_path).read_text(encoding="utf-8"))
+    assert document["T_parent_child"]["maps"] == "coordinates of caméra: links into lidar"
+    product = np.array(document["T_parent_child"]["matrix"]) @ document["T_child_parent"]["matrix"]
+    np.testing.assert_allclose(product, np.eye(4), atol=1e-14)
+
+
+def test_saving_again_replaces_the_file_and_leaves_nothing_else(tmp_path):
+    save_result(calibration(), tmp_path)
+    path = save_result(calibration(objective=2.0), tmp_path)
+    assert load_result(path).objective == 2.0
+    assert os.listdir(tmp_path) == ["extrinsic.yaml"]
+
+
+def test_a_write_that_fails_keeps_the_old_file(tmp_path, monkeypatch):
+    path = save_result(calibration(), tmp_path)
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match=r"cannot write .*extrinsic\.yaml: No space left on device"):
+        save_result(calibration(objective=2.0), tmp_path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["extrinsic.yaml"]
+
+
+def test_the_file_has_ordinary_permissions(tmp_path):
+    before = os.umask(0o027)
+    try:
+        path = save_result(calibration(), tmp_path)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+
+
+def test_a_directory_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot write .*file"):
+        save_result(calibration(), tmp_path / "file")
+
+
+def edited(**changes):
+    return yaml.safe_dump(calibration().to_dict() | changes)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected format hand_eye_calib/extrinsic, version 1; found format None, version None"),
+        ("a: 1", "found format None, version None"),
+        ("- 1", "found format None, version None"),
+        (edited(version=2), "expected format hand_eye_calib/extrinsic, version 1; found .*, version 2"),
+        (edited(format="urdf"), "found format urdf"),
+        (edited(T_parent_child={}), "lacks 'matrix'"),
+        (edited(T_parent_child={"matrix": [[1.0, 0.0]]}), "not as it was written"),
+        (edited(status="splendid"), "not as it was written: 'splendid'"),
+        (edited(warnings=None), "not as it was written"),
+        ("a: [1", "is not YAML"),
+        ("a: !!python/object:os.system {}", "is not YAML"),
+    ],
+)
+def test_what_is_no_calibration_is_refused_with_the_file(tmp_path, text, message):
+    path = tmp_path / "extrinsic.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=message) as caught:
+        load_result(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"cannot read .*absent: No such file"):
+        load_result(tmp_path / "absent")
+    with pytest.raises(InputError, match=r"cannot read .*extrinsic\.yaml: No such file"):
+        load_result(tmp_path)
+    (tmp_path / "extrinsic.yaml").write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(InputError, match="is not YAML"):
+        load_result(tmp_path)
