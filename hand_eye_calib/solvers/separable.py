@@ -14,7 +14,7 @@ def align_rotation_vectors(pairs):
 
     Conjugation ``R_A = R R_B R^T`` turns rotation vectors as it turns points: ``log(R_A) = R log(R_B)``. The best R is found from the
     singular value decomposition of their 3 x 3 correlation (Kabsch 1976), mirrored back where it is a reflection. No centroid is
-    taken off: the vectors have a common origin.
+    taken off: the vectors have a common origin. A motion of nearly half a turn has a rotation vector whose sign is a matter of noise.
     """
     rotvecs_parent = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
     rotvecs_child = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])

@@ -1,0 +1,264 @@
+"""Park, Taylor, Zhuang, Ali and the four metrics, against their definitions written out pair by pair."""
+
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime, check_grad, minimize
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.assessment.metrics import absolute_errors, errors, relative_errors
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.experiments import ali_as_published, published
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
+from hand_eye_calib.solvers import ali, park, taylor, zhuang
+
+TRUTH = se3.exp(np.array([0.4, -0.2, 0.7, 0.9, -0.5, 1.1]))
+
+
+def pairs_of(Ts_parenti_parentj, Ts_childi_childj):
+    index = np.arange(len(Ts_parenti_parentj))
+    return MotionPairs(np.asarray(Ts_parenti_parentj), np.asarray(Ts_childi_childj), index, index + 1)
+
+
+def random_pairs(noise=0.0, n_poses=25, seed=0):
+    """Motions of up to a metre and 0.8 rad per axis, with noise (m and rad) on both sensors' poses."""
+    random = np.random.default_rng(seed)
+    poses = [np.eye(4)]
+    for step in random.uniform([-1, -1, -1, -0.8, -0.8, -0.8], [1, 1, 1, 0.8, 0.8, 0.8], (n_poses - 1, 6)):
+        poses.append(poses[-1] @ se3.exp(step))
+    poses = np.array(poses)
+    parent_noise, child_noise = se3.exp(noise * random.normal(size=(2, n_poses, 6)))
+    return motion_pairs(poses @ parent_noise, poses @ TRUTH @ child_noise, "B1")
+
+
+def split(T):
+    return T[:3, :3], T[:3, 3]
+
+
+def squared_translation_residual(pairs, rotation, translation):
+    total = 0.0
+    for A, B in zip(pairs.Ts_parenti_parentj, pairs.Ts_childi_childj, strict=True):
+        (R_A, t_A), (_, t_B) = split(A), split(B)
+        total += np.sum((R_A @ translation + t_A - rotation @ t_B - translation) ** 2)
+    return total
+
+
+@pytest.fixture
+def noisy():
+    return random_pairs(noise=0.03)
+
+
+# Metrics
+
+
+def test_relative_errors_of_a_pair_worked_out_by_hand():
+    # The parent turns a quarter about z and moves by (1, 0, 0); X only shifts by (2, 0, 0): R_A t + t_A - R t_B - t = (-1, 2, 0) - t_B.
+    quarter = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
+    A = se3.from_rotation_translation(quarter[:3, :3], [1.0, 0.0, 0.0])
+    B = se3.from_rotation_translation(se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2 - 0.25]))[:3, :3], [-1.0, 2.0, 3.0])
+    X = se3.from_rotation_translation(np.eye(3), [2.0, 0.0, 0.0])
+    e_rt, e_rR = relative_errors(pairs_of([A], [B]), X)
+    assert e_rt == pytest.approx(3.0, abs=1e-14)
+    assert e_rR == pytest.approx(0.25, abs=1e-14)
+
+
+def test_relative_errors_are_means_over_the_pairs(noisy):
+    each = np.array([relative_errors(noisy[[k]], TRUTH) for k in range(len(noisy))])
+    np.testing.assert_allclose(relative_errors(noisy, TRUTH), each.mean(axis=0), rtol=1e-13)
+
+
+def test_relative_errors_vanish_for_the_truth_without_noise():
+    np.testing.assert_allclose(relative_errors(random_pairs(), TRUTH), 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [1e-12, 1e-7, 1e-3, 1.0, np.pi - 1e-7, np.pi])
+def test_absolute_errors_keep_their_digits_at_any_angle(angle):
+    turned = TRUTH @ se3.exp(np.array([0.0, 0.0, 0.0, *(angle * np.array([0.6, 0.0, 0.8]))]))
+    turned[:3, 3] += [3e-9, 0.0, -4e-9]
+    e_at, e_aR = absolute_errors(turned, TRUTH)
+    assert e_at == pytest.approx(5e-9, rel=1e-6)
+    assert e_aR == pytest.approx(angle, abs=1e-15, rel=1e-9)
+
+
+def test_errors_are_all_four(noisy):
+    found = errors(noisy, np.eye(4), TRUTH)
+    assert (found.e_rt, found.e_rR) == relative_errors(noisy, np.eye(4))
+    assert (found.e_at, found.e_aR) == absolute_errors(np.eye(4), TRUTH)
+
+
+# Park and Taylor
+
+
+def test_park_aligns_the_rotation_vectors(noisy):
+    rotvecs = [se3.rotation_log(T[:, :3, :3]) for T in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj)]
+    expected, _ = Rotation.align_vectors(*rotvecs)
+    np.testing.assert_allclose(park.solve(noisy).T_parent_child[:3, :3], expected.as_matrix(), atol=1e-12)
+
+
+def test_park_translation_is_the_best_for_its_rotation(noisy):
+    solution = park.solve(noisy)
+    rotation, translation = split(solution.T_parent_child)
+    cost = lambda t: squared_translation_residual(noisy, rotation, t)  # noqa: E731
+    assert solution.objective == pytest.approx(cost(translation), rel=1e-12)
+    np.testing.assert_allclose(minimize(cost, np.zeros(3), tol=1e-12).x, translation, atol=1e-6)
+
+
+def test_taylor_gives_parks_answer(noisy):
+    np.testing.assert_allclose(taylor.solve(noisy).T_parent_child, park.solve(noisy).T_parent_child, atol=1e-13)
+
+
+def test_rotation_is_never_a_reflection():
+    # Rotation vectors in a plane leave the sign of the third axis to the determinant.
+    motions = se3.exp(
+        np.array([[0.3, 0.1, 0.2, 0.5, 0.0, 0.0], [0.1, -0.3, 0.4, 0.0, 0.4, 0.0], [0.2, 0.2, 0.1, 0.3, 0.3, 0.0]])
+    )
+    pairs = pairs_of(motions, se3.inverse(TRUTH) @ motions @ TRUTH)
+    np.testing.assert_allclose(park.solve(pairs).T_parent_child, TRUTH, atol=1e-12)
+
+
+# Zhuang
+
+
+def zhuang_cost(parameters, pairs):
+    """Eqs 14-16, one pair at a time."""
+    z, t = parameters[:3], parameters[3:]
+    total = 0.0
+    for A, B in zip(pairs.Ts_parenti_parentj, pairs.Ts_childi_childj, strict=True):
+        (R_A, t_A), (R_B, t_B) = split(A), split(B)
+        k_A, k_B = zhuang_axis(R_A), zhuang_axis(R_B)
+        minus, plus = np.eye(3) - se3.skew(z), np.eye(3) + se3.skew(z)
+        f = minus @ k_A - plus @ k_B
+        g = minus @ ((R_A - np.eye(3)) @ t + t_A) - plus @ t_B
+        total += f @ f + g @ g
+    return total
+
+
+def zhuang_axis(rotation):
+    rotvec = Rotation.from_matrix(rotation).as_rotvec()
+    angle = np.linalg.norm(rotvec)
+    return rotvec / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
+
+
+def zhuang_parameters(T):
+    rotvec = se3.rotation_log(T[:3, :3])
+    angle = np.linalg.norm(rotvec)
+    return np.concatenate([np.tan(angle / 2) * rotvec / angle, T[:3, 3]])
+
+
+def test_zhuang_is_at_a_minimum_of_its_cost(noisy):
+    solution = zhuang.solve(noisy)
+    parameters = zhuang_parameters(solution.T_parent_child)
+    assert solution.converged
+    assert solution.iterations < 20
+    assert solution.objective == pytest.approx(zhuang_cost(parameters, noisy), rel=1e-10)
+    better = minimize(zhuang_cost, parameters, args=(noisy,), tol=1e-12)
+    assert solution.objective == pytest.approx(better.fun, rel=1e-8)
+
+
+def test_zhuang_takes_z_for_the_axis_of_no_rotation():
+    # A parent motion without rotation beside a child's that turns about x: only the convention says what f is.
+    pairs = random_pairs(noise=0.01)
+    still = se3.exp(np.array([[0.5, 0.2, 0.1, 0.0, 0.0, 0.0]]))
+    turning = se3.exp(np.array([[0.2, 0.1, 0.4, 0.3, 0.0, 0.0]]))
+    pairs = pairs_of(np.concatenate([pairs.Ts_parenti_parentj, still]), np.concatenate([pairs.Ts_childi_childj, turning]))
+    solution = zhuang.solve(pairs)
+    assert solution.objective == pytest.approx(zhuang_cost(zhuang_parameters(solution.T_parent_child), pairs), rel=1e-10)
+
+
+def test_zhuang_steps_are_gauss_newton():
+    """The condensed problem has the derivative of the written-out one."""
+    pairs = random_pairs(noise=0.05)
+    condensed = zhuang._condense(pairs)
+    parameters = np.array([0.3, -0.2, 0.5, 0.7, -0.4, 0.2])
+    products, derivative = zhuang._products(parameters)
+    residuals = condensed @ products
+    assert residuals @ residuals == pytest.approx(zhuang_cost(parameters, pairs), rel=1e-12)
+    gradient = approx_fprime(parameters, zhuang_cost, 1e-7, pairs)
+    np.testing.assert_allclose(2 * residuals @ condensed @ derivative, gradient, rtol=1e-4, atol=1e-4)
+
+
+# Ali
+
+
+def test_ali_minimises_the_translation_residual_over_rotations(noisy):
+    def cost(parameters):
+        return squared_translation_residual(noisy, se3.rotation_exp(parameters[:3]), parameters[3:])
+
+    solution = ali.solve(noisy)
+    rotation, translation = split(solution.T_parent_child)
+    assert solution.converged
+    assert solution.objective == pytest.approx(squared_translation_residual(noisy, rotation, translation), rel=1e-12)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    random = np.random.default_rng(1)
+    found = [minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun for _ in range(5)]
+    assert solution.objective <= min(found) * (1 + 1e-9)
+    assert solution.objective == pytest.approx(min(found), rel=1e-6)
+
+
+def test_ali_is_blind_to_the_rotation_of_the_child(noisy):
+    turned = noisy.Ts_childi_childj.copy()
+    turned[:, :3, :3] = np.eye(3)
+    same = ali.solve(pairs_of(noisy.Ts_parenti_parentj, turned))
+    assert same.objective == pytest.approx(ali.solve(noisy).objective, rel=1e-9)
+    assert park.solve(noisy).objective > same.objective
+
+
+def test_ali_as_published_fits_a_matrix_that_is_no_rotation(noisy):
+    rows = np.linalg.qr(ali.residual_rows(noisy), mode="r")
+    parameters = np.array([0.8, 0.3, -0.2, 0.4, 0.1, -0.5, 0.3])
+    value_and_gradient = [lambda p, part=part: ali_as_published._derivatives(p, rows)[part] for part in (0, 1)]
+    assert check_grad(*value_and_gradient, parameters) < 1e-5
+    hessian = ali_as_published._derivatives(parameters, rows)[2]
+    np.testing.assert_allclose(approx_fprime(parameters, value_and_gradient[1]), hessian, rtol=1e-5, atol=1e-4)
+    # With a unit quaternion the matrix is its rotation, and the cost is ali's.
+    quat = se3.to_quat_xyzw(TRUTH)
+    parameters = np.concatenate([np.roll(quat, 1), TRUTH[:3, 3]])
+    assert value_and_gradient[0](parameters) == pytest.approx(squared_translation_residual(noisy, *split(TRUTH)), rel=1e-10)
+    assert ali_as_published.solve(noisy).objective > ali.solve(noisy).objective
+
+
+def test_ali_as_published_finds_the_truth_without_noise():
+    np.testing.assert_allclose(ali_as_published.solve(random_pairs()).T_parent_child, TRUTH, atol=1e-9)
+
+
+# The reader of the published data
+
+
+def test_reader_says_what_the_folder_lacks(tmp_path):
+    (tmp_path / "published").mkdir()
+    with pytest.raises(InputError, match="found no kitti_tests, no simulation_tests"):
+        published.load_simulated(tmp_path)
+
+
+@pytest.fixture
+def data_folder(tmp_path):
+    for name in ("kitti_tests", "simulation_tests/mixture", "published"):
+        (tmp_path / name).mkdir(parents=True)
+    return tmp_path
+
+
+def test_reader_names_a_missing_file(data_folder):
+    with pytest.raises(InputError, match=r"cannot read .*simulation_tests_mixture\.csv: No such file"):
+        published.load_simulated(data_folder, ["mixture"])
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a,b\n1,2\n", "algorithm,method,err_tr,err_R,abs_tr,abs_R,T\nPark,B1,1,1,1,1,[[1 2 3]]\n"],
+    ids=["columns", "matrix"],
+)
+def test_reader_names_a_file_that_holds_something_else(data_folder, text):
+    (data_folder / "published" / "simulation_tests_mixture.csv").write_text(text)
+    with pytest.raises(InputError, match=r"simulation_tests_mixture\.csv is not a file of published results"):
+        published.load_simulated(data_folder, ["mixture"])
+
+
+def test_reader_refuses_results_without_their_trajectories(data_folder):
+    row = 'Park,B1,1,1,1,1,"[[1 0 0 0]\n [0 1 0 0]\n [0 0 1 0]\n [0 0 0 1]]"\n'
+    (data_folder / "published" / "simulation_tests_mixture.csv").write_text(
+        f"algorithm,method,err_tr,err_R,abs_tr,abs_R,T\n{row}"
+    )
+    with pytest.raises(
+        InputError, match=r"trajectories of mixture do not go with the published results: expected 38 runs \(found 0\)"
+    ):
+        published.load_simulated(data_folder, ["mixture"])
