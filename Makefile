@@ -1,0 +1,59 @@
+# Everything a newcomer or CI types. Needs python3 (3.11 or newer) and pip; the rest is installed into .venv here.
+#   make demo          simulate a drive, calibrate it from its bag and on the live node, compare with the truth
+#   make test          the whole test suite
+#   make test-oldest   the same on the oldest supported versions
+#   make lint          style
+#   make bench         benchmarks against the baseline
+#   make clean         remove everything the above made
+# PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest.
+PYTHON ?= python3
+PYTEST_ARGS ?=
+BENCH_ARGS ?=
+DEMO_ARGS ?= --out demo_output
+
+VENV := .venv
+OLDEST := .venv-oldest
+SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
+
+.PHONY: help demo test test-oldest bench lint format clean
+
+help:
+	@sed -n 's/^#   //p' Makefile
+
+demo: $(VENV)/.ready-demo
+	$(VENV)/bin/hand_eye_calib demo $(DEMO_ARGS)
+
+test: $(VENV)/.ready-test
+	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
+
+test-oldest: $(OLDEST)/.ready-test
+	$(OLDEST)/bin/python -m pytest $(PYTEST_ARGS)
+
+bench: $(VENV)/.ready-test
+	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py $(BENCH_ARGS)
+
+lint: $(VENV)/.ready-test
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+
+format: $(VENV)/.ready-test
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+clean:
+	rm -rf $(VENV) $(OLDEST) build install log demo_output *.egg-info .pytest_cache .hypothesis .ruff_cache
+	find hand_eye_calib test benchmarks launch -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The package is installed editable, so that what runs and what is tested is this work tree. A stamp is touched last: set-up
+# is repeated when it was interrupted or when one of the files that decide on it is newer.
+$(VENV)/.ready-demo: EXTRAS := ros,plot
+$(VENV)/.ready-test: EXTRAS := ros,plot,test,lint
+$(OLDEST)/.ready-test: EXTRAS := ros,plot,test
+$(OLDEST)/.ready-test: CONSTRAINTS := --constraint requirements/oldest.txt
+$(OLDEST)/.ready-test: requirements/oldest.txt
+
+$(VENV)/.ready-demo $(VENV)/.ready-test $(OLDEST)/.ready-test: $(SETUP_FILES)
+	@PYTHON="$(PYTHON)" sh requirements/make_venv.sh $(@D)
+	@echo "installing hand_eye_calib with [$(EXTRAS)] into $(@D)"
+	@$(@D)/bin/python -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable ".[$(EXTRAS)]"
+	@touch $@

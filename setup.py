@@ -1,0 +1,58 @@
+"""Build script for colcon (ament_python) and pip. Name, version, description, maintainer and licence come from package.xml."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from setuptools import find_packages, setup
+
+# Resolved, because colcon build --symlink-install runs a link to this file in a folder that has little else.
+HERE = Path(__file__).resolve().parent
+manifest = ElementTree.parse(HERE / "package.xml").getroot()
+name = manifest.findtext("name")
+
+
+def files(pattern):
+    """Relative paths, as setuptools wants its data files."""
+    return sorted(path.relative_to(HERE).as_posix() for path in HERE.glob(pattern))
+
+
+setup(
+    name=name,
+    version=manifest.findtext("version"),
+    description=manifest.findtext("description"),
+    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    maintainer=manifest.findtext("maintainer"),
+    maintainer_email=manifest.find("maintainer").get("email"),
+    license=manifest.findtext("license"),
+    packages=find_packages(include=[name, f"{name}.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
+        (f"share/{name}", ["package.xml"]),
+        (f"share/{name}/config", files("config/*.yaml")),
+        (f"share/{name}/launch", files("launch/*.launch.py")),
+    ],
+    zip_safe=False,
+    python_requires=">=3.11",
+    install_requires=[
+        "casadi>=3.7",
+        "numpy>=1.26",
+        "PyYAML>=6.0",
+        "rich>=13.7",
+        "rosbags>=0.11.7",
+        "scipy>=1.11",
+    ],
+    extras_require={
+        "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
+        "plot": ["matplotlib>=3.6"],
+        "test": ["colcon-common-extensions", "hypothesis>=6.98", "packaging", "pytest>=7.4", "wheel"],
+        "lint": ["ruff==0.17.5"],
+    },
+    entry_points={
+        "console_scripts": [
+            f"{name} = hand_eye_calib.cli.main:main",
+            "calibrator = hand_eye_calib.cli.main:calibrator",
+            "replay = hand_eye_calib.cli.main:replay",
+        ]
+    },
+)

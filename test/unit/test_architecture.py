@@ -1,0 +1,154 @@
+"""Imports go one way, and the heavy or ROS-bound libraries stay in their rooms."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "hand_eye_calib"
+SOURCE = Path(__file__).resolve().parents[2] / PACKAGE
+
+# A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the public Python API.
+# In the engine each room sees only rooms before it.
+ENGINE = {
+    "errors": set(),
+    "config": {"errors"},
+    "geometry": {"errors", "config"},
+    "calibration": {"errors", "geometry"},
+    "pairing": {"errors", "config", "geometry"},
+    "solvers": {"errors", "config", "geometry", "pairing"},
+    "adaptive": {"errors", "config", "geometry", "pairing", "solvers"},
+    "assessment": {"errors", "config", "geometry", "calibration", "pairing", "solvers", "adaptive"},
+}
+ENGINE["estimation"] = set(ENGINE)
+ENGINE["calibrator"] = set(ENGINE)
+ALLOWED = ENGINE | {
+    "calibration": ENGINE["calibration"] | {"io"},  # for Calibration.save alone, inside the method
+    "io": {"root", "errors", "config", "geometry", "calibration"},
+    "report": {"root", "errors", "config", "geometry", "calibration", "pairing", "assessment"},
+    "simulation": {"errors", "config", "geometry", "io"},
+    "root": {"errors", "config", "geometry", "calibration", "calibrator", "io"},
+    "ros": {"root", "io", "calibrator", *ENGINE},
+    "experiments": {"root", "io", "report", "simulation", "calibrator", *ENGINE},
+    "cli": {"root", "io", "report", "simulation", "ros", "experiments", "calibrator", *ENGINE},
+    "__main__": {"cli"},
+}
+
+# Where a library that is heavy, optional or bound to ROS may be imported.
+ROS_LIBRARIES = ("rclpy", "nav_msgs", "geometry_msgs", "std_srvs", "std_msgs", "diagnostic_msgs", "tf2_msgs", "tf2_ros",
+                 "rcl_interfaces", "builtin_interfaces", "rosidl_runtime_py", "rosgraph_msgs")  # fmt: skip
+CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
+    "rosbags": "io/bags.py",
+    "casadi": "solvers/ipopt.py",
+    "matplotlib": "report/",
+}
+
+
+def imports_of(path, package_root):
+    """Dotted names a file imports, inside functions too; relative ones resolved, import_module of a literal included."""
+    names = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parents = (PACKAGE, *path.relative_to(package_root).parts)[: -node.level]
+                base = ".".join((*parents, base)).rstrip(".")
+            names += [f"{base}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            if called in ("import_module", "__import__"):
+                names.append(str(node.args[0].value))
+    return names
+
+
+def room_of(relative):
+    if relative.name == "__init__.py" and len(relative.parts) == 1:
+        return "root"
+    return relative.parts[0].removesuffix(".py")
+
+
+def breaches(package_root):
+    """One line per import that goes the wrong way or takes a confined library out of its room."""
+    rooms = {room_of(path.relative_to(package_root)) for path in package_root.rglob("*.py")}
+    found = []
+    for path in sorted(package_root.rglob("*.py")):
+        relative = path.relative_to(package_root)
+        room = room_of(relative)
+        if room not in ALLOWED:
+            found.append(f"{relative}: room {room!r} has no place in the import order")
+            continue
+        for name in imports_of(path, package_root):
+            top, *rest = name.split(".")
+            home = CONFINED.get(top)
+            if home and not relative.as_posix().startswith(home):
+                found.append(f"{relative}: {top} may be imported only in {home}")
+            if top == PACKAGE:
+                target = rest[0] if rest and rest[0] in rooms else "root"
+                if target not in ALLOWED[room] | {room}:
+                    found.append(f"{relative}: {room} must not import {target}")
+    return found
+
+
+def test_imports_go_one_way_and_libraries_stay_in_their_rooms():
+    assert len(list(SOURCE.rglob("*.py"))) > 10, f"no sources found in {SOURCE}"
+    assert breaches(SOURCE) == []
+
+
+def test_order_itself_has_no_cycle_in_the_engine():
+    order = list(ENGINE)
+    assert all(order.index(seen) < order.index(room) for room, allowed in ENGINE.items() for seen in allowed)
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "message"),
+    [
+        ("geometry/se3.py", "from hand_eye_calib.solvers import dnl", "geometry must not import solvers"),
+        ("geometry/se3.py", "import hand_eye_calib.solvers.dnl", "geometry must not import solvers"),
+        ("geometry/se3.py", "from ..solvers import dnl", "geometry must not import solvers"),
+        ("geometry/se3.py", "from .. import solvers", "geometry must not import solvers"),
+        ("geometry/se3.py", "def late():\n    from hand_eye_calib import solvers", "geometry must not import solvers"),
+        ("geometry/se3.py", "from hand_eye_calib import calibrate", "geometry must not import root"),
+        ("errors.py", "from hand_eye_calib.geometry import se3", "errors must not import geometry"),
+        ("calibrator.py", "from hand_eye_calib.ros import node", "calibrator must not import ros"),
+        ("ros/node.py", "from hand_eye_calib.cli import main", "ros must not import cli"),
+        ("cli/main.py", "import rclpy", "rclpy may be imported only in ros/"),
+        ("simulation/drive.py", "from nav_msgs.msg import Odometry", "nav_msgs may be imported only in ros/"),
+        ("io/files.py", "from rosbags.highlevel import AnyReader", "rosbags may be imported only in io/bags.py"),
+        ("solvers/dnl.py", "import casadi as ca", "casadi may be imported only in solvers/ipopt.py"),
+        (
+            "cli/main.py",
+            "import importlib\nimportlib.import_module('matplotlib.pyplot')",
+            "matplotlib may be imported only in report/",
+        ),
+        ("attic/old.py", "", "room 'attic' has no place in the import order"),
+    ],
+)
+def test_a_breach_is_caught(tmp_path, file, line, message):
+    for room in ("geometry", "solvers", "cli", "ros"):
+        (tmp_path / room).mkdir()
+        (tmp_path / room / "__init__.py").touch()
+    breach = tmp_path / file
+    breach.parent.mkdir(exist_ok=True)
+    assert breaches(tmp_path) == []
+    breach.write_text(line + "\n")
+    assert breaches(tmp_path) == [f"{file}: {message}"]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import hand_eye_calib",
+        "import hand_eye_calib as hec; hec.Trajectory; hec.Calibration; hec.calibrate",
+        "from hand_eye_calib.calibrator import Calibrator; Calibrator()",
+        "import hand_eye_calib.cli.main",
+    ],
+)
+def test_importing_loads_nothing_heavy(code):
+    heavy = sorted({"rclpy", "rosbags", "casadi", "matplotlib"})
+    check = f"{code}\nimport sys; print(*[name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, cwd=SOURCE.parent)
+    assert (done.returncode, done.stdout.split()) == (0, []), done.stderr
