@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hand_eye_calib.adaptive import estimator as adaptive_estimator
 from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
 
@@ -26,6 +27,10 @@ _UNKNOWN_SIGMAS = np.r_[np.full(3, UNKNOWN_TRANSLATION), np.full(3, UNKNOWN_ROTA
 # A translation direction counts as observed when the rotations that reveal it have this many times the power of the rotation
 # errors themselves; below, noise alone would look like that motion.
 _LEAST_SIGNAL_TO_NOISE = 3.0
+
+# Nor does it where all rotation is about that direction but for this share (2 deg): odometries are wrong by a per cent or two of the turn, and
+# such errors last, so that the residuals do not show them.
+_NEARLY_ONE_AXIS = 0.04
 
 # Rotation errors are never taken to be smaller than this (rad): rounding, not motion.
 _ROUNDING_ANGLE = 1e-6
@@ -81,9 +86,54 @@ def assess(pairs, solution, solve_without):
     """
     model, unknown = model_covariance(pairs, solution)
     resampled = jackknife_covariance(len(pairs), solution.T_parent_child, solve_without)
+    return _combine(solution.T_parent_child, model, resampled, unknown)
+
+
+def assess_adaptive(pose_pairs, solution):
+    """Covariance and observability of an answer of the adaptive estimator.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    solution : AdaptiveSolution
+        Its answer for these poses.
+
+    Returns
+    -------
+    Assessment
+    """
+    poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
+    resampled = jackknife_covariance(
+        len(solution.jumps),
+        solution.T_parent_child,
+        lambda left_out: adaptive_estimator.solve_without(*poses, solution, left_out),
+    )
+    unseen = [*solution.unseen.T, *_noise_driven_baselines(pose_pairs.Ts_pw_p, solution)]
+    return _combine(solution.T_parent_child, solution.cov_parent_child_in_child, resampled, _basis(unseen))
+
+
+def _noise_driven_baselines(Ts_pw_p, solution):
+    """Directions (6,) of translation that even rotations over long baselines do not lift out of the rotation noise.
+
+    The adaptive estimator weighs increments, each of which may well drown in noise; what counts is the sum of them.
+    """
+    baseline = max(len(Ts_pw_p) // _BLOCKS, 1)
+    rotation = Ts_pw_p[:, :3, :3]
+    motions = np.swapaxes(rotation[:-baseline], 1, 2) @ rotation[baseline:]
+    # No baseline may run across a jump, unless all of them do.
+    jumps_before = np.concatenate([[0], np.cumsum(solution.jumps)])
+    weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
+    if not weights.any():
+        weights[:] = 1.0
+    variance = 2 * solution.noise.rotation_white**2 + baseline * solution.noise.rotation_drift**2
+    moved = (motions - np.eye(3)) @ solution.T_parent_child[:3, :3]
+    return _noise_driven_translations(weights, moved, variance * np.eye(3))
+
+
+def _combine(T_parent_child, model, resampled, unknown):
     known = np.eye(6) - unknown @ unknown.T
     covariance = known @ larger_by_direction(model, resampled) @ known + _unknown_variance(unknown)
-    return Assessment(covariance, _verdicts(solution.T_parent_child[:3, :3], covariance, unknown))
+    return Assessment(covariance, _verdicts(T_parent_child[:3, :3], covariance, unknown))
 
 
 def model_covariance(pairs, solution):
@@ -140,7 +190,7 @@ def _noise_driven_translations(weights, moved_in_child, cov_r):
     drowned = [
         direction
         for power, direction in zip(powers, directions.T, strict=True)
-        if power < _LEAST_SIGNAL_TO_NOISE * (direction @ noise @ direction)
+        if power < max(_LEAST_SIGNAL_TO_NOISE * (direction @ noise @ direction), _NEARLY_ONE_AXIS**2 * powers[-1])
     ]
     return [np.r_[direction, np.zeros(3)] for direction in drowned]
 

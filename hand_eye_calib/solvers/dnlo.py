@@ -39,7 +39,7 @@ _DECISIVE = 0.99
 _MAX_ROUNDS = 100
 
 # A batch of starts has settled when no objective falls by more than this share in a round.
-_SETTLED = 1e-7
+_SETTLED = 1e-5
 
 # Leaving pairs out: rounds of refitting from the full answer, and a finite cost that never counts as an inlier's.
 _ROUNDS_WITHOUT = 8
@@ -185,15 +185,18 @@ def _settle(condensed, Ts, weights, threshold, floor):
 
 
 def _alternate(condensed, T_start, threshold, floor):
-    """Weights and the exact minimum for them in turn until neither changes."""
+    """Weights and X in turn until neither changes; X is then the exact minimum for its weights."""
     T = T_start[None]
     weights, objective = truncate(_costs(condensed, T), threshold, floor)
     converged, iterations = False, 0
     while not converged and iterations < _MAX_ROUNDS:
         iterations += 1
-        T_new = quadratic_form.minimise(quadratic_form.expand(weights @ condensed), T[:, :3, :3]).T_parent_child
+        T_new = _refit(condensed, weights, T)
         new_weights, new_objective = truncate(_costs(condensed, T_new), threshold, floor)
-        converged = bool(np.array_equal(new_weights, weights) or new_objective >= objective)
+        if np.array_equal(new_weights, weights) or new_objective >= objective:
+            T_new = quadratic_form.minimise(quadratic_form.expand(weights @ condensed), T[:, :3, :3]).T_parent_child
+            new_weights, new_objective = truncate(_costs(condensed, T_new), threshold, floor)
+            converged = bool(np.array_equal(new_weights, weights) or new_objective >= objective)
         if new_objective <= objective:
             T, weights, objective = T_new, new_weights, new_objective
     return Solution(T[0], float(objective[0]), converged, iterations, weights[0])

@@ -20,7 +20,7 @@ _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
 _ROTATION, _TRANSLATION, _ONE = slice(0, 9), slice(9, 12), 12
 
 # Pairs condensed at a time: keeps the intermediate arrays in the processor's cache.
-_BLOCK = 4096
+_BLOCK = 1024
 
 # Eigenvalues of the translation block below this share of the largest count as zero: rounding, not motion.
 _RANK_TOLERANCE = 1e-10
@@ -43,34 +43,50 @@ def condense(pairs):
     (K, 91) array
         In the order of ``numpy.triu_indices(13)``; ``condensed @ monomials(X)`` gives all costs.
     """
-    condensed = np.empty((len(pairs), len(_ROWS)))
+    condensed = np.empty((len(_ROWS), len(pairs)))
     for start in range(0, len(pairs), _BLOCK):
         block = slice(start, start + _BLOCK)
-        condensed[block] = _full_forms(pairs.Ts_parenti_parentj[block], pairs.Ts_childi_childj[block])[:, _ROWS, _COLUMNS]
-    return condensed
+        condensed[:, block] = _triangles(pairs.Ts_parenti_parentj[block], pairs.Ts_childi_childj[block])
+    return condensed.T
 
 
-def _full_forms(Ts_parenti_parentj, Ts_childi_childj):
-    rotation_a, translation_a = Ts_parenti_parentj[:, :3, :3], Ts_parenti_parentj[:, :3, 3]
-    rotation_b, translation_b = Ts_childi_childj[:, :3, :3], Ts_childi_childj[:, :3, 3]
-    n_pairs, eye = len(rotation_a), np.eye(3)
-    moved = rotation_a - eye
-    forms = np.zeros((n_pairs, DIMENSION, DIMENSION))
+def _triangles(Ts_parenti_parentj, Ts_childi_childj):
+    """Upper triangles (91, K), one row per entry: every operation runs along the pairs."""
+    n_pairs = len(Ts_parenti_parentj)
+    R_a = Ts_parenti_parentj[:, :3, :3].reshape(n_pairs, 9).T.copy()
+    R_b = Ts_childi_childj[:, :3, :3].reshape(n_pairs, 9).T.copy()
+    t_a, t_b = Ts_parenti_parentj[:, :3, 3].T.copy(), Ts_childi_childj[:, :3, 3].T.copy()
+    moved = R_a.copy()
+    moved[[0, 4, 8]] -= 1.0
+    triangles = np.empty((len(_ROWS), n_pairs))
     # |R_A R - R R_B|^2 = 2 |R|^2 - 2 sum_ijkl A_ik R_kj R_il B_lj, plus |R t_B|^2
-    mixed = np.einsum("nik,nlj->nkjil", rotation_a, rotation_b).reshape(n_pairs, 9, 9)
-    forms[:, _ROTATION, _ROTATION] = (
-        2 * np.eye(9)
-        - mixed
-        - np.swapaxes(mixed, 1, 2)
-        + np.einsum("ik,nj,nl->nijkl", eye, translation_b, translation_b).reshape(n_pairs, 9, 9)
-    )
+    triangles[_RR] = -(R_a[_A_IK] * R_b[_B_LJ] + R_a[_A_KI] * R_b[_B_JL])
+    triangles[_RR_DIAGONAL] += 2.0
+    triangles[_RR_SAME_ROW] += t_b[_J_SAME_ROW] * t_b[_L_SAME_ROW]
     # the translation residual is (R_A - I) t + t_A - R t_B
-    forms[:, _ROTATION, _TRANSLATION] = -np.einsum("nia,nj->nija", moved, translation_b).reshape(n_pairs, 9, 3)
-    forms[:, _ROTATION, _ONE] = -np.einsum("ni,nj->nij", translation_a, translation_b).reshape(n_pairs, 9)
-    forms[:, _TRANSLATION, _TRANSLATION] = np.swapaxes(moved, 1, 2) @ moved
-    forms[:, _TRANSLATION, _ONE] = np.einsum("nia,ni->na", moved, translation_a)
-    forms[:, _ONE, _ONE] = np.einsum("ni,ni->n", translation_a, translation_a)
-    return forms
+    triangles[_RT] = -moved[_MOVED_IA] * t_b[_J_RT]
+    triangles[_R1] = -t_a[_I_R1] * t_b[_J_R1]
+    columns = moved.reshape(3, 3, n_pairs)  # columns[i, a] is (R_A - I)_ia
+    triangles[_TT] = (columns[:, _A_TT] * columns[:, _B_TT]).sum(axis=0)
+    triangles[_T1] = (columns * t_a[:, None]).sum(axis=0)
+    triangles[_11] = (t_a * t_a).sum(axis=0)
+    return triangles
+
+
+# Where the blocks of Q lie in its upper triangle, and which entries of A and B meet there. Rows 0-8 are vec R: entry 3 k + j is R_kj.
+_RR, _RT, _R1 = (
+    np.flatnonzero((_ROWS < 9) & where) for where in (_COLUMNS < 9, (_COLUMNS > 8) & (_COLUMNS < 12), _COLUMNS == 12)
+)
+_TT, _T1, _11 = (
+    np.flatnonzero((_ROWS > 8) & where) for where in ((_COLUMNS < 12), (_ROWS < 12) & (_COLUMNS == 12), _ROWS == 12)
+)
+(_K, _J), (_I, _L) = np.divmod(_ROWS[_RR], 3), np.divmod(_COLUMNS[_RR], 3)
+_A_IK, _A_KI, _B_LJ, _B_JL = 3 * _I + _K, 3 * _K + _I, 3 * _L + _J, 3 * _J + _L
+_RR_DIAGONAL = _RR[_ROWS[_RR] == _COLUMNS[_RR]]
+_RR_SAME_ROW, _J_SAME_ROW, _L_SAME_ROW = _RR[_K == _I], _J[_K == _I], _L[_K == _I]
+_MOVED_IA, _J_RT = 3 * (_ROWS[_RT] // 3) + _COLUMNS[_RT] - 9, _ROWS[_RT] % 3
+_I_R1, _J_R1 = np.divmod(_ROWS[_R1], 3)
+_A_TT, _B_TT = _ROWS[_TT] - 9, _COLUMNS[_TT] - 9
 
 
 def monomials(T_parent_child):

@@ -1,0 +1,1 @@
+"""The adaptive estimator: models the noise of the two trajectories instead of choosing a reference."""
