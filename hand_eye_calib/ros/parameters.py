@@ -1,0 +1,127 @@
+"""The node's parameters, made from the option dataclasses."""
+
+import dataclasses
+import difflib
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+
+from hand_eye_calib.config import CalibratorConfig, NodeConfig, check_value, option_name
+from hand_eye_calib.errors import ConfigError
+
+FIELDS = {option_name(field): field for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)}
+
+# Declared by rclpy itself.
+_SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
+
+
+class Parameters:
+    """Declares the parameters on a node and keeps them as option objects.
+
+    The node must have been made with ``automatically_declare_parameters_from_overrides=True``: that is how rclpy shows what
+    a file or the command line sets, unknown names included.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    qos_names : iterable of str
+        Names of the QoS override parameters that the node's subscriptions will declare.
+    on_change : callable
+        Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the new options by then.
+
+    Attributes
+    ----------
+    calibrator : CalibratorConfig
+    node : NodeConfig
+    unknown : list of str
+        One line for every given name that does not exist.
+
+    Raises
+    ------
+    ConfigError
+        Where a given value is of the wrong type or out of range.
+    """
+
+    def __init__(self, node, qos_names, on_change):
+        given = _take_overrides(node)
+        self.unknown = [_unknown(name) for name in given if name not in FIELDS and name not in qos_names]
+        self._values = {
+            name: _start_value(field, given[name]) if name in given else field.default for name, field in FIELDS.items()
+        }
+        self.calibrator, self.node = _configs(self._values)
+        for name, field in FIELDS.items():
+            node.declare_parameter(name, self._values[name], _descriptor(field))
+        self._on_change = on_change
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._apply)
+
+    def _proposed(self, parameters):
+        ours = {parameter.name: parameter.value for parameter in parameters if parameter.name in FIELDS}
+        return self._values | {name: check_value(FIELDS[name], value) for name, value in ours.items()}
+
+    def _check(self, parameters):
+        try:
+            _configs(self._proposed(parameters))
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, parameters):
+        if any(parameter.name in FIELDS for parameter in parameters):
+            self._values = self._proposed(parameters)
+            self.calibrator, self.node = _configs(self._values)
+            self._on_change()
+
+
+def _configs(values):
+    def part(config):
+        return config.from_options({option_name(field): values[option_name(field)] for field in dataclasses.fields(config)})
+
+    return part(CalibratorConfig), part(NodeConfig)
+
+
+def _take_overrides(node):
+    """Mapping of the names and values that file and command line give, undeclared again so that they can get descriptors."""
+    given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
+    for name in _SYSTEM_PARAMETERS:
+        given.pop(name, None)
+    for name in given:
+        node.undeclare_parameter(name)
+    return given
+
+
+def _unknown(name):
+    guesses = difflib.get_close_matches(name, FIELDS, n=1)
+    return f"parameter {name} does not exist and is ignored" + (f"; did you mean {guesses[0]}?" if guesses else "")
+
+
+def _start_value(field, value):
+    # ROS parameters have fixed types: rclpy refuses an integer for a double, and so does `ros2 param set`.
+    if isinstance(field.default, float) and type(value) is int and not _dynamic(field):
+        raise ConfigError(f"{option_name(field)} must be a double; got the integer {value}: write {value}.0")
+    return check_value(field, value)
+
+
+def _dynamic(field):
+    """Whether a parameter takes a word as well as a number, and so has no single type."""
+    return bool(field.metadata["words"])
+
+
+def _descriptor(field):
+    meta = field.metadata
+    words = meta["choices"] or (f"{' or '.join(meta['words'])}, or a number",) * _dynamic(field)
+    description = (
+        meta["doc"] + (f" Unit: {meta['unit']}." if meta["unit"] else "") + (f" Values: {', '.join(words)}." if words else "")
+    )
+    descriptor = ParameterDescriptor(
+        description=description,
+        additional_constraints=f"must match {meta['pattern']}" if meta["pattern"] else "",
+        read_only=meta["read_only"],
+        dynamic_typing=_dynamic(field),
+    )
+    if meta["minimum"] is not None and meta["maximum"] is not None and not _dynamic(field):
+        bounds = dict(from_value=type(field.default)(meta["minimum"]), to_value=type(field.default)(meta["maximum"]))
+        if isinstance(field.default, float):
+            descriptor.floating_point_range = [FloatingPointRange(**bounds)]
+        else:
+            descriptor.integer_range = [IntegerRange(**bounds)]
+    return descriptor

@@ -1,0 +1,88 @@
+"""From arguments to a spinning node, and from a signal to a clean end."""
+
+import argparse
+import os
+import re
+import sys
+import threading
+import traceback
+
+import rclpy
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import LoggingSeverity, set_logger_level
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.ros.calibrator_node import CalibratorNode
+
+# How long a running solve may hold up the end of the program.
+SOLVE_GRACE_S = 0.5
+
+
+def run(arguments, signals):
+    """Run the node until ``signals``, a file descriptor, becomes readable; returns the exit code."""
+    try:
+        _init(arguments)
+    except UnknownROSArgsError as error:
+        print(f"calibrator: unknown ROS arguments {error}", file=sys.stderr)
+        return 2
+    except RCLError as error:
+        reason = re.sub(r", at \S+:\d+", "", " ".join(str(error).split()))
+        print(f"calibrator: {reason}", file=sys.stderr)
+        return 1
+    return _run_node(signals)
+
+
+def _init(arguments):
+    parser = argparse.ArgumentParser(
+        prog="calibrator",
+        description="The extrinsic between two sensors from their odometry, live.",
+        epilog="ROS arguments follow --ros-args.",
+    )
+    # rcl logs an error of its own before it raises the one that says what is wrong.
+    set_logger_level("rcl", LoggingSeverity.FATAL)
+    parser.parse_args(remove_ros_args(args=arguments))
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    set_logger_level("rcl", LoggingSeverity.UNSET)
+
+
+def _run_node(signals):
+    # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
+    executor = SingleThreadedExecutor()
+    node = None
+    try:
+        node = CalibratorNode()
+        executor.add_node(node)
+        _spin(executor, signals)
+        code = 0
+    except HandEyeCalibError as error:
+        print(f"calibrator: {error}", file=sys.stderr)
+        code = 1
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    executor.shutdown()
+    if node is not None and not node.stop(SOLVE_GRACE_S):
+        # A solver deep in native code would abort the interpreter's own way out.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    if node is not None:
+        node.destroy_node()
+    rclpy.try_shutdown()
+    return code
+
+
+def _spin(executor, signals):
+    stopping = threading.Event()
+
+    def wait_for_signal():
+        os.read(signals, 1)
+        # As a task: executor.wake() alone does not make spin_once() return.
+        executor.create_task(stopping.set)
+
+    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
+    while not stopping.is_set():
+        executor.spin_once()

@@ -1,0 +1,45 @@
+"""A node in a process of its own and a peer, on a ROS domain that nobody else uses."""
+
+from pathlib import Path
+
+import pytest
+from ros_harness import NodeProcess, Peer, free_domain
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _quick_discovery():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("discovery.xml")))
+        yield
+
+
+@pytest.fixture
+def domain():
+    return free_domain()
+
+
+@pytest.fixture
+def start_node(domain, tmp_path):
+    """Function that starts the node with ROS arguments such as ``"-p method:=dnl"``."""
+    running = []
+
+    def start(*ros_arguments):
+        running.append(NodeProcess(domain, tmp_path / f"node{len(running)}.log", ros_arguments))
+        return running[-1]
+
+    yield start
+    still_running = [node for node in running if node.process.poll() is None]
+    try:
+        for node in still_running:
+            code, _ = node.stop()
+            assert (code, "Traceback" in node.log) == (0, False), node.log
+    finally:
+        for node in running:
+            node.kill()
+
+
+@pytest.fixture
+def peer(domain):
+    made = Peer(domain)
+    yield made
+    made.close()

@@ -1,0 +1,101 @@
+"""Between messages and numbers, without a node."""
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+
+from hand_eye_calib import config
+from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.ros import conversions
+
+T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
+
+
+def calibration(covariance, T_parent_child=T_PARENT_CHILD):
+    return Calibration(
+        T_parent_child=T_parent_child,
+        covariance=covariance,
+        status=SolveStatus.OK,
+        observability=(),
+        objective=0.0,
+        method="dnlo",
+        reference="B1",
+        backend="fast",
+        n_poses=10,
+        n_pairs=9,
+        n_inliers=9,
+        stamp_ns=1_700_000_000_123_456_789,
+        parent_frame="lidar",
+        child_frame="camera",
+    )
+
+
+def test_every_pose_type_of_the_options_can_be_read():
+    assert set(conversions.POSE_TYPES) | {"auto"} == set(config.POSE_TYPES)
+
+
+@pytest.mark.parametrize("kind", [Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped])
+def test_pose_and_frame_are_read_from_each_type(kind):
+    message = kind()
+    if kind is TransformStamped:
+        place, turn = message.transform.translation, message.transform.rotation
+    else:
+        pose = message.pose if kind is PoseStamped else message.pose.pose
+        place, turn = pose.position, pose.orientation
+    place.x, place.y, place.z = 1.0, 2.0, 3.0
+    turn.x, turn.y, turn.z, turn.w = 0.1, 0.2, 0.3, 0.9
+    message.header.frame_id = "world"
+    pose_type = conversions.POSE_TYPES[f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"]
+    assert pose_type.message is kind
+    assert pose_type.position(message) == (1.0, 2.0, 3.0)
+    assert pose_type.quat_xyzw(message) == (0.1, 0.2, 0.3, 0.9)
+    if kind in (Odometry, TransformStamped):
+        message.child_frame_id = "lidar"
+        assert pose_type.sensor_frame(message) == "lidar"
+    else:
+        assert pose_type.sensor_frame is None
+
+
+@pytest.mark.parametrize("stamp_ns", [0, 1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789, -1, -1_500_000_000])
+def test_stamps_survive_a_round_trip(stamp_ns):
+    assert conversions.to_ns(conversions.to_time(stamp_ns)) == stamp_ns
+
+
+def test_nanoseconds_are_not_rounded():
+    assert conversions.to_ns(Time(sec=1_700_000_000, nanosec=123_456_789)) == 1_700_000_000_123_456_789
+
+
+def test_messages_carry_frames_stamp_and_transform():
+    transform = conversions.to_transform(calibration(np.eye(6)))
+    assert (transform.header.frame_id, transform.child_frame_id) == ("lidar", "camera")
+    assert conversions.to_ns(transform.header.stamp) == 1_700_000_000_123_456_789
+    pose = conversions.to_pose_with_covariance(calibration(np.eye(6)))
+    assert pose.header == transform.header
+    for place, turn in (
+        (transform.transform.translation, transform.transform.rotation),
+        (pose.pose.pose.position, pose.pose.pose.orientation),
+    ):
+        read = se3.from_quat_xyzw([place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w])
+        np.testing.assert_allclose(read, T_PARENT_CHILD, atol=1e-15)
+
+
+def test_covariance_is_about_the_fixed_axes_of_the_parent():
+    rng = np.random.default_rng(7)
+    factor = 2e-3 * np.tril(rng.normal(size=(6, 6)) + 2 * np.eye(6))
+    cov_in_child = factor @ factor.T
+    samples = 400_000
+    errors = rng.normal(size=(samples, 6)) @ factor.T
+    moved = T_PARENT_CHILD @ se3.exp(errors)
+    # What a receiver of the message measures: where the origin went, and the rotation about fixed axes that took it there.
+    shift = moved[:, :3, 3] - T_PARENT_CHILD[:3, 3]
+    turn = se3.rotation_log(moved[:, :3, :3] @ T_PARENT_CHILD[:3, :3].T)
+    measured = np.cov(np.hstack([shift, turn]).T)
+    converted = conversions.covariance_about_parent_axes(T_PARENT_CHILD, cov_in_child)
+    scale = np.sqrt(np.outer(np.diag(measured), np.diag(measured)))
+    # Standard error of a sampled correlation is below 1 / sqrt(samples); five of them, and the second-order terms of exp.
+    np.testing.assert_allclose(converted / scale, measured / scale, atol=5 / np.sqrt(samples) + 5e-3)
+    # The test can tell: the unconverted covariance is far off.
+    assert np.abs((cov_in_child - measured) / scale).max() > 0.3

@@ -1,0 +1,129 @@
+"""The demo from the outside: a process, what it prints, its exit code."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hand_eye_calib
+from hand_eye_calib.cli import demo
+from hand_eye_calib.cli.demo import DRIVE, TOPICS
+from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.ros.player import Player
+
+# How long a hang takes to fail a test; the demo takes about 5 s.
+PATIENCE_S = 120.0
+
+# Over seeds 0 to 15 the largest errors were 10.1 mm and 0.14 deg, the medians 1.9 mm and 0.10 deg; the default seed had 2.7 mm and 0.07 deg.
+LARGEST_ERROR_M = 0.015
+LARGEST_ERROR_RAD = np.radians(0.3)
+
+
+def run(*arguments, domain=0):
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain)},
+        cwd=Path(hand_eye_calib.__file__).parents[1],
+    )
+
+
+def errors(T_parent_child, truth):
+    return np.linalg.norm(T_parent_child[:3, 3] - truth[:3, 3]), se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3])
+
+
+def test_demo_recovers_the_truth_offline_and_live(tmp_path, domain):
+    done = run("-m", "hand_eye_calib", "demo", "--out", tmp_path, "--json", domain=domain)
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    truth, offline, online = (np.array(document[key]["T_parent_child"]) for key in ("truth", "offline", "online"))
+    assert (document["status"], document["parent_frame"], document["child_frame"]) == ("ok", "lidar", "camera")
+    assert document["poses"] == {"parent": DRIVE.poses, "child": 2 * DRIVE.poses}
+    for key, estimate in (("offline", offline), ("online", online)):
+        reported = document[key]["error"]
+        assert (reported["translation_m"], reported["rotation_rad"]) == pytest.approx(errors(estimate, truth), abs=1e-12)
+        assert 0.0 < reported["translation_m"] < LARGEST_ERROR_M
+        assert 0.0 < reported["rotation_rad"] < LARGEST_ERROR_RAD
+        np.testing.assert_allclose(np.array(document[key]["T_child_parent"]) @ estimate, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(online, offline, rtol=0, atol=1e-9)
+    assert document["online"]["stamp_ns"] == document["offline"]["stamp_ns"]
+
+    # The replay command finds the same in the bag that is left behind.
+    topics = ["--parent-topic", TOPICS["parent"], "--child-topic", TOPICS["child"]]
+    replayed = run("-m", "hand_eye_calib", "replay", document["bag"], *topics, "--json")
+    assert replayed.returncode == 0, replayed.stderr
+    np.testing.assert_array_equal(json.loads(replayed.stdout)["T_parent_child"]["matrix"], offline)
+
+
+def test_demo_prints_both_directions_and_replaces_an_earlier_demo(tmp_path, domain):
+    (tmp_path / "demo_bag").mkdir()
+    (tmp_path / "demo_bag" / "metadata.yaml").write_text("of an earlier demo")
+    (tmp_path / "mine.txt").write_text("not of a demo")
+    done = run("-m", "hand_eye_calib", "demo", "--out", tmp_path, "--seed", 3, domain=domain)
+    assert done.returncode == 0, done.stderr
+    for title in ("Pose of camera in lidar", "Pose of lidar in camera", "Error of the pose of camera in lidar"):
+        (line,) = [number for number, line in enumerate(done.stdout.splitlines()) if line.startswith(title)]
+        rows = [row.strip() for row in done.stdout.splitlines()[line + 1 : line + 4]]
+        assert any(row.startswith("replay of the bag") for row in rows)
+        assert any(row.startswith("live node") for row in rows)
+    assert "Offline and online differ by" in done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo_bag", "mine.txt", "node.log"]
+
+
+def test_demo_without_ros_says_what_to_install(tmp_path):
+    program = "import sys; sys.modules['rclpy'] = None; from hand_eye_calib.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    done = run("-c", program, "demo", "--out", tmp_path / "out")
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
+    assert "rclpy is missing" in done.stderr
+    assert "pip install" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_player_gives_up_on_a_node_that_does_not_come(domain, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    with (
+        Player(TOPICS, patience_s=0.1) as player,
+        pytest.raises(HandEyeCalibError, match="waited 0.1 s for the node to subscribe"),
+    ):
+        player.play([], speed=1.0)
+    with Player(TOPICS, patience_s=0.1) as player, pytest.raises(HandEyeCalibError, match="to serve ~/solve"):
+        player.wait_for_extrinsic(0)
+
+
+def test_player_stops_waiting_when_told_that_the_node_is_gone(domain, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+
+    def gone():
+        raise HandEyeCalibError("the node ended")
+
+    with Player(TOPICS, gone) as player, pytest.raises(HandEyeCalibError, match="the node ended"):
+        player.play([], speed=1.0)
+
+
+def test_demo_notices_a_node_that_dies(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo.sys, "executable", shutil.which("false"))
+
+    def wait():
+        with demo._node(tmp_path / "node.log") as check:
+            end = time.monotonic() + PATIENCE_S
+            while time.monotonic() < end:
+                check()
+
+    with pytest.raises(HandEyeCalibError, match="the node ended with exit code 1; see .*node.log"):
+        wait()
+
+
+def test_demo_says_why_ros_does_not_start(tmp_path):
+    done = run("-m", "hand_eye_calib", "demo", "--out", tmp_path, domain="one")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "error: cannot start ROS: " in done.stderr.splitlines()[-1]
+    assert "ROS_DOMAIN_ID is not an integral number" in done.stderr.splitlines()[-1]

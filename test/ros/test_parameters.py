@@ -1,0 +1,136 @@
+"""Parameters: declared from the options, checked, applied."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
+
+from hand_eye_calib.config import METHODS, CalibratorConfig, NodeConfig, option_name
+
+FIELDS = {option_name(field): field for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)}
+
+
+def parameter_file(path, **parameters):
+    lines = [f"    {name}: {value}" for name, value in parameters.items()]
+    path.write_text("\n".join(["/**:", "  ros__parameters:", *lines]) + "\n")
+    return f"--params-file {path}"
+
+
+def test_every_option_is_a_parameter_with_its_description_and_range(start_node, peer):
+    start_node()
+    assert set(FIELDS) <= peer.parameter_names()
+    for name in ("threshold", "max_pairs", "method", "scale", "parent_frame"):
+        meta = FIELDS[name].metadata
+        descriptor = peer.describe(name)
+        assert descriptor.description.startswith(meta["doc"])
+        assert descriptor.read_only == meta["read_only"]
+        assert descriptor.dynamic_typing == bool(meta["words"])
+        assert peer.parameter(name) == FIELDS[name].default
+    assert peer.describe("threshold").floating_point_range[0].to_value == FIELDS["threshold"].metadata["maximum"]
+    assert peer.describe("max_pairs").integer_range[0].from_value == FIELDS["max_pairs"].metadata["minimum"]
+    assert ", ".join(METHODS) in peer.describe("method").description
+
+
+def test_changes_are_applied_or_rejected_with_the_reason(start_node, peer):
+    start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
+    publishers = peer.publishers()
+    answer, _ = peer.solve(publishers, *drive())
+    assert "; dnlo " in answer.message
+    assert peer.set_parameter("method", "dnl").successful
+    assert peer.set_parameter("reference", "B3").successful
+    assert "; dnl B3: " in peer.trigger("solve").message
+
+    for name, value, reason in [
+        ("method", "magic", f"method must be one of {', '.join(METHODS)}"),
+        ("reference", "B0", "reference must match"),
+        ("threshold", -1.0, "threshold out of range"),
+        ("threshold", 1, "Wrong parameter type"),
+        ("scale", "huge", "scale must be none or "),
+        ("scale", -2.0, "scale must be at least"),
+        ("parent_frame", "lidar", "read-only"),
+    ]:
+        before = peer.parameter(name)
+        result = peer.set_parameter(name, value)
+        assert not result.successful, (name, value)
+        assert reason in result.reason
+        assert peer.parameter(name) == before
+    assert "; dnl B3: " in peer.trigger("solve").message
+
+
+def test_scale_takes_a_word_or_a_number(start_node, peer):
+    start_node("-p solve_period:=1000.0", "-p scale:=2.0", *RELIABLE_INPUTS)
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
+    Ts_cw_c[:, :3, 3] /= 2.0
+    _, extrinsic = peer.solve(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
+    np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-6)
+    heard = peer.listen(TransformStamped, "extrinsic")
+    assert peer.set_parameter("scale", "none").successful
+    peer.trigger("solve")
+    peer.spin_until(lambda: heard and not np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3), "the unscaled result")
+    assert peer.set_parameter("scale", 2).successful
+    peer.trigger("solve")
+    peer.spin_until(lambda: np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-6), "the scaled result")
+
+
+def test_shorter_solve_period_takes_effect_at_once(start_node, peer):
+    start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
+    extrinsics = peer.listen(TransformStamped, "extrinsic")
+    peer.feed(peer.publishers(), *drive())
+    assert peer.set_parameter("solve_period", 0.1).successful
+    peer.spin_until(lambda: extrinsics, "a result without ~/solve")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("solve_period", "5", "solve_period must be a double; got the integer 5: write 5.0"),
+        ("threshold", "-1.0", "threshold must be at least 1e-12 m^2; got -1.0"),
+        ("max_pairs", "many", "max_pairs must be of type int; got 'many'"),
+        ("max_pairs", "[1, 2]", "max_pairs must be of type int; got"),
+        ("method", "magic", f"method must be one of {', '.join(METHODS)}; got 'magic'"),
+        ("scale", "huge", "scale must be none or "),
+        ("scale", "[]", "a parameter that was given has no usable value, such as []"),
+        ("parent_type", "sensor_msgs/msg/Imu", "parent_type must be one of auto, nav_msgs/msg/Odometry"),
+    ],
+)
+def test_bad_value_in_the_file_is_one_line_and_code_1(start_node, tmp_path, name, value, expected):
+    node = start_node(parameter_file(tmp_path / "bad.yaml", **{name: value}))
+    assert node.wait() == 1
+    assert node.log.startswith(f"calibrator: {expected}")
+    assert node.log.count("\n") == 1
+
+
+def test_unreadable_file_is_one_line_and_code_1(start_node, tmp_path):
+    (tmp_path / "broken.yaml").write_text("a: [1\n b: {")
+    for name in ("broken.yaml", "absent.yaml"):
+        node = start_node(f"--params-file {tmp_path / name}")
+        assert node.wait() == 1
+        assert str(tmp_path / name) in node.log
+        assert node.log.count("\n") == 1
+
+
+def test_bad_qos_override_is_one_line_and_code_1(start_node):
+    node = start_node(
+        "-p parent_type:=nav_msgs/msg/Odometry", "-p qos_overrides./parent_odom.subscription.reliability:=sometimes"
+    )
+    assert node.wait() == 1
+    assert node.log.startswith("calibrator: cannot subscribe to /parent_odom with the QoS overrides given: ")
+    assert node.log.count("\n") == 1
+
+
+def test_wrong_usage_is_code_2(start_node):
+    node = start_node("--no-such-option")
+    assert node.wait() == 2
+    assert "no-such-option" in node.log
+    assert "Traceback" not in node.log
+
+
+def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
+    node = start_node(parameter_file(tmp_path / "typo.yaml", treshold=0.02, nonsense=1, threshold=0.03), *RELIABLE_INPUTS)
+    log = node.wait_for_log(
+        "parameter treshold does not exist and is ignored; did you mean threshold?", "parameter nonsense does not exist"
+    )
+    assert log.count("does not exist") == 2
+    assert node.stop()[0] == 0

@@ -1,0 +1,134 @@
+"""What the node publishes, over the real middleware, from poses with a known or published answer."""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from published_data import kitti_short, rotation_error_deg, translation_error_m
+from ros_harness import POSE_KINDS, RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix
+from std_msgs.msg import String
+
+from hand_eye_calib.calibrator import Calibrator
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.ros import conversions
+
+FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]
+
+
+@pytest.mark.parametrize("use_sim_time", ["false", "true"])  # true, and no /clock: as with a bag that is paused
+def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer, use_sim_time):
+    node = start_node("-p solve_period:=0.2", f"-p use_sim_time:={use_sim_time}")
+    extrinsics = peer.listen(TransformStamped, "extrinsic")
+    poses = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
+    peer.feed(peer.publishers(), *drive())
+    peer.spin_until(lambda: extrinsics and poses, "a result")
+    np.testing.assert_allclose(matrix(extrinsics[-1]), T_PARENT_CHILD, atol=1e-6)
+    assert (extrinsics[-1].header.frame_id, extrinsics[-1].child_frame_id) == ("lidar", "camera")
+    assert START_NS < conversions.to_ns(extrinsics[-1].header.stamp) <= drive()[0][-1]
+    assert poses[-1].header.frame_id == "lidar"
+    covariance = np.reshape(poses[-1].pose.covariance, (6, 6))
+    assert np.isfinite(covariance).all()
+    np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
+    node.wait_for_log(
+        "subscribed to /parent_odom (nav_msgs/msg/Odometry)",
+        "subscribed to /child_odom (nav_msgs/msg/Odometry)",
+        "first pose on /parent_odom",
+        "first pose on /child_odom",
+        "camera in lidar: xyz = (",
+    )
+
+
+@pytest.mark.parametrize("kind", POSE_KINDS[1:])
+def test_each_message_type_is_found_from_the_graph(start_node, peer, kind):
+    start_node("-p solve_period:=1000.0", *FRAMES, *RELIABLE_INPUTS)
+    publishers = peer.publishers(kind, child_kind=Odometry)
+    _, extrinsic = peer.solve(publishers, *drive())
+    np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-6)
+    assert (extrinsic.header.frame_id, extrinsic.child_frame_id) == ("lidar", "camera")
+
+
+def test_type_by_parameter_subscribes_before_there_is_a_publisher(start_node, peer):
+    types = [f"-p {stream}_type:=geometry_msgs/msg/PoseStamped" for stream in ("parent", "child")]
+    node = start_node("-p solve_period:=1000.0", *types, *FRAMES, *RELIABLE_INPUTS)
+    node.wait_for_log(
+        "subscribed to /parent_odom (geometry_msgs/msg/PoseStamped)",
+        "subscribed to /child_odom (geometry_msgs/msg/PoseStamped)",
+    )
+    _, extrinsic = peer.solve(peer.publishers(PoseStamped), *drive())
+    np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-6)
+
+
+def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, peer):
+    node = start_node()
+    peer.publisher(String, "parent_odom")
+    node.wait_for_log(
+        "/parent_odom has type std_msgs/msg/String; expected nav_msgs/msg/Odometry, geometry_msgs/msg/PoseStamped"
+    )
+
+
+def test_inputs_are_remapped_and_named_as_they_are(start_node, peer):
+    node = start_node("-p solve_period:=1000.0", "-r parent_odom:=/lidar/odom", "-r child_odom:=/camera/odom")
+    publishers = peer.publisher(Odometry, "/lidar/odom"), peer.publisher(Odometry, "/camera/odom")
+    peer.feed(publishers, *drive(20))
+    node.wait_for_log("first pose on /lidar/odom", "first pose on /camera/odom")
+
+
+def test_late_joiner_gets_the_latest_result(start_node, peer):
+    start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
+    _, extrinsic = peer.solve(peer.publishers(), *drive())
+    late = peer.listen(TransformStamped, "extrinsic")
+    late_with_covariance = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
+    peer.spin_until(lambda: late and late_with_covariance, "the latched result")
+    assert late == [extrinsic]
+    assert late_with_covariance[0].header == extrinsic.header
+
+
+def test_best_effort_publishers_are_heard(start_node, peer):
+    from rclpy.qos import qos_profile_sensor_data
+
+    node = start_node("-p solve_period:=1000.0")
+    publishers = [peer.node.create_publisher(Odometry, f"{name}_odom", qos_profile_sensor_data) for name in ("parent", "child")]
+    peer.feed(publishers, *drive(5))
+    node.wait_for_log("first pose on /parent_odom", "first pose on /child_odom")
+
+
+def test_kitti_through_the_node_equals_the_engine_fed_directly(start_node, peer):
+    case = kitti_short()
+    options = {"method": "dnlo", "reference": "B10", "max_gap": 60.0}
+    engine = Calibrator(CalibratorConfig.from_options(options))
+    for stream, trajectory in (("parent", case.parent), ("child", case.child)):
+        engine.set_frame(stream, {"parent": "lidar", "child": "camera"}[stream])
+        for stamp_ns, T_world_sensor in zip(case.stamps_ns, trajectory.poses, strict=True):
+            engine.add_pose(stream, int(stamp_ns), T_world_sensor[:3, 3].tolist(), se3.to_quat_xyzw(T_world_sensor).tolist())
+    offline = engine.estimate()
+
+    start_node("-p solve_period:=1000.0", *(f"-p {name}:={value}" for name, value in options.items()), *RELIABLE_INPUTS)
+    answer, extrinsic = peer.solve(peer.publishers(), case.stamps_ns, case.parent.poses, case.child.poses)
+    np.testing.assert_allclose(matrix(extrinsic), offline.T_parent_child, rtol=0, atol=1e-9)
+    assert conversions.to_ns(extrinsic.header.stamp) == offline.stamp_ns
+    assert f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers" in answer.message
+    assert translation_error_m(matrix(extrinsic), case.T_parent_child) == pytest.approx(0.20, abs=0.01)
+    assert rotation_error_deg(matrix(extrinsic), case.T_parent_child) == pytest.approx(0.23, abs=0.01)
+
+
+def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, peer):
+    stamps_ns, _, _ = drive()
+    s = (stamps_ns - START_NS) * 1e-9
+    flat = se3.from_rotation_translation(
+        se3.rotation_exp(np.outer(np.sin(0.4 * s), [0, 0, 1])), np.stack([s, np.sin(0.5 * s), 0 * s], axis=1)
+    )
+    node = start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
+    poses = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
+    answer, extrinsic = peer.solve(peer.publishers(), stamps_ns, flat, flat @ T_PARENT_CHILD)
+    assert not answer.success
+    assert "status unobservable" in answer.message
+    assert "the motion does not reveal z of the child sensor" in answer.message
+    node.wait_for_log("[WARN]", "the motion does not reveal z of the child sensor")
+    np.testing.assert_allclose(matrix(extrinsic)[:2, 3], T_PARENT_CHILD[:2, 3], atol=1e-6)
+    peer.spin_until(lambda: poses, "the pose with covariance")
+    covariance = np.reshape(poses[-1].pose.covariance, (6, 6))
+    assert np.isfinite(covariance).all()
+    # Known directions to a millimetre, the hidden one to no better than metres.
+    assert max(covariance[0, 0], covariance[1, 1]) < 1e-6
+    assert covariance[2, 2] > 10.0

@@ -1,0 +1,237 @@
+"""The node in a process of its own, and the process of the test as the other end of the middleware."""
+
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_srvs.srv import SetBool, Trigger
+
+import hand_eye_calib
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.ros import conversions
+
+# Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is busy with other things.
+PATIENCE_S = 30.0
+
+T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
+POSE_KINDS = (Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped)
+START_NS = 1_700_000_000_000_000_000
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RELIABLE_INPUTS = [f"-p qos_overrides./{stream}_odom.subscription.reliability:=reliable" for stream in ("parent", "child")]
+
+_domains = itertools.count(os.getpid())
+
+
+def free_domain():
+    """A domain id whose first participant's port nobody listens on."""
+    for candidate in itertools.islice(_domains, 100):
+        domain = 1 + candidate % 100  # above 101, the ports run into those that Linux gives to clients
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", 7410 + 250 * domain))
+            except OSError:
+                continue
+        return domain
+    raise RuntimeError("no free ROS domain")
+
+
+def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS):
+    """Stamps and noise-free poses of both sensors on a rig that turns about all axes."""
+    s = np.arange(n_poses) * period_ns * 1e-9
+    turns = np.stack([0.5 * np.sin(0.7 * s), 0.4 * np.sin(0.9 * s + 1.0), 0.8 * np.sin(0.4 * s)], axis=1)
+    places = np.stack([s, 2.0 * np.sin(0.5 * s), 0.5 * np.cos(0.8 * s)], axis=1)
+    Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
+    T_cw_pw = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, 0.1, 2.0]))
+    return start_ns + period_ns * np.arange(n_poses), Ts_pw_p, T_cw_pw @ Ts_pw_p @ T_PARENT_CHILD
+
+
+def message(kind, stamp_ns, T_world_sensor, sensor_frame):
+    """A pose message of any accepted type."""
+    made = kind()
+    made.header.stamp = conversions.to_time(stamp_ns)
+    made.header.frame_id = "world"
+    pose_type = conversions.POSE_TYPES[f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"]
+    place, turn = pose_type.pose(made)
+    place.x, place.y, place.z = T_world_sensor[:3, 3].tolist()
+    turn.x, turn.y, turn.z, turn.w = se3.to_quat_xyzw(T_world_sensor).tolist()
+    if pose_type.sensor_frame is not None:
+        made.child_frame_id = sensor_frame
+    return made
+
+
+def matrix(transform):
+    """(4, 4) array of a TransformStamped."""
+    t, q = transform.transform.translation, transform.transform.rotation
+    return se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
+
+
+class NodeProcess:
+    """``python -m hand_eye_calib calibrator`` with its output in a file."""
+
+    def __init__(self, domain, log_file, ros_arguments):
+        self._log_file = log_file
+        command = [sys.executable, "-m", "hand_eye_calib", "calibrator"]
+        arguments = [word for argument in ros_arguments for word in str(argument).split(" ", 1)]
+        with log_file.open("wb") as log:
+            self.process = subprocess.Popen(
+                [*command, *(["--ros-args", *arguments] if arguments else [])],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"},
+                cwd=Path(hand_eye_calib.__file__).parents[1],
+            )
+
+    @property
+    def log(self):
+        return self._log_file.read_text(errors="replace")
+
+    def wait_for_log(self, *texts):
+        """Wait until the log has all texts; returns the log."""
+        end = time.monotonic() + PATIENCE_S
+        while not all(text in self.log for text in texts):
+            assert time.monotonic() < end, f"no {texts} in the node's log:\n{self.log}"
+            assert self.process.poll() is None, f"the node ended with {self.process.returncode}:\n{self.log}"
+            time.sleep(0.02)
+        return self.log
+
+    def wait(self):
+        """Exit code once the node has ended by itself."""
+        return self.process.wait(PATIENCE_S)
+
+    def stop(self, *signals):
+        """Send signals, 50 ms apart; exit code and seconds it took."""
+        start = time.monotonic()
+        for number, next_signal in enumerate(signals or [signal.SIGINT]):
+            time.sleep(0.05 * (number > 0))
+            self.process.send_signal(next_signal)
+        return self.process.wait(PATIENCE_S), time.monotonic() - start
+
+    def kill(self):
+        """End it at once where it still runs."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+
+class Peer:
+    """Publishes poses to the node, hears its results, calls its services."""
+
+    def __init__(self, domain):
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context, domain_id=domain)
+        self.node = rclpy.create_node("peer", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._clients = {}
+
+    def close(self):
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def spin_until(self, condition, what):
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < end, f"waited {PATIENCE_S} s for {what}"
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def publisher(self, kind, topic):
+        """Publisher that keeps all it is given until a reliable subscription has it."""
+        return self.node.create_publisher(kind, topic, QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE))
+
+    def publishers(self, kind=Odometry, child_kind=None):
+        """Publishers on both inputs of the node."""
+        return self.publisher(kind, "parent_odom"), self.publisher(child_kind or kind, "child_odom")
+
+    def wait_matched(self, *publishers):
+        self.spin_until(lambda: all(each.get_subscription_count() for each in publishers), "the node to subscribe")
+
+    def feed(self, publishers, stamps_ns, Ts_pw_p, Ts_cw_c, frames=("lidar", "camera")):
+        """Publish both trajectories, interleaved."""
+        self.wait_matched(*publishers)
+        for stamp_ns, poses in zip(stamps_ns, zip(Ts_pw_p, Ts_cw_c, strict=True), strict=True):
+            for publisher, T_world_sensor, frame in zip(publishers, poses, frames, strict=True):
+                publisher.publish(message(publisher.msg_type, stamp_ns, T_world_sensor, frame))
+
+    def listen(self, kind, name):
+        """List that fills with the node's messages on a latched topic."""
+        heard = []
+        self.node.create_subscription(kind, f"calibrator/{name}", heard.append, LATCHED)
+        return heard
+
+    def ask(self, kind, name, request=None):
+        """Future of a service's answer."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, f"calibrator/{name}")
+        client = self._clients[name]
+        self.spin_until(client.service_is_ready, f"service {name}")
+        return client.call_async(request or kind.Request())
+
+    def call(self, kind, name, request=None):
+        """Answer of a service."""
+        asked = []
+
+        def answered():
+            # An answer is lost where the server has not discovered the client yet: then ask once more.
+            if not asked or time.monotonic() > asked[-1][0] + 3.0:
+                asked.append((time.monotonic(), self.ask(kind, name, request)))
+            return any(future.done() for _, future in asked)
+
+        self.spin_until(answered, f"the answer of {name}")
+        return next(future.result() for _, future in asked if future.done())
+
+    def trigger(self, name):
+        return self.call(Trigger, name)
+
+    def solve(self, publishers, stamps_ns, Ts_pw_p, Ts_cw_c, **options):
+        """Feed, then have the node solve with everything; answer of the last ~/solve.
+
+        Best-effort delivery and services share no order, so it asks until the last stamp is in the result.
+        """
+        self.feed(publishers, stamps_ns, Ts_pw_p, Ts_cw_c, **options)
+        extrinsics = self.listen(TransformStamped, "extrinsic")
+        answers = []
+
+        def solved():
+            answers.append(self.trigger("solve"))
+            self._executor.spin_once(timeout_sec=0.05)
+            return extrinsics and conversions.to_ns(extrinsics[-1].header.stamp) >= stamps_ns[-1]
+
+        self.spin_until(solved, "a result with the last pose")
+        return answers[-1], extrinsics[-1]
+
+    def set_enabled(self, data):
+        return self.call(SetBool, "set_enabled", SetBool.Request(data=data))
+
+    def set_parameter(self, name, value):
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        assert isinstance(parameter, ParameterMessage)
+        (result,) = self.call(SetParameters, "set_parameters", SetParameters.Request(parameters=[parameter])).results
+        return result
+
+    def parameter_names(self):
+        return set(self.call(ListParameters, "list_parameters").result.names)
+
+    def parameter(self, name):
+        (value,) = self.call(GetParameters, "get_parameters", GetParameters.Request(names=[name])).values
+        return rclpy.parameter.parameter_value_to_python(value)
+
+    def describe(self, name):
+        request = DescribeParameters.Request(names=[name])
+        (descriptor,) = self.call(DescribeParameters, "describe_parameters", request).descriptors
+        return descriptor
