@@ -14,10 +14,12 @@ from hand_eye_calib.adaptive.increments import NUISANCES, Increments
 from hand_eye_calib.adaptive.noise import (
     LOWEST_VARIANCE,
     NoiseLevels,
+    covariance_factor,
     fit_rotation_variances,
     fit_translation_variances,
     generalised_least_squares,
     join_variances,
+    solve_weighted,
     starting_variances,
 )
 from hand_eye_calib.geometry import se3
@@ -47,8 +49,8 @@ _STRETCH = 100
 # Noise levels and X are improved in turn until X moves by less than this share of its sigma and no jump appears.
 _MAX_ROUNDS, _SETTLED_SIGMAS = 4, 0.1
 
-_MAX_FINAL_STEPS = 20
-_CONVERGED_STEP = 1e-10
+_MAX_STEPS = 20
+_CONVERGED_SIGMAS, _CONVERGED_STEP = 1e-4, 1e-10
 
 
 @dataclass(frozen=True)
@@ -105,8 +107,11 @@ def solve(stamps_ns, Ts_pw_p, Ts_cw_c, nuisances=("none", "scale", "bias")):
     """
     increments = Increments(stamps_ns, Ts_pw_p, Ts_cw_c)
     T_start = dnlo.solve(motion_pairs(Ts_pw_p, Ts_cw_c, _START_REFERENCE)).T_parent_child
-    first_jumps = _robust_jumps(increments.residuals(T_start))
-    fits = [_fit(increments, T_start, nuisance, first_jumps) for nuisance in nuisances]
+    fits = []
+    start = _Start(T_start, _robust_jumps(increments.residuals(T_start)))
+    for nuisance in nuisances:
+        fits.append(_fit(increments, start, nuisance))
+        start = _Start(fits[0].T_parent_child, fits[0].jumps, fits[0].noise.variances())
     # The jumps found under different models differ; the criterion needs the same evidence for all.
     jumps = np.logical_or.reduce([fit.jumps for fit in fits]) if len(fits) > 1 else fits[0].jumps
     scores = [_criterion(increments, fit, jumps) for fit in fits]
@@ -136,36 +141,40 @@ def solve_without(stamps_ns, Ts_pw_p, Ts_cw_c, solution, left_out):
     return solution.T_parent_child @ se3.exp(np.array(steps))
 
 
-def _fit(increments, T_start, nuisance, jumps):
-    T, parameters = T_start, np.zeros(NUISANCES[nuisance])
+@dataclass(frozen=True)
+class _Start:
+    T_parent_child: np.ndarray
+    jumps: np.ndarray
+    variances: np.ndarray | None = None
+
+
+def _fit(increments, start, nuisance):
+    T, parameters, jumps, variances = start.T_parent_child, np.zeros(NUISANCES[nuisance]), start.jumps, start.variances
     sample = _noise_sample(len(increments))
-    sampled = increments if sample is None else increments.rows(sample)
-    rotation_variances = translation_variances = None
+    sampled = increments.rows(sample)
     iterations = 0
     while iterations < _MAX_ROUNDS:
         iterations += 1
-        part = sampled.linearise(T, nuisance, parameters)
-        part_jumps = jumps if sample is None else jumps[sample]
-        if rotation_variances is None:
-            rotation_variances = starting_variances(part.residuals[:, :3], part_jumps)
-            translation_variances = starting_variances(part.residuals[:, 3:], part_jumps)
-        rotation_variances = fit_rotation_variances(part, part_jumps, rotation_variances)
-        translation_variances = fit_translation_variances(part, part_jumps, rotation_variances, translation_variances)
-        variances = join_variances(rotation_variances, translation_variances)
-        linearisation = part if sample is None else increments.linearise(T, nuisance, parameters)
+        variances = _fit_noise(sampled.linearise(T, nuisance, parameters), jumps[sample], variances)
+        linearisation = increments.linearise(T, nuisance, parameters)
         solve = generalised_least_squares(linearisation, variances, jumps)
         T, parameters = T @ se3.exp(solve.step[:6]), parameters + solve.step[6:]
         known_jumps = jumps
-        jumps = _jumps(increments.linearise(T, nuisance, parameters), variances, solve.factor, jumps)
-        sigmas = np.sqrt(np.diag(solve.covariance))
-        if np.array_equal(jumps, known_jumps) and (np.abs(solve.step) < _SETTLED_SIGMAS * sigmas).all():
+        residuals = increments.residuals(T, nuisance, parameters)
+        jumps = _jumps(residuals, linearisation.components, variances, solve.factor, jumps)
+        settled = np.abs(solve.step) < _SETTLED_SIGMAS * np.sqrt(np.diag(solve.covariance))
+        if np.array_equal(jumps, known_jumps) and settled.all():
             break
+    # The covariance is settled; what is left is to follow the residuals to the minimum.
+    factor = covariance_factor(linearisation.components, variances, jumps)
     converged = False
-    while not converged and iterations < _MAX_FINAL_STEPS:
-        solve = generalised_least_squares(increments.linearise(T, nuisance, parameters), variances, jumps)
-        T, parameters, iterations = T @ se3.exp(solve.step[:6]), parameters + solve.step[6:], iterations + 1
-        sigmas = np.sqrt(np.diag(solve.covariance))
-        converged = bool((np.abs(solve.step) < np.maximum(1e-4 * sigmas, _CONVERGED_STEP)).all())
+    while not converged and iterations < _MAX_STEPS:
+        iterations += 1
+        arguments = (T, nuisance, parameters)
+        solve = solve_weighted(increments.residuals(*arguments), increments.jacobian(*arguments), factor)
+        T, parameters = T @ se3.exp(solve.step[:6]), parameters + solve.step[6:]
+        tolerance = np.maximum(_CONVERGED_SIGMAS * np.sqrt(np.diag(solve.covariance)), _CONVERGED_STEP)
+        converged = bool((np.abs(solve.step) < tolerance).all())
     return AdaptiveSolution(
         T,
         solve.covariance[:6, :6],
@@ -178,6 +187,17 @@ def _fit(increments, T_start, nuisance, jumps):
         converged,
         iterations,
     )
+
+
+def _fit_noise(linearisation, jumps, variances):
+    """Variances (4,) from some of the increments, starting from earlier ones if there are any."""
+    if variances is None:
+        rotation = starting_variances(linearisation.residuals[:, :3], jumps)
+        translation = starting_variances(linearisation.residuals[:, 3:], jumps)
+    else:
+        rotation, translation = variances[::2], variances[1::2]
+    rotation = fit_rotation_variances(linearisation, jumps, rotation)
+    return join_variances(rotation, fit_translation_variances(linearisation, jumps, rotation, translation))
 
 
 def _criterion(increments, fit, jumps):
@@ -201,16 +221,15 @@ def _robust_jumps(residuals):
     return jumps
 
 
-def _jumps(linearisation, variances, factor, known_jumps):
+def _jumps(residuals, components, variances, factor, known_jumps):
     """Increments that the noise does not explain.
 
     Judged by what is left of each once those before it are known. For a known jump that is next to nothing, its variance being
     huge; it stays one unless its whole size is quite probable after all.
     """
-    residuals = linearisation.residuals
     innovations = factor.whiten(residuals.reshape(-1, 1)).reshape(-1, 6)
     surprising = (innovations**2).sum(axis=1) > chi2.isf(_FALSE_ALARMS / len(residuals), 6)
-    bands = np.tensordot(variances, linearisation.components[:, :BLOCK], axes=1).reshape(BLOCK, -1, BLOCK)
+    bands = np.tensordot(variances, components[:, :BLOCK], axes=1).reshape(BLOCK, -1, BLOCK)
     blocks = np.empty((len(residuals), BLOCK, BLOCK))
     for column in range(BLOCK):
         blocks[:, column:, column] = blocks[:, column, column:] = bands[: BLOCK - column, :, column].T
@@ -224,9 +243,9 @@ def _jumps(linearisation, variances, factor, known_jumps):
 
 
 def _noise_sample(n_increments):
-    """Indices of evenly spread stretches, or None for all."""
+    """Indices of the increments to judge the noise by: all, or evenly spread stretches."""
     if n_increments <= _MOST_NOISE_INCREMENTS:
-        return None
+        return np.arange(n_increments)
     n_stretches = _MOST_NOISE_INCREMENTS // _STRETCH
     starts = np.linspace(0, n_increments - _STRETCH, n_stretches).astype(int)
     return (starts[:, None] + np.arange(_STRETCH)).ravel()

@@ -89,33 +89,30 @@ class Solve:
         return 0.5 * (self.log_determinant + self.cost)
 
 
-def generalised_least_squares(linearisation, variances, jumps):
-    """Solve for the parameters under given variances.
+def covariance_factor(components, variances, jumps):
+    """Factor of the covariance of the residuals.
 
     Parameters
     ----------
-    linearisation : Linearisation
-        Of n increments.
+    components : (4, 12, 6 n) array
+        See :class:`~hand_eye_calib.adaptive.increments.Linearisation`.
     variances : (4,) array
     jumps : (n,) bool array
         Increments that carry no evidence.
 
-    Returns
-    -------
-    Solve
-
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where the covariance of the residuals is not positive definite to rounding.
+        Where it is not positive definite to rounding.
     """
-    components = linearisation.components
     bands = np.tensordot(variances, components, axes=1)
-    if jumps.any():
-        bands[0].reshape(len(jumps), 6)[jumps] += _JUMP_VARIANCE
-    factor = Factor(bands)
-    n_parameters = linearisation.jacobian.shape[2]
-    columns = np.concatenate([linearisation.jacobian.reshape(-1, n_parameters), linearisation.residuals.reshape(-1, 1)], axis=1)
+    bands[0].reshape(len(jumps), 6)[jumps] += _JUMP_VARIANCE
+    return Factor(bands)
+
+
+def solve_weighted(residuals, jacobian, factor):
+    """Least squares of residuals (n, 6) over the parameters of their jacobian (n, 6, 6 + k), weighted by a covariance's factor."""
+    columns = np.concatenate([jacobian.reshape(-1, jacobian.shape[2]), residuals.reshape(-1, 1)], axis=1)
     whitened = factor.whiten(columns)
     products = whitened.T @ whitened
     covariance, log_information, unseen = _invert(products[:-1, :-1])
@@ -123,6 +120,12 @@ def generalised_least_squares(linearisation, variances, jumps):
     step = -covariance @ gradient
     cost = float(products[-1, -1] + gradient @ step)
     return Solve(step, covariance, log_information, unseen, cost, factor.log_determinant(), factor)
+
+
+def generalised_least_squares(linearisation, variances, jumps):
+    """:func:`solve_weighted` of a linearisation under given variances and jumps."""
+    factor = covariance_factor(linearisation.components, variances, jumps)
+    return solve_weighted(linearisation.residuals, linearisation.jacobian, factor)
 
 
 def _invert(information):
