@@ -1,6 +1,7 @@
 """Trajectories and results published with Välimäki et al. 2023 (github.com/tau-alma/trajectory_calibration_experiments, MIT licence).
 
-The folder holds ``kitti_tests`` and ``simulation_tests``, trajectories in TUM format, and ``published``, one CSV of results per test set.
+The folder is a clone of that repository: ``kitti_tests`` and ``simulation_tests`` hold trajectories in TUM format, ``calib`` (or
+``published``) one CSV of results per test set.
 """
 
 import csv
@@ -29,6 +30,9 @@ _LEVELS = {
 }
 _LEVEL_COLUMNS = {"noise": "noise_var", "outliers": "outliers", "drift": "drift_rate", "mixture": None}
 SIMULATED = tuple(_LEVELS)
+KITTI = ("kitti_short", "kitti_long")
+LEVELS = {dataset: tuple(folders.values()) for dataset, folders in _LEVELS.items()}
+_RESULTS_FOLDERS = ("published", "calib")
 
 # The answers of a closed-form method agree to the eight digits that are printed.
 _SAME_ANSWER = 1e-6
@@ -95,13 +99,20 @@ def check_folder(folder):
         Where it is not that of the published data.
     """
     folder = Path(folder)
-    missing = [name for name in ("kitti_tests", "simulation_tests", "published") if not (folder / name).is_dir()]
+    missing = [name for name in ("kitti_tests", "simulation_tests") if not (folder / name).is_dir()]
+    if not any((folder / name).is_dir() for name in _RESULTS_FOLDERS):
+        missing.append(" or ".join(_RESULTS_FOLDERS))
     if missing:
         raise InputError(
-            f"{folder}: expected the folder of the published data, with kitti_tests, simulation_tests and published in it; "
-            f"found no {', no '.join(missing)}"
+            f"{folder}: expected the published data, a clone of github.com/tau-alma/trajectory_calibration_experiments, with "
+            f"kitti_tests, simulation_tests and calib (the results, also as published) in it; found no {', no '.join(missing)}"
         )
     return folder
+
+
+def results_folder(folder):
+    """Where in the checked folder the CSV files of results are."""
+    return next(folder / name for name in _RESULTS_FOLDERS if (folder / name).is_dir())
 
 
 def load_kitti_short(folder):
@@ -112,13 +123,14 @@ def load_kitti_short(folder):
     InputError
         Where a file is missing or cannot be used.
     """
-    drive = check_folder(folder) / "kitti_tests" / "2011_09_30_drive_0027"
+    folder = check_folder(folder)
+    drive = folder / "kitti_tests" / "2011_09_30_drive_0027"
     return _kitti_case(
         "kitti_short",
         read_trajectory(drive / "LIDAR_HDL64E" / "traj_HDL_aft_opt.csv"),
         read_trajectory(drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt")[1:],
         drive / "camera_gray_left_in_velo_link.txt",
-        Path(folder) / "published" / "kitti_tests_keyframe.csv",
+        results_folder(folder) / "kitti_tests_keyframe.csv",
     )
 
 
@@ -130,13 +142,14 @@ def load_kitti_long(folder):
     InputError
         Where a file is missing or cannot be used.
     """
-    drive = check_folder(folder) / "kitti_tests" / "2011_10_03_drive_0027"
+    folder = check_folder(folder)
+    drive = folder / "kitti_tests" / "2011_10_03_drive_0027"
     return _kitti_case(
         "kitti_long",
         read_trajectory(drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt"),
         read_trajectory(drive / "cam23" / "KeyFrameTrajectory_TUM_Format.txt"),
         drive / "camera_color_left_in_camera_gray_left.txt",
-        Path(folder) / "published" / "kitti_tests_long_cam.csv",
+        results_folder(folder) / "kitti_tests_long_cam.csv",
     )
 
 
@@ -171,7 +184,7 @@ def load_simulated(folder, datasets=SIMULATED, levels=None):
     folder = check_folder(folder)
     cases = []
     for dataset in datasets:
-        results = _read_results(folder / "published" / f"simulation_tests_{dataset}.csv", _LEVEL_COLUMNS[dataset])
+        results = _read_results(results_folder(folder) / f"simulation_tests_{dataset}.csv", _LEVEL_COLUMNS[dataset])
         for level_folder, level in _LEVELS[dataset].items():
             if levels is None or level is None or level in levels:
                 runs_folder = folder / "simulation_tests" / dataset / level_folder

@@ -1,0 +1,151 @@
+"""Real recordings: offsets, scales, planar motion and priors against what is known of them."""
+
+import numpy as np
+import pytest
+import real_data
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.assessment.agreement import check_streams
+from hand_eye_calib.calibration import DofVerdict, SolveStatus
+from hand_eye_calib.calibrator import calibrate
+from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.stream_checks import tidy
+from hand_eye_calib.solvers.alignment import estimate_time_offset
+
+
+def rpy_deg(T):
+    return Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
+
+
+@pytest.fixture(scope="module")
+def results():
+    """The three pairs of the cycle."""
+    options = dict(time_offset="estimate", method="park", reference="B10")
+    return [calibrate(pair.parent, pair.child, **options) for pair in real_data.tango_pairs()]
+
+
+class TestThreeDevicesWithoutACommonClock:
+    """Their stamps lie two to four minutes apart; nothing but the poses is known."""
+
+    def test_offsets(self, results):
+        for pair, result in zip(real_data.tango_pairs(), results, strict=True):
+            assert result.time_offset_s == pytest.approx(pair.time_offset_s, abs=0.002), pair.name
+            assert result.time_offset_sigma_s < 0.002
+
+    def test_translations(self, results):
+        known = [(0.940, -0.403, 1.002), (0.914, -0.113, 0.254), (0.434, 0.072, -0.213)]
+        for expected, result in zip(known, results, strict=True):
+            np.testing.assert_allclose(result.T_parent_child[:3, 3], expected, atol=0.02)
+
+    def test_the_cycle_closes(self, results):
+        cycle = np.linalg.multi_dot([result.T_parent_child for result in results])
+        assert np.linalg.norm(cycle[:3, 3]) < 0.020
+        assert np.degrees(Rotation.from_matrix(cycle[:3, :3]).magnitude()) < 0.1
+        assert abs(sum(result.time_offset_s for result in results)) < 0.002
+
+
+class TestRoadVehicle:
+    """Figure-eights on flat ground."""
+
+    @pytest.mark.parametrize("bag", [1, 2, 3])
+    def test_lidar_odometry(self, bag):
+        recording = real_data.zxl19(bag, "LO")
+        result = calibrate(recording.parent, recording.child, time_offset="estimate")
+        assert result.status is SolveStatus.UNOBSERVABLE
+        assert result.unobservable() == ["z"]
+        assert rpy_deg(result.T_parent_child)[2] == pytest.approx(-90.78, abs=0.5)
+        np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
+        assert abs(result.time_offset_s) < 0.09
+
+    @pytest.mark.parametrize("bag", [1, 2, 3])
+    def test_prior_holds_what_is_unobservable(self, bag):
+        recording = real_data.zxl19(bag, "LO")
+        result = calibrate(recording.parent, recording.child, time_offset="estimate", **{"prior.z": "1.0+/-0.02"})
+        verdicts = {dof.name: dof for dof in result.observability}
+        assert result.status is SolveStatus.OK
+        assert verdicts["z"].verdict is DofVerdict.PRIOR
+        assert result.T_parent_child[2, 3] == pytest.approx(1.0, abs=0.005)
+        assert verdicts["z"].sigma == pytest.approx(0.02, rel=0.1)
+        assert max(verdicts["x"].sigma, verdicts["y"].sigma) < 0.05
+        np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
+
+    def test_lidar_odometry_from_the_csv_exports(self):
+        recording = real_data.zxl19_raw()
+        result = calibrate(recording.parent, recording.child, time_offset="estimate", reference="B10")
+        assert "z" in result.unobservable()
+        assert rpy_deg(result.T_parent_child)[2] == pytest.approx(-90.78, abs=0.5)
+        np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
+        assert result.time_offset_s == pytest.approx(-214.35, abs=0.02)
+
+    @pytest.mark.parametrize(("bag", "scale"), [(1, 3.34), (2, 3.76), (3, 2.66)])
+    def test_monocular_scale(self, bag, scale):
+        recording = real_data.zxl19(bag, "VO")
+        result = calibrate(recording.parent, recording.child, time_offset="estimate", scale="auto")
+        assert result.scale == pytest.approx(scale, rel=0.01)
+        assert 0 < result.scale_sigma < 0.01 * scale
+        assert "z" in result.unobservable()
+
+
+class TestBoreas:
+    def test_extrinsic(self):
+        recording = real_data.boreas()
+        result = calibrate(recording.parent, recording.child)
+        error = np.linalg.inv(real_data.BOREAS_TRUTH) @ result.T_parent_child
+        in_plane = result.T_parent_child[:2, 3] - real_data.BOREAS_TRUTH[:2, 3]
+        assert np.linalg.norm(in_plane) < 0.005
+        assert abs(np.degrees(Rotation.from_matrix(error[:3, :3]).as_rotvec()[2])) < 0.05
+        z = result.observability[2]
+        assert "z" in result.unobservable() or abs(result.T_parent_child[2, 3] - 0.21) < 4 * z.sigma
+
+    def test_microseconds_among_nanoseconds_are_noticed(self):
+        recording = real_data.boreas()
+        as_read = Trajectory(recording.parent.stamps_ns // 1000, recording.parent.poses)
+        finding = check_streams(as_read, recording.child).findings[0]
+        assert (finding.code, finding.stream) == ("stamp_unit", "parent")
+        assert "microseconds" in finding.what
+
+
+class TestArms:
+    def test_the_axis_of_one_axis_motion_is_named(self):
+        recording = real_data.robot_arm("sim")
+        result = calibrate(recording.parent, recording.child, time_offset="estimate")
+        assert result.unobservable() == ["x"]
+        note = next(f for f in check_streams(recording.parent, recording.child).findings if f.code == "one_axis")
+        assert "(1.00, -0.01, 0.01)" in note.what
+        assert "translation along it, x, will be unobservable" in note.what
+
+    @pytest.mark.parametrize(
+        ("name", "low", "high"),
+        [
+            ("complete", (0.001, -0.016, 0.001), (0.004, -0.016, 0.001)),
+            ("primesense", (0.064, 0.040, 0.030), (0.068, 0.043, 0.034)),
+        ],
+    )
+    def test_gross_jumps(self, name, low, high):
+        recording = real_data.primesense() if name == "primesense" else real_data.robot_arm(name)
+        result = calibrate(recording.parent, recording.child, time_offset="estimate", reference="B20")
+        translation = result.T_parent_child[:3, 3]
+        outside = np.maximum(np.maximum(low - translation, translation - high), 0.0)
+        assert outside.max() < 0.0035
+        assert (outside <= [1.5 * dof.sigma for dof in result.observability[:3]]).all()
+        if name == "primesense":
+            assert 0.005 - 2 * result.time_offset_sigma_s < result.time_offset_s < 0.030
+
+    def test_repeated_and_disordered_stamps_are_found(self):
+        rows = real_data.asl_rows("asl_robot_arm", "robot_arm_sim_hand")
+        _, findings = tidy(np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:], "parent")
+        assert "duplicates" in [finding.code for finding in findings]
+
+
+def test_kitti_long_scale():
+    recording = real_data.kitti("long")
+    result = calibrate(recording.parent, recording.child, scale="auto")
+    assert result.scale == pytest.approx(1 - 0.022, abs=0.002)
+    assert result.scale_sigma < 0.002
+
+
+def test_unrelated_recordings_have_no_offset():
+    first, second = real_data.zxl19(1, "LO"), real_data.zxl19(2, "LO")
+    with pytest.raises(NotEnoughDataError, match="time offset cannot be estimated"):
+        estimate_time_offset(first.parent, second.child)
