@@ -26,6 +26,7 @@ setup(
     maintainer_email=manifest.find("maintainer").get("email"),
     license=manifest.findtext("license"),
     packages=find_packages(include=[name, f"{name}.*"]),
+    package_data={f"{name}.report": ["templates/*.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
         (f"share/{name}", ["package.xml"]),
@@ -44,7 +45,8 @@ setup(
     ],
     extras_require={
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
-        "plot": ["matplotlib>=3.6"],
+        "plot": ["jinja2>=3.1.2", "matplotlib>=3.6"],
+        "cluster": ["distributed>=2024.1"],
         "test": ["colcon-common-extensions", "hypothesis>=6.98", "packaging", "pytest>=7.4", "wheel"],
         "lint": ["ruff==0.17.5"],
     },

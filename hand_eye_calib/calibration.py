@@ -23,11 +23,12 @@ class SolveStatus(str, Enum):
 
 
 class DofVerdict(str, Enum):
-    """What the motion says about one degree of freedom."""
+    """What the motion says about one degree of freedom; PRIOR where a prior says (most of) it."""
 
     OBSERVED = "observed"
     WEAK = "weak"
     UNOBSERVABLE = "unobservable"
+    PRIOR = "prior"
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,14 @@ class Calibration:
         What was solved; ``reference`` is the one used, also where ``auto`` was asked for.
     n_poses, n_pairs, n_inliers : int
         Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
-    time_offset_s : float
-        Seconds added to the child's stamps.
-    scale : float
-        Factor applied to the child's translations.
+    time_offset_s, time_offset_sigma_s : float
+        Seconds added to the child's stamps, and one standard deviation: 0 where the offset was given.
+    scale, scale_sigma : float
+        Factor applied to the child's translations, and one standard deviation: 0 where the scale was given.
+    reference_reason : str
+        Why ``auto`` chose the reference; empty where it was given.
+    noise : dict or None
+        What the adaptive estimator found out about the trajectories' noise; None with other methods.
     stamp_ns : int
         Stamp of the newest pose used, parent clock.
     parent_frame, child_frame : str
@@ -90,7 +95,11 @@ class Calibration:
     n_pairs: int
     n_inliers: int
     time_offset_s: float = 0.0
+    time_offset_sigma_s: float = 0.0
     scale: float = 1.0
+    scale_sigma: float = 0.0
+    reference_reason: str = ""
+    noise: dict | None = None
     stamp_ns: int = 0
     parent_frame: str = "parent"
     child_frame: str = "child"
@@ -134,7 +143,11 @@ class Calibration:
             "n_pairs": self.n_pairs,
             "n_inliers": self.n_inliers,
             "time_offset_s": self.time_offset_s,
+            "time_offset_sigma_s": self.time_offset_sigma_s,
             "scale": self.scale,
+            "scale_sigma": self.scale_sigma,
+            "reference_reason": self.reference_reason,
+            "noise": self.noise,
             "stamp_ns": self.stamp_ns,
             "warnings": list(self.warnings),
         }
@@ -164,6 +177,10 @@ class Calibration:
                 ),
                 warnings=tuple(data["warnings"]),
                 **{name: data[name] for name in plain},
+                # older files lack these
+                **{name: data.get(name, 0.0) for name in ("time_offset_sigma_s", "scale_sigma")},
+                reference_reason=data.get("reference_reason", ""),
+                noise=data.get("noise"),
             )
         except KeyError as error:
             raise InputError(f"the calibration lacks {error}; it is not as it was written") from None

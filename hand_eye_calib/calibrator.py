@@ -5,23 +5,36 @@ The one engine behind the node, the replay of bags and the Python function :func
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from hand_eye_calib.assessment.agreement import check_streams
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.estimation import estimate_extrinsic
 from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream, synchronise
+from hand_eye_calib.pairing.time_offset import Correlation
+from hand_eye_calib.solvers.alignment import TimeOffset, estimate_time_offset
+from hand_eye_calib.solvers.similarity import SimilarityFit
 
 STREAMS = ("parent", "child")
+ESTIMATE = "estimate"
 
-# Raw poses of a stream that wait to be synchronised. Within this horizon messages may come in any order; a session that stays
-# below it (200 s at 100 Hz) is solved from all its poses at once, whatever the order they came in.
+# Raw poses of a stream that wait to be synchronised, at most. So many wait where the other stream lags behind, or where the time
+# offset is still to be estimated.
 _MAX_WAITING_POSES = 20_000
 
-# When the waiting room is full, the newest poses of this share stay behind for latecomers.
+# From so many on, the oldest are made into pairs, a few at a time: no pose costs more than a few milliseconds. Within this
+# horizon (20 s at 100 Hz) messages may come in any order.
+_CROWDED_POSES = 2_000
+_POSES_AT_A_TIME, _POSES_BETWEEN = 256, 32
+
+# Poses this much older than the newest of their stream are not made into pairs yet, for the sake of latecomers. When the waiting
+# room is full, the newest of this share are not.
+_LATECOMERS_NS = 1_000_000_000
 _SHARE_LEFT_WAITING = 0.1
 
 
@@ -49,6 +62,29 @@ class StreamStatistics:
     dropped_unpaired: int = 0
     first_stamp_ns: int | None = None
     last_stamp_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class RawPoses:
+    """Poses as they came in, in order of time.
+
+    Attributes
+    ----------
+    stamps_ns : (N,) int64 array
+    poses : (N, 7) array
+        x y z qx qy qz qw.
+    """
+
+    stamps_ns: np.ndarray
+    poses: np.ndarray
+
+    def __len__(self):
+        return len(self.stamps_ns)
+
+    @cached_property
+    def trajectory(self):
+        """The same as a Trajectory; this is the expensive part."""
+        return Trajectory.from_quat_xyzw(self.stamps_ns, self.poses[:, :3], self.poses[:, 3:])
 
 
 class _Stream:
@@ -102,17 +138,52 @@ class _Stream:
     def is_full(self):
         return self._count == _MAX_WAITING_POSES
 
+    @property
+    def is_crowded(self):
+        return self._count > _CROWDED_POSES and self.statistics.received % _POSES_BETWEEN == 0
+
     def __len__(self):
         return self._count
 
     def stamp_at(self, share):
         """Stamp below which this share of the waiting poses lies."""
-        return int(self._stamps_ns[int(share * (self._count - 1))])
+        return self.stamp_of(int(share * (self._count - 1)))
 
-    def trajectory(self):
-        """The waiting poses, copied."""
-        poses = self._poses[: self._count]
-        return Trajectory.from_quat_xyzw(self._stamps_ns[: self._count].copy(), poses[:, :3], poses[:, 3:])
+    def stamp_of(self, index):
+        """Stamp of a waiting pose, or of the newest."""
+        return int(self._stamps_ns[min(index, self._count - 1)])
+
+    def state(self):
+        """All there is to know, as arrays."""
+        return {
+            "stamps_ns": self._stamps_ns[: self._count].copy(),
+            "poses": self._poses[: self._count].copy(),
+            "frame": np.array(self.frame),
+            "statistics": np.array([-1 if value is None else value for value in dataclasses.astuple(self.statistics)]),
+            "let_go_until_ns": np.array([] if self._let_go_until_ns is None else [self._let_go_until_ns], dtype=np.int64),
+        }
+
+    @classmethod
+    def from_state(cls, state):
+        """The stream that gave this state."""
+        stream = cls()
+        stream._count = len(state["stamps_ns"])
+        stream._stamps_ns[: stream._count] = state["stamps_ns"]
+        stream._poses[: stream._count] = state["poses"]
+        stream._last_stamp_ns = int(state["stamps_ns"][-1]) if stream._count else None
+        stream.frame = str(state["frame"])
+        *counts, first_ns, last_ns = state["statistics"].tolist()
+        has_poses = counts[0] > 0
+        stream.statistics = StreamStatistics(*counts, first_ns if has_poses else None, last_ns if has_poses else None)
+        stream._let_go_until_ns = int(state["let_go_until_ns"][0]) if len(state["let_go_until_ns"]) else None
+        return stream
+
+    def poses(self, until_ns=None):
+        """The waiting poses, copied: all, or those up to a stamp and the next one."""
+        end = self._count
+        if until_ns is not None:
+            end = min(int(np.searchsorted(self._stamps_ns[: self._count], until_ns, side="right")) + 1, self._count)
+        return RawPoses(self._stamps_ns[:end].copy(), self._poses[:end].copy())
 
     def let_go(self, until_ns, unpaired=False):
         """Forget poses up to and including a stamp, but for the last of them: what comes next is interpolated from it."""
@@ -132,15 +203,32 @@ class Snapshot:
 
     config: CalibratorConfig
     kept: PosePairs
-    parent: Trajectory
-    child: Trajectory
+    waiting_parent: RawPoses | Trajectory
+    waiting_child: RawPoses | Trajectory
     base_stream: str | None
     parent_frame: str
     child_frame: str
     warnings: tuple = ()
+    time_offset: TimeOffset | None = None
+
+    @property
+    def parent(self):
+        """Trajectory of the parent's poses that wait to be paired."""
+        return _as_trajectory(self.waiting_parent)
+
+    @property
+    def child(self):
+        """Trajectory of the child's poses that wait to be paired."""
+        return _as_trajectory(self.waiting_child)
 
     def pose_pairs(self):
         """Synchronised pose pairs, the kept ones of earlier and those of the poses still waiting."""
+        if self.config.time_offset == ESTIMATE:
+            return self._with_time_offset.pose_pairs()
+        return self._pose_pairs
+
+    @cached_property
+    def _pose_pairs(self):
         waiting = _synchronised(self.config, self.parent, self.child, self.base_stream, self.kept)
         return thin(PosePairs.concatenate(self.kept, waiting), self.config.max_pairs)
 
@@ -151,16 +239,47 @@ class Snapshot:
                 f"both streams name {self.parent_frame!r} as their sensor frame, so there is nothing to calibrate between; "
                 "give parent_frame and child_frame"
             )
+        if self.config.time_offset == ESTIMATE:
+            return self._with_time_offset.estimate()
         pose_pairs = self.pose_pairs()
         if len(pose_pairs) < self.config.min_pairs:
             raise NotEnoughDataError(self._what_is_missing(len(pose_pairs)))
-        result = estimate_extrinsic(pose_pairs, self.config)
+        result = estimate_extrinsic(pose_pairs, self.config, self.time_offset)
         return dataclasses.replace(
             result,
             parent_frame=self.parent_frame,
             child_frame=self.child_frame,
             warnings=self.warnings + result.warnings,
         )
+
+    @property
+    def found_time_offset(self):
+        """The TimeOffset that pose_pairs() or estimate() found; None where that was not their task or they failed."""
+        return self.__dict__["_with_time_offset"].time_offset if "_with_time_offset" in self.__dict__ else None
+
+    def check(self, calibration=None):
+        """Agreement of the streams whose poses wait: what is wrong with them, given a calibration's time offset and scale.
+
+        Parameters
+        ----------
+        calibration : Calibration, optional
+            Its time offset and scale count as known; without one, those of the options.
+        """
+        offset_s = calibration.time_offset_s if calibration else self.config.time_offset
+        scale = calibration.scale if calibration else self.config.scale
+        return check_streams(
+            self.parent,
+            self.child,
+            0.0 if offset_s == ESTIMATE else offset_s,
+            1.0 if isinstance(scale, str) else scale,
+            self.config.max_gap,
+        )
+
+    @cached_property
+    def _with_time_offset(self):
+        """The same with the time offset estimated: from the poses that wait, unless pairs were made with one before."""
+        found = self.time_offset or estimate_time_offset(self.parent, self.child, self.config.max_gap)
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, time_offset=found.seconds), time_offset=found)
 
     def _what_is_missing(self, n_pairs):
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
@@ -176,7 +295,7 @@ class Snapshot:
         if end_ns < start_ns:
             return (
                 f"{needed}: the streams do not overlap in time ({counts}, {(start_ns - end_ns) * 1e-9:.3f} s apart); "
-                "set time_offset if their clocks differ"
+                "if their clocks differ, set time_offset to estimate or to the seconds between them"
             )
         return (
             f"{needed} from {counts} that overlap for {(end_ns - start_ns) * 1e-9:.2f} s; "
@@ -210,12 +329,33 @@ class Calibrator:
         self._streams = {stream: _Stream() for stream in STREAMS}
         self._kept = PosePairs.empty()
         self._base_stream = None
+        self._time_offset = self._proposed_offset = None
 
     def reconfigure(self, config):
         """Put other options in force. Poses are kept, except pairs already made with another time offset."""
         if config.time_offset != self._config.time_offset:
             self._kept, self._base_stream = PosePairs.empty(), None
+            self._time_offset = self._proposed_offset = None
         self._config = config
+
+    def state(self):
+        """All poses and pairs as a flat mapping of names to arrays, for :meth:`restore`; options are not part of it."""
+        state = {f"{stream}.{name}": value for stream in STREAMS for name, value in self._streams[stream].state().items()}
+        kept = {"stamps_ns": self._kept.stamps_ns, "Ts_pw_p": self._kept.Ts_pw_p, "Ts_cw_c": self._kept.Ts_cw_c}
+        state |= {f"kept.{name}": value for name, value in kept.items()} | {"base": np.array(self._base_stream or "")}
+        return state | (_offset_state(self._time_offset) if self._time_offset else {})
+
+    def restore(self, state):
+        """Go on from a :meth:`state`, of this or an earlier calibrator."""
+        parts = {part: {} for part in (*STREAMS, "kept", "offset", "correlation", "fit")}
+        for name, value in state.items():
+            part, _, rest = name.partition(".")
+            if rest:
+                parts[part][rest] = value
+        self._streams = {stream: _Stream.from_state(parts[stream]) for stream in STREAMS}
+        self._kept = PosePairs(**parts["kept"])
+        self._base_stream = str(state["base"]) or None
+        self._time_offset = _offset_from_state(parts) if parts["offset"] else None
 
     def statistics(self, stream):
         """StreamStatistics of "parent" or "child"."""
@@ -279,13 +419,24 @@ class Calibrator:
         waiting = self._streams[stream]
         if waiting.is_full:
             self._make_room()
+        elif waiting.is_crowded:
+            self._make_pairs()
         return waiting.add(stamp_ns, position, quat_xyzw)
 
     def snapshot(self):
         """What is known now, for an estimate in this or another thread."""
         parent, child = self._streams["parent"], self._streams["child"]
         frames, warnings = _name_frames(self._config, {"parent": parent.frame, "child": child.frame})
-        return Snapshot(self._config, self._kept, parent.trajectory(), child.trajectory(), self._base_stream, *frames, warnings)
+        return Snapshot(
+            self._config,
+            self._kept,
+            parent.poses(),
+            child.poses(),
+            self._base_stream,
+            *frames,
+            warnings,
+            self._time_offset,
+        )
 
     def estimate(self):
         """Solve for the extrinsic from all poses so far.
@@ -304,28 +455,83 @@ class Calibrator:
         return self.snapshot().estimate()
 
     def _make_room(self):
-        """Synchronise what waits, keep the pairs, and let go of the poses they came from."""
-        parent, child = self._streams["parent"], self._streams["child"]
-        offset_ns = round(self._config.time_offset * 1e9)
-        if not len(parent) or not len(child):
-            full = parent if parent.is_full else child
-            full.let_go(full.stamp_at(0.5), unpaired=True)
-            return
-        if self._base_stream is None:
-            self._base_stream = slower_stream(parent.trajectory(), child.trajectory())
-        # Up to here (parent clock) no more poses are awaited.
-        horizon_ns = min(
-            parent.stamp_at(1 - _SHARE_LEFT_WAITING),
-            child.stamp_at(1 - _SHARE_LEFT_WAITING) + offset_ns,
-        )
-        made = _synchronised(self._config, parent.trajectory(), child.trajectory(), self._base_stream, self._kept)
-        made = made[made.stamps_ns <= horizon_ns]
-        self._kept = thin(PosePairs.concatenate(self._kept, made), self._config.max_pairs)
-        parent.let_go(horizon_ns)
-        child.let_go(horizon_ns - offset_ns)
-        for stream in (parent, child):
-            if stream.is_full:  # the other stream has fallen silent: waiting longer would not pair these
+        """Find place in a full waiting room."""
+        self._make_pairs(1 - _SHARE_LEFT_WAITING)
+        for stream in self._streams.values():
+            if stream.is_full:  # the other stream has nothing at these times: waiting longer would not pair them
                 stream.let_go(stream.stamp_at(0.5), unpaired=True)
+
+    def _make_pairs(self, settled_share=None):
+        """Make the oldest waiting poses into pairs, keep the pairs, and let go of the poses they came from.
+
+        Only poses that no latecomer is expected among: those older than the newest by a while, or the given share of them.
+        """
+        parent, child = self._streams["parent"], self._streams["child"]
+        if not len(parent) or not len(child):
+            return
+        config = self._config_with_time_offset(estimate=settled_share is not None)
+        if config is None:
+            return
+        offset_ns = round(config.time_offset * 1e9)
+
+        def settled_ns(stream):
+            return stream.stamp_at(1) - _LATECOMERS_NS if settled_share is None else stream.stamp_at(settled_share)
+
+        horizon_ns = min(
+            settled_ns(parent),
+            settled_ns(child) + offset_ns,
+            parent.stamp_of(_POSES_AT_A_TIME),
+            child.stamp_of(_POSES_AT_A_TIME) + offset_ns,
+        )
+        longer, its_offset_ns = (parent, 0) if len(parent) >= len(child) else (child, offset_ns)
+        if settled_share is None and horizon_ns < longer.stamp_of(_POSES_AT_A_TIME // 2) + its_offset_ns:
+            return  # too few to be worth it
+        waiting = parent.poses(horizon_ns), child.poses(horizon_ns - offset_ns)
+        if self._base_stream is None:
+            self._base_stream = slower_stream(parent.poses(), child.poses())
+        made = _synchronised(config, *(poses.trajectory for poses in waiting), self._base_stream, self._kept_parts[-1])
+        self._keep(made[made.stamps_ns <= horizon_ns])
+        alone = parent.stamp_of(0) > horizon_ns or child.stamp_of(0) + offset_ns > horizon_ns
+        parent.let_go(horizon_ns, unpaired=alone)
+        child.let_go(horizon_ns - offset_ns, unpaired=alone)
+
+    def _keep(self, made):
+        if not len(made):
+            return
+        self._kept_parts.append(made)
+        if sum(map(len, self._kept_parts)) > self._config.max_pairs:
+            self._kept_parts = [thin(self._kept, self._config.max_pairs)]
+
+    @property
+    def _kept(self):
+        """All pose pairs made so far; they come in parts, which are put together only when somebody asks."""
+        if len(self._kept_parts) > 1:
+            self._kept_parts = [PosePairs.concatenate(*self._kept_parts)]
+        return self._kept_parts[0]
+
+    @_kept.setter
+    def _kept(self, pose_pairs):
+        self._kept_parts = [pose_pairs]
+
+    def adopt(self, snapshot):
+        """Take over the time offset that a snapshot has estimated, to spare the calibrator that work when it needs one."""
+        self._proposed_offset = snapshot.found_time_offset or self._proposed_offset
+
+    def _config_with_time_offset(self, estimate):
+        """The configuration with a time offset in seconds; None where it is to be estimated and cannot or need not be yet."""
+        if self._config.time_offset != ESTIMATE:
+            return self._config
+        if self._time_offset is None and not estimate:
+            return None
+        if self._time_offset is None:
+            parent, child = self._streams["parent"].poses(), self._streams["child"].poses()
+            try:
+                self._time_offset = self._proposed_offset or estimate_time_offset(
+                    parent.trajectory, child.trajectory, self._config.max_gap
+                )
+            except NotEnoughDataError:
+                return None
+        return dataclasses.replace(self._config, time_offset=self._time_offset.seconds)
 
 
 def calibrate(parent, child, **options):
@@ -350,14 +556,42 @@ def calibrate(parent, child, **options):
     NotEnoughDataError
         Where too few poses could be paired.
     """
-    config = offline_config(parent, child, options)
+    return whole_snapshot(offline_config(parent, child, options), parent, child).estimate()
+
+
+def whole_snapshot(config, parent, child):
+    """The Snapshot of two whole trajectories."""
     frames, warnings = _name_frames(config, {"parent": parent.sensor_frame, "child": child.sensor_frame})
-    return Snapshot(config, PosePairs.empty(), parent, child, None, *frames, warnings).estimate()
+    return Snapshot(config, PosePairs.empty(), parent, child, None, *frames, warnings)
 
 
 def offline_config(parent, child, options):
     """The CalibratorConfig for two whole trajectories: no limit on the pairs unless the options set one."""
     return CalibratorConfig.from_options({"max_pairs": max(len(parent), len(child), 10), **options})
+
+
+def _offset_state(offset):
+    """A TimeOffset as a flat mapping of names to arrays."""
+    state = {"offset.seconds": offset.seconds, "offset.sigma_s": offset.sigma_s}
+    for part in ("correlation", "fit"):
+        found = getattr(offset, part)
+        if found is not None:
+            state |= {f"{part}.{field.name}": getattr(found, field.name) for field in dataclasses.fields(found)}
+    return {name: np.asarray(value) for name, value in state.items()}
+
+
+def _offset_from_state(parts):
+    """The TimeOffset that gave these parts of a state."""
+
+    def values(part):
+        return {name: value if value.ndim else value.item() for name, value in parts[part].items()}
+
+    fit = SimilarityFit(**values("fit")) if parts["fit"] else None
+    return TimeOffset(**values("offset"), correlation=Correlation(**values("correlation")), fit=fit)
+
+
+def _as_trajectory(poses):
+    return poses if isinstance(poses, Trajectory) else poses.trajectory
 
 
 def _name_frames(config, known):

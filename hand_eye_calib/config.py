@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from hand_eye_calib.errors import ConfigError
 
-METHODS = ("dnlo", "dnl", "park", "taylor", "zhuang", "ali")
+METHODS = ("dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive")
 BACKENDS = ("fast", "ipopt")
 REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]*|C([2-9]|[1-9][0-9]+)"
 POSE_TYPES = (
@@ -24,7 +24,18 @@ POSE_TYPES = (
 
 
 def option(
-    default, doc, *, unit="", minimum=None, maximum=None, choices=None, pattern=None, words=(), name=None, read_only=False
+    default,
+    doc,
+    *,
+    unit="",
+    minimum=None,
+    maximum=None,
+    choices=None,
+    pattern=None,
+    words=(),
+    name=None,
+    read_only=False,
+    parse=None,
 ):
     """A dataclass field that knows all there is to know about an option.
 
@@ -48,10 +59,12 @@ def option(
         Public name where it differs from the attribute's, such as ``keyframe.min_translation``.
     read_only : bool
         The node cannot change it while it runs.
+    parse : callable, optional
+        Of a text option: ``parse(name, value)`` raises ConfigError where the value does not say what it has to.
     """
     metadata = dict(
         doc=doc, unit=unit, minimum=minimum, maximum=maximum, choices=choices, pattern=pattern, words=words, name=name,
-        read_only=read_only,
+        read_only=read_only, parse=parse,
     )  # fmt: skip
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -72,9 +85,8 @@ def check_value(field, value):
     meta, name, kind = field.metadata, option_name(field), type(field.default)
     if isinstance(value, str) and value in meta["words"]:
         return value
-    if meta["words"] and kind is str:
-        value = _number(name, value, meta)
-        kind = float
+    if meta["words"]:
+        value, kind = _number(name, value, meta), float
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = float(value)
         if not math.isfinite(value):
@@ -90,6 +102,8 @@ def check_value(field, value):
         raise ConfigError(f"{name} must be one of {', '.join(meta['choices'])}; got {value!r}")
     if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
         raise ConfigError(f"{name} must match {meta['pattern']}; got {value!r}")
+    if meta["parse"] is not None:
+        meta["parse"](name, value)
     return value
 
 
@@ -123,11 +137,80 @@ class OptionSet:
         return {option_name(field): getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
+AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
+_IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
+
+
+def parse_prior(name, text):
+    """Values and standard deviations of the axes that a prior option gives.
+
+    Parameters
+    ----------
+    name : str
+        prior.x ... prior.yaw or prior.transform.
+    text : str
+        ``VALUE+/-SIGMA`` for an axis; ``X Y Z ROLL PITCH YAW +/- SIGMA_TRANSLATION SIGMA_ROTATION`` for the transform. Metres and radians,
+        or with units (m, cm, mm, rad, deg). Empty for nothing.
+
+    Returns
+    -------
+    dict
+        Axis name to (value, sigma), in m or rad.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if not text:
+        return {}
+    axis = name.removeprefix("prior.")
+    axes = tuple(AXIS_UNITS) if axis == "transform" else (axis,)
+    expected = "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION" if axis == "transform" else "VALUE+/-SIGMA"
+    values, plus_minus, sigmas = text.replace("±", "+/-").partition("+/-")
+    values, sigmas = values.split(), sigmas.split()
+    if axis == "transform" and len(sigmas) == 2:
+        sigmas = [sigmas[0]] * 3 + [sigmas[1]] * 3
+    if not plus_minus or len(values) != len(axes) or len(sigmas) != len(axes):
+        raise ConfigError(f"{name} must be {expected}, with how sure that is; got {text!r}")
+    prior = {}
+    for axis, value, sigma in zip(axes, values, sigmas, strict=True):
+        unit = AXIS_UNITS[axis]
+        prior[axis] = (_quantity(name, value, unit), _quantity(name, sigma, unit))
+        if not prior[axis][1] > 0:
+            raise ConfigError(f"{name} needs a standard deviation above 0; got {text!r}")
+        if unit == "rad" and abs(prior[axis][0]) > 2 * math.pi:
+            raise ConfigError(f"{name} is in radians unless it says deg; got {value!r}: write {value}deg")
+    return prior
+
+
+def _quantity(name, text, unit):
+    match = _QUANTITY.fullmatch(text)
+    if not match or (match[2] or unit) not in _IN_SI[unit]:
+        raise ConfigError(f"{name} must be numbers in {' or '.join(_IN_SI[unit])}; got {text!r}")
+    return float(match[1]) * _IN_SI[unit][match[2] or unit]
+
+
+def _prior(axis, unit):
+    example = "1.85+/-0.02 or 185cm+/-2cm" if unit == "m" else "-90deg+/-2deg"
+    return option(
+        "",
+        f"What is known of {axis} of the child sensor in the parent sensor's frame: VALUE+/-SIGMA, such as {example}. Empty for nothing.",
+        unit=unit,
+        name=f"prior.{axis}",
+        parse=parse_prior,
+    )
+
+
 @dataclass(frozen=True)
 class CalibratorConfig(OptionSet):
     """Options of the engine: the same for the node, the replay of bags, files and Python."""
 
-    method: str = option("dnlo", "Solver; dnlo rejects outliers, the others use every pair.", choices=METHODS)
+    method: str = option(
+        "dnlo",
+        "Solver; dnlo rejects outliers, adaptive models the noise and needs no reference, the others use every pair.",
+        choices=METHODS,
+    )
     reference: str = option(
         "auto",
         "Which poses form motion pairs: A (all against the first), B<n> (against the n-th before), C<n> (segments of n), or auto "
@@ -159,14 +242,43 @@ class CalibratorConfig(OptionSet):
     max_gap: float = option(
         0.5, "Longest time between two poses of a stream that interpolation may bridge.", unit="s", minimum=1e-3, maximum=60.0
     )
-    time_offset: float = option(
-        0.0, "Added to the child's stamps to get the parent's clock.", unit="s", minimum=-1e9, maximum=1e9
+    time_offset: float | str = option(
+        0.0,
+        "Added to the child's stamps to get the parent's clock; estimate finds it from how both streams turn.",
+        unit="s",
+        words=("estimate",),
+        minimum=-1e9,
+        maximum=1e9,
     )
     scale: str | float = option(
-        "none", "Factor from the child's length unit to metres, or none.", words=("none",), minimum=1e-6, maximum=1e6
+        "none",
+        "Factor from the child's lengths to metres; estimate finds it, auto does so where it differs from 1 beyond doubt.",
+        words=("none", "auto", "estimate"),
+        minimum=1e-6,
+        maximum=1e6,
+    )
+    prior_x: str = _prior("x", "m")
+    prior_y: str = _prior("y", "m")
+    prior_z: str = _prior("z", "m")
+    prior_roll: str = _prior("roll", "rad")
+    prior_pitch: str = _prior("pitch", "rad")
+    prior_yaw: str = _prior("yaw", "rad")
+    prior_transform: str = option(
+        "",
+        "What is known of the whole pose: X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION, such as "
+        "0.4 0 1.85 0 0 -90deg+/-0.05 5deg. Empty for nothing.",
+        name="prior.transform",
+        parse=parse_prior,
     )
     parent_frame: str = option("", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True)
     child_frame: str = option("", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True)
+
+    def prior(self):
+        """What is known beforehand: axis name to (value, sigma), in m and rad; a single axis goes before the transform."""
+        known = {}
+        for name in ("transform", *AXIS_UNITS):
+            known |= parse_prior(f"prior.{name}", getattr(self, f"prior_{name}"))
+        return known
 
 
 @dataclass(frozen=True)
@@ -180,4 +292,17 @@ class NodeConfig(OptionSet):
     child_type: str = option(
         "auto", "Message type of child_odom; auto looks at the publisher.", choices=POSE_TYPES, read_only=True
     )
-    output_directory: str = option("", "Where ~/save writes the result files; empty for nowhere.")
+    output_directory: str = option(
+        "", "Where ~/save and the end of the node write the result files, and the journal is; empty for nowhere."
+    )
+    journal: str = option(
+        "new",
+        "The session on disk, in journal/ of output_directory, so that a crash loses less than a second of it: new begins a session "
+        "and keeps the one before aside, resume goes on with the one there.",
+        choices=("new", "resume", "off"),
+        read_only=True,
+    )
+    publish_tf: bool = option(
+        False,
+        "Broadcast the result on /tf_static once all of it is observable; leave it off where the robot's description has this edge.",
+    )

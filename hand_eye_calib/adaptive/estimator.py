@@ -89,6 +89,18 @@ class AdaptiveSolution:
     converged: bool
     iterations: int
 
+    def describe(self, stamps_ns):
+        """The noise in plain numbers and strings: levels per axis, the systematic error, and when trajectories jumped (ns)."""
+        return {
+            "rotation_white_rad": self.noise.rotation_white,
+            "translation_white_m": self.noise.translation_white,
+            "rotation_drift_rad_per_pose": self.noise.rotation_drift,
+            "translation_drift_m_per_pose": self.noise.translation_drift,
+            "systematic": self.nuisance,
+            "systematic_parameters": self.parameters.tolist(),
+            "jumps_before_stamp_ns": stamps_ns[1:][self.jumps].tolist(),
+        }
+
 
 def solve(stamps_ns, Ts_pw_p, Ts_cw_c, nuisances=("none", "scale", "bias")):
     """Estimate T_parent_child, the noise of the trajectories, and their covariance.

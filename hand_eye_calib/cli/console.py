@@ -34,18 +34,41 @@ def waiting_for(what):
 
 
 def with_progress(items, total, doing):
-    """Pass on ``items``; on a terminal, once that has taken two seconds, show how far it has got."""
+    """Pass on ``items``; on a terminal, once that has taken two seconds, show how far, how fast and how long still.
+
+    Parameters
+    ----------
+    items : iterable
+    total : int or None
+        How many there are, as far as one knows.
+    doing : str
+    """
     if not sys.stderr.isatty():
         yield from items
         return
-    redraw_at = time.monotonic() + _SILENT_S
-    shown = False
+    started = redraw_at = time.monotonic()
+    redraw_at += _SILENT_S
+    progress = None
     try:
         for done, item in enumerate(items):
-            if time.monotonic() >= redraw_at:
-                print(f"\r{doing}: {done / max(total, 1):4.0%}", end="", file=sys.stderr, flush=True)
-                redraw_at, shown = time.monotonic() + _REDRAW_S, True
+            if (now := time.monotonic()) >= redraw_at:
+                if progress is None:
+                    progress = _progress_bar()
+                    progress.start()
+                    task = progress.add_task(doing, total=total, rate="")
+                progress.update(task, completed=done, rate=f"{done / max(now - started, 1e-9):,.0f}/s")
+                redraw_at = now + _REDRAW_S
             yield item
     finally:
-        if shown:
-            print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
+        if progress is not None:
+            progress.stop()
+
+
+def _progress_bar():
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
+    )  # fmt: skip
+    return Progress(*columns, console=Console(stderr=True), transient=True)

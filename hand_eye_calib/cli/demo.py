@@ -18,6 +18,7 @@ from hand_eye_calib.cli.console import fail, note
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.cli.present import EXIT_CODES
 from hand_eye_calib.cli.replay import feed
+from hand_eye_calib.cli.reporting import write_report
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.simulation.drive import HILLY_DRIVE, simulate_drive
@@ -43,7 +44,7 @@ def add_arguments(parser):
         metavar="DIR",
         type=Path,
         default=Path("demo_output"),
-        help="directory for the bag and the node's log; those of an earlier demo are replaced. Default: demo_output",
+        help="directory for the bag, the node's log and report.html; those of an earlier demo are replaced. Default: demo_output",
     )
     parser.add_argument("--seed", type=int, default=0, help="another seed, another drive. Default: 0")
     add_json_argument(parser)
@@ -57,11 +58,14 @@ def run(arguments):
     drive = simulate_drive(arguments.seed, DRIVE, NOISE)
     bag_path = _write_bag(arguments.out, drive)
     note(f"simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
-    offline = _replay(bag_path)
+    calibrator = _replay(bag_path)
+    offline = calibrator.estimate()
     note(f"replayed it offline; playing it to the live node at {PLAY_SPEED:g} times the speed")
     live = _play(Player, bag_path, arguments.out / "node.log", offline.stamp_ns)
     document = _document(drive, bag_path, offline, live)
     print(json.dumps(document, indent=2, allow_nan=False) if arguments.json else _text(document))
+    inputs = {"bag": str(bag_path)} | {stream: {"topic": topic} for stream, topic in TOPICS.items()}
+    write_report(arguments.out, offline, calibrator.snapshot(), inputs)
     if max(document["agreement"].values()) > AGREEMENT:
         return fail(
             f"offline and online differ by more than {AGREEMENT}: {document['agreement']}; the same messages must give the same",
@@ -112,7 +116,7 @@ def _replay(bag_path):
     calibrator = Calibrator()
     with _poses(bag_path) as poses:
         feed(calibrator, poses, TOPICS)
-    return calibrator.estimate()
+    return calibrator
 
 
 def _play(Player, bag_path, log_path, stamp_ns):

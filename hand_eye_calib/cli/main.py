@@ -20,9 +20,11 @@ EXIT_BROKEN_PIPE = 128 + 13
 COMMANDS = {
     "replay": "calibrate from the poses in a bag",
     "calibrate": "calibrate from two trajectory files",
+    "check": "look for what is wrong with two streams",
     "calibrator": "run the ROS 2 node",
     "info": "show a saved result",
     "simulate": "make trajectories or a bag with known truth",
+    "experiment": "reproduce a figure or table of the article",
     "demo": "simulate a drive and calibrate it, offline and live",
 }
 

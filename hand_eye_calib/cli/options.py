@@ -15,6 +15,7 @@ _NODE_OPTIONS = {option_name(field) for field in dataclasses.fields(NodeConfig)}
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 _NODE_NAMES = ("calibrator", "**", "*")
 _PREFIX = "option "
+_PRIOR = "prior."
 
 
 def add_config_arguments(parser):
@@ -35,12 +36,26 @@ def add_config_arguments(parser):
             metavar=_metavar(name, meta),
             help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
         )
+    axes = ", ".join(name.removeprefix(_PRIOR) for name in _FIELDS if name.startswith(_PRIOR))
+    group.add_argument(
+        "--prior",
+        metavar="AXIS=VALUE+/-SIGMA",
+        action="append",
+        type=_prior_argument,
+        default=argparse.SUPPRESS,
+        help=f"the same as --prior-AXIS VALUE+/-SIGMA, for one of {axes}; may be repeated",
+    )
 
 
 def add_output_arguments(parser):
     """Add ``--out`` and ``--json``."""
     group = parser.add_argument_group("output")
-    group.add_argument("--out", metavar="DIR", type=Path, help="save the result in this directory, as extrinsic.yaml")
+    group.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro and static_transform.launch.py",
+    )
     add_json_argument(group)
 
 
@@ -65,12 +80,24 @@ def options_from(arguments):
         Where the file cannot be read.
     """
     options = _read_config(arguments.config) if arguments.config else {}
+    options |= dict(getattr(arguments, "prior", ()))
     return options | {name.removeprefix(_PREFIX): value for name, value in vars(arguments).items() if name.startswith(_PREFIX)}
 
 
 def config_from(arguments):
     """The CalibratorConfig that was asked for: :func:`options_from` before the defaults."""
     return CalibratorConfig.from_options(options_from(arguments))
+
+
+def _prior_argument(text):
+    axis, equals, value = text.partition("=")
+    if not equals or _PRIOR + axis not in _FIELDS:
+        axes = ", ".join(name.removeprefix(_PRIOR) for name in _FIELDS if name.startswith(_PRIOR))
+        raise argparse.ArgumentTypeError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {axes}; got {text!r}")
+    try:
+        return _PRIOR + axis, check_value(_FIELDS[_PRIOR + axis], value)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _metavar(name, meta):

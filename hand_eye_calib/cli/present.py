@@ -1,6 +1,7 @@
 """A calibration on the screen: as text for people, as JSON for programs, and as an exit code."""
 
 import json
+import math
 import shlex
 
 import numpy as np
@@ -13,7 +14,7 @@ EXIT_CODES = {SolveStatus.OK: 0, SolveStatus.NOT_CONVERGED: 1, SolveStatus.UNOBS
 _ROTATIONS = ("roll", "pitch", "yaw")
 
 
-def deliver(calibration, arguments, inputs):
+def deliver(calibration, arguments, inputs, snapshot=None, **more):
     """Print a calibration, save it where ``--out`` asks for that, and return the exit code.
 
     Parameters
@@ -23,12 +24,20 @@ def deliver(calibration, arguments, inputs):
         With ``json`` and ``out``.
     inputs : dict
         Where the data came from, in plain values: part of the JSON document and of the saved file's provenance.
+    snapshot : Snapshot, optional
+        The poses and options that gave it, for the report.
+    **more
+        What else the JSON document holds.
     """
     if arguments.out:
         from hand_eye_calib.io.results import save_result
 
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
-    print(as_json(calibration, inputs=inputs) if arguments.json else as_text(calibration))
+    print(as_json(calibration, inputs=inputs, **more) if arguments.json else as_text(calibration))
+    if arguments.out and snapshot is not None:
+        from hand_eye_calib.cli.reporting import write_report
+
+        write_report(arguments.out, calibration, snapshot, inputs, more.get("findings", ()))
     if calibration.status is SolveStatus.NOT_CONVERGED:
         fail("the solver did not converge; do not use this result, record more varied motion", 1)
     return EXIT_CODES[calibration.status]
@@ -53,13 +62,48 @@ def as_text(calibration):
         f"Solved with {calibration.method} ({calibration.backend}) on reference {calibration.reference}: "
         f"{calibration.n_inliers} of {calibration.n_pairs} motion pairs are inliers, from {calibration.n_poses} poses; "
         f"objective {calibration.objective:.6g}",
-        f"  time offset {calibration.time_offset_s:g} s, scale {calibration.scale:g}",
+        *([f"  reference {calibration.reference_reason}"] if calibration.reference_reason else []),
+        *([f"  {line}" for line in noise_lines(calibration.noise)] if calibration.noise else []),
+        f"  time offset {_with_sigma(calibration.time_offset_s, calibration.time_offset_sigma_s, 4)} s, "
+        f"scale {_with_sigma(calibration.scale, calibration.scale_sigma, 4)}",
         f"Status: {_status(calibration)}",
         *(f"Warning: {warning}" for warning in calibration.warnings),
         "To publish it:",
         f"  {static_transform_command(calibration)}",
     ]
     return "\n".join(lines)
+
+
+def noise_lines(noise):
+    """What the adaptive estimator found about the noise, in words a person understands."""
+    yield (
+        f"each pose is off by {100 * noise['translation_white_m']:.2g} cm and {_degrees(noise['rotation_white_rad'])} per axis, "
+        f"and what stays grows by {100 * noise['translation_drift_m_per_pose']:.2g} cm and "
+        f"{_degrees(noise['rotation_drift_rad_per_pose'])} from pose to pose (both sensors together)"
+    )
+    if noise["systematic"] == "scale":
+        yield f"the child's lengths are {100 * noise['systematic_parameters'][0]:+.2f} % short of the parent's"
+    elif noise["systematic"] == "bias":
+        along = ", ".join(f"{name} {1000 * value:.2g}" for name, value in zip("xyz", noise["systematic_parameters"], strict=True))
+        yield f"the child's path is off by {along} mm per metre travelled, along its own axes"
+    if jumps := noise["jumps_before_stamp_ns"]:
+        shown = ", ".join(f"{stamp_ns * 1e-9:.3f}" for stamp_ns in jumps[:5])
+        yield f"{len(jumps)} jumps of a trajectory, just before {shown}{' ...' if len(jumps) > 5 else ''} s"
+
+
+def _degrees(angle_rad):
+    return f"{math.degrees(angle_rad):.2g} deg"
+
+
+def convergence_line(entry):
+    """One line of what ``replay --every`` found on the way: an entry of its history."""
+    calibration, at = entry["calibration"], f"after {entry['bag_time_s']:g} s:"
+    if calibration is None:
+        return f"{at} no estimate yet, {entry['reason']}"
+    transform = calibration["T_parent_child"]
+    values = [f"{name} {value:.3f}" for name, value in zip("xyz", transform["translation"], strict=True)]
+    values += [f"{name} {value:.2f}" for name, value in zip(_ROTATIONS, transform["rpy_deg"], strict=True)]
+    return f"{at} {' '.join(values[:3])} m, {' '.join(values[3:])} deg, {calibration['n_poses']} poses, {calibration['status']}"
 
 
 def static_transform_command(calibration):
@@ -85,6 +129,11 @@ def _transform_lines(transform):
 
 def _row(names, values, digits=6):
     return "  ".join(f"{name} {value:{digits + 6}.{digits}f}" for name, value in zip(names, values, strict=True))
+
+
+def _with_sigma(value, sigma, digits):
+    """A number that was given as it is, one that was estimated with its standard deviation."""
+    return f"{value:.{digits}f} +/- {sigma:.{digits}f}" if sigma else f"{value:g}"
 
 
 def _observability_line(dof):

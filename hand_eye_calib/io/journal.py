@@ -8,6 +8,7 @@ that a process killed in the middle of a write costs at most the record it was w
 
 import io
 import os
+import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -36,7 +37,7 @@ class JournalWriter:
     checkpoint : dict of str to arrays
         The engine's state to start from (:meth:`hand_eye_calib.calibrator.Calibrator.state`).
     segment_bytes : int
-        Size at which :attr:`is_full` asks for a new checkpoint.
+        Bytes since the checkpoint at which :attr:`is_full` asks for a new one.
 
     Raises
     ------
@@ -89,7 +90,7 @@ class JournalWriter:
         os.replace(temporary, path)
         self.close()
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - kept open for the session
-        self._written, self._pending = len(beginning), bytearray()
+        self._written, self._pending = 0, bytearray()
         for segment in old:
             segment.unlink(missing_ok=True)
 
@@ -109,6 +110,36 @@ class JournalWriter:
 def has_session(directory):
     """Whether a directory holds a journal."""
     return bool(_segments(Path(directory)))
+
+
+def keep_aside(directory):
+    """Rename a journal's directory so that a new session can use it; returns where it went.
+
+    Only the last one is kept: what was kept before is removed.
+
+    Raises
+    ------
+    OSError
+    """
+    directory = Path(directory)
+    aside = directory.with_name(f"{directory.name}.previous")
+    if aside.exists():
+        shutil.rmtree(aside)
+    return directory.replace(aside)
+
+
+def count_poses(directory):
+    """Poses in the session that a directory holds; None where it is damaged.
+
+    Raises
+    ------
+    OSError
+    """
+    try:
+        checkpoint, events, _ = read_journal(directory)
+    except InputError:
+        return None
+    return sum(int(checkpoint[f"{stream}.statistics"][0]) for stream in _STREAMS) + sum(event[0] == "pose" for event in events)
 
 
 def read_journal(directory):

@@ -1,44 +1,120 @@
 """Trajectories in text files.
 
-The TUM format has one pose a line, ``timestamp tx ty tz qx qy qz qw``: seconds, metres, scalar-last quaternion. Lines that
-start with ``#`` and empty lines are skipped.
+========  ====================================================================================================================
+tum       ``timestamp tx ty tz qx qy qz qw``, separated by white space
+kitti     the first three rows of the pose's matrix, 12 numbers; stamps, one a line, in a file of their own
+euroc     ``timestamp, px, py, pz, qw, qx, qy, qz, ...``, nanoseconds; what follows (velocities, biases) is ignored
+csv       columns found by the names in the header, or named by ``columns``; separated by commas, semicolons or white space
+========  ====================================================================================================================
+
+Lines that start with ``#`` and empty lines are skipped, but a csv file's header may start with ``#``. Lengths are in metres. The unit of the
+stamps is recognised from their size. The order of a quaternion's numbers is the format's or is named, never guessed.
 """
 
+import csv
+import re
+import warnings
+from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, Trajectory
+from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, ROTATION_TOLERANCE, Trajectory
+
+FORMATS = ("tum", "kitti", "euroc", "csv")
+STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 _TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+_EUROC_COLUMNS = "timestamp, px, py, pz, qw, qx, qy, qz"
+_POSE_NAMES = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _NS_PER_S = 1_000_000_000
-_LARGEST_S = Decimal(int(np.iinfo(np.int64).max)) / _NS_PER_S
+_LARGEST_NS = int(np.iinfo(np.int64).max)
+
+# The largest stamp of a file decides: seconds since 1970 have ten digits, and each smaller unit three more.
+_SMALLEST_OF_UNIT = {"ns": Decimal(10) ** 17, "us": Decimal(10) ** 14, "ms": Decimal(10) ** 11, "s": Decimal(0)}
+# Poses farther apart than this are of no use to a calibration: rather the unit has been mistaken.
+_LONGEST_INTERVAL_S = 10
+
+# Last parts of column names, lower case, words joined by underscores; exports of bags have whole paths such as .pose.pose.position.x.
+_ALIASES = {
+    "t": ("t", "time", "timestamp", "timestamps", "stamp", "gpstime", "header_stamp"),
+    "x": ("x", "tx", "px", "p_x", "pos_x", "position_x", "translation_x", "p_rs_r_x", "easting"),
+    "y": ("y", "ty", "py", "p_y", "pos_y", "position_y", "translation_y", "p_rs_r_y", "northing"),
+    "z": ("z", "tz", "pz", "p_z", "pos_z", "position_z", "translation_z", "p_rs_r_z", "altitude"),
+    **{f"q{axis}": (f"q{axis}", f"q_{axis}", f"quat_{axis}", f"quaternion_{axis}", f"rot_{axis}", f"orientation_{axis}",
+                    f"rotation_{axis}", f"q_rs_{axis}") for axis in "xyzw"},
+    "secs": ("header_stamp_secs", "header_stamp_sec", "stamp_secs", "stamp_sec", "secs", "sec"),
+    "nsecs": ("header_stamp_nsecs", "header_stamp_nanosec", "stamp_nsecs", "stamp_nanosec", "nsecs", "nanosec"),
+}  # fmt: skip
 
 
-def read_trajectory(path, format="tum"):
-    """Read a trajectory from a file.
+def read_trajectory(path, format="tum", *, topic=None, tf=None, columns=None, times=None, stamp_unit=None, repair=False):
+    """Read a trajectory from a text file, or from a bag where ``topic`` or ``tf`` is given.
 
     Parameters
     ----------
     path : str or path-like
     format : str
-        "tum".
+        "tum", "kitti", "euroc" or "csv"; see the module's table.
+    topic : str, optional
+        Of a bag: the topic of the poses. No other option goes with it.
+    tf : str, optional
+        Of a bag: the two frames, ``world:sensor``, whose transform is the trajectory, from ``/tf`` and ``/tf_static``.
+    columns : str, optional
+        For csv without a header: the columns' names, such as ``"t,x,y,z,qw,qx,qy,qz"``. Other names are columns to skip.
+    times : str or path-like, optional
+        For kitti: the file of the stamps.
+    stamp_unit : str, optional
+        "s", "ms", "us" or "ns"; recognised from the stamps' size or taken from the header (``timestamp [ns]``) where left out.
+    repair : bool
+        Sort poses that are out of order and drop those with a stamp that is there already, with a ``UserWarning`` that says how
+        many; otherwise they are an error.
 
     Returns
     -------
     Trajectory
-        Stamps are exactly the decimal numbers of the file, in nanoseconds; frame names are empty.
+        Stamps are exactly the decimal numbers of the file, in nanoseconds; frame names are empty, from a bag those of the messages.
 
     Raises
     ------
     InputError
         Where the file cannot be read or a line cannot be used; the message names file, line and what was found.
     ConfigError
-        For a format that is not known.
+        For a format or unit that is not known, and options that do not go together.
     """
-    return _format(format)[0](path)
+    if topic or tf:
+        if (format, columns, times, stamp_unit, repair) != ("tum", None, None, None, False) or (topic and tf):
+            raise ConfigError("topic and tf are for bags: give one of them and none of the options of text files")
+        from hand_eye_calib.io.bags import read_bag_trajectory
+
+        trajectory, notes = read_bag_trajectory(path, topic, tf)
+    else:
+        trajectory, notes = read_trajectory_file(path, format, columns, times, stamp_unit, repair)
+    for text in notes:
+        warnings.warn(text, UserWarning, stacklevel=2)
+    return trajectory
+
+
+def read_trajectory_file(path, format="tum", columns=None, times=None, stamp_unit=None, repair=False):
+    """As :func:`read_trajectory` for text files, but what a person should know is returned: (Trajectory, list of str)."""
+    if stamp_unit is not None and stamp_unit not in STAMP_UNITS:
+        raise ConfigError(f"unknown unit of stamps {stamp_unit!r}; known are {', '.join(STAMP_UNITS)}")
+    if format not in FORMATS:
+        raise ConfigError(f"unknown trajectory format {format!r}; known are {', '.join(FORMATS)}")
+    if columns is not None and format != "csv":
+        raise ConfigError(f"columns are named for format csv only; the format is {format}")
+    if times is not None and format != "kitti":
+        raise ConfigError(f"a file of times belongs to format kitti only; the format is {format}")
+    table = _READERS[format](path, *((columns,) if format == "csv" else (times,) if format == "kitti" else ()))
+    if not table.stamps:
+        raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
+    stamps_ns = _to_ns(path, table, stamp_unit)
+    positions, quats_xyzw = _poses(path, table)
+    keep, notes = _ordered(path, table, stamps_ns, repair)
+    return Trajectory.from_quat_xyzw(stamps_ns[keep], positions[keep], quats_xyzw[keep]), notes
 
 
 def write_trajectory(path, trajectory, format="tum"):
@@ -56,9 +132,11 @@ def write_trajectory(path, trajectory, format="tum"):
     InputError
         Where the file cannot be written.
     ConfigError
-        For a format that is not known.
+        For any other format.
     """
-    text = _format(format)[1](trajectory)
+    if format != "tum":
+        raise ConfigError(f"trajectories are written in format tum; got {format!r}")
+    text = _tum_text(trajectory)
     try:
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
@@ -66,88 +144,283 @@ def write_trajectory(path, trajectory, format="tum"):
         raise InputError(f"cannot write {path}: {error.strerror}") from None
 
 
-def _format(name):
-    if name not in _FORMATS:
-        raise ConfigError(f"unknown trajectory format {name!r}; known are {', '.join(_FORMATS)}")
-    return _FORMATS[name]
+@dataclass
+class _Table:
+    """What the lines of a file say; stamps and values row by row, the values in the format's own order.
+
+    ``stamps`` are Decimal in ``unit``, or in a unit to be recognised where that is empty.
+    """
+
+    expected: str
+    unit: str = ""
+    matrices: bool = False
+    line_numbers: list = field(default_factory=list)
+    stamps: list = field(default_factory=list)
+    values: list = field(default_factory=list)
+
+
+# ---- formats
 
 
 def _read_tum(path):
-    line_numbers, stamps_ns, values = [], [], []
-    for number, line in enumerate(_lines(path), start=1):
+    table = _Table(f"8 numbers, {_TUM_COLUMNS}")
+    for number, line in _data_lines(path, table.expected):
         fields = line.split()
-        if not fields or fields[0].startswith("#"):
-            continue
         if len(fields) != 8:
+            raise _unexpected(path, number, table.expected, line, len(fields))
+        _add(path, table, number, fields[0], fields[1:])
+    return table
+
+
+def _read_euroc(path):
+    table = _Table(_EUROC_COLUMNS, unit="ns")
+    for number, line in _data_lines(path, table.expected):
+        fields = [cell.strip() for cell in line.split(",")]
+        if len(fields) < 8:
+            raise _unexpected(path, number, f"8 numbers or more, {table.expected}", line, len(fields))
+        qw, qx, qy, qz = fields[4:8]
+        _add(path, table, number, fields[0], [*fields[1:4], qx, qy, qz, qw])
+    return table
+
+
+def _read_kitti(path, times):
+    table = _Table("12 numbers, the first three rows of a pose", matrices=True)
+    if times is None:
+        raise ConfigError(f"{path}: the poses of format kitti have no stamps; name their file with times (--times)")
+    stamps = list(_data_lines(times, "stamps"))
+    for index, (number, line) in enumerate(_data_lines(path, table.expected)):
+        fields = line.split()
+        if len(fields) != 12:
+            raise _unexpected(path, number, table.expected, line, len(fields))
+        _add(path, table, number, stamps[index][1].strip() if index < len(stamps) else "0", fields)
+    if len(stamps) != len(table.values):
+        raise InputError(
+            f"{path}: {len(table.values)} poses, but {times} has {len(stamps)} stamps; they belong to different drives"
+        )
+    return table
+
+
+def _read_csv(path, columns):
+    lines = [(number, line) for number, line in enumerate(_lines(path, "a table"), start=1) if line.strip()]
+    if columns is None:
+        names, lines = _header(path, lines)
+    else:
+        names, unit = [name.strip() for name in columns.split(",")], ""
+    lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
+    chosen = _choose(path, names)
+    unit = _unit_in(names[chosen["t"]]) if "t" in chosen else "ns"
+    table = _Table(f"{len(names)} columns: {', '.join(names)}", unit=unit)
+    for number, line in lines:
+        cells = _cells(line)
+        if len(cells) != len(names):
+            raise _unexpected(path, number, table.expected, line, len(cells))
+        row = {name: cells[index] for name, index in chosen.items()}
+        stamp = row["t"] if "t" in row else _joined(path, number, row["secs"], row["nsecs"])
+        _add(path, table, number, stamp, [row[name] for name in _POSE_NAMES[1:]])
+    return table
+
+
+_READERS = {"tum": _read_tum, "kitti": _read_kitti, "euroc": _read_euroc, "csv": _read_csv}
+
+
+def _header(path, lines):
+    """Names in the first line that is not a number table's, and the lines after it."""
+    if not lines:
+        return list(_POSE_NAMES), []
+    names = _cells(lines[0][1].lstrip().lstrip("#"))
+    if all(_is_number(name) for name in names if name):
+        raise InputError(
+            f"{path}: the first line names no columns, so the order of the quaternion is unknown; name them with columns "
+            f"(--columns), such as t,x,y,z,qx,qy,qz,qw; there are {len(names)}"
+        )
+    return names, lines[1:]
+
+
+def _choose(path, names):
+    """Where the stamp and the pose are among the columns."""
+    plain = [_plain(name) for name in names]
+    chosen = {}
+    for wanted, aliases in _ALIASES.items():
+        found = [index for index, name in enumerate(plain) if name in aliases]
+        # Of paths, the longest end that is known: position_x rather than x.
+        found = found or [
+            index for index, name in enumerate(plain) if any(name.endswith("_" + end) for end in aliases if "_" in end)
+        ]
+        if len(found) > 1:
             raise InputError(
-                f"{path}, line {number}: expected 8 numbers, {_TUM_COLUMNS}; found {len(fields)}: {_shortened(line)}"
+                f"{path}: columns {', '.join(names[index] for index in found)} could all be {wanted}; name them with columns"
             )
-        try:
-            stamps_ns.append(_nanoseconds(fields[0]))
-            values.extend(map(float, fields[1:]))
-        except ValueError as error:
-            raise InputError(f"{path}, line {number}: expected 8 numbers, {_TUM_COLUMNS}; {error}") from None
-        line_numbers.append(number)
-    if not stamps_ns:
-        raise InputError(f"{path}: no poses in it; expected lines of {_TUM_COLUMNS}")
-    stamps_ns, values = np.array(stamps_ns, dtype=np.int64), np.array(values).reshape(-1, 7)
-    _check(path, line_numbers, stamps_ns, values)
-    return Trajectory.from_quat_xyzw(stamps_ns, values[:, :3], values[:, 3:])
+        if found:
+            chosen[wanted] = found[0]
+    if {"secs", "nsecs"} <= chosen.keys():
+        chosen.pop("t", None)  # the stamp of the message's header rather than the time of its arrival
+    needed = set(_POSE_NAMES) - ({"t"} if {"secs", "nsecs"} <= chosen.keys() else set())
+    missing = [name for name in _POSE_NAMES if name in needed - chosen.keys()]
+    if missing:
+        raise InputError(
+            f"{path}: no column for {', '.join(missing)} among {', '.join(names)}; name all columns with columns (--columns), such as "
+            "t,x,y,z,qw,qx,qy,qz"
+        )
+    return {name: index for name, index in chosen.items() if name in needed or name in ("secs", "nsecs")}
 
 
-def _lines(path):
+def _plain(name):
+    """A column's name without its unit: ``.pose.position.x [m]`` to ``pose_position_x``."""
+    name = re.sub(r"\[.*?\]|\(.*?\)", "", name).strip().lower()
+    name = re.sub(r"[^a-z0-9]+", "_", name).strip("_")
+    return re.sub(r"_(s|ms|us|ns)$", "", name) if name.startswith(("t_", "time", "stamp")) else name
+
+
+def _unit_in(name):
+    """Unit of the stamps in a column's name, empty where it has none."""
+    found = re.search(r"[\[(]\s*(s|ms|us|ns)\s*[\])]\s*$|^\W*(?:t|time|timestamp|stamp)_(s|ms|us|ns)$", name.strip().lower())
+    return (found[1] or found[2]) if found else ""
+
+
+def _cells(line):
+    if "," not in line and ";" not in line:
+        return line.split()
+    reader = csv.reader([line], delimiter="," if "," in line else ";", skipinitialspace=True)
+    return [cell.strip() for cell in next(reader)]
+
+
+def _joined(path, number, secs, nsecs):
+    """Nanoseconds of a stamp in two columns."""
+    if not (re.fullmatch(r"-?\d+", secs) and re.fullmatch(r"\d{1,9}", nsecs)):
+        raise InputError(f"{path}, line {number}: expected whole seconds and nanoseconds; found {secs!r} and {nsecs!r}")
+    return str(int(secs) * _NS_PER_S + int(nsecs))
+
+
+# ---- lines and numbers
+
+
+def _lines(path, expected):
     try:
-        with open(path, encoding="utf-8-sig") as file:
+        with open(path, encoding="utf-8-sig", newline=None) as file:
             return file.read().splitlines()
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; expected lines of {_TUM_COLUMNS}") from None
+        raise InputError(f"{path}: not a text file; expected lines of {expected}") from None
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
 
 
-def _nanoseconds(text):
-    """Seconds as decimal text to whole nanoseconds, with no binary floating point in between."""
+def _data_lines(path, expected):
+    """Line numbers, from 1, and lines that are neither empty nor comments."""
+    for number, line in enumerate(_lines(path, expected), start=1):
+        stripped = line.strip()
+        if stripped and not stripped.startswith("#"):
+            yield number, line
+
+
+def _unexpected(path, number, expected, line, found):
+    shortened = line if len(line) <= 60 else line[:60] + "..."
+    return InputError(f"{path}, line {number}: expected {expected}; found {found}: {shortened!r}")
+
+
+def _add(path, table, number, stamp, values):
     try:
-        seconds = Decimal(text)
+        table.stamps.append(_decimal(stamp))
+        table.values.append([float(value) for value in values])
+    except ValueError as error:
+        raise InputError(f"{path}, line {number}: expected {table.expected}; {error}") from None
+    table.line_numbers.append(number)
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _decimal(text):
+    """A stamp as it is written, with no binary floating point in between."""
+    try:
+        stamp = Decimal(text)
     except InvalidOperation:
-        seconds = Decimal("nan")
-    if not seconds.is_finite():
+        stamp = Decimal("nan")
+    if not stamp.is_finite() or stamp.adjusted() > 30:
         raise ValueError(f"found {text!r} for the timestamp")
-    if not -_LARGEST_S <= seconds <= _LARGEST_S:
-        raise ValueError(f"the timestamp must be in seconds, found {text!r}; divide milli-, micro- or nanoseconds first")
-    return int((seconds * _NS_PER_S).to_integral_value())
+    return stamp
 
 
-def _check(path, line_numbers, stamps_ns, values):
-    """What Trajectory would refuse too, but here the line in the file can be named."""
+def _to_ns(path, table, stamp_unit):
+    """Stamps in nanoseconds, in the unit that is given, that the format has, or that their size tells."""
+    unit = stamp_unit or table.unit
+    largest = max(map(abs, table.stamps))
+    recognised = unit or next(unit for unit, smallest in _SMALLEST_OF_UNIT.items() if largest >= smallest)
+    if largest > Decimal(_LARGEST_NS) / STAMP_UNITS[recognised]:
+        index = max(range(len(table.stamps)), key=lambda index: abs(table.stamps[index]))
+        raise InputError(
+            f"{path}, line {table.line_numbers[index]}: the timestamp {table.stamps[index]:.6g} is too large for {recognised}; "
+            "name its unit with stamp_unit (--stamp-unit)"
+        )
+    stamps_ns = np.array([int((stamp * STAMP_UNITS[recognised]).to_integral_value()) for stamp in table.stamps], dtype=np.int64)
+    interval_s = float(np.median(np.abs(np.diff(stamps_ns)))) * 1e-9 if len(stamps_ns) > 1 else 0.0
+    is_whole = all(stamp == stamp.to_integral_value() for stamp in table.stamps)  # with a fraction, they are in seconds
+    if not unit and is_whole and interval_s > _LONGEST_INTERVAL_S:
+        raise InputError(
+            f"{path}: the unit of the timestamps is unclear; read as {recognised}, the poses are {interval_s:.4g} s apart; "
+            "name it with stamp_unit (--stamp-unit): s, ms, us or ns"
+        )
+    return stamps_ns
+
+
+def _poses(path, table):
+    """Positions (N, 3) and quaternions (N, 4), scalar last; what Trajectory would refuse too, but here the line can be named."""
+    values = np.array(table.values)
 
     def refuse(wrong, message):
         index = int(np.argmax(wrong))
         if wrong[index]:
-            raise InputError(f"{path}, line {line_numbers[index]}: {message(index)}")
+            raise InputError(f"{path}, line {table.line_numbers[index]}: {message(index)}")
 
     refuse(
         ~np.isfinite(values).all(axis=1), lambda index: "found a value that is not finite; remove the line or repair its source"
     )
+    if table.matrices:
+        matrices = values.reshape(-1, 3, 4)
+        rotations = matrices[:, :, :3]
+        deviation = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+        refuse(
+            (deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotations) < 0),
+            lambda index: f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check what the numbers are",
+        )
+        return matrices[:, :, 3], Rotation.from_matrix(rotations).as_quat()
     norms = np.linalg.norm(values[:, 3:], axis=1)
     refuse(
         np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE,
         lambda index: (
             f"found a quaternion of length {norms[index]:.4g}, expected 1 within {QUATERNION_NORM_TOLERANCE}; "
-            f"check the column order ({_TUM_COLUMNS})"
+            f"check the column order ({table.expected})"
         ),
     )
-    refuse(
-        np.diff(stamps_ns, prepend=stamps_ns[0] - 1) <= 0,
-        lambda index: (
-            f"timestamps must increase, found {_seconds(stamps_ns[index])} after {_seconds(stamps_ns[index - 1])}; "
-            "sort the lines and drop repeated timestamps"
-        ),
-    )
+    return values[:, :3], values[:, 3:]
 
 
-def _shortened(line, length=60):
-    return repr(line if len(line) <= length else line[:length] + "...")
+def _ordered(path, table, stamps_ns, repair):
+    """Indices of the poses in the order of time, and what was repaired for that."""
+    wrong = np.diff(stamps_ns, prepend=stamps_ns[0] - 1) <= 0
+    if not wrong.any():
+        return np.arange(len(stamps_ns)), []
+    if not repair:
+        index = int(np.argmax(wrong))
+        raise InputError(
+            f"{path}, line {table.line_numbers[index]}: timestamps must increase, found {_seconds(stamps_ns[index])} after "
+            f"{_seconds(stamps_ns[index - 1])}; {int(wrong.sum())} such lines; "
+            "sort the lines and drop repeated timestamps, or have that done with repair (--repair-stamps)"
+        )
+    order = np.argsort(stamps_ns, kind="stable")
+    repeated = np.diff(stamps_ns[order], prepend=stamps_ns[order[0]] - 1) == 0
+    backward = int((np.diff(stamps_ns) < 0).sum())
+    return order[~repeated], [
+        f"{path}: stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted; "
+        f"{int(repeated.sum())} with a stamp that was there already were dropped"
+    ]
+
+
+# ---- writing
 
 
 def _tum_text(trajectory):
@@ -161,6 +434,3 @@ def _tum_text(trajectory):
 def _seconds(stamp_ns):
     seconds, nanoseconds = divmod(abs(int(stamp_ns)), _NS_PER_S)
     return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
-
-
-_FORMATS = {"tum": (_read_tum, _tum_text)}

@@ -52,7 +52,11 @@ def motion_pairs(Ts_pw_p, Ts_cw_c, reference="B1"):
     """
     if len(Ts_pw_p) != len(Ts_cw_c):
         raise InputError(f"parent and child need the same number of poses; found {len(Ts_pw_p)} and {len(Ts_cw_c)}")
-    i, j = reference_indices(reference, len(Ts_pw_p))
+    return pairs_between(Ts_pw_p, Ts_cw_c, *reference_indices(reference, len(Ts_pw_p)))
+
+
+def pairs_between(Ts_pw_p, Ts_cw_c, i, j):
+    """MotionPairs from the instants i to the instants j, (K,) int arrays."""
     return MotionPairs(_relative(Ts_pw_p, i, j), _relative(Ts_cw_c, i, j), i, j)
 
 

@@ -37,12 +37,8 @@ class PosePairs:
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)))
 
     @classmethod
-    def concatenate(cls, first, second):
-        return cls(
-            np.concatenate([first.stamps_ns, second.stamps_ns]),
-            np.concatenate([first.Ts_pw_p, second.Ts_pw_p]),
-            np.concatenate([first.Ts_cw_c, second.Ts_cw_c]),
-        )
+    def concatenate(cls, *parts):
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("stamps_ns", "Ts_pw_p", "Ts_cw_c")))
 
 
 def slower_stream(parent: Trajectory, child: Trajectory):

@@ -25,6 +25,8 @@ class Parameters:
     node : rclpy.node.Node
     qos_names : iterable of str
         Names of the QoS override parameters that the node's subscriptions will declare.
+    check : callable
+        ``check(NodeConfig)`` raises ConfigError for options that cannot be had.
     on_change : callable
         Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the new options by then.
 
@@ -41,15 +43,17 @@ class Parameters:
         Where a given value is of the wrong type or out of range.
     """
 
-    def __init__(self, node, qos_names, on_change):
+    def __init__(self, node, qos_names, on_change, check=lambda options: None):
         given = _take_overrides(node)
         self.unknown = [_unknown(name) for name in given if name not in FIELDS and name not in qos_names]
         self._values = {
             name: _start_value(field, given[name]) if name in given else field.default for name, field in FIELDS.items()
         }
         self.calibrator, self.node = _configs(self._values)
+        check(self.node)
+        self._check_node = check
         for name, field in FIELDS.items():
-            node.declare_parameter(name, self._values[name], _descriptor(field))
+            node.declare_parameter(name, self._values[name], _descriptor(field), ignore_override=True)  # it is in the value
         self._on_change = on_change
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
@@ -60,7 +64,8 @@ class Parameters:
 
     def _check(self, parameters):
         try:
-            _configs(self._proposed(parameters))
+            _, node = _configs(self._proposed(parameters))
+            self._check_node(node)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -98,6 +103,8 @@ def _start_value(field, value):
     # ROS parameters have fixed types: rclpy refuses an integer for a double, and so does `ros2 param set`.
     if isinstance(field.default, float) and type(value) is int and not _dynamic(field):
         raise ConfigError(f"{option_name(field)} must be a double; got the integer {value}: write {value}.0")
+    if value is False and "off" in (field.metadata["choices"] or ()):
+        value = "off"  # which is what YAML makes of an off without quotes
     return check_value(field, value)
 
 

@@ -20,6 +20,9 @@ from hand_eye_calib.ros.calibrator_node import CalibratorNode
 # How long a running solve may hold up the end of the program.
 SOLVE_GRACE_S = 0.5
 
+# How long the solver may keep the interpreter from a message that waits (s). Python's own 5 ms are asked for several times a message.
+_SWITCH_INTERVAL_S = 0.0005
+
 
 def run(arguments, signals):
     """Run the node until ``signals``, a file descriptor, becomes readable; returns the exit code."""
@@ -51,6 +54,7 @@ def _init(arguments):
 def _run_node(signals):
     # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
     executor = SingleThreadedExecutor()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     node = None
     try:
         node = CalibratorNode()
@@ -64,7 +68,7 @@ def _run_node(signals):
         traceback.print_exc()
         code = 1
     executor.shutdown()
-    if node is not None and not node.stop(SOLVE_GRACE_S):
+    if node is not None and not _stopped(node):
         # A solver deep in native code would abort the interpreter's own way out.
         sys.stdout.flush()
         sys.stderr.flush()
@@ -73,6 +77,15 @@ def _run_node(signals):
         node.destroy_node()
     rclpy.try_shutdown()
     return code
+
+
+def _stopped(node):
+    """Whether the node has ended all it does; a failure to save is reported there."""
+    try:
+        return node.stop(SOLVE_GRACE_S)
+    except Exception:
+        traceback.print_exc()
+        return False
 
 
 def _spin(executor, signals):

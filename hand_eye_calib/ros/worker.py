@@ -2,16 +2,22 @@
 
 import queue
 import threading
+import time
 from dataclasses import dataclass
 
+from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.calibrator import Snapshot
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a solve ended: with a calibration or with an exception."""
+    """How a solve of a snapshot ended, after how many seconds: with a calibration or with an exception."""
 
     session: int
+    snapshot: Snapshot
+    seconds: float
+    seen: Excitation | None = None
     calibration: Calibration | None = None
     error: Exception | None = None
 
@@ -42,6 +48,11 @@ class SolveWorker:
         """The next outcome, after ``on_done`` has announced it."""
         return self._outcomes.get()
 
+    def rest(self):
+        """Outcomes that nobody has taken."""
+        while not self._outcomes.empty():
+            yield self._outcomes.get()
+
     def stop(self, timeout_s):
         """Ask the thread to end and wait for it; True when it has ended."""
         self._stopping.set()
@@ -57,7 +68,10 @@ class SolveWorker:
 
 
 def _solve(session, snapshot):
+    start, seen, calibration, failure = time.monotonic(), None, None, None
     try:
-        return Outcome(session, calibration=snapshot.estimate())
+        seen = excitation(snapshot.pose_pairs())
+        calibration = snapshot.estimate()
     except Exception as error:  # handed to the executor's thread, which reports it
-        return Outcome(session, error=error)
+        failure = error
+    return Outcome(session, snapshot, time.monotonic() - start, seen, calibration, failure)

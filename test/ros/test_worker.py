@@ -4,6 +4,7 @@ import threading
 
 import pytest
 
+from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.ros.worker import SolveWorker
 
 
@@ -12,6 +13,7 @@ class Work:
 
     def __init__(self, estimate):
         self.estimate = estimate
+        self.pose_pairs = PosePairs.empty
 
 
 @pytest.fixture

@@ -1,6 +1,8 @@
 """The command line: what it prints where, its exit codes, and one line for everything that is wrong with the input."""
 
 import dataclasses
+import hashlib
+import io
 import json
 import os
 import re
@@ -181,10 +183,19 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     out_dir = tmp_path / "result"
     code, text, err = run("replay", new_bag(), *TOPICS, "--out", out_dir)
     assert (code, err) == (0, f"hand_eye_calib: note: wrote {out_dir / 'extrinsic.yaml'}\n")
+    assert sorted(path.name for path in out_dir.iterdir()) == [
+        "extrinsic.urdf.xacro",
+        "extrinsic.yaml",
+        "static_transform.launch.py",
+    ]
     assert run("info", out_dir) == (0, text, "")
     document = json.loads(run("info", out_dir / "extrinsic.yaml", "--json")[1])
     assert document == load_result(out_dir).to_dict()
-    assert yaml.safe_load((out_dir / "extrinsic.yaml").read_text())["provenance"]["inputs"]["child"]["topic"] == CHILD_TOPIC
+    provenance = yaml.safe_load((out_dir / "extrinsic.yaml").read_text())["provenance"]
+    assert provenance["inputs"]["child"]["topic"] == CHILD_TOPIC
+    (file,) = provenance["inputs"]["files"]
+    assert file["sha256"] == hashlib.sha256(Path(file["file"]).read_bytes()).hexdigest()
+    assert provenance["parameters"]["method"] == "dnlo"
 
 
 def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
@@ -239,7 +250,7 @@ def test_missing_bag(refused, tmp_path):
     assert f"no bag at {tmp_path / 'absent'}" in refused("replay", tmp_path / "absent", *TOPICS)
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "rosbag1"])
+@pytest.mark.parametrize("storage", ["sqlite3", "rosbag1"])
 def test_bag_cut_in_half(refused, new_bag, storage):
     path = Path(new_bag(storage=storage))
     file = path if path.is_file() else next(part for part in path.iterdir() if part.suffix != ".yaml")
@@ -602,11 +613,24 @@ def test_what_takes_a_while_is_shown_on_a_terminal_and_wiped_out(monkeypatch, ca
     assert capsys.readouterr().err == "\r\033[K"
 
 
-def test_progress_is_silent_at_first_and_cleans_up_after_itself(monkeypatch, capsys):
+def test_progress_is_silent_at_first_and_shows_share_rate_and_time_left(monkeypatch, capsys):
     assert list(with_progress(range(3), 3, "reading")) == [0, 1, 2]
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    clock = iter([0.0, 1.9, 2.0, 2.0, 2.1, 2.3, 2.3])
-    monkeypatch.setattr("hand_eye_calib.cli.console.time.monotonic", lambda: next(clock))
-    assert list(with_progress(range(4), 4, "reading")) == [0, 1, 2, 3]
-    assert capsys.readouterr().err == "\rreading:  25%\rreading:  75%\r\033[K"
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    clock = iter([0.0, *[0.1] * 5, *[2.5] * 5, *[3.0] * 10])
+    monkeypatch.setattr("hand_eye_calib.cli.console.time.monotonic", lambda: next(clock, 3.0))
+    items = with_progress(range(20), 20, "reading")
+    assert [next(items) for _ in range(5)] == [0, 1, 2, 3, 4]
+    assert terminal.getvalue() == ""
+    assert [next(items) for _ in range(10)] == list(range(5, 15))
+    assert list(items) == [15, 16, 17, 18, 19]
+    shown = terminal.getvalue()
+    assert re.search(r"reading.*\b\d+%.*\d/s.*(\d:\d\d:\d\d|-:--:--)", shown), shown
+    assert "\x1b[2K" in shown.rpartition("reading")[2]  # wiped out

@@ -21,7 +21,9 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 
 # Library imported: (requirement in setup.py, key in package.xml); None where that side has no say, as with pip and launch.
 DECLARED_AS = {
+    "dask": ("distributed", None),  # optional, for replay --batch --dask alone
     "casadi": ("casadi", "casadi-pip"),
+    "jinja2": ("jinja2", "python3-jinja2"),
     "matplotlib": ("matplotlib", "python3-matplotlib"),
     "numpy": ("numpy", "python3-numpy"),
     "rich": ("rich", "python3-rich"),
@@ -97,7 +99,7 @@ def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
     assert {"numpy", "scipy", "rclpy"} <= imported
     for name in imported:
         pip_name, rosdep_key = DECLARED_AS[name]
-        assert rosdep_key in keys, f"{name} is imported; package.xml lacks <exec_depend>{rosdep_key}</exec_depend>"
+        assert rosdep_key is None or rosdep_key in keys, f"{name} is imported; package.xml lacks <exec_depend>{rosdep_key}</exec_depend>"
         assert pip_name is None or pip_name in requirements, f"{name} is imported; setup.py does not require {pip_name}"
 
 
@@ -159,6 +161,7 @@ def test_pip_install_gives_the_commands(source, tmp_path):
     assert not (target / "lib" / PACKAGE).exists()
     where = run([sys.executable, "-c", "import hand_eye_calib; print(hand_eye_calib.__file__)"], env=environment, cwd=tmp_path)
     assert Path(where.stdout.strip()).is_relative_to(site)
+    assert (site / PACKAGE / "report" / "templates" / "report.html").is_file()
     assert "usage: hand_eye_calib" in run([target / "bin" / PACKAGE, "--help"], env=environment, cwd=tmp_path).stdout
     assert "usage: hand_eye_calib replay" in run([target / "bin" / "replay", "--help"], env=environment, cwd=tmp_path).stdout
     version = run([sys.executable, "-m", PACKAGE, "--version"], env=environment, cwd=tmp_path).stdout

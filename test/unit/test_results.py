@@ -1,9 +1,12 @@
 """Saved calibrations come back to the last bit, and what cannot be one is refused."""
 
+import ast
 import dataclasses
+import hashlib
 import json
 import os
 import stat
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -12,8 +15,9 @@ import yaml
 from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.results import load_result, save_result
+from hand_eye_calib.io.results import fingerprint, load_result, save_result
 
+FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -74,12 +78,16 @@ def test_numpy_numbers_can_be_saved(tmp_path):
 
 
 def test_the_file_says_where_it_came_from(tmp_path):
-    document = yaml.safe_load(save_result(calibration(), tmp_path, {"bag": "drive", "messages": 7}).read_text(encoding="utf-8"))
+    inputs = {"bag": "drive", "messages": 7, "options": {"method": "dnl"}}
+    document = yaml.safe_load(save_result(calibration(), tmp_path, inputs).read_text(encoding="utf-8"))
     assert (document["format"], document["version"]) == ("hand_eye_calib/extrinsic", 1)
     provenance = document["provenance"]
     assert provenance["inputs"] == {"bag": "drive", "messages": 7}
     assert provenance["package"] == "hand_eye_calib"
     assert provenance["package_version"]
+    assert provenance["parameters"] == {"method": "dnl"}
+    assert provenance["versions"]["numpy"] == np.__version__
+    assert provenance["versions"].keys() == {"python", "numpy", "scipy"}
     assert provenance["created"].endswith("+00:00")
 
 
@@ -90,11 +98,62 @@ def test_both_directions_are_in_the_file_by_name(tmp_path):
     np.testing.assert_allclose(product, np.eye(4), atol=1e-14)
 
 
+def test_a_fingerprint_is_of_the_whole_file(tmp_path):
+    path = tmp_path / "drive.bag"
+    content = bytes(range(256)) * 5000
+    path.write_bytes(content)
+    assert fingerprint(path) == {"file": str(path), "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    with pytest.raises(InputError, match="cannot read .*absent"):
+        fingerprint(tmp_path / "absent")
+
+
+AWKWARD = {"parent_frame": 'li"dar & <${x}>', "child_frame": "caméra -- 'left' \\ side"}
+
+
+@pytest.mark.parametrize("frames", [{}, AWKWARD])
+def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path, frames):
+    written = calibration(**frames)
+    save_result(written, tmp_path)
+    root = ElementTree.parse(tmp_path / "extrinsic.urdf.xacro").getroot()
+    (joint,) = root
+    assert (root.tag, joint.tag, joint.get("type")) == ("robot", "joint", "fixed")
+    assert joint.find("parent").get("link").replace("$$", "$") == written.parent_frame
+    assert joint.find("child").get("link") == written.child_frame
+    xyz, rpy = (np.array(joint.find("origin").get(name).split(), dtype=float) for name in ("xyz", "rpy"))
+    roll, pitch, yaw = (se3.rotation_exp(angle * axis) for angle, axis in zip(rpy, np.eye(3), strict=True))
+    np.testing.assert_allclose(yaw @ pitch @ roll, written.T_parent_child[:3, :3], atol=1e-12)  # as URDF defines rpy
+    np.testing.assert_array_equal(xyz, written.T_parent_child[:3, 3])
+
+
+@pytest.mark.parametrize("frames", [{}, AWKWARD])
+def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path, frames):
+    written = calibration(**frames)
+    save_result(written, tmp_path)
+    text = (tmp_path / "static_transform.launch.py").read_text(encoding="utf-8")
+    compile(text, "static_transform.launch.py", "exec")
+    calls = {node.func.id: node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)}
+    assert set(calls) == {"LaunchDescription", "Node"}
+    node = {keyword.arg: ast.literal_eval(keyword.value) for keyword in calls["Node"].keywords}
+    assert (node["package"], node["executable"]) == ("tf2_ros", "static_transform_publisher")
+    options = dict(zip(node["arguments"][::2], node["arguments"][1::2], strict=True))
+    assert (options.pop("--frame-id"), options.pop("--child-frame-id")) == (written.parent_frame, written.child_frame)
+    values = [float(options.pop(f"--{name}")) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    assert options == {}
+    np.testing.assert_allclose(se3.from_quat_xyzw(values[:3], values[3:]), written.T_parent_child, atol=1e-11)
+
+
+@pytest.mark.parametrize(("status", "said"), [("ok", False), ("unobservable", True), ("not_converged", True)])
+def test_files_for_robots_warn_of_a_result_that_is_not_good(tmp_path, status, said):
+    save_result(calibration(status=SolveStatus(status)), tmp_path)
+    for name in ("extrinsic.urdf.xacro", "static_transform.launch.py"):
+        assert ("DO NOT USE AS IT IS" in (tmp_path / name).read_text(encoding="utf-8")) is said
+
+
 def test_saving_again_replaces_the_file_and_leaves_nothing_else(tmp_path):
     save_result(calibration(), tmp_path)
     path = save_result(calibration(objective=2.0), tmp_path)
     assert load_result(path).objective == 2.0
-    assert os.listdir(tmp_path) == ["extrinsic.yaml"]
+    assert sorted(os.listdir(tmp_path)) == FILES
 
 
 def test_a_write_that_fails_keeps_the_old_file(tmp_path, monkeypatch):
@@ -105,10 +164,10 @@ def test_a_write_that_fails_keeps_the_old_file(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError, match=r"cannot write .*extrinsic\.yaml: No space left on device"):
+    with pytest.raises(InputError, match=r"cannot write .*extrinsic\.urdf\.xacro: No space left on device"):
         save_result(calibration(objective=2.0), tmp_path)
     assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["extrinsic.yaml"]
+    assert sorted(os.listdir(tmp_path)) == FILES
 
 
 def test_the_file_has_ordinary_permissions(tmp_path):

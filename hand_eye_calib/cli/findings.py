@@ -1,0 +1,44 @@
+"""The stream checks beside a calibration, and as a table."""
+
+import dataclasses
+import textwrap
+
+from hand_eye_calib.assessment.agreement import check_streams
+from hand_eye_calib.pairing.stream_checks import Severity
+
+_MARKS = {Severity.ERROR: "ERROR", Severity.WARNING: "WARNING", Severity.NOTE: "note"}
+_WIDTH = 100
+
+
+def with_findings(calibration, parent, child, max_gap_s):
+    """A calibration whose warnings hold what is wrong with its streams, and all findings as plain values.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    parent, child : Trajectory
+        The streams it comes from, as they were read.
+    max_gap_s : float
+    """
+    agreement = check_streams(parent, child, calibration.time_offset_s, calibration.scale, max_gap_s)
+    grave = [str(finding) for finding in agreement.findings if finding.severity is not Severity.NOTE]
+    calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *grave))
+    return calibration, [finding.to_dict() for finding in agreement.findings]
+
+
+def table(findings):
+    """Findings as text for a terminal, the gravest first."""
+    if not findings:
+        return "No findings: nothing speaks against calibrating with these streams."
+    lines = []
+    for finding in findings:
+        head = f"{_MARKS[finding.severity]:<8} {finding.code:<17} {finding.stream:<7} {finding.confidence.value:<9} "
+        body = textwrap.wrap(finding.what, _WIDTH - 4) + textwrap.wrap(f"-> {finding.advice}{_typed(finding)}", _WIDTH - 4)
+        lines += [head.rstrip(), *(f"    {line}" for line in body)]
+    return "\n".join(lines)
+
+
+def _typed(finding):
+    """The options as they are typed."""
+    typed = [f"--{name.replace('_', '-')} {value}" for name, value in finding.options]
+    return f": {' '.join(typed)}" if typed else ""

@@ -1,0 +1,71 @@
+"""Bags of whatever messages a test needs."""
+
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from hand_eye_calib.geometry import se3
+
+JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
+NOETIC.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+NOETIC.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf/msg/tfMessage"))
+TF, PATH = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Path"
+
+
+def header(typestore, stamp_ns, frame):
+    extra = {"seq": 0} if typestore is NOETIC else {}
+    stamp = typestore.types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), 10**9))
+    return typestore.types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **extra)
+
+
+def pose(typestore, matrix, kind="Pose"):
+    """A Pose or Transform of a (4, 4) matrix."""
+    types, translation, quat_xyzw = typestore.types, matrix[:3, 3].tolist(), se3.to_quat_xyzw(matrix).tolist()
+    vector = types["geometry_msgs/msg/Point" if kind == "Pose" else "geometry_msgs/msg/Vector3"](*translation)
+    return types[f"geometry_msgs/msg/{kind}"](vector, types["geometry_msgs/msg/Quaternion"](*quat_xyzw))
+
+
+def tf_message(edges, message_type=TF):
+    """Makes a message of transforms: (stamp, parent, child, matrix) each."""
+
+    def make(typestore):
+        transforms = [
+            typestore.types["geometry_msgs/msg/TransformStamped"](
+                header(typestore, stamp_ns, parent), child, pose(typestore, matrix, "Transform")
+            )
+            for stamp_ns, parent, child, matrix in edges
+        ]
+        return typestore.types[message_type](transforms)
+
+    return make
+
+
+def path_message(stamps_ns, poses, frame="map"):
+    """Makes a nav_msgs/Path."""
+
+    def make(typestore):
+        steps = [
+            typestore.types["geometry_msgs/msg/PoseStamped"](header(typestore, stamp_ns, frame), pose(typestore, matrix))
+            for stamp_ns, matrix in zip(stamps_ns, poses, strict=True)
+        ]
+        return typestore.types[PATH](header(typestore, stamps_ns[-1] if len(stamps_ns) else 0, frame), steps)
+
+    return make
+
+
+def write_messages(path, messages, storage="mcap", mode=None):
+    """Write (bag time, topic, type, make) messages, in the order of bag time; ``mode`` is rosbag2's compression mode."""
+    typestore = NOETIC if storage == "rosbag1" else JAZZY
+    if storage == "rosbag1":
+        writer, serialize = rosbag1.Writer(path), NOETIC.serialize_ros1
+    else:
+        writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+        serialize = JAZZY.serialize_cdr
+        if mode:
+            writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        for bag_ns, topic, message_type, make in sorted(messages, key=lambda message: message[0]):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message_type, typestore=typestore)
+            writer.write(connections[topic], int(bag_ns), serialize(make(typestore), message_type))
+    return path

@@ -1,0 +1,163 @@
+"""Nothing is lost: the node killed, stopped, restarted, and with a disk that fails."""
+
+import hashlib
+import resource
+import signal
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
+
+from hand_eye_calib.io.journal import count_poses, has_session, read_journal
+from hand_eye_calib.io.results import load_result
+
+QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
+
+
+def into(folder, journal="new"):
+    return [f"-p output_directory:={folder}", f"-p journal:={journal}"]
+
+
+def wait_written(peer, folder, poses):
+    """Wait until the journal on disk has so many poses."""
+    journal = folder / "journal"
+    peer.spin_until(lambda: has_session(journal) and count_poses(journal) == poses, f"{poses} poses in the journal")
+
+
+def test_a_killed_session_goes_on_where_it_ended(start_node, peer, tmp_path):
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
+    node = start_node(*QUIET, *into(tmp_path))
+    peer.feed(peer.publishers(), stamps_ns[:60], Ts_pw_p[:60], Ts_cw_c[:60])
+    wait_written(peer, tmp_path, 120)
+    node.process.kill()
+    node.wait()
+
+    again = start_node(*QUIET, *into(tmp_path, "resume"))
+    again.wait_for_log(f"session resumed from {tmp_path / 'journal'}: 120 poses")
+    heard = peer.listen(TransformStamped, "extrinsic")
+    answer = peer.trigger("solve")
+    assert "60 poses" in answer.message
+    assert "camera in lidar" in answer.message
+    peer.spin_until(lambda: heard, "the resumed result")
+    np.testing.assert_allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-6)
+
+
+def test_an_earlier_session_is_kept_aside_once_and_an_empty_one_is_not(start_node, peer, tmp_path):
+    node = start_node(*QUIET, *into(tmp_path))
+    peer.feed(peer.publishers(), *drive(30))
+    wait_written(peer, tmp_path, 60)
+    assert node.stop()[0] == 0
+    for _ in range(2):  # the second finds the empty session of the first
+        node = start_node(*QUIET, *into(tmp_path))
+        assert "no poses" in peer.trigger("solve").message
+        wait_written(peer, tmp_path, 0)
+        assert node.stop()[0] == 0
+        assert count_poses(tmp_path / "journal.previous") == 60
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("journal")) == [
+        "journal",
+        "journal.previous",
+    ]
+    first_log = (tmp_path / "node1.log").read_text()
+    assert "the session before this one (60 poses) is kept in" in first_log
+    assert "rename that folder to journal and start with the parameter journal at resume" in first_log
+
+
+def test_reset_keeps_the_session_aside_too(start_node, peer, tmp_path):
+    start_node(*QUIET, *into(tmp_path))
+    peer.feed(peer.publishers(), *drive(30))
+    wait_written(peer, tmp_path, 60)
+    assert peer.trigger("reset").success
+    wait_written(peer, tmp_path, 0)
+    assert count_poses(tmp_path / "journal.previous") == 60
+
+
+def test_nothing_to_resume_and_a_damaged_journal_begin_a_new_session(start_node, peer, tmp_path):
+    node = start_node(*QUIET, *into(tmp_path, "resume"))
+    node.wait_for_log(f"no session to resume in {tmp_path / 'journal'}: a new one begins")
+    assert node.stop()[0] == 0
+    (segment,) = (tmp_path / "journal").iterdir()
+    segment.write_bytes(b"something else")
+    node = start_node(*QUIET, *into(tmp_path, "resume"))
+    node.wait_for_log("cannot resume: ", "damaged from its first byte", "a damaged session is kept in")
+    wait_written(peer, tmp_path, 0)
+
+
+def test_resume_without_a_directory_is_one_line_and_code_1(start_node):
+    node = start_node("-p journal:=resume")
+    assert node.wait() == 1
+    assert node.log == "calibrator: journal resume needs output_directory: that is where the session to resume is\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_the_newest_result_and_the_whole_journal(start_node, peer, tmp_path, number):
+    node = start_node(*QUIET, *into(tmp_path))
+    peer.solve(peer.publishers(), *drive())
+    code, _ = node.stop(number)
+    assert (code, "Traceback" in node.log) == (0, False), node.log
+    assert f"result saved to {tmp_path}" in node.log
+    np.testing.assert_allclose(load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert count_poses(tmp_path / "journal") == 240
+    assert read_journal(tmp_path / "journal")[2] == 0
+
+
+def test_results_of_an_earlier_session_are_kept_when_they_are_replaced(start_node, peer, tmp_path):
+    node = start_node(*QUIET, *into(tmp_path, "off"))
+    peer.solve(peer.publishers(), *drive())
+    assert node.stop()[0] == 0
+    first = (tmp_path / "extrinsic.yaml").read_bytes()
+    start_node(*QUIET, *into(tmp_path, "off"))
+    peer.solve(peer.publishers(), *drive(100))
+    assert peer.trigger("save").success
+    assert peer.trigger("save").success
+    assert (tmp_path / "previous" / "extrinsic.yaml").read_bytes() == first
+    assert load_result(tmp_path).n_poses == 100
+
+
+def test_off_writes_nothing(start_node, peer, tmp_path):
+    start_node(*QUIET, *into(tmp_path / "out", "off"))
+    answer, _ = peer.solve(peer.publishers(), *drive())
+    assert answer.success
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_disk_that_is_full_is_reported_the_node_goes_on_and_the_journal_comes_back(start_node, peer, tmp_path):
+    node = start_node(*QUIET, *into(tmp_path / "out"))
+    publishers = peer.publishers()
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
+    peer.solve(publishers, stamps_ns[:40], Ts_pw_p[:40], Ts_cw_c[:40])
+    assert peer.trigger("save").success
+    saved = fingerprints(tmp_path / "out")
+    # No file may grow beyond so many bytes: for the node, the disk is full.
+    resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+    answer, _ = peer.solve(publishers, stamps_ns[40:], Ts_pw_p[40:], Ts_cw_c[40:])
+    assert answer.success
+    peer.spin_until(lambda: not peer.trigger("save").success, "the save to fail")
+    assert fingerprints(tmp_path / "out") == saved
+    resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    wait_written(peer, tmp_path / "out", 240)
+    assert peer.trigger("save").success
+    node.wait_for_log("cannot write the session journal in", "going on without it", "cannot save to", "is being written again")
+
+
+def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(start_node, peer, tmp_path):
+    blocked = tmp_path / "a_file"
+    blocked.write_text("")
+    node = start_node(*QUIET, *into(blocked / "out"))
+    node.wait_for_log("cannot write the session journal in")
+    assert peer.solve(peer.publishers(), *drive())[0].success
+    code, _ = node.stop()
+    assert (code, "Traceback" in node.log) == (0, False), node.log
+    assert "cannot save to" in node.log
+
+
+def test_the_journal_follows_the_output_directory(start_node, peer, tmp_path):
+    start_node(*QUIET)
+    peer.feed(peer.publishers(), *drive(30))
+    peer.spin_until(lambda: "30 poses" in peer.trigger("solve").message, "all poses")
+    assert peer.set_parameter("output_directory", str(tmp_path / "out")).successful
+    wait_written(peer, tmp_path / "out", 60)
+
+
+def fingerprints(folder):
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}

@@ -1,0 +1,166 @@
+"""Every parameter has an effect: whoever adds one says here which."""
+
+import dataclasses
+import importlib.util
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from ros_harness import RELIABLE_INPUTS, NodeProcess, Peer, drive, free_domain, message
+
+from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.journal import has_session
+
+QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
+LAX = {"threshold": 1e-9}
+
+# Parameters that change the answer while the node runs: another value, and what has to be set beforehand for it to matter.
+CHANGES = {
+    "method": ("park", {}),
+    "reference": ("B7", {}),
+    "backend": ("ipopt", {}),
+    "threshold": (1e-5, {}),
+    "min_inlier_fraction": (0.9, LAX),
+    "min_pairs": (1000, {}),
+    "max_pairs": (50, {}),
+    "keyframe.min_translation": (0.5, {}),
+    "keyframe.min_rotation": (0.3, {}),
+    "keyframe.min_interval": (0.45, {}),
+    "max_gap": (0.05, {}),
+    "time_offset": (0.03, {}),
+    "scale": (1.5, {}),
+    "prior.x": ("1+/-0.001", {}),
+    "prior.y": ("1+/-0.001", {}),
+    "prior.z": ("1+/-0.001", {}),
+    "prior.roll": ("10deg+/-0.01deg", {}),
+    "prior.pitch": ("10deg+/-0.01deg", {}),
+    "prior.yaw": ("10deg+/-0.01deg", {}),
+    "prior.transform": ("1 1 1 0.1 0.1 0.1+/-0.001 0.001", {}),
+}
+
+
+@pytest.fixture(scope="module")
+def fed(tmp_path_factory):
+    """A peer of a node that has a noisy drive, the child 30 ms after the parent; and the answer with everything at its default but B5."""
+    domain = free_domain()
+    node = NodeProcess(domain, tmp_path_factory.mktemp("effects") / "node.log", [*QUIET, "-p reference:=B5"])
+    peer = Peer(domain)
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive(200)
+    noise = se3.exp(np.random.default_rng(0).normal(size=(2, 200, 6)) * np.repeat([0.01, 0.003], 3))
+    publishers = peer.publishers()
+    peer.wait_matched(*publishers)
+    for publisher, frame, late_ns, Ts in zip(
+        publishers, ("lidar", "camera"), (0, 30_000_000), (Ts_pw_p @ noise[0], Ts_cw_c @ noise[1]), strict=True
+    ):
+        for stamp_ns, T_world_sensor in zip(stamps_ns.tolist(), Ts, strict=True):
+            publisher.publish(message(publisher.msg_type, stamp_ns + late_ns, T_world_sensor, frame))
+    peer.spin_until(lambda: "199 poses" in peer.trigger("solve").message, "all poses in the result")
+    yield peer
+    peer.close()
+    code, _ = node.stop()
+    node.kill()
+    assert (code, "Traceback" in node.log) == (0, False), node.log
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_change_while_the_node_runs_changes_the_answer_and_back(fed, name):
+    value, beforehand = CHANGES[name]
+    defaults = {each: fed.parameter(each) for each in (name, *beforehand)}
+    for each, other in beforehand.items():
+        assert fed.set_parameter(each, other).successful
+    before = fed.trigger("solve").message
+    assert fed.set_parameter(name, value).successful
+    after = fed.trigger("solve").message
+    assert after != before
+    assert fed.set_parameter(name, defaults[name]).successful
+    assert fed.trigger("solve").message == before
+    for each in beforehand:
+        assert fed.set_parameter(each, defaults[each]).successful
+
+
+def frame_is_used(start_node, peer, tmp_path, stream, text):
+    start_node(*QUIET, f"-p {stream}_frame:=chosen")
+    assert text in peer.solve(peer.publishers(), *drive())[0].message
+
+
+def type_is_used(start_node, peer, tmp_path, stream):
+    node = start_node(*QUIET, f"-p {stream}_type:=geometry_msgs/msg/PoseStamped")
+    node.wait_for_log(f"subscribed to /{stream}_odom (geometry_msgs/msg/PoseStamped)")  # though nobody publishes
+    peer.wait_matched(peer.publisher(PoseStamped, f"{stream}_odom"))
+
+
+def solve_period_is_used(start_node, peer, tmp_path):
+    start_node(*QUIET)
+    heard = peer.listen(TransformStamped, "extrinsic")
+    peer.feed(peer.publishers(), *drive())
+    assert peer.set_parameter("solve_period", 0.1).successful
+    peer.spin_until(lambda: heard, "a result without being asked")
+
+
+def output_directory_is_used(start_node, peer, tmp_path):
+    start_node(*QUIET)
+    peer.solve(peer.publishers(), *drive())
+    assert not peer.trigger("save").success
+    assert peer.set_parameter("output_directory", str(tmp_path / "out")).successful
+    assert peer.trigger("save").success
+    assert (tmp_path / "out" / "extrinsic.yaml").exists()
+
+
+def journal_is_used(start_node, peer, tmp_path):
+    node = start_node(*QUIET, f"-p output_directory:={tmp_path / 'off'}", "-p journal:=off")
+    assert not peer.trigger("solve").success
+    assert node.stop()[0] == 0
+    assert not has_session(tmp_path / "off" / "journal")
+    start_node(*QUIET, f"-p output_directory:={tmp_path / 'new'}", "-p journal:=new")
+    peer.spin_until(lambda: has_session(tmp_path / "new" / "journal"), "a journal")
+
+
+def publish_tf_is_used(start_node, peer, tmp_path):
+    start_node(*QUIET)
+    if importlib.util.find_spec("tf2_msgs") is None:
+        refused = peer.set_parameter("publish_tf", True)
+        assert not refused.successful
+        assert refused.reason.startswith("publish_tf needs the message package tf2_msgs, which is not installed")
+        assert peer.parameter("publish_tf") is False
+        return
+    from ros_harness import LATCHED
+    from tf2_msgs.msg import TFMessage
+
+    heard = []
+    peer.node.create_subscription(TFMessage, "/tf_static", heard.append, LATCHED)
+    _, extrinsic = peer.solve(peer.publishers(), *drive())
+    assert not heard
+    assert peer.set_parameter("publish_tf", True).successful
+    peer.spin_until(lambda: heard, "the edge on /tf_static")
+    assert heard[-1].transforms == [extrinsic]
+
+
+EFFECTS = {
+    "parent_frame": lambda *fixtures: frame_is_used(*fixtures, "parent", "camera in chosen: "),
+    "child_frame": lambda *fixtures: frame_is_used(*fixtures, "child", "chosen in lidar: "),
+    "parent_type": lambda *fixtures: type_is_used(*fixtures, "parent"),
+    "child_type": lambda *fixtures: type_is_used(*fixtures, "child"),
+    "solve_period": solve_period_is_used,
+    "output_directory": output_directory_is_used,
+    "journal": journal_is_used,
+    "publish_tf": publish_tf_is_used,
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_effect(start_node, peer, tmp_path, name):
+    EFFECTS[name](start_node, peer, tmp_path)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("tf2_msgs") is not None, reason="tf2_msgs is installed")
+def test_tf_at_the_start_without_its_messages_is_one_line_and_code_1(start_node):
+    node = start_node("-p publish_tf:=true")
+    assert node.wait() == 1
+    assert node.log.startswith("calibrator: publish_tf needs the message package tf2_msgs, which is not installed: install ")
+    assert node.log.count("\n") == 1
+
+
+def test_no_parameter_is_left_out():
+    declared = {option_name(field) for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)}
+    assert declared == {*CHANGES, *EFFECTS}

@@ -1,0 +1,326 @@
+"""``replay``: sources, listing, convergence, and many bags at once."""
+
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+import yaml
+from bag_making import TF, path_message, tf_message, write_messages
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from published_data import data_folder
+
+from hand_eye_calib.cli import batch
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.results import load_result
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]
+POSES = wandering_poses(100)
+PARENT = as_trajectory(POSES, sensor_frame="lidar", world_frame="map")
+CHILD = as_trajectory(disturbed(child_of(POSES), 1, 0.002, 0.001), sensor_frame="camera", world_frame="odom")
+
+
+@pytest.fixture
+def run(capsys):
+    """Runs replay in this process; returns exit code, stdout and stderr."""
+
+    def call(*arguments):
+        try:
+            code = main(["replay", *map(str, arguments)])
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def bag(tmp_path):
+    path = tmp_path / "drive"
+    write_bag(path, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)})
+    return path
+
+
+def matrix(text):
+    return np.array(json.loads(text)["T_parent_child"]["matrix"])
+
+
+# ---- sources
+
+
+def test_frames_stand_for_topics(run, bag, tmp_path):
+    messages = [
+        (stamp_ns, "/tf", TF, tf_message([(stamp_ns, "map", "lidar", parent), (stamp_ns, "odom", "camera", child)]))
+        for stamp_ns, parent, child in zip(PARENT.stamps_ns, PARENT.poses, CHILD.poses, strict=True)
+    ]
+    path = write_messages(tmp_path / "tf", messages)
+    code, out, err = run(path, "--parent-tf", "map:lidar", "--child-tf", "odom:camera", "--json")
+    document = json.loads(out)
+    assert (code, err) == (0, "")
+    assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
+    assert document["inputs"]["child"]["topic"] == "transform odom:camera"
+    np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
+    code, out, err = run(path, "--parent-tf", "map:lidar", "--child-tf", "odom:radar")
+    assert (code, out) == (1, "")
+    assert "no frame 'radar' in the bag's transforms; it has map:lidar, odom:camera" in err
+
+
+def test_a_topic_and_frames_together(run, bag, tmp_path):
+    path_topic = [(PARENT.stamps_ns[-1], "/path", "nav_msgs/msg/Path", path_message(PARENT.stamps_ns, PARENT.poses))]
+    path = write_messages(tmp_path / "path", path_topic)
+    code, out, _ = run(bag, path, "--parent-topic", "/path", "--child-topic", "/b", "--json", "--parent-frame", "lidar")
+    assert code == 0
+    np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["bag", "--parent-tf", "odom"], "argument --parent-tf: expected two frames as WORLD:SENSOR"),
+        (["bag", "--parent-tf", "a:b", "--parent-topic", "/a"], "not allowed with argument"),
+        (["bag", "--every", "soon"], "argument --every: expected a duration such as 5s"),
+        (["bag", "--every", "0s"], "argument --every: expected a duration such as 5s"),
+        (["bag", "--jobs", "2"], "--jobs and --dask are for --batch"),
+        (["--batch", "fleet.yaml", "bag"], "--batch names its bags in its file"),
+        ([], "the following arguments are required: BAG, or --batch FILE"),
+    ],
+)
+def test_wrong_usage(run, arguments, message):
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+
+
+def test_several_bags_of_one_drive_give_what_one_gives(run, bag, tmp_path):
+    for name, part in (("first", slice(0, 60)), ("second", slice(60, 100))):
+        write_bag(tmp_path / f"{name}.bag", {"/a": (PARENT[part], ODOMETRY), "/b": (CHILD[part], ODOMETRY)}, "rosbag1")
+    code, out, _ = run(tmp_path / "second.bag", tmp_path / "first.bag", *STREAMS, "--json")
+    assert code == 0
+    np.testing.assert_array_equal(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]))
+
+
+def test_a_bag_cut_in_half_gives_what_came_before_and_a_warning(run, bag):
+    file = bag / "drive.mcap"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    code, out, err = run(bag, *STREAMS, "--json")
+    assert code in (0, 3)
+    (warning,) = [text for text in json.loads(out)["warnings"] if "recovered" in text]
+    assert re.search(r"the file ends at byte \d+, in the middle of a .*; recovered are \d+ messages covering [\d.]+ s", warning)
+    assert f"hand_eye_calib: note: {warning}\n" in err
+
+
+def test_absurd_positions_end_in_one_line(run, bag, tmp_path, monkeypatch):
+    poses = CHILD.poses.copy()
+    poses[7, 0, 3] = 1e150
+    write_bag(tmp_path / "bad", {"/a": (PARENT, ODOMETRY), "/b": (as_trajectory(poses, sensor_frame="camera"), ODOMETRY)})
+    code, out, err = run(tmp_path / "bad", *STREAMS)
+    assert (code, out) == (1, "")
+    assert re.search(
+        r"error: /b, message 8, stamp 1700000000\.700000000: position \(1e\+150, .* is more than 1e\+08 m from the origin", err
+    )
+
+
+# ---- listing
+
+
+def test_list_shows_topics_types_counts_rates_durations_and_frames(run, tmp_path):
+    messages = [(PARENT.stamps_ns[0], "/tf_static", TF, tf_message([(0, "base", "lidar", np.eye(4))]))]
+    write_messages(tmp_path / "tf", messages)
+    write_bag(tmp_path / "drive", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, "geometry_msgs/msg/PoseStamped")})
+    code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list")
+    assert (code, err) == (0, "")
+    rows = [line.split() for line in out.splitlines() if line.strip().startswith("/")]
+    assert ["/a", ODOMETRY, "100", "10.0", "Hz", "9.9", "s", "map:lidar"] in rows
+    assert ["/b", "geometry_msgs/msg/PoseStamped", "100", "10.0", "Hz", "9.9", "s", "odom"] in rows
+    assert ["/tf_static", TF, "1", "base:lidar"] in rows
+    code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list", "--json")
+    document = json.loads(out)
+    assert (code, err, document["warnings"]) == (0, "", [])
+    assert document["duration_s"] == pytest.approx(9.9)
+    first = document["topics"][0]
+    assert first == {
+        "name": "/a", "type": ODOMETRY, "count": 100, "rate_hz": pytest.approx(10), "duration_s": pytest.approx(9.9),
+        "frames": ["map:lidar"], "is_usable": True,
+    }  # fmt: skip
+
+
+# ---- convergence
+
+
+def test_every_estimates_on_the_way_and_over_everything_in_the_end(run, bag):
+    code, out, err = run(bag, *STREAMS, "--every", "2s", "--json", "--reference", "B5")
+    document = json.loads(out)
+    assert code == 0
+    history = document["convergence"]
+    assert [entry["bag_time_s"] for entry in history] == [2.0, 4.0, 6.0, 8.0]
+    assert [entry["calibration"]["n_poses"] for entry in history] == [20, 40, 60, 80]
+    errors = [np.linalg.norm(np.array(entry["calibration"]["T_parent_child"]["matrix"]) - T_PARENT_CHILD) for entry in history]
+    assert max(errors) < 0.05
+    assert document["n_poses"] == 100
+    np.testing.assert_array_equal(matrix(out), matrix(run(bag, *STREAMS, "--json", "--reference", "B5")[1]))
+    lines = [line for line in err.splitlines() if "note: after " in line]
+    assert [re.search(r"after (\d) s: x .* m, roll .* deg, (\d+) poses, ok", line).groups() for line in lines] == [
+        ("2", "20"), ("4", "40"), ("6", "60"), ("8", "80")
+    ]  # fmt: skip
+
+
+def test_every_says_why_there_is_no_estimate_yet(run, bag):
+    code, out, err = run(bag, *STREAMS, "--every", "500ms", "--json", "--reference", "B5")
+    assert code == 0
+    first = json.loads(out)["convergence"][0]
+    assert (first["bag_time_s"], first["calibration"]) == (0.5, None)
+    assert "after 0.5 s: no estimate yet, 10 synchronised pose pairs are needed, found 5" in err
+
+
+# ---- many bags
+
+
+@pytest.fixture
+def fleet(tmp_path):
+    """Three drives, a bag that is missing, and the file that names them."""
+    for number in range(3):
+        poses = wandering_poses(60, seed=number)
+        streams = {
+            "/a": (as_trajectory(poses, sensor_frame="lidar"), ODOMETRY),
+            "/b": (as_trajectory(child_of(poses), sensor_frame="camera"), ODOMETRY),
+        }
+        write_bag(tmp_path / "bags" / f"drive{number}", streams)
+    document = {
+        "options": {"reference": "B5"},
+        "parent_topic": "/a",
+        "child_topic": "/b",
+        "bags": ["bags/drive*", {"bag": "absent", "name": "gone"}, {"bag": ["bags/drive0"], "name": "again", "options": {"reference": "B1"}}],
+    }  # fmt: skip
+    path = tmp_path / "fleet.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def assert_is_result_of_the_fleet(code, out, err):
+    summary = json.loads(out)
+    assert code == 1
+    assert summary["failures"] == ["gone"]
+    assert "note: gone failed: no bag at " in err
+    rows = {row["name"]: row for row in summary["results"]}
+    assert list(rows) == ["drive0", "drive1", "drive2", "gone", "again"]
+    for name, row in rows.items():
+        if name != "gone":
+            np.testing.assert_allclose(row["calibration"]["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+            assert row["calibration"]["reference"] == ("B1" if name == "again" else "B5")
+
+
+def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, monkeypatch):
+    out_dir = tmp_path / "out"
+    assert_is_result_of_the_fleet(*run("--batch", fleet, "--out", out_dir, "--json", "--jobs", "2"))
+    np.testing.assert_allclose(load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert (out_dir / "drive1" / "static_transform.launch.py").exists()
+    done = []
+    monkeypatch.setattr(batch, "_on_cores", lambda jobs: here(done))
+    code, out, err = run("--batch", fleet, "--out", out_dir, "--json")
+    assert_is_result_of_the_fleet(code, out, err)
+    assert done == ["gone"]
+    assert "4 of 5 bags are done already" in err
+    # Another option or another bag is another task.
+    write_bag(tmp_path / "absent", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)})
+    fleet.write_text(fleet.read_text().replace("B1", "B2"))
+    done.clear()
+    code, out, err = run("--batch", fleet, "--out", out_dir)
+    assert (code, done) == (0, ["gone", "again"])
+    assert re.search(r"^ ?again +ok +0\.\d{4} ", out, re.MULTILINE)
+    assert "5 of 5 bags calibrated, 0 failed" in out
+
+
+def here(done):
+    """Stands in for processes: does the work in this one and notes what was done."""
+    from contextlib import nullcontext
+
+    def outcomes(tasks):
+        for task in tasks:
+            done.append(task.name)
+            yield task, batch.work(task)
+
+    return nullcontext(outcomes)
+
+
+def test_a_batch_on_a_dask_cluster(run, fleet):
+    distributed = pytest.importorskip("dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster:
+        assert_is_result_of_the_fleet(*run("--batch", fleet, "--json", "--dask", cluster.scheduler_address))
+
+
+def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    code, out, err = run("--batch", fleet, "--dask", "tcp://127.0.0.1:1")
+    assert (code, out) == (1, "")
+    assert "pip install 'hand_eye_calib[cluster]'" in err
+
+
+def test_a_defect_in_one_bag_leaves_the_others_alone(fleet, monkeypatch):
+    tasks = batch.read_batch(fleet, {}, {})
+    monkeypatch.setattr(batch, "replay", lambda *_, **__: 1 / 0)
+    outcome = batch.work(tasks[0])
+    assert outcome["error"] == "unexpected ZeroDivisionError: division by zero"
+    assert "ZeroDivisionError" in outcome["traceback"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("3", "expected a list of bags, or a mapping with one under 'bags'"),
+        ("bags: []", "expected a list of bags"),
+        ("[{bag: a, colour: red}]", "entry 1: unknown key 'colour'; known are bag, name, options, parent_topic"),
+        ("[a, {name: b}]", "entry 2: expected a bag's path or a list of paths; got None"),
+        ("[{bag: a, options: {method: magic}}]", "entry 1: method must be one of"),
+        ("[{bag: a, options: 3}]", "entry 1: options must be a mapping"),
+        ("{bags: [a], parent_tf: odom}", "entry 1: expected two frames as WORLD:SENSOR"),
+    ],
+)
+def test_batch_files_that_are_wrong(run, tmp_path, text, message):
+    path = tmp_path / "fleet.yaml"
+    path.write_text(text)
+    code, out, err = run("--batch", path)
+    assert (code, out) == (2, "")
+    assert message in err
+
+
+def test_a_batch_file_that_cannot_be_read(run, tmp_path):
+    code, _, err = run("--batch", tmp_path / "absent.yaml")
+    assert (code, "cannot read" in err) == (1, True)
+
+
+def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
+    path = tmp_path / "fleet.yaml"
+    path.write_text(
+        "{parent_tf: 'odom:lidar', options: {method: dnl}, bags: [a, {bag: b/a, parent_topic: /p, options: {reference: A}}]}"
+    )
+    first, second = batch.read_batch(path, {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"})
+    assert first.options == {"method": "dnl", "max_gap": 0.3}
+    assert first.sources == {"parent_tf": "odom:lidar", "child_topic": "/c"}
+    assert second.options == {"method": "dnl", "max_gap": 0.3, "reference": "A"}
+    assert second.sources == {"parent_topic": "/p", "child_topic": "/c"}
+    assert (first.name, second.name) == ("a", "a_2")
+    assert first.bags == (str(tmp_path / "a"),)
+
+
+# ---- bags of others
+
+
+def test_every_bag_of_other_programs_is_listed_or_refused_in_one_line(run):
+    folder = data_folder() / "bags"
+    paths = [
+        path for path in folder.rglob("*") if path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").exists()
+    ]
+    assert len(paths) > 20
+    refused = []
+    for path in sorted(paths):
+        code, out, err = run(path, "--list", "--json")
+        if code == 0:
+            assert json.loads(out)["topics"] or path.name == "no-messages.bag"
+            continue
+        assert (code, out) == (1, "")
+        assert len(err.splitlines()) == 1, err
+        refused.append(path.name)
+    assert refused == ["empty-file.bag"]

@@ -1,0 +1,171 @@
+"""The engine over sessions that outgrow its waiting room: every pose is used, whatever the order, rates and gaps."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, feed, planar_poses, wandering_poses
+
+from hand_eye_calib import calibrator as engine
+from hand_eye_calib.calibrator import Calibrator, thin
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+
+@pytest.fixture(autouse=True)
+def small_waiting_room(monkeypatch):
+    """10 s at 10 Hz, so that a short drive outgrows it many times; latecomers are waited for for half a second."""
+    for name, value in {
+        "_MAX_WAITING_POSES": 500, "_CROWDED_POSES": 100, "_POSES_AT_A_TIME": 16, "_POSES_BETWEEN": 4, "_LATECOMERS_NS": 500_000_000,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(engine, name, value)
+
+
+def messages(stream, trajectory):
+    quats = se3.to_quat_xyzw(trajectory.poses)
+    return [
+        (stamp_ns, stream, pose[:3, 3], quat)
+        for stamp_ns, pose, quat in zip(trajectory.stamps_ns.tolist(), trajectory.poses, quats, strict=True)
+    ]
+
+
+def play(sequence, **options):
+    calibrator = Calibrator(CalibratorConfig(reference="B3", **options))
+    for stamp_ns, stream, position, quat in sequence:
+        calibrator.add_pose(stream, stamp_ns, position, quat)
+    return calibrator
+
+
+def drive(n_poses=600, child_every=1):
+    parent = as_trajectory(wandering_poses(n_poses))
+    return parent, as_trajectory(child_of(parent.poses))[::child_every]
+
+
+def by_stamp(*streams):
+    return sorted(
+        sum((messages(name, each) for name, each in zip(("parent", "child"), streams, strict=True)), []), key=lambda m: m[:2]
+    )
+
+
+@pytest.mark.parametrize("child_every", [1, 7])
+def test_every_pose_is_paired_once_and_memory_stays_small(child_every):
+    parent, child = drive(child_every=child_every)
+    calibrator = play(by_stamp(parent, child), max_gap=1.0)
+    assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, child.stamps_ns)
+    assert len(calibrator.snapshot().parent) < 150
+    np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
+
+
+def test_the_answer_is_that_of_all_poses_at_once(monkeypatch):
+    sequence = by_stamp(*drive())
+    in_parts = play(sequence).estimate()
+    monkeypatch.setattr(engine, "_CROWDED_POSES", 500)
+    monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 5000)
+    at_once = play(sequence).estimate()
+    assert np.array_equal(in_parts.T_parent_child, at_once.T_parent_child)
+    assert in_parts.n_pairs == at_once.n_pairs
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_late_and_swapped_messages_within_the_horizon_change_nothing(seed):
+    sequence = by_stamp(*drive())
+    random = np.random.default_rng(seed)
+    # Every message comes up to 0.4 s late.
+    arrival = [message[0] + random.uniform(0, 0.4e9) for message in sequence]
+    late = [sequence[k] for k in np.argsort(arrival)]
+    calibrator = play(late)
+    assert calibrator.statistics("parent").refused_late == calibrator.statistics("child").refused_late == 0
+    assert np.array_equal(calibrator.estimate().T_parent_child, play(sequence).estimate().T_parent_child)
+
+
+def test_latecomers_beyond_the_horizon_are_counted():
+    sequence = by_stamp(*drive())
+    calibrator = play(sequence[1:])
+    stamp_ns, stream, position, quat = sequence[0]
+    assert not calibrator.add_pose(stream, stamp_ns + 1, position, quat)
+    assert calibrator.statistics(stream).refused_late == 1
+
+
+def test_a_stream_that_lags_by_half_a_minute_loses_nothing():
+    parent, child = drive()
+    lagging = [(stamp_ns + 30 * 10**9, name) for stamp_ns, name, *_ in messages("child", child)]
+    arrivals = [message[0] for message in messages("parent", parent)] + [stamp_ns for stamp_ns, _ in lagging]
+    sequence = messages("parent", parent) + messages("child", child)
+    calibrator = play([sequence[k] for k in np.argsort(arrivals, kind="stable")])
+    assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, child.stamps_ns)
+    assert calibrator.statistics("parent").dropped_unpaired == 0
+
+
+def test_streams_that_start_minutes_apart_are_paired_where_both_run():
+    parent, child = drive(3000)
+    late_child = child[2000:]
+    calibrator = play(by_stamp(parent, late_child))
+    assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, late_child.stamps_ns)
+    assert calibrator.statistics("parent").dropped_unpaired > 1000
+    np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
+
+
+def test_a_gap_in_one_stream_costs_the_pairs_in_it_and_no_more():
+    parent, child = drive()
+    kept = np.r_[0:200, 300:600]
+    calibrator = play(by_stamp(parent[kept], child))
+    expected = child.stamps_ns[kept]
+    assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, expected)
+
+
+def test_the_informative_pairs_are_kept_not_the_newest():
+    """An hour straight ahead after two minutes of turning, which is all there is to learn from."""
+    turning = wandering_poses(1200)
+    straight = turning[-1] @ se3.exp(np.outer(np.arange(1, 7001), [0.1, 0, 0, 0, 0, 0]))
+    parent = as_trajectory(np.concatenate([turning, straight]))
+    child = dataclasses.replace(parent, poses=disturbed(child_of(parent.poses), 1, 1e-4, 1e-4))
+    calibrator = play(by_stamp(parent, child), max_pairs=1500)
+    stamps_ns = calibrator.snapshot().pose_pairs().stamps_ns
+    assert len(stamps_ns) <= 1500
+    assert (stamps_ns <= parent.stamps_ns[1199]).sum() > 900
+    result = calibrator.estimate()
+    np.testing.assert_allclose(result.T_parent_child[:3, 3], T_PARENT_CHILD[:3, 3], atol=2e-3)
+
+
+def test_thinning_keeps_both_ends_and_the_limit():
+    poses = planar_poses(3000)
+    pairs = PosePairs(np.arange(3000), poses, child_of(poses))
+    for limit in (10, 100, 2999, 3000):
+        left = thin(pairs, limit)
+        assert len(left) <= limit
+        assert (left.stamps_ns[0], left.stamps_ns[-1]) == (0, 2999)
+        assert (np.diff(left.stamps_ns) > 0).all()
+
+
+def test_an_estimated_time_offset_is_part_of_the_state():
+    parent, child = drive(1500)
+    late = Trajectory(child.stamps_ns - 2_000_000_000, child.poses)
+    calibrator = Calibrator(CalibratorConfig(reference="B3", time_offset="estimate"))
+    feed(calibrator, "parent", parent[:450])
+    feed(calibrator, "child", late[:450])
+    feed(calibrator, "parent", parent[450:600])
+    again = Calibrator(calibrator.config)
+    again.restore(calibrator.state())
+    for each in (calibrator, again):
+        feed(each, "child", late[450:])
+        feed(each, "parent", parent[600:])
+    first, second = calibrator.estimate(), again.estimate()
+    assert first.time_offset_s == second.time_offset_s == pytest.approx(2.0, abs=1e-3)
+    assert np.array_equal(first.T_parent_child, second.T_parent_child)
+    assert np.array_equal(first.covariance, second.covariance)
+
+
+def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
+    parent, child = drive(400)
+    calibrator = Calibrator(CalibratorConfig(reference="B3", time_offset="estimate"))
+    feed(calibrator, "parent", parent)
+    feed(calibrator, "child", child)
+    snapshot = calibrator.snapshot()
+    snapshot.estimate()
+    calibrator.adopt(snapshot)
+    monkeypatch.setattr(engine, "estimate_time_offset", None)
+    extra = as_trajectory(wandering_poses(900))[400:]
+    feed(calibrator, "parent", extra)
+    assert calibrator.estimate().time_offset_s == snapshot.found_time_offset.seconds

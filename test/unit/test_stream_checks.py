@@ -1,0 +1,213 @@
+"""Each usual mistake is found and named; sound streams are left in peace."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
+from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
+
+from hand_eye_calib.assessment.agreement import check_streams
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.pairing.stream_checks import Severity, check_stamps, check_stream, frozen_share, summarise, tidy
+
+
+def drive(seed=0, noise=0.001, wander=wandering_poses, n_poses=500):
+    """A walk far from the origin, so that it matters whose pose is in which frame."""
+    start = se3.from_rotation_translation(np.eye(3), [30.0, -20.0, 2.0])
+    poses = start @ wander(n_poses, seed)
+    child = child_of(poses)
+    return (
+        as_trajectory(disturbed(poses, seed + 1, noise, noise)),
+        as_trajectory(disturbed(child, seed + 2, noise, noise)),
+    )
+
+
+def grave(agreement):
+    return [(finding.code, finding.stream) for finding in agreement.findings if finding.severity is not Severity.NOTE]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("wander", [wandering_poses, planar_poses])
+def test_no_false_alarm(seed, wander):
+    agreement = check_streams(*drive(seed, wander=wander))
+    assert grave(agreement) == []
+    assert agreement.is_good
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_every_fault_is_named(fault):
+    damage, code = FAULTS[fault]
+    parent, child = drive()
+    agreement = check_streams(*damage(parent, child, drive(9)[1]))
+    assert [found for found, _ in grave(agreement)] == [code]
+    assert not agreement.is_good
+
+
+class TestWhichStreamAndWhatToDo:
+    @pytest.mark.parametrize("damage", [reordered, inverted])
+    def test_the_parent_is_named_where_it_is_the_parent(self, damage):
+        parent, child = drive()
+        code = {reordered: "quaternion_order", inverted: "inverse"}[damage]
+        assert grave(check_streams(damage(parent), child)) == [(code, "parent")]
+        assert grave(check_streams(parent, damage(child))) == [(code, "child")]
+
+    def test_offset_and_scale_come_as_options(self):
+        parent, child = drive()
+        findings = {f.code: f for f in check_streams(parent, child.shifted(-7.25).scaled(0.5)).findings}
+        assert dict(findings["time_offset"].options)["time_offset"] == pytest.approx(7.25, abs=0.002)
+        assert dict(findings["scale"].options)["scale"] == pytest.approx(2.0, rel=0.005)
+        known = check_streams(parent, child.shifted(-7.25).scaled(0.5), time_offset_s=7.25, scale=2.0)
+        assert grave(known) == []
+
+    def test_which_axes_are_swapped(self):
+        parent, child = drive()
+        finding = check_streams(parent, with_swapped_axes(child, (0, 2, 1))).findings[0]
+        assert (finding.code, finding.stream) == ("axes", "child")
+        assert "(x z y)" in finding.what
+
+    def test_left_handed_axes(self):
+        parent, child = drive()
+        assert grave(check_streams(parent, mirrored(child))) == [("left_handed", "child")]
+
+    def test_two_mistakes_at_once(self):
+        parent, child = drive()
+        found = grave(check_streams(parent, reordered(child).shifted(-33.0).scaled(1000.0)))
+        assert sorted(found) == [("quaternion_order", "child"), ("time_offset", "child"), ("units", "child")]
+
+    def test_turning_about_one_axis_is_named_in_the_parent_frame(self):
+        lying = se3.from_rotation_translation(se3.rotation_exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
+        parent, child = drive(wander=planar_poses)
+        note = check_streams(as_trajectory(parent.poses @ lying), child).findings[0]
+        assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
+        assert "translation along it, y, will be unobservable" in note.what
+        assert dict(note.options) == {"prior": "y=VALUE+/-SIGMA"}
+
+    def test_motion_without_turns(self):
+        poses = np.tile(np.eye(4), (300, 1, 1))
+        poses[:, 0, 3] = np.linspace(0, 50, 300)
+        straight = as_trajectory(poses)
+        assert grave(check_streams(straight, straight)) == [("no_turning", "both")]
+
+
+class TestOneStream:
+    def test_gaps(self):
+        parent, _ = drive()
+        keep = np.ones(len(parent), dtype=bool)
+        keep[100:130] = False
+        finding = check_stream(parent[keep], "parent")[0]
+        assert (finding.code, finding.severity) == ("gaps", Severity.NOTE)
+        assert "1 gaps of up to 3.10 s" in finding.what
+
+    def test_jumps(self):
+        parent, _ = drive()
+        poses = parent.poses.copy()
+        poses[200:, :3, 3] += 3.0  # a lasting one
+        poses[[50, 300], :3, 3] -= 2.0  # there and back
+        jumps = [f for f in check_stream(dataclasses.replace(parent, poses=poses), "child") if f.code == "jumps"]
+        assert "1.0% of the child stream's steps" in jumps[0].what
+
+    def test_disorder_and_repeated_stamps(self):
+        stamps_ns = np.array([0, 10, 20, 20, 40, 30, 50]) * 10**7
+        trajectory, findings = tidy(stamps_ns, np.arange(21).reshape(7, 3), np.tile([0, 0, 0, 1.0], (7, 1)), "child")
+        assert np.array_equal(trajectory.stamps_ns, np.array([0, 10, 20, 30, 40, 50]) * 10**7)
+        assert trajectory.poses[2, 0, 3] == 6.0
+        assert [f.code for f in findings] == ["duplicates", "disorder"]
+
+    def test_frozen_only_while_the_other_moves(self):
+        parent, child = drive()
+        assert frozen_share(frozen(child, 0.75), parent) == pytest.approx(0.25, abs=0.01)
+        assert frozen_share(child, parent) == 0.0
+        assert frozen_share(frozen(child, 0.75), frozen(parent, 0.75)) == 0.0
+
+    def test_too_short(self):
+        parent, child = drive()
+        assert grave(check_streams(parent[:3], child)) == [("too_short", "parent")]
+
+    def test_numbers(self):
+        summary = summarise(drive(noise=0.0)[0])
+        assert (summary.poses, summary.rate_hz) == (500, pytest.approx(10.0))
+        assert summary.duration_s == pytest.approx(49.9)
+        assert summary.longest_interval_s == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds")])
+def test_stamps_in_another_unit(factor, unit):
+    parent, child = drive()
+    wrong = (parent.stamps_ns / factor).astype(np.int64)
+    finding = check_stamps(wrong, child.stamps_ns)[0]
+    assert (finding.code, finding.stream) == ("stamp_unit", "parent")
+    assert f"stamps are {unit}" in finding.what
+    assert check_stamps(parent.stamps_ns, child.stamps_ns) == []
+
+
+class TestCommand:
+    @pytest.fixture
+    def files(self, tmp_path):
+        def write(parent, child):
+            paths = [str(tmp_path / name) for name in ("parent.tum", "child.tum")]
+            for path, stream in zip(paths, (parent, child), strict=True):
+                write_trajectory(path, stream)
+            return paths
+
+        return write
+
+    def test_good_streams(self, files, capsys):
+        assert main(["check", *files(*drive())]) == 0
+        out, err = capsys.readouterr()
+        assert "nothing speaks against" in out
+        assert "500" in out
+        assert err == ""
+
+    def test_a_fault_is_one_line_on_stderr_and_a_table_on_stdout(self, files, capsys):
+        parent, child = drive()
+        assert main(["check", *files(parent, child.shifted(-2.0))]) == 1
+        out, err = capsys.readouterr()
+        assert "--time-offset 2.0" in out
+        assert "WARNING  time_offset" in out
+        assert len(err.splitlines()) == 1
+        assert main(["check", *files(parent, child.shifted(-2.0)), "--time-offset", "2"]) == 0
+
+    def test_json(self, files, capsys):
+        parent, child = drive()
+        assert main(["check", *files(parent, child.scaled(1000.0)), "--json"]) == 1
+        document = json.loads(capsys.readouterr().out)
+        assert document["findings"][0]["code"] == "units"
+        assert document["findings"][0]["options"] == {"scale": 0.001}
+        assert document["streams"]["child"]["poses"] == 500
+
+    def test_bag(self, tmp_path, capsys):
+        parent, child = drive()
+        streams = {"/a": (parent, "geometry_msgs/msg/PoseStamped"), "/b": (reordered(child), "geometry_msgs/msg/PoseStamped")}
+        write_bag(tmp_path / "bag", streams)
+        assert main(["check", str(tmp_path / "bag"), "--parent-topic", "/a", "--child-topic", "/b", "--json"]) == 1
+        assert [f["code"] for f in json.loads(capsys.readouterr().out)["findings"]] == ["quaternion_order"]
+
+    def test_three_inputs_are_too_many(self, capsys):
+        assert main(["check", "a", "b", "c"]) == 2
+        assert "one bag or two trajectory files" in capsys.readouterr().err
+
+    def test_calibrate_says_the_same(self, files, capsys):
+        parent, child = drive()
+        paths = files(parent, inverted(child))
+        main(["calibrate", *paths, "--reference", "B5", "--json"])
+        document = json.loads(capsys.readouterr().out)
+        assert document["findings"][0]["code"] == "inverse"
+        assert any("inverse poses" in warning for warning in document["warnings"])
+
+
+def test_findings_are_plain_values():
+    parent, child = drive()
+    finding = check_streams(parent, child.shifted(-1.0)).findings[0]
+    assert json.loads(json.dumps(finding.to_dict()))["severity"] == "warning"
+    assert str(finding).startswith("the child's clock is 1.0")
+
+
+def test_stamps_of_files_are_exact_to_the_nanosecond():
+    stamps = Trajectory(np.array([1, 2, 3, 4]) * 10**18, np.tile(np.eye(4), (4, 1, 1))).stamps_ns
+    assert check_stamps(stamps, stamps) == []

@@ -1,0 +1,147 @@
+"""Clock offsets: found from turning alone, refined with the extrinsic, refused where the evidence is weak."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, feed, planar_poses, wandering_poses
+
+from hand_eye_calib import calibrator as engine
+from hand_eye_calib.calibrator import Calibrator, calibrate
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.time_offset import correlate_turning
+from hand_eye_calib.solvers.alignment import estimate_time_offset
+
+
+def drive(seed=0, seconds=60, parent_hz=20.0, child_hz=33.0, shift_s=0.0, noise=0.0, wander=wandering_poses):
+    """Both sensors at rates of their own; the child's clock is ``shift_s`` behind, so that this is the offset to find."""
+    truth = as_trajectory(wander(seconds * 10, seed), 10.0)
+    start_ns, end_ns = (int(stamp) for stamp in truth.stamps_ns[[0, -1]])
+
+    def sampled(rate_hz, first_ns):
+        stamps_ns = np.arange(first_ns, end_ns, round(1e9 / rate_hz))
+        return stamps_ns, truth.at(stamps_ns)
+
+    stamps_ns, poses = sampled(parent_hz, start_ns)
+    parent = Trajectory(stamps_ns, disturbed(poses, seed + 1, noise, noise))
+    stamps_ns, poses = sampled(child_hz, start_ns + 7_000_000)
+    child = Trajectory(stamps_ns, disturbed(child_of(poses), seed + 2, noise, noise)).shifted(-shift_s)
+    return parent, child
+
+
+@pytest.mark.parametrize("shift_s", [0.0, 0.1234, -3.7, 500.0, -12345.678])
+def test_any_offset_is_found_also_without_common_time(shift_s):
+    found = estimate_time_offset(*drive(shift_s=shift_s, noise=0.0005))
+    assert found.seconds == pytest.approx(shift_s, abs=0.002)
+    assert found.correlation.is_clear
+    assert found.sigma_s < 0.002
+
+
+def test_streams_that_overlap_only_in_part():
+    parent, child = drive(seconds=90, shift_s=-17.5)
+    child = child[child.stamps_ns > child.stamps_ns[0] + 40_000_000_000]
+    parent = parent[parent.stamps_ns < parent.stamps_ns[0] + 70_000_000_000]
+    assert estimate_time_offset(parent, child).seconds == pytest.approx(-17.5, abs=0.002)
+
+
+@pytest.mark.parametrize("rates", [(100.0, 5.0), (4.0, 30.0), (10.0, 10.0)])
+def test_rates_may_differ(rates):
+    parent, child = drive(seconds=90, parent_hz=rates[0], child_hz=rates[1], shift_s=2.25)
+    assert estimate_time_offset(parent, child).seconds == pytest.approx(2.25, abs=0.01)
+
+
+def test_standard_deviation_is_of_the_size_of_the_errors():
+    found = [estimate_time_offset(*drive(seed, shift_s=1.5, noise=0.003)) for seed in range(12)]
+    ratios = [(offset.seconds - 1.5) / offset.sigma_s for offset in found]
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 3.0
+
+
+def test_jumps_do_no_harm():
+    parent, child = drive(shift_s=41.0, noise=0.001)
+    poses = child.poses.copy()
+    random = np.random.default_rng(3)
+    jumping = random.random(len(child)) < 0.05
+    poses[jumping] = poses[jumping] @ se3.exp(random.normal(size=(int(jumping.sum()), 6)) * 0.5)
+    assert estimate_time_offset(parent, dataclasses.replace(child, poses=poses)).seconds == pytest.approx(41.0, abs=0.01)
+
+
+def test_planar_motion_and_an_unknown_scale_do_no_harm():
+    parent, child = drive(shift_s=0.75, wander=planar_poses)
+    assert estimate_time_offset(parent, child.scaled(0.3)).seconds == pytest.approx(0.75, abs=0.005)
+
+
+def test_turning_does_not_depend_on_conventions():
+    parent, child = drive(shift_s=8.0)
+    plain = correlate_turning(parent, child).offset_s
+    inverse = dataclasses.replace(child, poses=se3.inverse(child.poses))
+    reordered = Trajectory.from_quat_xyzw(
+        child.stamps_ns, child.poses[:, :3, 3], np.roll(se3.to_quat_xyzw(child.poses), 1, axis=1)
+    )
+    for stream in (inverse, reordered):
+        assert correlate_turning(parent, stream).offset_s == pytest.approx(plain, abs=1e-6)
+
+
+class TestWeakEvidenceIsRefused:
+    def test_streams_that_have_nothing_to_do_with_each_other(self):
+        for seed in range(5):
+            with pytest.raises(NotEnoughDataError, match="time offset cannot be estimated: .*(correlated by|times better)"):
+                estimate_time_offset(drive(seed)[0], drive(seed + 50)[1])
+
+    def test_motion_without_turns(self):
+        poses = np.tile(np.eye(4), (300, 1, 1))
+        poses[:, 0, 3] = np.linspace(0, 50, 300)
+        straight = as_trajectory(poses)
+        with pytest.raises(NotEnoughDataError, match="hardly turn"):
+            estimate_time_offset(straight, straight)
+
+    def test_motion_that_is_too_short(self):
+        parent, child = drive()
+        with pytest.raises(NotEnoughDataError, match="give time_offset in seconds"):
+            estimate_time_offset(parent[:40], child[:60])
+
+
+class TestInTheEngine:
+    def test_result_carries_the_offset_and_its_uncertainty(self):
+        parent, child = drive(shift_s=123.456, noise=0.0005)
+        result = calibrate(parent, child, time_offset="estimate", reference="B5")
+        assert result.time_offset_s == pytest.approx(123.456, abs=0.002)
+        assert 0 < result.time_offset_sigma_s < 0.002
+        np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.02)
+        document = result.to_dict()
+        assert document["time_offset_sigma_s"] == result.time_offset_sigma_s
+        assert type(result).from_dict(document).time_offset_sigma_s == result.time_offset_sigma_s
+
+    def test_uncertainty_of_the_offset_enters_that_of_the_extrinsic(self):
+        parent, child = drive(noise=0.0005)
+        estimated = calibrate(parent, child, time_offset="estimate", reference="B5")
+        given = calibrate(parent, child, time_offset=estimated.time_offset_s, reference="B5")
+        np.testing.assert_array_equal(given.T_parent_child, estimated.T_parent_child)
+        assert given.time_offset_sigma_s == 0.0
+        assert np.linalg.eigvalsh(estimated.covariance - given.covariance)[-1] > 0
+        assert any(one.sigma > other.sigma for one, other in zip(estimated.observability, given.observability, strict=True))
+
+    def test_long_sessions_settle_it_when_the_waiting_room_is_full(self, monkeypatch):
+        monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 900)
+        parent, child = drive(seconds=120, shift_s=0.2)
+        calibrator = Calibrator(CalibratorConfig(time_offset="estimate", reference="B5"))
+        for part in range(8):
+            for stream, trajectory in (("parent", parent), ("child", child)):
+                feed(calibrator, stream, trajectory[part * len(trajectory) // 8 : (part + 1) * len(trajectory) // 8])
+        snapshot = calibrator.snapshot()
+        assert len(snapshot.kept) > 0
+        assert snapshot.time_offset.seconds == pytest.approx(0.2, abs=0.002)
+        result = snapshot.estimate()
+        assert result.time_offset_s == snapshot.time_offset.seconds
+        np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.02)
+
+    def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self, monkeypatch):
+        monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 300)
+        calibrator = Calibrator(CalibratorConfig(time_offset="estimate"))
+        for stream, trajectory in zip(("parent", "child"), (drive(1)[0], drive(77)[1]), strict=True):
+            feed(calibrator, stream, trajectory)
+        assert calibrator.statistics("child").dropped_unpaired > 0
+        with pytest.raises(NotEnoughDataError):
+            calibrator.estimate()
