@@ -4,6 +4,7 @@
 #   make test-oldest   the same on the oldest supported versions
 #   make lint          style
 #   make bench         benchmarks against the baseline
+#   make bench-node    load, soak and crashes of the node, measured; about seven minutes
 #   make clean         remove everything the above made
 # PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest.
 PYTHON ?= python3
@@ -15,7 +16,7 @@ VENV := .venv
 OLDEST := .venv-oldest
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help demo test test-oldest bench lint format clean
+.PHONY: help demo test test-oldest bench bench-node lint format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -32,6 +33,9 @@ test-oldest: $(OLDEST)/.ready-test
 bench: $(VENV)/.ready-test
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py $(BENCH_ARGS)
 
+bench-node: $(VENV)/.ready-test
+	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/node_load.py $(BENCH_ARGS)
+
 lint: $(VENV)/.ready-test
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
@@ -47,8 +51,8 @@ clean:
 # The package is installed editable, so that what runs and what is tested is this work tree. A stamp is touched last: set-up
 # is repeated when it was interrupted or when one of the files that decide on it is newer.
 $(VENV)/.ready-demo: EXTRAS := ros,plot
-$(VENV)/.ready-test: EXTRAS := ros,plot,test,lint
-$(OLDEST)/.ready-test: EXTRAS := ros,plot,test
+$(VENV)/.ready-test: EXTRAS := ros,plot,cluster,test,lint
+$(OLDEST)/.ready-test: EXTRAS := ros,plot,cluster,test
 $(OLDEST)/.ready-test: CONSTRAINTS := --constraint requirements/oldest.txt
 $(OLDEST)/.ready-test: requirements/oldest.txt
 

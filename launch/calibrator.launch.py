@@ -10,18 +10,22 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-# Arguments that become the parameter of the same name, when given.
+# Arguments that become the parameter of the same name, when given; texts all but the last.
 PARAMETERS = {
+    "method": "Solver: dnlo, dnl, park, taylor, zhuang or ali; empty leaves it to the parameter file.",
+    "reference": "Which poses form motion pairs: auto, A, B<n> or C<n>; empty leaves it to the parameter file.",
     "parent_frame": "Name of the parent sensor's frame; empty takes it from the messages.",
     "child_frame": "Name of the child sensor's frame; empty takes it from the messages.",
-    "output_directory": "Where ~/save writes the result files; empty leaves it to the parameter file.",
+    "output_directory": "Where results and the session journal are written; empty leaves it to the parameter file.",
+    "journal": "new begins a session, resume goes on with the one in output_directory, off keeps none; empty leaves it to the parameter file.",
+    "publish_tf": "true broadcasts the result on /tf_static; leave it off where the robot's description has this edge.",
 }
 
 
 def calibrator(context):
     # An argument that was not given must not override the parameter file, hence not simply a dictionary of substitutions.
     given = {name: text for name in PARAMETERS if (text := LaunchConfiguration(name).perform(context))}
-    overrides = {name: ParameterValue(text, value_type=str) for name, text in given.items()}
+    overrides = {name: ParameterValue(text, value_type=bool if name == "publish_tf" else str) for name, text in given.items()}
     overrides["use_sim_time"] = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     return [
         Node(

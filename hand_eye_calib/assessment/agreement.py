@@ -208,22 +208,27 @@ _PLAIN = _Hypothesis("", "child", lambda trajectory: trajectory, 0)
 _USUAL = [
     _Hypothesis(code, stream, undone_by)
     for stream in ("child", "parent")
-    for code, undone_by in (("quaternion_order", _reordered), ("inverse", _inverted))
+    for code, undone_by in (
+        ("quaternion_order", _reordered),
+        ("inverse", _inverted),
+        ("left_handed", _with_axes(-np.eye(3))),
+    )
 ]
 
 
 def _axis_hypotheses():
-    """All ways to permute and flip the axes of the positions, the simplest first."""
+    """All ways to permute and flip the axes of the positions but for mirroring all three, the simplest first."""
     hypotheses = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1, -1), repeat=3):
             matrix = np.zeros((3, 3))
             matrix[range(3), order] = signs
             changes = _changes(matrix)
-            if changes:
+            if changes and not np.array_equal(matrix, -np.eye(3)):
                 detail = " ".join(f"{'-' * (sign < 0)}{'xyz'[column]}" for column, sign in zip(order, signs, strict=True))
-                code = "left_handed" if np.array_equal(matrix, -np.eye(3)) else "axes"
-                hypotheses += [_Hypothesis(code, stream, _with_axes(matrix), changes, detail) for stream in ("child", "parent")]
+                hypotheses += [
+                    _Hypothesis("axes", stream, _with_axes(matrix), changes, detail) for stream in ("child", "parent")
+                ]
     return sorted(hypotheses, key=lambda hypothesis: hypothesis.complexity)
 
 

@@ -26,7 +26,8 @@ table1     KITTI 2011_09_30_drive_0027, lidar and camera
 table2     KITTI 2011_10_03_drive_0027, two cameras
 s-figures  S1-S5: as fig3, for the other methods
 s-tables   S1-S12: every method and reference on both drives
-all        all of these, the article's conclusions checked, and what is wrong with the published results
+adaptive   past the article: the adaptive estimator and reference auto against the best choice with hindsight
+all        all but the last, the article's conclusions checked, and what is wrong with the published results
 
 Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV; beside each, *_comparison.csv and *_comparison.md say
 cell by cell how it compares with the published results. What was solved is kept in DIR/solved: an interrupted run goes on from there.

@@ -84,7 +84,9 @@ def noise_lines(noise):
     if noise["systematic"] == "scale":
         yield f"the child's lengths are {100 * noise['systematic_parameters'][0]:+.2f} % short of the parent's"
     elif noise["systematic"] == "bias":
-        along = ", ".join(f"{name} {1000 * value:.2g}" for name, value in zip("xyz", noise["systematic_parameters"], strict=True))
+        along = ", ".join(
+            f"{name} {1000 * value:.2g}" for name, value in zip("xyz", noise["systematic_parameters"], strict=True)
+        )
         yield f"the child's path is off by {along} mm per metre travelled, along its own axes"
     if jumps := noise["jumps_before_stamp_ns"]:
         shown = ", ".join(f"{stamp_ns * 1e-9:.3f}" for stamp_ns in jumps[:5])

@@ -47,10 +47,10 @@ def write_report(directory, calibration, snapshot, inputs, findings=()):
             path = report.write_report(
                 directory,
                 calibration,
-                config,
+                snapshot.config,
                 pose_pairs,
                 estimate_extrinsic,
-                inputs=inputs | {"options": snapshot.config.to_options()},
+                inputs=inputs,
                 findings=findings,
                 streams=streams,
                 command=static_transform_command(calibration),

@@ -5,7 +5,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.experiments import conclusions, figures, findings, runner, statistics, tables
+from hand_eye_calib.experiments import conclusions, figures, findings, past_the_paper, runner, statistics, tables
 from hand_eye_calib.experiments.published import KITTI, LEVELS, METHODS, SIMULATED
 from hand_eye_calib.experiments.rows import ALI_AS_PUBLISHED, cells
 
@@ -48,6 +48,7 @@ def _artefacts():
     everything = cells(SIMULATED, _SIMULATION_METHODS) + cells(KITTI, METHODS)
     found["conclusions"] = Artefact("conclusions", everything, conclusions.write)
     found["findings"] = Artefact("findings", everything, findings.write)
+    found["adaptive"] = Artefact("adaptive", [], lambda results: past_the_paper.write("adaptive", results))
     return found
 
 
@@ -57,6 +58,7 @@ EXPERIMENTS = {
     **{name: (name,) for name in ("fig3", "fig4", "fig5", "table1", "table2")},
     "s-figures": _S_FIGURES,
     "s-tables": tuple(tables.VARIANT_TABLES),
+    "adaptive": ("adaptive",),
     "all": ("fig3", "fig4", "fig5", *_S_FIGURES, "table1", "table2", *tables.VARIANT_TABLES, "conclusions", "findings"),
 }
 

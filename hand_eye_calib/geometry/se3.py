@@ -76,9 +76,14 @@ def rotation_exp(rotation_vector):
     return matrices.reshape(rotation_vector.shape + (3,))
 
 
+# SciPy holds the interpreter's lock while it converts, and messages that come in meanwhile have to wait.
+_AT_A_TIME = 1000
+
+
 def _converted(convert, rotations, shape):
     """A stack of rotations in another form of the given shape. Older SciPy (1.11) refuses an empty stack."""
-    return convert(rotations) if len(rotations) else np.empty((0, *shape))
+    parts = [convert(rotations[first : first + _AT_A_TIME]) for first in range(0, len(rotations), _AT_A_TIME)]
+    return np.concatenate(parts) if parts else np.empty((0, *shape))
 
 
 def inverse(transforms):

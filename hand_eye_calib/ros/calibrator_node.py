@@ -98,6 +98,7 @@ class CalibratorNode(Node):
 
         self._solving = False
         self._solves = 0
+        self._rest_until_s = 0.0
         self._outcome = None
         self._solved_at_s = None
         self._failure, self._failed_unexpectedly = "", False
@@ -241,7 +242,7 @@ class CalibratorNode(Node):
         silent = [stream for stream in self._streams if stream.guard.last_ns is None]
         if silent and self._enabled and self._is_due("silent", 2 * LOG_PERIOD_S):
             self.get_logger().info("; ".join(self._say_silent(stream) for stream in silent))
-        if self._new_poses and not self._solving:
+        if self._new_poses and not self._solving and time.monotonic() >= self._rest_until_s:
             self._start_solve()
 
     def _say_silent(self, stream):
@@ -267,6 +268,8 @@ class CalibratorNode(Node):
         if outcome.session != self._session:
             return False, "the session was reset during the solve: its result is dropped"
         self._solves += 1
+        # Solves that take longer than their period leave the processor free for half the time.
+        self._rest_until_s = time.monotonic() + outcome.seconds
         self._outcome = outcome
         self._calibrator.adopt(outcome.snapshot)
         self._failure, self._failed_unexpectedly = "", False

@@ -1,13 +1,20 @@
 """One thread that solves, so that solving never holds up receiving."""
 
+import multiprocessing
+import os
 import queue
+import signal
 import threading
 import time
+import traceback
 from dataclasses import dataclass
 
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.calibrator import Snapshot
+
+# Whoever else needs the processor goes before the solver's process.
+_NICENESS = 10
 
 
 @dataclass(frozen=True)
@@ -36,6 +43,7 @@ class SolveWorker:
         self._snapshots = queue.SimpleQueue()
         self._outcomes = queue.SimpleQueue()
         self._stopping = threading.Event()
+        self._apart = SolverProcess()
         # A daemon: a solver that is deep in native code must not keep the process alive.
         self._thread = threading.Thread(target=self._run, name="solve", daemon=True)
         self._thread.start()
@@ -57,21 +65,92 @@ class SolveWorker:
         """Ask the thread to end and wait for it; True when it has ended."""
         self._stopping.set()
         self._snapshots.put(None)
+        self._apart.stop()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     def _run(self):
         while (job := self._snapshots.get()) is not None:
-            self._outcomes.put(_solve(*job))
+            outcome = _solve(*job, self._apart)
+            if self._stopping.is_set() and outcome.error is not None:
+                return  # nobody waits for it, and its process may have been ended
+            self._outcomes.put(outcome)
             if not self._stopping.is_set():
                 self._on_done()
 
 
-def _solve(session, snapshot):
+class SolverProcess:
+    """Estimates in a process of its own, started when it is first needed.
+
+    CasADi keeps the interpreter's lock for a tenth of a second while it builds a problem, and all messages would wait.
+    """
+
+    def __init__(self):
+        self._process = None
+
+    def estimate(self, snapshot):
+        """``snapshot.estimate()``, there.
+
+        Raises
+        ------
+        Exception
+            What it raised there; RuntimeError where the process has died.
+        """
+        if self._process is None or not self._process.is_alive():
+            self._start()
+        try:
+            self._connection.send(snapshot)
+            answer = self._connection.recv()
+        except (EOFError, OSError):
+            self._process.join(1.0)
+            raise RuntimeError(f"the solver's process ended with code {self._process.exitcode}") from None
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def stop(self):
+        """End the process, whatever it does."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+
+    def _start(self):
+        spawn = multiprocessing.get_context("spawn")  # a fork would copy the middleware's threads' locks
+        self._connection, theirs = spawn.Pipe()
+        self._process = spawn.Process(target=_serve, args=(theirs,), name="solver", daemon=True)
+        self._process.start()
+        theirs.close()
+
+
+def _serve(connection):
+    # Ctrl-C goes to all processes of a terminal; this one ends when the node's does.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(_NICENESS)
+    while True:
+        try:
+            snapshot = connection.recv()
+        except EOFError:
+            return
+        try:
+            answer = snapshot.estimate()
+        except Exception as error:  # raised again in the node
+            error.add_note("".join(traceback.format_exception(error)))
+            answer = error
+        try:
+            connection.send(answer)
+        except OSError:
+            return
+
+
+def _solve(session, snapshot, apart):
     start, seen, calibration, failure = time.monotonic(), None, None, None
     try:
         seen = excitation(snapshot.pose_pairs())
-        calibration = snapshot.estimate()
+        calibration = apart.estimate(snapshot) if _needs_process(snapshot) else snapshot.estimate()
     except Exception as error:  # handed to the executor's thread, which reports it
         failure = error
     return Outcome(session, snapshot, time.monotonic() - start, seen, calibration, failure)
+
+
+def _needs_process(snapshot):
+    return snapshot.config.backend == "ipopt"

@@ -26,10 +26,10 @@ def fault_table():
     table = {}
     for index, recording in enumerate(recordings):
         parent, child = recording.parent, recording.corrected()
-        other = recordings[(index + 5) % len(recordings)].corrected()
-        expected = REALLY_THERE.get(recording.name, set())
+        other = recordings[(index + 5) % len(recordings)]
+        expected = REALLY_THERE.get(recording.name, set()) | REALLY_THERE.get(other.name, set())
         cells = {CLEAN: found_codes(parent, child)}
-        cells |= {fault: found_codes(*damage(parent, child, other)) for fault, (damage, _) in FAULTS.items()}
+        cells |= {fault: found_codes(*damage(parent, child, other.corrected())) for fault, (damage, _) in FAULTS.items()}
         table[recording.name] = {
             fault: ((codes - expected) == ({FAULTS[fault][1]} if fault in FAULTS else set()), sorted(codes - expected))
             for fault, codes in cells.items()

@@ -56,6 +56,8 @@ def number(value):
 
 
 def value_of(field):
+    if isinstance(field.default, bool):
+        return str(field.default).lower()
     return f'"{field.default}"' if isinstance(field.default, str) else repr(field.default)
 
 

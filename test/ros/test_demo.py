@@ -76,7 +76,7 @@ def test_demo_prints_both_directions_and_replaces_an_earlier_demo(tmp_path, doma
         assert any(row.startswith("replay of the bag") for row in rows)
         assert any(row.startswith("live node") for row in rows)
     assert "Offline and online differ by" in done.stdout
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo_bag", "mine.txt", "node.log"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo_bag", "mine.txt", "node.log", "report.html"]
 
 
 def test_demo_without_ros_says_what_to_install(tmp_path):

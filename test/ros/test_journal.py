@@ -128,8 +128,8 @@ def test_a_disk_that_is_full_is_reported_the_node_goes_on_and_the_journal_comes_
     peer.solve(publishers, stamps_ns[:40], Ts_pw_p[:40], Ts_cw_c[:40])
     assert peer.trigger("save").success
     saved = fingerprints(tmp_path / "out")
-    # No file may grow beyond so many bytes: for the node, the disk is full.
-    resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+    # No file may grow beyond so many bytes, which its log does not reach: for the node, the disk is full.
+    resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))
     answer, _ = peer.solve(publishers, stamps_ns[40:], Ts_pw_p[40:], Ts_cw_c[40:])
     assert answer.success
     peer.spin_until(lambda: not peer.trigger("save").success, "the save to fail")

@@ -2,10 +2,15 @@
 
 import threading
 
+import numpy as np
 import pytest
+from motions import as_trajectory, child_of, feed, wandering_poses
 
+from hand_eye_calib.calibrator import Calibrator
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.ros.worker import SolveWorker
+from hand_eye_calib.ros.worker import SolverProcess, SolveWorker
 
 
 class Work:
@@ -14,6 +19,7 @@ class Work:
     def __init__(self, estimate):
         self.estimate = estimate
         self.pose_pairs = PosePairs.empty
+        self.config = CalibratorConfig()
 
 
 @pytest.fixture
@@ -61,3 +67,35 @@ def test_stop_does_not_wait_for_a_long_solve_and_silences_it(announced):
     release.set()
     assert worker.stop(timeout_s=30.0)
     assert not announced.acquire(blocking=False)
+
+
+class TestSolverProcess:
+    """What the ipopt backend runs in."""
+
+    @pytest.fixture
+    def apart(self):
+        made = SolverProcess()
+        yield made
+        made.stop()
+
+    @staticmethod
+    def snapshot():
+        calibrator = Calibrator(CalibratorConfig(backend="ipopt", reference="B3"))
+        for stream, poses in (("parent", wandering_poses(60)), ("child", child_of(wandering_poses(60)))):
+            feed(calibrator, stream, as_trajectory(poses))
+        return calibrator.snapshot()
+
+    def test_gives_the_same_answer(self, apart):
+        snapshot = self.snapshot()
+        for _ in range(2):
+            assert np.array_equal(apart.estimate(snapshot).T_parent_child, snapshot.estimate().T_parent_child)
+
+    def test_raises_what_was_raised_there(self, apart):
+        with pytest.raises(NotEnoughDataError, match="no poses on the parent stream"):
+            apart.estimate(Calibrator(CalibratorConfig(backend="ipopt")).snapshot())
+
+    def test_that_died_is_said_and_started_anew(self, apart):
+        snapshot = self.snapshot()
+        apart.estimate(snapshot)
+        apart.stop()
+        assert apart.estimate(snapshot).n_poses == 60

@@ -43,6 +43,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "rosbags": "io/bags.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
+    "jinja2": "report/",
 }
 
 

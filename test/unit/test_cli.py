@@ -182,10 +182,12 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
 def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     out_dir = tmp_path / "result"
     code, text, err = run("replay", new_bag(), *TOPICS, "--out", out_dir)
-    assert (code, err) == (0, f"hand_eye_calib: note: wrote {out_dir / 'extrinsic.yaml'}\n")
+    wrote = [f"hand_eye_calib: note: wrote {out_dir / name}\n" for name in ("extrinsic.yaml", "report.html")]
+    assert (code, err) == (0, "".join(wrote))
     assert sorted(path.name for path in out_dir.iterdir()) == [
         "extrinsic.urdf.xacro",
         "extrinsic.yaml",
+        "report.html",
         "static_transform.launch.py",
     ]
     assert run("info", out_dir) == (0, text, "")

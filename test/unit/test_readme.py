@@ -20,12 +20,16 @@ HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
 def parameter_table(config):
     """The Markdown table of an option dataclass."""
     rows = [
-        [f"`{option_name(field)}`", f"`{field.default!r}`".replace("'", '"'), meta["unit"], allowed(field), meaning(meta)]
+        [f"`{option_name(field)}`", f"`{default(field)}`", meta["unit"], allowed(field), meaning(meta)]
         for field in dataclasses.fields(config)
         for meta in [field.metadata]
     ]
     lines = [HEADER, ["---"] * len(HEADER), *([escaped(cell) for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def default(field):
+    return str(field.default).lower() if isinstance(field.default, bool) else repr(field.default).replace("'", '"')
 
 
 def escaped(cell):
@@ -35,6 +39,8 @@ def escaped(cell):
 
 def allowed(field):
     meta = field.metadata
+    if isinstance(field.default, bool):
+        return "`true`, `false`"
     if meta["choices"]:
         return ", ".join(f"`{choice}`" for choice in meta["choices"])
     words = [f"`{word}`" for word in meta["words"]]

@@ -1,0 +1,298 @@
+"""The report: what is in it, that its numbers are the result's, and that it is one page that stands alone."""
+
+import dataclasses
+import re
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+pytest.importorskip("jinja2")
+pytest.importorskip("matplotlib")
+
+import hand_eye_calib as hec
+from hand_eye_calib.calibration import DofVerdict, SolveStatus
+from hand_eye_calib.calibrator import offline_config, whole_snapshot
+from hand_eye_calib.cli import main as cli
+from hand_eye_calib.cli.demo import DRIVE, NOISE
+from hand_eye_calib.cli.present import static_transform_command
+from hand_eye_calib.cli.reporting import write_report
+from hand_eye_calib.estimation import estimate_extrinsic
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.pairing.synchronise import synchronise
+from hand_eye_calib.report import evidence
+from hand_eye_calib.report.report import render
+from hand_eye_calib.simulation.drive import simulate_drive
+
+FIGURES = ("trajectories", "residuals", "convergence", "excitation", "methods", "halves")
+VOID = {"meta", "br", "hr", "img", "link", "input"}
+
+
+class Page(HTMLParser):
+    """A page taken apart; an end tag that does not fit is an error."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.ids, self.elements, self.text, self.errors = [], [], [], "", []
+        self.feed(text)
+        self.close()
+        self.text = " ".join(self.text.split())
+
+    def handle_starttag(self, tag, attrs):
+        self.handle_startendtag(tag, attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.elements.append((tag, attributes))
+        if len(attributes) != len(attrs):
+            self.errors.append(f"<{tag}> has an attribute twice")
+        if "id" in attributes:
+            self.ids.append(attributes["id"])
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.errors.append(f"</{tag}> closes nothing")
+
+    def handle_data(self, data):
+        if self.open[-1:] != ["style"]:
+            self.text += data
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def simulated(planar=False, poses=200, frames=("lidar", "camera"), **options):
+    """Snapshot and calibration of a simulated drive."""
+    flat = {"terrain_height": 0.0} if planar else {}
+    names = dict(zip(("parent_frame", "child_frame"), frames, strict=True))
+    drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=poses, **flat, **names), NOISE)
+    snapshot = whole_snapshot(offline_config(drive.parent, drive.child, options), drive.parent, drive.child)
+    return snapshot, snapshot.estimate()
+
+
+def page_of(snapshot, calibration, **more):
+    more.setdefault("command", static_transform_command(calibration))
+    text = render(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic, **more)
+    return text, Page(text)
+
+
+@pytest.fixture(scope="module")
+def hilly():
+    snapshot, calibration = simulated()
+    return snapshot, calibration, *page_of(snapshot, calibration, streams={"parent": snapshot.parent, "child": snapshot.child})
+
+
+@pytest.fixture(scope="module")
+def planar():
+    snapshot, calibration = simulated(planar=True)
+    return snapshot, calibration, *page_of(snapshot, calibration)
+
+
+@pytest.mark.parametrize("drive", ["hilly", "planar"])
+def test_page_is_whole_and_stands_alone(drive, request):
+    _, _, text, page = request.getfixturevalue(drive)
+    assert text.startswith("<!DOCTYPE html>")
+    assert page.errors == []
+    assert page.open == []
+    assert len(page.ids) == len(set(page.ids))
+    assert not re.search(r"https?:|//\w|@import", text)
+    for tag, attributes in page.elements:
+        assert tag not in ("script", "link", "img", "iframe")
+        for name in ("src", "href", "xlink:href"):
+            assert attributes.get(name, "#").startswith("#")
+    referred = {target for attributes in (a for _, a in page.elements) for target in re.findall(r"#([\w-]+)", str(attributes))}
+    assert {target for target in referred if "-" in target} <= set(page.ids)
+    assert len(text.encode()) < 1_500_000
+
+
+def test_every_section_and_figure_is_there_verdict_first(hilly):
+    _, _, text, page = hilly
+    sections = [attributes["aria-labelledby"] for attributes in page.all("section")]
+    assert sections == ["verdict", "uncertainty", "evidence", "data"]
+    figures = [attributes["id"] for attributes in page.all("figure")]
+    assert figures == [f"figure-{name}" for name in FIGURES]
+    assert len(page.all("svg")) == len(FIGURES)
+    described = [a["aria-label"] for a in page.all("div") if a.get("role") == "img" and a.get("class") == "scroll"]
+    assert len(described) == len(FIGURES)
+    assert all(re.search(r"\d", label) for label in described)
+    assert [tag for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)][:2] == ["h1", "h2"]
+    assert "prefers-color-scheme: dark" in text
+    assert "@media print" in text
+
+
+@pytest.mark.parametrize("drive", ["hilly", "planar"])
+def test_numbers_are_the_calibrations(drive, request):
+    _, calibration, _, page = request.getfixturevalue(drive)
+    for T in (calibration.T_parent_child, calibration.T_child_parent):
+        for value in [*T[:3, 3], *se3.to_quat_xyzw(T)]:
+            assert f"{round(value, 4) + 0.0:.4f}" in page.text
+    for dof in calibration.observability:
+        if dof.verdict is DofVerdict.UNOBSERVABLE:
+            continue
+        factor, unit = (100, " cm") if dof.name in "xyz" else (180 / np.pi, "°")
+        label = next(a["aria-label"] for a in page.all("div") if a.get("aria-label", "").startswith(f"{dof.name}: "))
+        number, verdict = re.fullmatch(rf"{dof.name}: ([\d.]+){unit}, (\w+)", label).groups()
+        assert float(number) == pytest.approx(factor * dof.sigma, rel=0.06)
+        assert verdict == dof.verdict.value
+    assert static_transform_command(calibration) in page.text
+    assert f"{calibration.n_inliers} of {calibration.n_pairs} are inliers" in page.text
+    for warning in calibration.warnings:
+        assert " ".join(warning.split()) in page.text
+    assert "Pose of camera in lidar Maps coordinates of camera into lidar." in page.text
+    assert "Pose of lidar in camera Maps coordinates of lidar into camera." in page.text
+
+
+def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
+    _, calibration, _, page = planar
+    assert calibration.status is SolveStatus.UNOBSERVABLE
+    assert calibration.unobservable() == ["z"]
+    verdict = page.text[: page.text.index("Pose of camera in lidar")]
+    assert "Status: unobservable" in verdict
+    assert "does not reveal z" in verdict
+    assert "What to do: turning about z is fine" in verdict
+    assert "not before the above is settled" in page.text
+    assert "z: unknown, unobservable" in {a.get("aria-label") for a in page.all("div")}
+
+
+def test_hostile_names_stay_text():
+    hostile = ('<script>alert("x")</script>', "_a$b$ & 'c' id=\"y\" --> ünï 雷")
+    snapshot, calibration = simulated(poses=60, frames=hostile)
+    finding = {"severity": "note", "stream": "<em>", "confidence": "likely", "what": "<img src=x>", "advice": "</li>"}
+    inputs = {"bag": "</td><script>", "parent": {"topic": "<em>"}, "files": [{"file": "/a/<u>", "bytes": 1, "sha256": "0"}]}
+    _, page = page_of(snapshot, calibration, findings=[finding], inputs=inputs)
+    assert page.errors == []
+    assert len(page.ids) == len(set(page.ids))
+    assert {"script", "img", "em", "u"} & {tag for tag, _ in page.elements} == set()
+    for name in (*hostile, "<img src=x>", "</td><script>", "<u>"):
+        assert name in page.text
+
+
+@pytest.mark.parametrize(
+    ("motion", "options"),
+    [
+        ({"speed": 0.0, "max_yaw_rate": 0.0}, {}),  # nothing is observable
+        ({"poses": 15}, {}),  # nothing to cut in parts
+        ({"poses": 300}, {"method": "adaptive"}),
+        ({"poses": 100}, {"reference": "A"}),
+        ({"poses": 100}, {"method": "park", "reference": "C5"}),
+        ({"poses": 100, "terrain_height": 0.0}, {"prior.z": "0.1+/-0.02", "scale": "estimate", "time_offset": "estimate"}),
+    ],
+)
+def test_any_result_gets_a_page(tmp_path, motion, options):
+    drive = simulate_drive(1, dataclasses.replace(DRIVE, **({"poses": 60} | motion)), NOISE)
+    snapshot = whole_snapshot(offline_config(drive.parent, drive.child, options), drive.parent, drive.child)
+    calibration = snapshot.estimate()
+    write_report(tmp_path, calibration, snapshot, {})
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert page.errors == []
+    assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]
+    assert "nan" not in re.findall(r"[a-z]+", page.text.lower())
+    assert not re.search(r"\binf\b", page.text)
+
+
+def test_outliers_shown_are_those_the_solver_left_out(hilly):
+    snapshot, calibration, _, _ = hilly
+    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic)
+    assert found.residuals.is_outlier.sum() == calibration.n_pairs - calibration.n_inliers > 0
+    cost = found.residuals.translation_m**2 + 4 * (1 - np.cos(found.residuals.rotation_rad))
+    assert cost[found.residuals.is_outlier].min() > snapshot.config.threshold
+    assert cost[~found.residuals.is_outlier].max() <= snapshot.config.threshold
+
+
+def test_evidence_ends_at_the_result_and_halves_are_halves(hilly):
+    snapshot, calibration, _, _ = hilly
+    pose_pairs = snapshot.pose_pairs()
+    found = evidence.gather(calibration, snapshot.config, pose_pairs, estimate_extrinsic)
+    assert found.convergence[-1].calibration is calibration
+    parts = [one.calibration.n_poses for one in found.convergence]
+    assert parts == sorted(parts)
+    assert parts[-1] == len(pose_pairs)
+    assert sum(half.calibration.n_poses for half in found.halves) == len(pose_pairs)
+    alone = hec.calibrate(
+        Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p)[: len(pose_pairs) // 2],
+        Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c)[: len(pose_pairs) // 2],
+        reference=calibration.reference,
+        parent_frame="a",
+        child_frame="b",
+    )
+    np.testing.assert_allclose(found.halves[0].calibration.T_parent_child, alone.T_parent_child, atol=1e-9)
+    labels = [one.label for one in found.comparison]
+    assert {"dnl B1", "park B10"} <= set(labels)
+    assert any(label.startswith("adaptive") for label in labels)
+    assert f"{calibration.method} {calibration.reference}" not in labels
+
+
+def test_tracks_of_perfect_odometry_coincide():
+    rng = np.random.default_rng(0)
+    steps = se3.exp(np.c_[np.full((80, 1), 0.1), np.zeros((80, 2)), 0.1 * rng.standard_normal((80, 3))])
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    X, world = se3.exp(np.array([0.4, -0.1, 0.2, 0.3, -0.2, 1.1])), se3.exp(np.array([5.0, -3.0, 1.0, 0.1, 0.4, -2.0]))
+    stamps_ns = 100_000_000 * np.arange(81)
+    parent, child = Trajectory(stamps_ns, np.array(poses)), Trajectory(stamps_ns, world @ np.array(poses) @ X)
+    calibration = hec.calibrate(parent, child, parent_frame="a", child_frame="b", reference="B1")
+    config = offline_config(parent, child, {"reference": "B1"})
+    found = evidence.gather(calibration, config, synchronise(parent, child, 0.5), estimate_extrinsic)
+    np.testing.assert_allclose(found.tracks.child, found.tracks.parent, atol=1e-7)
+    np.testing.assert_allclose(found.residuals.translation_m, 0, atol=1e-7)
+    np.testing.assert_allclose(evidence.deviation(calibration.T_parent_child, X), 0, atol=1e-6)
+
+
+def test_long_drives_are_thinned(monkeypatch):
+    snapshot, calibration = simulated(poses=400, reference="B10")
+    monkeypatch.setattr(evidence, "_MANY_TIMES", {"dnlo": 50})
+    monkeypatch.setattr(evidence, "_FEW_TIMES", {"dnlo": 100, "adaptive": 60})
+    monkeypatch.setattr(evidence, "_MOST_POSES_OF_OTHERS", 100)
+    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic)
+    assert max(one.calibration.n_poses for one in found.convergence[:-1]) <= 50
+    assert max(one.calibration.n_poses for one in (*found.halves, *found.comparison)) <= 100
+    assert [half.calibration.reference for half in found.halves] == ["B5", "B5"]  # every second pose
+    assert "dnlo B4" in [one.label for one in found.comparison]  # B1 of every fourth
+    assert "one pose in" in page_of(snapshot, calibration)[1].text
+
+
+@pytest.fixture
+def files(tmp_path):
+    drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=100), NOISE)
+    paths = [tmp_path / "parent.tum", tmp_path / "child.tum"]
+    for path, trajectory in zip(paths, (drive.parent, drive.child), strict=True):
+        write_trajectory(path, trajectory)
+    return [str(path) for path in paths]
+
+
+def calibrate(files, out):
+    return cli.main(["calibrate", *files, "--parent-frame", "lidar", "--child-frame", "camera", "--out", str(out)])
+
+
+def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
+    assert calibrate(files, tmp_path / "out") in (0, 3)
+    assert f"wrote {tmp_path / 'out' / 'report.html'}" in capsys.readouterr().err
+    page = Page((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+    saved = hec.load(tmp_path / "out")
+    assert static_transform_command(saved) in page.text
+    assert all(file in page.text for file in files)
+
+
+@pytest.mark.parametrize("library", ["jinja2", "matplotlib"])
+def test_without_the_libraries_the_rest_is_written(files, tmp_path, capsys, monkeypatch, library):
+    for name in [name for name in sys.modules if name.startswith("hand_eye_calib.report")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, library, None)
+    assert calibrate(files, tmp_path / "out") in (0, 3)
+    assert f"no report.html: {library} is missing" in capsys.readouterr().err
+    assert (tmp_path / "out" / "extrinsic.yaml").exists()
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_without_out_nothing_is_drawn(files, capsys, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("a report was written that nobody asked for")
+
+    monkeypatch.setattr("hand_eye_calib.cli.reporting.write_report", never)
+    assert cli.main(["calibrate", *files, "--parent-frame", "a", "--child-frame", "b"]) in (0, 3)
