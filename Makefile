@@ -1,7 +1,7 @@
 # Everything a newcomer or CI types. Needs python3 (3.11 or newer) and pip; the rest is installed into .venv here.
 #   make demo          simulate a drive, calibrate it from its bag and on the live node, compare with the truth
 #   make test          the whole test suite
-#   make test-oldest   the same on the oldest supported versions
+#   make test-oldest   the same, slow tests left out, on the oldest supported versions
 #   make lint          style
 #   make bench         benchmarks against the baseline
 #   make bench-node    load, soak and crashes of the node, measured; about seven minutes
@@ -28,7 +28,7 @@ test: $(VENV)/.ready-test
 	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
 
 test-oldest: $(OLDEST)/.ready-test
-	$(OLDEST)/bin/python -m pytest $(PYTEST_ARGS)
+	$(OLDEST)/bin/python -m pytest -m 'not slow' $(PYTEST_ARGS)
 
 bench: $(VENV)/.ready-test
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py $(BENCH_ARGS)

@@ -17,6 +17,13 @@ from hand_eye_calib.solvers.alignment import MOST_UNEXPLAINED, Scale, estimate_s
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
 
+# Beyond this share of jumps the trajectories' errors are not the noise that the adaptive estimator models.
+_MOST_JUMPS = 0.1
+
+
+# Tried in turn where the reference that auto chose leaves something unobservable.
+_LONGER_REFERENCES = ("B5", "B20")
+
 
 @dataclass(frozen=True)
 class _Evaluation:
@@ -62,6 +69,11 @@ def estimate_extrinsic(pose_pairs, config, time_offset=None):
     assessment = widened(evaluation.assessment, solution.T_parent_child[:3, :3], spread)
     fused = fuse(solution.T_parent_child, assessment, config.prior())
     status, warnings = _judge(solution, fused)
+    if config.method == "adaptive" and np.mean(evaluation.weights < 0.5) > _MOST_JUMPS:
+        warnings += (
+            f"{np.mean(evaluation.weights < 0.5):.0%} of the increments are jumps: these errors are not the noise that method adaptive "
+            "models, and its standard deviations are too small; compare with method dnlo",
+        )
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
@@ -88,12 +100,37 @@ def estimate_extrinsic(pose_pairs, config, time_offset=None):
 def _solve_pairs(pose_pairs, config):
     """A method of the paper on the motion pairs of one reference."""
     method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
-    choice = select_reference(pose_pairs, method) if config.reference == "auto" else None
-    reference = choice.reference if choice else config.reference
+    if config.reference != "auto":
+        return _solve_reference(pose_pairs, method, config.reference)
+    choice = select_reference(pose_pairs, method)
+    chosen = _solve_reference(pose_pairs, method, choice.reference, choice.reason())
+    for reference in _LONGER_REFERENCES:
+        # Where noise drowns what the motion reveals, longer baselines may still lift it out: the prediction assumes noise
+        # without spikes, and is too kind to short ones where there are any.
+        if not _unobservable(chosen.assessment):
+            break
+        if len(pose_pairs) < 2 * int(reference[1:]):
+            continue
+        longer = _solve_reference(
+            pose_pairs,
+            method,
+            reference,
+            f"{reference}: {chosen.reference}, from which less error is predicted, leaves more axes unobservable",
+        )
+        if len(_unobservable(longer.assessment)) < len(_unobservable(chosen.assessment)):
+            chosen = longer
+    return chosen
+
+
+def _solve_reference(pose_pairs, method, reference, reason=""):
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
     solution = method.solve(pairs)
     assessment = assess(pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out))
-    return _Evaluation(solution, assessment, reference, solution.weights, choice.reason() if choice else "")
+    return _Evaluation(solution, assessment, reference, solution.weights, reason)
+
+
+def _unobservable(assessment):
+    return [dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
 
 
 def _solve_adaptive(pose_pairs, config):

@@ -7,6 +7,10 @@ increments between i and j, written in the parent world's axes, plus what their 
 
 with G the path of the child so far. The error of the answer is therefore linear in the increments, whose covariance is known: white
 noise, drift, and what is left of jumps and systematic errors that the method does not model.
+
+One effect of second order is too large to leave out: noise in R_A looks like motion and pulls t towards zero, the more so the less
+the sensors turn between i and j. With noise of variance s^2 per axis in the rotations of w pairs, t is off by
+``-2 s^2 w (sum w (R_A - I)'(R_A - I))^-1 t``.
 """
 
 import numpy as np
@@ -51,14 +55,27 @@ class ReferencePredictor:
         pairs = motion_pairs(*self._poses, reference)
         if len(pairs) < 6:
             return None
-        gain = self._gain(pairs, self._weights(pairs))
+        weights = self._weights(pairs)
+        gain = self._gain(pairs, weights)
         if gain is None:
             return None
         flat = gain.reshape(6, -1)
         expected = flat @ _band_product(self._bands, flat.T)
         systematic = np.einsum("anb,nb->a", gain, self._systematic)
         jumps = np.einsum("anb,nb->na", gain, self._jumps)
-        return expected + np.outer(systematic, systematic) + jumps.T @ jumps
+        pull = self._pull(pairs, weights)
+        return expected + np.outer(systematic, systematic) + jumps.T @ jumps + np.outer(pull, pull)
+
+    def _pull(self, pairs, weights):
+        """(6,) array: by how much rotation noise is expected to pull the translation towards zero."""
+        rotation, translation = self._solution.T_parent_child[:3, :3], self._solution.T_parent_child[:3, 3]
+        noise = self._solution.noise
+        spans = float(weights @ (pairs.j - pairs.i))
+        # The parent's share of the noise: half of either variance; white noise enters at both ends of a motion.
+        total = float(weights.sum()) * noise.rotation_white**2 + 0.5 * spans * noise.rotation_drift**2
+        moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+        turning = np.einsum("k,kai,kaj->ij", weights, moved, moved)
+        return np.r_[-2.0 * total * (rotation.T @ np.linalg.pinv(turning, hermitian=True) @ translation), np.zeros(3)]
 
     def _weights(self, pairs):
         threshold, fraction = self._rejection

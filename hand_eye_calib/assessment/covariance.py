@@ -182,7 +182,7 @@ def model_covariance(pairs, solution):
 
     hessian = information_t + 2 * information_r
     values, vectors = np.linalg.eigh(hessian)
-    seen = values > _RANK_TOLERANCE * max(values[-1], np.finfo(float).tiny)
+    seen = values > max(_RANK_TOLERANCE * values[-1], weights.sum() * _ROUNDING_ANGLE**2)
     inverse = (vectors * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)) @ vectors.T
     covariance = inverse @ (variance_t * information_t + 4 * variance_r * information_r) @ inverse
 

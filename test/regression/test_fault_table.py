@@ -1,7 +1,10 @@
 """Ten faults in fifteen real recordings: found, named right, and no false alarm.
 
+The test takes every fourth cell, all faults and recordings among them; HAND_EYE_CALIB_ALL_FAULTS=1 makes it take all 150, several minutes.
 ``PYTHONPATH=.:test python test/regression/test_fault_table.py`` prints the table as Markdown, for docs/stream_checks.md.
 """
+
+import os
 
 import pytest
 import real_data
@@ -20,8 +23,8 @@ def found_codes(parent, child):
     return {finding.code for finding in check_streams(parent, child).findings if finding.severity is not Severity.NOTE}
 
 
-def fault_table():
-    """Recording to fault to (whether right, what was found); no fault is ``CLEAN``."""
+def fault_table(every=1):
+    """Recording to fault to (whether right, what was found), of every n-th cell; no fault is ``CLEAN``."""
     recordings = real_data.all_recordings()
     table = {}
     for index, recording in enumerate(recordings):
@@ -29,7 +32,11 @@ def fault_table():
         other = recordings[(index + 5) % len(recordings)]
         expected = REALLY_THERE.get(recording.name, set()) | REALLY_THERE.get(other.name, set())
         cells = {CLEAN: found_codes(parent, child)}
-        cells |= {fault: found_codes(*damage(parent, child, other.corrected())) for fault, (damage, _) in FAULTS.items()}
+        cells |= {
+            fault: found_codes(*damage(parent, child, other.corrected()))
+            for column, (fault, (damage, _)) in enumerate(FAULTS.items())
+            if (index + column) % every == 0
+        }
         table[recording.name] = {
             fault: ((codes - expected) == ({FAULTS[fault][1]} if fault in FAULTS else set()), sorted(codes - expected))
             for fault, codes in cells.items()
@@ -41,20 +48,24 @@ def as_markdown(table):
     columns = [CLEAN, *FAULTS]
     lines = ["| Recording | " + " | ".join(columns) + " |", "|" + " --- |" * (1 + len(columns))]
     for name, cells in table.items():
-        marks = ["yes" if right else ", ".join(codes) or "missed" for right, codes in (cells[column] for column in columns)]
+        marks = [
+            "" if column not in cells else "yes" if cells[column][0] else ", ".join(cells[column][1]) or "missed"
+            for column in columns
+        ]
         lines.append(f"| {name.replace('<-', ' from ')} | " + " | ".join(marks) + " |")
     return "\n".join(lines)
 
 
 @pytest.mark.slow
 def test_faults_are_found_and_named(capsys):
-    table = fault_table()
+    every = 1 if os.environ.get("HAND_EYE_CALIB_ALL_FAULTS") else 4
+    table = fault_table(every)
     with capsys.disabled():
         print("\n" + as_markdown(table))
     false_alarms = {name: cells[CLEAN][1] for name, cells in table.items() if not cells[CLEAN][0]}
     assert false_alarms == {}
     cells = [cell for row in table.values() for fault, cell in row.items() if fault != CLEAN]
-    assert len(cells) == 150
+    assert len(cells) == (150 if every == 1 else 37)
     assert sum(right for right, _ in cells) / len(cells) >= LEAST_SHARE
 
 
