@@ -24,6 +24,10 @@ help:
 demo: $(VENV)/.ready-demo
 	$(VENV)/bin/hand_eye_calib demo $(DEMO_ARGS)
 
+# One thread per process: small matrices gain nothing from more, and the last digit does not depend on the number of cores.
+test test-oldest: export OMP_NUM_THREADS := 1
+test test-oldest: export OPENBLAS_NUM_THREADS := 1
+
 test: $(VENV)/.ready-test
 	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
 
