@@ -26,7 +26,7 @@ _SIGNIFICANT_RATIO = 4.1
 # matrix stays usable. The verdicts carry the plain statement.
 UNKNOWN_TRANSLATION = 10.0
 UNKNOWN_ROTATION = np.pi
-_UNKNOWN_SIGMAS = np.r_[np.full(3, UNKNOWN_TRANSLATION), np.full(3, UNKNOWN_ROTATION)]
+UNKNOWN_SIGMAS = np.r_[np.full(3, UNKNOWN_TRANSLATION), np.full(3, UNKNOWN_ROTATION)]
 
 # A translation direction counts as observed when the rotations that reveal it have this many times the power of the rotation
 # errors themselves; below, noise alone would look like that motion.
@@ -215,7 +215,7 @@ def _basis(directions):
 
 
 def _unknown_variance(unknown):
-    scaled = _UNKNOWN_SIGMAS[:, None] * unknown
+    scaled = UNKNOWN_SIGMAS[:, None] * unknown
     return scaled @ scaled.T
 
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.assessment.covariance import (
     UNKNOWN_ROTATION,
+    UNKNOWN_SIGMAS,
     UNKNOWN_TRANSLATION,
     WEAK_ROTATION,
     WEAK_TRANSLATION,
@@ -131,9 +132,8 @@ def _known(axis, sigma):
 
 def _unknown_directions(covariance):
     """Orthonormal basis (6, U) of the directions along which a covariance says "unknown"."""
-    scale = np.r_[np.full(3, UNKNOWN_TRANSLATION), np.full(3, UNKNOWN_ROTATION)]
-    shares, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    directions = scale[:, None] * vectors[:, shares > _UNKNOWN_SHARE]
+    shares, vectors = np.linalg.eigh(covariance / np.outer(UNKNOWN_SIGMAS, UNKNOWN_SIGMAS))
+    directions = UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE]
     return np.linalg.qr(directions)[0]
 
 

@@ -124,23 +124,6 @@ def expand(condensed):
     return matrices
 
 
-def translation_of(Q, rotation):
-    """Translation that minimises the form for given rotations, 0 along directions the form does not see.
-
-    Parameters
-    ----------
-    Q : (..., 13, 13) array
-    rotation : (..., 3, 3) array
-
-    Returns
-    -------
-    (..., 3) array, metres
-    """
-    gain = -_pseudo_inverse(Q[..., _TRANSLATION, _TRANSLATION])
-    flat = rotation.reshape(rotation.shape[:-2] + (9, 1))
-    return (gain @ (Q[..., _TRANSLATION, _ROTATION] @ flat + Q[..., _TRANSLATION, _ONE, None]))[..., 0]
-
-
 def _pseudo_inverse(matrices):
     values, vectors = np.linalg.eigh(matrices)
     seen = values > _RANK_TOLERANCE * np.maximum(values[..., -1:], np.finfo(float).tiny)
