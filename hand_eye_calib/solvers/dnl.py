@@ -18,8 +18,7 @@ def solve(pairs):
     -------
     Solution
     """
-    condensed = quadratic_form.condense(pairs)
-    minimum = quadratic_form.minimise(quadratic_form.expand(condensed.sum(axis=0)), start_rotations(pairs))
+    minimum = quadratic_form.minimise(quadratic_form.weighted_sum(pairs, np.ones(len(pairs))), start_rotations(pairs))
     best = int(np.argmin(minimum.value))
     T_parent_child = minimum.T_parent_child[best]
     return Solution(
@@ -33,16 +32,14 @@ def solve(pairs):
 
 def solve_without(pairs, solution, left_out):
     """Answers (B, 4, 4) near a given one when the pairs of each row of ``left_out`` (B, K) are left out, for resampling."""
-    condensed = quadratic_form.condense(pairs)
-    forms = quadratic_form.expand((~left_out).astype(float) @ condensed)
+    forms = np.stack([quadratic_form.weighted_sum(pairs, kept) for kept in (~left_out).astype(float)])
     starts = np.repeat(solution.T_parent_child[None, :3, :3], len(left_out), axis=0)
     return quadratic_form.minimise(forms, starts).T_parent_child
 
 
 def pair_costs(pairs, T_parent_child):
     """Costs ``|A X - X B|_F^2`` (K,) straight from the matrices: exact to the last digit where the condensed forms cancel."""
-    residuals = (pairs.Ts_parenti_parentj @ T_parent_child - T_parent_child @ pairs.Ts_childi_childj)[:, :3]
-    return np.einsum("kij,kij->k", residuals, residuals)
+    return quadratic_form.costs(pairs, T_parent_child)
 
 
 def start_rotations(pairs):

@@ -2,46 +2,54 @@
 
 For a fixed X the weights have a closed form: a pair counts where its cost is below c, and where that keeps fewer than d pairs,
 the d cheapest count. DNLO is thus truncated least squares with a floor on the inliers. Weights and X are improved in turn
-until nothing changes. Since that ends in one of many local minima, the search has four stages:
+until nothing changes. Since that ends in one of many local minima, a search comes first:
 
 1. Graduated non-convexity (Yang, Antonante, Tzoumas, Carlone, *Graduated non-convexity for robust spatial perception*, RA-L
    2020): from the minimum over all pairs, the truncation is switched on by degrees.
-2. Around that answer: minima over random parts of its inliers, the best of which replaces it.
-3. Everywhere: minima over small random subsets of all pairs, as in FAST-LTS (Rousseeuw, Van Driessen, *Computing LTS regression
-   for large data sets*, 2006). Such an answer may lie far away, so it must be decisively better: between distant minima of
-   nearly the same height, the annealed one is the more trustworthy.
-4. The truncation is switched on by degrees once more, from the best so far.
+2. Rivals: minima over random parts of its inliers and over small random subsets of all pairs. As in FAST-LTS (Rousseeuw, Van
+   Driessen, *Computing LTS regression for large data sets*, 2006) many are started, and only the most promising followed to the end.
+   One from the answer's own inliers replaces it where it is better. One from anywhere may lie far away and must be decisively
+   better: between distant minima of nearly the same height, the annealed one is the more trustworthy. A new answer has new rivals.
 
-The random subsets come from a fixed seed: the same pairs in the same order give the same answer.
+Many pairs are searched by an even sample of them; the answer is then improved on all. The random subsets come from a fixed seed: the
+same pairs in the same order give the same answer.
 """
 
 import math
 
 import numpy as np
 
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.solvers import dnl, quadratic_form
 from hand_eye_calib.solvers.solution import Solution
 
-# Graduated non-convexity: how much sharper the truncation gets each round, and where it counts as sharp.
-_SHARPENING = 1.6
+# The most pairs that are searched.
+_MAX_SEARCHED = 512
+
+# Graduated non-convexity: Gauss-Newton steps to the minimum over all pairs, how much sharper the truncation gets each round, and
+# where it counts as sharp.
+_STEPS_OVER_ALL = 6
+_SHARPENING = 2.0
 _SHARP = 100.0
 
-# Random subsets: shares of the inliers for the search around an answer; sizes for the search everywhere (small ones escape
-# outliers, large ones resist noise); starts per batch, batches of each kind, and the most pairs that starts are judged on.
+# Rivals: shares of the inliers for those near an answer; sizes for those anywhere (small ones escape outliers, large ones resist
+# noise). Of each kind as many are started as make up so many pairs in all: a hundred where there are a hundred pairs.
 _INLIER_SHARES = (0.15, 0.33)
 _SUBSET_SIZES = (4, 8, 16, 32)
-_BATCH, _BATCHES = 16, 2
-_MAX_JUDGED_PAIRS = 512
+_STARTED_PAIRS = 10_000
+_FIRST_ROUNDS, _FOLLOWED, _MAX_GENERATIONS = 3, 4, 3
 
-# A distant minimum replaces the annealed one when its objective is below this share of it.
+# A rival from anywhere replaces the answer when its objective is below this share of it. A new answer that is hardly lower ends the search.
 _DECISIVE = 0.99
+_HARDLY = 1e-6
 
+# Rounds of weights and X in turn, and the share by which the objective falls when they end: in the search, and on all pairs, where X
+# is refitted by a few steps for each choice of weights.
 _MAX_ROUNDS = 100
+_SETTLED, _CONVERGED = 1e-5, 1e-9
+_STEPS_PER_FIT = 3
 
-# A batch of starts has settled when no objective falls by more than this share in a round.
-_SETTLED = 1e-5
-
-# Leaving pairs out: rounds of refitting from the full answer, and a finite cost that never counts as an inlier's.
+# Leaving pairs out: rounds of refitting, and a finite cost that never counts as an inlier's.
 _ROUNDS_WITHOUT = 8
 _NEVER = 1e100
 
@@ -63,25 +71,17 @@ def solve(pairs, threshold=0.01, min_inlier_fraction=0.5):
     Solution
         ``objective`` is eq. (5) with the outliers' c included; ``weights`` are alpha.
     """
-    condensed = quadratic_form.condense(pairs)
-    floor = min_inlier_fraction * len(pairs)
-    T_annealed = _anneal(condensed, _minimum_over_all(condensed, pairs), threshold, floor)
-    best = _alternate(condensed, T_annealed, threshold, floor)
-    random = np.random.default_rng(0)
-    for draw, enough in ((_parts_of_inliers, 1.0), (_small_subsets, _DECISIVE)):
-        for _ in range(_BATCHES):
-            T_rival, objective = _best_of_batch(condensed, best.T_parent_child, draw, random, threshold, floor)
-            if objective < enough * best.objective:
-                best = _better(best, _alternate(condensed, T_rival, threshold, floor))
-    T_annealed = _anneal(condensed, best.T_parent_child, threshold, floor)
-    best = _better(best, _alternate(condensed, T_annealed, threshold, floor))
-    # The condensed forms cancel where the fit is perfect; the answer's own numbers come from the matrices.
-    weights, objective = truncate(dnl.pair_costs(pairs, best.T_parent_child), threshold, floor)
-    return Solution(best.T_parent_child, float(objective), best.converged, best.iterations, weights)
+    searched = pairs
+    if len(pairs) > _MAX_SEARCHED:
+        searched = pairs[np.linspace(0, len(pairs) - 1, _MAX_SEARCHED).astype(int)]
+    T_found = _search(searched, threshold, min_inlier_fraction * len(searched))
+    return _finish(pairs, T_found, threshold, min_inlier_fraction * len(pairs))
 
 
 def solve_without(pairs, solution, left_out, threshold=0.01, min_inlier_fraction=0.5):
-    """Answers near a given one when some pairs are left out, for resampling.
+    """Answers when some pairs are left out, for resampling.
+
+    A few pairs less may tip the choice of the inliers, and the answer with it: the search starts at the full answer, and by annealing.
 
     Parameters
     ----------
@@ -99,11 +99,24 @@ def solve_without(pairs, solution, left_out, threshold=0.01, min_inlier_fraction
     (B, 4, 4) array
     """
     condensed = quadratic_form.condense(pairs)
-    Ts, weights = np.repeat(solution.T_parent_child[None], len(left_out), axis=0), solution.weights * ~left_out
     floor = min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
+    everything = near
     for _ in range(_ROUNDS_WITHOUT):
-        Ts = _refit(condensed, weights, Ts)
+        everything = _refit(condensed, (~left_out).astype(float), everything)
+    annealed = _anneal(condensed, everything, threshold, floor, left_out)
+    # An answer for some of the pairs may be better for others than what was found from there.
+    candidates = np.concatenate([_follow(condensed, Ts, threshold, floor, left_out) for Ts in (near, annealed)])
+    costs = _costs(condensed, candidates)
+    best = [np.argmin(truncate(costs[:, ~row], threshold, floor)[1]) for row in left_out]
+    return _follow(condensed, candidates[best], threshold, floor, left_out)
+
+
+def _follow(condensed, Ts, threshold, floor, left_out):
+    """A few rounds of weights and X in turn, without the pairs that are left out in each row."""
+    for _ in range(_ROUNDS_WITHOUT):
         weights, _ = truncate(np.where(left_out, _NEVER, _costs(condensed, Ts)), threshold, floor)
+        Ts = _refit(condensed, weights, Ts)
     return Ts
 
 
@@ -117,7 +130,7 @@ def truncate(costs, threshold, floor):
     threshold : float
         c, in the unit of the costs.
     floor : float
-        d: the weights add up to at least this; with a fractional part the last pair counts in part.
+        d: the weights add up to at least this; pairs that cost the same share what the cheaper ones leave of it.
 
     Returns
     -------
@@ -125,117 +138,120 @@ def truncate(costs, threshold, floor):
     objective : (...) array
         Eq. (5).
     """
-    weights = (costs < threshold).astype(float)
-    too_few = weights.sum(axis=-1) < floor
+    below = costs < threshold
+    weights = below.astype(float)
+    too_few = np.count_nonzero(below, axis=-1) < floor
     if np.any(too_few):
-        whole = math.ceil(floor)
+        last = math.ceil(floor) - 1
         short = costs[too_few]
-        order = np.argpartition(short, whole - 1, axis=-1)[..., :whole]
-        floored = np.zeros_like(short)
-        np.put_along_axis(floored, order, 1.0, axis=-1)
-        np.put_along_axis(floored, order[..., -1:], 1.0 - (whole - floor), axis=-1)
-        weights[too_few] = floored
+        dearest = np.partition(short, last, axis=-1)[..., last, None]
+        cheaper, tied = short < dearest, short == dearest
+        missing = floor - np.count_nonzero(cheaper, axis=-1)
+        weights[too_few] = cheaper + tied * (missing / np.count_nonzero(tied, axis=-1))[..., None]
     return weights, (weights * costs + (1.0 - weights) * threshold).sum(axis=-1)
 
 
-def _better(solution, rival):
-    return rival if rival.objective < solution.objective else solution
+def _search(pairs, threshold, floor):
+    """The annealed answer (4, 4), or a rival that beats it."""
+    condensed = quadratic_form.condense(pairs)
+    T_annealed = _anneal(condensed, _minimum_over_all(condensed, pairs), threshold, floor)
+    best, objective = _settle(condensed, T_annealed, threshold, floor)
+    random = np.random.default_rng(0)
+    for _ in range(_MAX_GENERATIONS):
+        rivals = _rivals(condensed, best, threshold, floor, random)
+        rivals, objectives = _settle(condensed, rivals, threshold, floor)
+        before = objective
+        for kind, enough in ((slice(_FOLLOWED), 1.0), (slice(_FOLLOWED, None), _DECISIVE)):
+            first = [(kind.start or 0) + int(np.argmin(objectives[kind]))]
+            if objectives[first] < enough * objective:
+                best, objective = rivals[first], objectives[first]
+        if objective >= before * (1 - _HARDLY):
+            break
+    return best[0]
+
+
+def _rivals(condensed, T, threshold, floor, random):
+    """The most promising minima over random parts of the inliers of T (1, 4, 4), then over small random subsets: (8, 4, 4)."""
+    n_pairs = len(condensed)
+    started = 4 * (1 + _STARTED_PAIRS // (4 * n_pairs))
+    inliers, _ = truncate(_costs(condensed, T), threshold, floor)
+    near = np.repeat(_INLIER_SHARES, started // 2)[:, None] * inliers
+    anywhere = np.repeat(_SUBSET_SIZES, started // 4)[:, None] * np.full(n_pairs, 1 / n_pairs)
+    chances = np.concatenate([near, anywhere])
+    weights = (random.random(chances.shape) < chances).astype(float)
+    Ts = np.repeat(T, len(weights), axis=0)
+    for _ in range(_FIRST_ROUNDS):
+        Ts = _refit(condensed, weights, Ts)
+        weights, objectives = truncate(_costs(condensed, Ts), threshold, floor)
+    promising = np.argsort(objectives.reshape(2, started), axis=1, kind="stable")[:, :_FOLLOWED] + [[0], [started]]
+    return Ts[promising.ravel()]
 
 
 def _minimum_over_all(condensed, pairs):
-    minimum = quadratic_form.minimise(quadratic_form.expand(condensed.sum(axis=0)), dnl.start_rotations(pairs))
-    return minimum.T_parent_child[int(np.argmin(minimum.value))]
+    """X (1, 4, 4) near the minimum over all pairs, where annealing starts."""
+    total = condensed.sum(axis=0)
+    Ts = se3.from_rotation_translation(dnl.start_rotations(pairs), np.zeros(3))
+    for _ in range(_STEPS_OVER_ALL):
+        Ts = quadratic_form.gauss_newton_step(quadratic_form.expand(total), Ts)
+    return Ts[[int(np.argmin(_costs(total[None], Ts)))]]
+
+
+def _anneal(condensed, Ts, threshold, floor, left_out=None):
+    """Graduated non-convexity from a batch of starts (S, 4, 4), with the truncation at c or at the d-th smallest cost, whichever is larger."""
+    last = max(math.ceil(floor) - 1, 0)
+
+    def judge(Ts):
+        costs = _costs(condensed, Ts)
+        if left_out is not None:
+            costs[left_out] = _NEVER
+        return costs, np.maximum(threshold, np.partition(costs, last)[:, last])
+
+    costs, cut = judge(Ts)
+    largest = np.max(costs, axis=1, initial=0.0, where=costs < _NEVER)
+    sharpness = np.maximum(cut / np.maximum(2 * largest - cut, cut), 1e-4)
+    while sharpness.min() < _SHARP:
+        ratio = np.sqrt((cut * sharpness * (sharpness + 1))[:, None] / np.maximum(costs, 1e-300)) - sharpness[:, None]
+        Ts = _refit(condensed, np.clip(ratio, 0.0, 1.0), Ts)
+        costs, cut = judge(Ts)
+        sharpness = sharpness * _SHARPENING
+    return Ts
 
 
 def _costs(condensed, Ts_parent_child):
-    return np.maximum(quadratic_form.monomials(Ts_parent_child) @ condensed.T, 0.0)
-
-
-def _anneal(condensed, T_start, threshold, floor):
-    """Graduated non-convexity, with the truncation at c or at the d-th smallest cost, whichever is larger."""
-    T = T_start[None]
-    last = max(math.ceil(floor) - 1, 0)
-    costs = _costs(condensed, T)[0]
-    cut = max(threshold, np.partition(costs, last)[last])
-    sharpness = max(cut / max(2 * costs.max() - cut, cut), 1e-4)
-    while sharpness < _SHARP:
-        ratio = np.sqrt(cut * sharpness * (sharpness + 1) / np.maximum(costs, 1e-300)) - sharpness
-        T = _refit(condensed, np.clip(ratio, 0.0, 1.0)[None], T)
-        costs = _costs(condensed, T)[0]
-        cut = max(threshold, np.partition(costs, last)[last])
-        sharpness *= _SHARPENING
-    return T[0]
+    return quadratic_form.monomials(Ts_parent_child) @ condensed.T
 
 
 def _refit(condensed, weights, Ts):
     return quadratic_form.gauss_newton_step(quadratic_form.expand(weights @ condensed), Ts)
 
 
-def _settle(condensed, Ts, weights, threshold, floor):
-    """A Gauss-Newton step and new weights in turn, for a batch of starts (S, 4, 4), until no objective falls any more."""
-    objectives = np.full(len(Ts), np.inf)
+def _settle(condensed, Ts, threshold, floor):
+    """A Gauss-Newton step and new weights in turn until no objective of a batch falls: the best X (S, 4, 4) of each, and its objective."""
+    weights, objectives = truncate(_costs(condensed, Ts), threshold, floor)
     for _ in range(_MAX_ROUNDS):
-        Ts = _refit(condensed, weights, Ts)
-        weights, new_objectives = truncate(_costs(condensed, Ts), threshold, floor)
-        falling = new_objectives < objectives * (1 - _SETTLED)
-        objectives = new_objectives
-        if not falling.any():
+        Ts_new = _refit(condensed, weights, Ts)
+        weights, objectives_new = truncate(_costs(condensed, Ts_new), threshold, floor)
+        settled = objectives_new >= objectives * (1 - _SETTLED)
+        better = objectives_new < objectives
+        Ts = np.where(better[:, None, None], Ts_new, Ts)
+        objectives = np.where(better, objectives_new, objectives)
+        if settled.all():
             break
     return Ts, objectives
 
 
-def _alternate(condensed, T_start, threshold, floor):
-    """Weights and X in turn until neither changes; X is then the exact minimum for its weights."""
-    T = T_start[None]
-    weights, objective = truncate(_costs(condensed, T), threshold, floor)
+def _finish(pairs, T_start, threshold, floor):
+    """Weights and X in turn on all pairs until the objective falls no more. The costs come from the matrices, which cancel least."""
+    T = T_start
+    weights, objective = truncate(quadratic_form.costs(pairs, T), threshold, floor)
     converged, iterations = False, 0
     while not converged and iterations < _MAX_ROUNDS:
         iterations += 1
-        T_new = _refit(condensed, weights, T)
-        new_weights, new_objective = truncate(_costs(condensed, T_new), threshold, floor)
-        if np.array_equal(new_weights, weights) or new_objective >= objective:
-            T_new = quadratic_form.minimise(quadratic_form.expand(weights @ condensed), T[:, :3, :3]).T_parent_child
-            new_weights, new_objective = truncate(_costs(condensed, T_new), threshold, floor)
-            converged = bool(np.array_equal(new_weights, weights) or new_objective >= objective)
-        if new_objective <= objective:
-            T, weights, objective = T_new, new_weights, new_objective
-    return Solution(T[0], float(objective[0]), converged, iterations, weights[0])
-
-
-def _parts_of_inliers(costs, threshold, floor, random):
-    """Weights (_BATCH, K): each row a random part of the pairs that count as inliers."""
-    inliers = np.flatnonzero(truncate(costs[None], threshold, floor)[0][0])
-    sizes = [round(_INLIER_SHARES[row % len(_INLIER_SHARES)] * len(inliers)) for row in range(_BATCH)]
-    return _indicators(len(costs), inliers, sizes, random)
-
-
-def _small_subsets(costs, threshold, floor, random):
-    """Weights (_BATCH, K): each row a few random pairs."""
-    sizes = [_SUBSET_SIZES[row % len(_SUBSET_SIZES)] for row in range(_BATCH)]
-    return _indicators(len(costs), np.arange(len(costs)), sizes, random)
-
-
-def _indicators(n_pairs, candidates, sizes, random):
-    weights = np.zeros((len(sizes), n_pairs))
-    for row, size in zip(weights, sizes, strict=True):
-        row[random.permutation(candidates)[: max(size, _SUBSET_SIZES[0])]] = 1.0
-    return weights
-
-
-def _best_of_batch(condensed, T_start, draw, random, threshold, floor):
-    """The best of a batch of minima over random subsets, and its objective.
-
-    Many pairs are judged by an even sample of them; only the best is then followed on all.
-    """
-    n_pairs = len(condensed)
-    sampled = n_pairs > _MAX_JUDGED_PAIRS
-    judged = condensed[np.linspace(0, n_pairs - 1, _MAX_JUDGED_PAIRS).astype(int)] if sampled else condensed
-    judged_floor = floor * len(judged) / n_pairs
-    weights = draw(_costs(judged, T_start[None])[0], threshold, judged_floor, random)
-    Ts, objectives = _settle(judged, np.repeat(T_start[None], _BATCH, axis=0), weights, threshold, judged_floor)
-    best = [int(np.argmin(objectives))]
-    if sampled:
-        weights, _ = truncate(_costs(condensed, Ts[best]), threshold, floor)
-        Ts, objectives = _settle(condensed, Ts[best], weights, threshold, floor)
-        best = [0]
-    return Ts[best[0]], float(objectives[best[0]])
+        Q, T_new = quadratic_form.weighted_sum(pairs, weights), T[None]
+        for _ in range(_STEPS_PER_FIT):
+            T_new = quadratic_form.gauss_newton_step(Q, T_new)
+        weights_new, objective_new = truncate(quadratic_form.costs(pairs, T_new[0]), threshold, floor)
+        converged = bool(objective_new >= objective * (1 - _CONVERGED))
+        if objective_new <= objective:
+            T, weights, objective = T_new[0], weights_new, objective_new
+    return Solution(T, float(objective), converged, iterations, weights)

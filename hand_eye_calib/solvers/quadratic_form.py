@@ -4,9 +4,12 @@
 
     e_k(X) = | A X - X B |_F^2  (top three rows)  =  x^T Q_k x,
 
-is therefore a quadratic form with a constant symmetric 13 x 13 matrix. The pairs are condensed once, into the 91 numbers of
-each upper triangle; from then on every residual is one matrix product and every weighted sum of pairs is again one 13 x 13
-matrix, whose minimum takes a three-variable Newton iteration however many pairs went in.
+is therefore a quadratic form with a constant symmetric 13 x 13 matrix, and so is every weighted sum of pairs, whose minimum takes
+a three-variable Newton iteration however many pairs went in.
+
+Both ends of the residual are linear: it is ``(A - I) X - X (B - I)``, where a pair enters with the 24 numbers u of ``A - I`` and
+``B - I``. Residuals, forms and sums of forms are thus plain matrix products of u with a constant array. Taking the identity off
+first keeps the digits of small motions.
 """
 
 from dataclasses import dataclass
@@ -17,10 +20,27 @@ from hand_eye_calib.geometry import se3
 
 DIMENSION = 13
 _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
+_UPPER = _ROWS * DIMENSION + _COLUMNS
+_TRIANGLE_OF_SQUARE = np.empty((DIMENSION, DIMENSION), dtype=int)
+_TRIANGLE_OF_SQUARE[_ROWS, _COLUMNS] = _TRIANGLE_OF_SQUARE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
 _ROTATION, _TRANSLATION, _ONE = slice(0, 9), slice(9, 12), 12
 
-# Pairs condensed at a time: keeps the intermediate arrays in the processor's cache.
-_BLOCK = 1024
+# Where x lies in the sixteen numbers of X: x = X.ravel()[_X_IN_T].
+_X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
+# X[i, j] = _ENTRY[i, j] @ x
+_ENTRY = np.zeros((16, DIMENSION))
+_ENTRY[_X_IN_T, np.arange(DIMENSION)] = 1.0
+_ENTRY = _ENTRY.reshape(4, 4, DIMENSION)
+# (24, 12, 13): number u of a pair times number m of x adds this share to residual (i, j).
+_RESIDUAL = np.concatenate(
+    [
+        np.einsum("il,kjm->ikljm", np.eye(3), _ENTRY).reshape(12, 12, DIMENSION),
+        -np.einsum("jl,ikm->kjilm", np.eye(4), _ENTRY[:3, :3]).reshape(12, 12, DIMENSION),
+    ]
+)
+
+# Pairs handled at a time: keeps the intermediate arrays in the processor's cache.
+_BLOCK, _SUMMED_BLOCK = 128, 1024
 
 # Eigenvalues of the translation block below this share of the largest count as zero: rounding, not motion.
 _RANK_TOLERANCE = 1e-10
@@ -43,50 +63,44 @@ def condense(pairs):
     (K, 91) array
         In the order of ``numpy.triu_indices(13)``; ``condensed @ monomials(X)`` gives all costs.
     """
-    condensed = np.empty((len(_ROWS), len(pairs)))
-    for start in range(0, len(pairs), _BLOCK):
-        block = slice(start, start + _BLOCK)
-        condensed[:, block] = _triangles(pairs.Ts_parenti_parentj[block], pairs.Ts_childi_childj[block])
-    return condensed.T
+    condensed = np.empty((len(pairs), len(_UPPER)))
+    # New large arrays are slow to get from the system: these are used for every block.
+    residuals, forms = np.empty((_BLOCK, 12, DIMENSION)), np.empty((_BLOCK, DIMENSION, DIMENSION))
+    for block, numbers in _blocks(pairs, _BLOCK):
+        part = slice(len(numbers))
+        np.matmul(numbers, _RESIDUAL.reshape(24, -1), out=residuals[part].reshape(-1, 12 * DIMENSION))
+        np.matmul(np.swapaxes(residuals[part], 1, 2), residuals[part], out=forms[part])
+        np.take(forms[part].reshape(-1, DIMENSION**2), _UPPER, axis=1, out=condensed[block], mode="clip")
+    return condensed
 
 
-def _triangles(Ts_parenti_parentj, Ts_childi_childj):
-    """Upper triangles (91, K), one row per entry: every operation runs along the pairs."""
-    n_pairs = len(Ts_parenti_parentj)
-    R_a = Ts_parenti_parentj[:, :3, :3].reshape(n_pairs, 9).T.copy()
-    R_b = Ts_childi_childj[:, :3, :3].reshape(n_pairs, 9).T.copy()
-    t_a, t_b = Ts_parenti_parentj[:, :3, 3].T.copy(), Ts_childi_childj[:, :3, 3].T.copy()
-    moved = R_a.copy()
-    moved[[0, 4, 8]] -= 1.0
-    triangles = np.empty((len(_ROWS), n_pairs))
-    # |R_A R - R R_B|^2 = 2 |R|^2 - 2 sum_ijkl A_ik R_kj R_il B_lj, plus |R t_B|^2
-    triangles[_RR] = -(R_a[_A_IK] * R_b[_B_LJ] + R_a[_A_KI] * R_b[_B_JL])
-    triangles[_RR_DIAGONAL] += 2.0
-    triangles[_RR_SAME_ROW] += t_b[_J_SAME_ROW] * t_b[_L_SAME_ROW]
-    # the translation residual is (R_A - I) t + t_A - R t_B
-    triangles[_RT] = -moved[_MOVED_IA] * t_b[_J_RT]
-    triangles[_R1] = -t_a[_I_R1] * t_b[_J_R1]
-    columns = moved.reshape(3, 3, n_pairs)  # columns[i, a] is (R_A - I)_ia
-    triangles[_TT] = (columns[:, _A_TT] * columns[:, _B_TT]).sum(axis=0)
-    triangles[_T1] = (columns * t_a[:, None]).sum(axis=0)
-    triangles[_11] = (t_a * t_a).sum(axis=0)
-    return triangles
+def costs(pairs, T_parent_child):
+    """Costs ``|A X - X B|_F^2`` (K,) at one X."""
+    residual = _RESIDUAL @ T_parent_child.ravel()[_X_IN_T]
+    found = np.empty(len(pairs))
+    for block, numbers in _blocks(pairs, _SUMMED_BLOCK):
+        residuals = numbers @ residual
+        np.einsum("ki,ki->k", residuals, residuals, out=found[block])
+    return found
 
 
-# Where the blocks of Q lie in its upper triangle, and which entries of A and B meet there. Rows 0-8 are vec R: entry 3 k + j is R_kj.
-_RR, _RT, _R1 = (
-    np.flatnonzero((_ROWS < 9) & where) for where in (_COLUMNS < 9, (_COLUMNS > 8) & (_COLUMNS < 12), _COLUMNS == 12)
-)
-_TT, _T1, _11 = (
-    np.flatnonzero((_ROWS > 8) & where) for where in ((_COLUMNS < 12), (_ROWS < 12) & (_COLUMNS == 12), _ROWS == 12)
-)
-(_K, _J), (_I, _L) = np.divmod(_ROWS[_RR], 3), np.divmod(_COLUMNS[_RR], 3)
-_A_IK, _A_KI, _B_LJ, _B_JL = 3 * _I + _K, 3 * _K + _I, 3 * _L + _J, 3 * _J + _L
-_RR_DIAGONAL = _RR[_ROWS[_RR] == _COLUMNS[_RR]]
-_RR_SAME_ROW, _J_SAME_ROW, _L_SAME_ROW = _RR[_K == _I], _J[_K == _I], _L[_K == _I]
-_MOVED_IA, _J_RT = 3 * (_ROWS[_RT] // 3) + _COLUMNS[_RT] - 9, _ROWS[_RT] % 3
-_I_R1, _J_R1 = np.divmod(_ROWS[_R1], 3)
-_A_TT, _B_TT = _ROWS[_TT] - 9, _COLUMNS[_TT] - 9
+def weighted_sum(pairs, weights):
+    """Sum (13, 13) of all forms, each with its weight (K,): as ``expand(weights @ condense(pairs))``, without making the forms."""
+    moments = np.zeros((24, 24))
+    for block, numbers in _blocks(pairs, _SUMMED_BLOCK):
+        moments += (numbers * weights[block, None]).T @ numbers
+    return np.einsum("uim,uin->mn", _RESIDUAL, np.tensordot(moments, _RESIDUAL, 1), optimize=True)
+
+
+def _blocks(pairs, size):
+    """Slices of the pairs, and their numbers u (., 24): the top three rows of A - I, then of B - I."""
+    tops = [Ts.reshape(-1, 16)[:, :12] for Ts in (pairs.Ts_parenti_parentj, pairs.Ts_childi_childj)]
+    for start in range(0, len(pairs), size):
+        block = slice(start, start + size)
+        yield block, np.concatenate([top[block] for top in tops], axis=1) - _IDENTITIES
+
+
+_IDENTITIES = np.tile(np.eye(4)[:3].ravel(), 2)
 
 
 def monomials(T_parent_child):
@@ -101,16 +115,8 @@ def monomials(T_parent_child):
     (..., 91) array
         ``x_i x_j``, doubled off the diagonal.
     """
-    T_parent_child = np.asarray(T_parent_child, dtype=float)
-    x = np.concatenate(
-        [
-            T_parent_child[..., :3, :3].reshape(T_parent_child.shape[:-2] + (9,)),
-            T_parent_child[..., :3, 3],
-            np.ones(T_parent_child.shape[:-2] + (1,)),
-        ],
-        axis=-1,
-    )
-    return x[..., _ROWS] * x[..., _COLUMNS] * _MULTIPLICITY
+    numbers = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,))
+    return numbers.take(_X_IN_T[_ROWS], axis=-1) * (numbers.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY)
 
 
 _MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
@@ -118,10 +124,7 @@ _MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 
 def expand(condensed):
     """Symmetric (..., 13, 13) matrices from upper triangles (..., 91)."""
-    matrices = np.empty(condensed.shape[:-1] + (DIMENSION, DIMENSION))
-    matrices[..., _ROWS, _COLUMNS] = condensed
-    matrices[..., _COLUMNS, _ROWS] = condensed
-    return matrices
+    return condensed.take(_TRIANGLE_OF_SQUARE, axis=-1)
 
 
 def _pseudo_inverse(matrices):
@@ -212,20 +215,28 @@ def gauss_newton_step(Q, Ts_parent_child):
     -------
     (B, 4, 4) array
     """
-    rotation, translation = Ts_parent_child[:, :3, :3], Ts_parent_child[:, :3, 3]
-    n_forms = len(rotation)
-    x = np.ones((n_forms, DIMENSION, 1))
-    x[:, _ROTATION, 0], x[:, _TRANSLATION, 0] = rotation.reshape(n_forms, 9), translation
-    tangents = np.zeros((n_forms, 6, DIMENSION))
-    tangents[:, :3, _TRANSLATION] = np.eye(3)
-    tangents[:, 3:, _ROTATION] = (rotation[:, None] @ _GENERATORS).reshape(n_forms, 3, 9)
-    pulled = tangents @ Q
-    curvature = pulled @ np.swapaxes(tangents, 1, 2)
+    n_forms = len(Ts_parent_child)
+    # The derivatives of x along the six tangents at X, and x itself, are linear in X.
+    tangents = (Ts_parent_child.reshape(n_forms, 16) @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
+    normal = tangents @ Q @ tangents.transpose(0, 2, 1)
     # Enough damping to keep directions that the pairs do not see where they are, too little to slow down the others.
-    diagonal = np.einsum("bii->bi", curvature)
+    diagonal = normal.reshape(n_forms, 49)[:, :48:8]
     diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-300
-    step = -np.linalg.solve(curvature, pulled @ x)[:, :, 0]
-    return se3.from_rotation_translation(rotation @ se3.rotation_exp(step[:, 3:]), translation + step[:, :3])
+    step = np.linalg.solve(normal[:, :6, :6], -normal[:, :6, 6:])
+    # Cayley's map: a rotation, equal to the exponential up to second order, and cheaper.
+    twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
+    shrink = 1 / (1 + 0.25 * (step[:, 3:] ** 2).sum(axis=1, keepdims=True))
+    return Ts_parent_child @ (np.eye(4) + shrink * (twist + 0.5 * twist @ twist))
+
+
+# (6, 16): a tangent (rho, phi) times it gives the matrix D of ``X D``, the derivative of X along it.
+_TWISTS = np.zeros((6, 4, 4))
+_TWISTS[[0, 1, 2], [0, 1, 2], 3] = 1.0
+_TWISTS[3:, :3, :3] = _GENERATORS
+# (16, 91): X.ravel() times it gives x of X D for all six, then x of X.
+_TANGENTS = np.einsum("in,dkl->nkdil", np.eye(4), np.concatenate([_TWISTS, np.eye(4)[None]]))
+_TANGENTS = _TANGENTS.reshape(16, 7, 16)[:, :, _X_IN_T].reshape(16, 7 * DIMENSION)
+_TWISTS = _TWISTS.reshape(6, 16)
 
 
 def _derivatives(S, linear, rotation):
