@@ -80,21 +80,20 @@ def fuse(T_parent_child, assessment, prior):
     unknown = _unknown_directions(covariance)
     if not prior and not unknown.shape[1]:
         return Fused(T_parent_child, assessment, {})
-    information = _known_information(covariance, unknown)
-    targets, weights = _unknown_targets(T_parent_child, unknown)
+    root, inverse_root, targets = _whitened(T_parent_child, covariance, unknown)
     T = T_parent_child
     for _ in range(_MAX_STEPS):
-        xi = _difference(T_parent_child, T)
         residuals, jacobian = _prior_residuals(T, prior)
-        normal = information + (unknown * weights) @ unknown.T + jacobian.T @ jacobian
-        right = information @ xi + (unknown * weights) @ (unknown.T @ xi - targets) + jacobian.T @ residuals
-        step = -np.linalg.solve(normal, right)
+        jacobian = jacobian @ root
+        normal = np.eye(6) + jacobian.T @ jacobian
+        deviations = inverse_root @ _difference(T_parent_child, T) - targets
+        step = -root @ np.linalg.solve(normal, deviations + jacobian.T @ residuals)
         T = se3.from_rotation_translation(T[:3, :3] @ se3.rotation_exp(step[3:]), T[:3, 3] + T[:3, :3] @ step[:3])
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     if not prior:
         return Fused(T, assessment, {})
-    fused = Assessment(np.linalg.inv(normal), ())
+    fused = Assessment(root @ np.linalg.inv(normal) @ root.T, ())
     fused = dataclasses.replace(fused, observability=_verdicts(T[:3, :3], fused, T_parent_child[:3, :3], assessment, prior))
     return Fused(T, fused, _contradictions(T_parent_child, covariance, prior))
 
@@ -137,21 +136,26 @@ def _unknown_directions(covariance):
     return np.linalg.qr(directions)[0]
 
 
-def _known_information(covariance, unknown):
-    """Inverse covariance along the known directions, zero along the others."""
+def _whitened(T_parent_child, covariance, unknown):
+    """What makes deviations from the answer numbers of unit variance: known and unknown directions differ by many powers of ten.
+
+    Returns
+    -------
+    root, inverse_root : (6, 6) arrays
+        Deviation from unit numbers, and back.
+    targets : (6,) array
+        Unit numbers of where the answer is put if nothing else is known: at the parent sensor's origin along unknown translations.
+    """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
     known = vectors[:, values < 0.5]
     variances, axes = np.linalg.eigh(known.T @ covariance @ known)
-    axes = known @ axes
-    return (axes / np.maximum(variances, _ROUNDING_VARIANCE)) @ axes.T
-
-
-def _unknown_targets(T_parent_child, unknown):
-    """Where along the unknown directions the answer is put if nothing else is known, and with what weight."""
     is_translation = (unknown[:3] ** 2).sum(axis=0) > 0.5
+    unknown_sigmas = np.where(is_translation, UNKNOWN_TRANSLATION, UNKNOWN_ROTATION)
+    directions = np.concatenate([known @ axes, unknown], axis=1)
+    sigmas = np.concatenate([np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE)), unknown_sigmas])
     in_child = T_parent_child[:3, :3].T @ T_parent_child[:3, 3]
-    targets = np.where(is_translation, -(unknown[:3].T @ in_child), 0.0)
-    return targets, np.where(is_translation, UNKNOWN_TRANSLATION, UNKNOWN_ROTATION) ** -2.0
+    targets = np.where(is_translation, -(unknown[:3].T @ in_child), 0.0) / unknown_sigmas
+    return directions * sigmas, (directions / sigmas).T, np.concatenate([np.zeros(len(variances)), targets])
 
 
 def _difference(T_from, T_to):
