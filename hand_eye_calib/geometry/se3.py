@@ -2,7 +2,7 @@
 
 Transforms are ``(..., 4, 4)`` arrays named ``T_target_source``: they map coordinates of ``source`` into ``target``. Tangent
 vectors are ``(..., 6)`` arrays ``(rho, phi)``, translation (m) before rotation (rad), acting on the right:
-``T_target_source @ exp(xi_in_source)``. Rotation conversions are SciPy's.
+``T_target_source @ exp(xi_in_source)``. Rotation conversions are SciPy's but for the logarithm.
 """
 
 import numpy as np
@@ -65,8 +65,32 @@ def to_quat_xyzw(transforms):
 def rotation_log(rotation):
     """Rotation vectors (..., 3), in rad and of length at most pi, of rotation matrices (..., 3, 3)."""
     rotation = np.asarray(rotation, dtype=float)
-    vectors = _converted(lambda matrices: Rotation.from_matrix(matrices).as_rotvec(), rotation.reshape(-1, 3, 3), (3,))
+    quats = _scaled_quats(rotation.reshape(-1, 3, 3))
+    sine = np.linalg.norm(quats[:, :3], axis=1)  # of half the angle, times the quaternion's length
+    angle = 2.0 * np.arctan2(sine, quats[:, 3])
+    vectors = quats[:, :3] * (angle / np.where(sine > 0.0, sine, 1.0))[:, None]
     return vectors.reshape(rotation.shape[:-1])
+
+
+def _scaled_quats(rotations):
+    """Quaternions (N, 4), scalar last and not negative, of rotations (N, 3, 3), but of any length: many times quicker than SciPy's.
+
+    From the largest of their numbers, so that no digits are lost: S. W. Shepperd, *Quaternion from rotation matrix*, 1978.
+    """
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotations.reshape(-1, 9).T
+    trace = r00 + r11 + r22
+    quats = np.stack([r21 - r12, r02 - r20, r10 - r01, 1.0 + trace], axis=1)
+    turned_far = np.flatnonzero(trace < 0.0)
+    if turned_far.size:
+        R, row = rotations[turned_far], np.arange(len(turned_far))
+        i = np.argmax(np.diagonal(R, axis1=1, axis2=2), axis=1)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        far = np.empty((len(R), 4))
+        far[row, i] = 1.0 - trace[turned_far] + 2.0 * R[row, i, i]
+        far[row, j], far[row, k] = R[row, j, i] + R[row, i, j], R[row, k, i] + R[row, i, k]
+        far[:, 3] = R[row, k, j] - R[row, j, k]
+        quats[turned_far] = np.where(far[:, 3:] < 0.0, -far, far)
+    return quats
 
 
 def rotation_exp(rotation_vector):

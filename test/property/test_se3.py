@@ -63,3 +63,24 @@ def test_interpolation_runs_at_constant_twist(start_xi, step_xi, fraction):
     np.testing.assert_allclose(
         se3.log(se3.inverse(start) @ between), fraction * step_xi, atol=1e-7 * (1 + np.abs(step_xi).max())
     )
+
+
+@given(DIRECTIONS, st.one_of(ANGLES, st.just(np.pi)))
+def test_rotation_log_agrees_with_scipy_up_to_exact_half_turns(direction, angle):
+    from scipy.spatial.transform import Rotation
+
+    axis = np.array(direction) / np.linalg.norm(direction)
+    half_turn = 2 * np.outer(axis, axis) - np.eye(3)
+    rotation = half_turn if angle == np.pi else se3.rotation_exp(angle * axis)
+    found, expected = se3.rotation_log(rotation), Rotation.from_matrix(rotation).as_rotvec()
+    # At half a turn both signs are right.
+    np.testing.assert_allclose(min(found, -found, key=lambda v: np.abs(v - expected).max()), expected, atol=1e-14)
+    if angle < np.pi:
+        assert found @ expected >= 0.0
+
+
+def test_rotation_log_of_a_stack_is_that_of_each():
+    rotations = se3.rotation_exp(np.random.default_rng(0).normal(size=(4, 5, 3)) * 2)
+    one_by_one = [[se3.rotation_log(rotation) for rotation in row] for row in rotations]
+    np.testing.assert_array_equal(se3.rotation_log(rotations), one_by_one)
+    assert se3.rotation_log(np.empty((0, 3, 3))).shape == (0, 3)
