@@ -4,6 +4,7 @@ The one engine behind the node, the replay of bags and the Python function :func
 """
 
 import dataclasses
+from bisect import bisect_left
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,6 +32,12 @@ _MAX_WAITING_POSES = 20_000
 # horizon (20 s at 100 Hz) messages may come in any order.
 _CROWDED_POSES = 2_000
 _POSES_AT_A_TIME, _POSES_BETWEEN = 256, 32
+
+# A quaternion's squared length.
+_LEAST_NORM2, _MOST_NORM2 = (1 - QUATERNION_NORM_TOLERANCE) ** 2, (1 + QUATERNION_NORM_TOLERANCE) ** 2
+
+# Checks look across gaps between pairs of up to so many usual intervals.
+_FEW_INTERVALS = 4
 
 # Poses this much older than the newest of their stream are not made into pairs yet, for the sake of latecomers. When the waiting
 # room is full, the newest of this share are not.
@@ -87,6 +94,14 @@ class RawPoses:
         return Trajectory.from_quat_xyzw(self.stamps_ns, self.poses[:, :3], self.poses[:, 3:])
 
 
+class UnusablePose(InputError):
+    """One of many poses cannot be used: its ``index`` among them, and why."""
+
+    def __init__(self, index, reason):
+        super().__init__(str(reason))
+        self.index = index
+
+
 class _Stream:
     """Poses of one sensor that wait to be synchronised, in order of their stamps."""
 
@@ -94,45 +109,71 @@ class _Stream:
         self._stamps_ns = np.empty(_MAX_WAITING_POSES, dtype=np.int64)
         self._poses = np.empty((_MAX_WAITING_POSES, 7))  # x y z qx qy qz qw
         self._count = 0
-        self._last_stamp_ns = None
         self._let_go_until_ns = None
         self.frame = ""
-        self.statistics = StreamStatistics()
+        self._received = self._refused_duplicate = self._refused_late = self._dropped_unpaired = 0
+        self._first_ns = self._last_ns = None  # of all stamps taken
+
+    @property
+    def statistics(self):
+        """StreamStatistics so far."""
+        return StreamStatistics(
+            self._received,
+            self._refused_duplicate,
+            self._refused_late,
+            self._dropped_unpaired,
+            self._first_ns,
+            self._last_ns,
+        )
 
     def add(self, stamp_ns, position, quat_xyzw):
         """Take a pose; False where its stamp is taken or too old."""
         if self._let_go_until_ns is not None and stamp_ns <= self._let_go_until_ns:
-            self._count_up("refused_late")
+            self._refused_late += 1
             return False
         index = self._count
-        if self._last_stamp_ns is not None and stamp_ns <= self._last_stamp_ns:
+        if self._last_ns is None:
+            self._first_ns = self._last_ns = stamp_ns
+        elif stamp_ns > self._last_ns:
+            self._last_ns = stamp_ns
+        else:
             index = int(np.searchsorted(self._stamps_ns[: self._count], stamp_ns))
             if index < self._count and self._stamps_ns[index] == stamp_ns:
-                self._count_up("refused_duplicate")
+                self._refused_duplicate += 1
                 return False
             self._stamps_ns[index + 1 : self._count + 1] = self._stamps_ns[index : self._count]
             self._poses[index + 1 : self._count + 1] = self._poses[index : self._count]
-        else:
-            self._last_stamp_ns = stamp_ns
+            self._first_ns = min(self._first_ns, stamp_ns)
         self._stamps_ns[index] = stamp_ns
         row = self._poses[index]
         row[0], row[1], row[2] = position
         row[3], row[4], row[5], row[6] = quat_xyzw
         self._count += 1
-        statistics = self.statistics
-        first_ns, last_ns = statistics.first_stamp_ns, statistics.last_stamp_ns
-        self.statistics = StreamStatistics(
-            statistics.received + 1,
-            statistics.refused_duplicate,
-            statistics.refused_late,
-            statistics.dropped_unpaired,
-            stamp_ns if first_ns is None else min(first_ns, stamp_ns),
-            stamp_ns if last_ns is None else max(last_ns, stamp_ns),
-        )
+        self._received += 1
         return True
 
-    def _count_up(self, counter, by=1):
-        self.statistics = dataclasses.replace(self.statistics, **{counter: getattr(self.statistics, counter) + by})
+    def extend(self, stamps_ns, poses):
+        """Take poses (N, 7), each newer than all before; there must be room for them."""
+        end = self._count + len(stamps_ns)
+        self._stamps_ns[self._count : end] = stamps_ns
+        self._poses[self._count : end] = poses
+        self._last_ns = int(stamps_ns[-1])
+        if self._first_ns is None:
+            self._first_ns = int(stamps_ns[0])
+        self._count = end
+        self._received += len(stamps_ns)
+
+    def are_newer(self, stamps_ns):
+        """(N,) whether each stamp is newer than all before it."""
+        last_ns = np.iinfo(np.int64).min if self._last_ns is None else self._last_ns
+        return stamps_ns > np.maximum.accumulate(np.concatenate([[last_ns], stamps_ns]))[:-1]
+
+    @property
+    def quiet_for(self):
+        """How many newer poses may come until the waiting room is full or, at the time to look at it, crowded."""
+        until_crowded = max(_CROWDED_POSES + 1 - self._count, 0)
+        until_looked_at = until_crowded + -(self._received + until_crowded) % _POSES_BETWEEN
+        return min(until_looked_at, _MAX_WAITING_POSES - self._count)
 
     @property
     def is_full(self):
@@ -140,7 +181,7 @@ class _Stream:
 
     @property
     def is_crowded(self):
-        return self._count > _CROWDED_POSES and self.statistics.received % _POSES_BETWEEN == 0
+        return self._count > _CROWDED_POSES and self._received % _POSES_BETWEEN == 0
 
     def __len__(self):
         return self._count
@@ -170,11 +211,11 @@ class _Stream:
         stream._count = len(state["stamps_ns"])
         stream._stamps_ns[: stream._count] = state["stamps_ns"]
         stream._poses[: stream._count] = state["poses"]
-        stream._last_stamp_ns = int(state["stamps_ns"][-1]) if stream._count else None
         stream.frame = str(state["frame"])
         *counts, first_ns, last_ns = state["statistics"].tolist()
-        has_poses = counts[0] > 0
-        stream.statistics = StreamStatistics(*counts, first_ns if has_poses else None, last_ns if has_poses else None)
+        stream._received, stream._refused_duplicate, stream._refused_late, stream._dropped_unpaired = counts
+        if stream._received:
+            stream._first_ns, stream._last_ns = first_ns, last_ns
         stream._let_go_until_ns = int(state["let_go_until_ns"][0]) if len(state["let_go_until_ns"]) else None
         return stream
 
@@ -189,7 +230,7 @@ class _Stream:
         """Forget poses up to and including a stamp, but for the last of them: what comes next is interpolated from it."""
         split = max(int(np.searchsorted(self._stamps_ns[: self._count], until_ns, side="right")) - 1, 0)
         if unpaired:
-            self._count_up("dropped_unpaired", split)
+            self._dropped_unpaired += split
         rest = self._count - split
         self._stamps_ns[:rest] = self._stamps_ns[split : self._count].copy()
         self._poses[:rest] = self._poses[split : self._count].copy()
@@ -257,8 +298,17 @@ class Snapshot:
         """The TimeOffset that pose_pairs() or estimate() found; None where that was not their task or they failed."""
         return self.__dict__["_with_time_offset"].time_offset if "_with_time_offset" in self.__dict__ else None
 
+    @cached_property
+    def streams(self):
+        """Trajectories of the whole session, each on its own clock: as they came in, or at the instants of the pairs where there are some."""
+        if not len(self.kept):
+            return self.parent, self.child
+        pairs = self.pose_pairs()
+        offset_s = self.time_offset.seconds if self.time_offset else self.config.time_offset
+        return Trajectory(pairs.stamps_ns, pairs.Ts_pw_p), Trajectory(pairs.stamps_ns, pairs.Ts_cw_c).shifted(-offset_s)
+
     def check(self, calibration=None):
-        """Agreement of the streams whose poses wait: what is wrong with them, given a calibration's time offset and scale.
+        """Agreement of the streams: what is wrong with them, given a calibration's time offset and scale.
 
         Parameters
         ----------
@@ -267,13 +317,18 @@ class Snapshot:
         """
         offset_s = calibration.time_offset_s if calibration else self.config.time_offset
         scale = calibration.scale if calibration else self.config.scale
-        return check_streams(
-            self.parent,
-            self.child,
+        # Pairs that were thinned out lie farther apart than poses.
+        interval_s = float(np.median(np.diff(self.streams[0].stamps_ns))) * 1e-9 if len(self.kept) else 0.0
+        agreement = check_streams(
+            *self.streams,
             0.0 if offset_s == ESTIMATE else offset_s,
             1.0 if isinstance(scale, str) else scale,
-            self.config.max_gap,
+            max(self.config.max_gap, _FEW_INTERVALS * interval_s),
         )
+        if not len(self.kept):
+            return agreement
+        # Between pairs there may be gaps where the streams have none.
+        return dataclasses.replace(agreement, findings=tuple(f for f in agreement.findings if f.code != "gaps"))
 
     @cached_property
     def _with_time_offset(self):
@@ -405,23 +460,68 @@ class Calibrator:
         InputError
             Where a number is not finite or the quaternion is not of unit length.
         """
-        x, y, z = position
-        qx, qy, qz, qw = quat_xyzw
-        squared_norm = qx * qx + qy * qy + qz * qz + qw * qw
-        # A sum is finite only if all its terms are; nan fails every comparison.
-        if not abs(x + y + z) < np.inf:
-            raise InputError(f"position ({x}, {y}, {z}) is not finite")
-        if not (1 - QUATERNION_NORM_TOLERANCE) ** 2 <= squared_norm <= (1 + QUATERNION_NORM_TOLERANCE) ** 2:
-            raise InputError(
-                f"quaternion (x {qx}, y {qy}, z {qz}, w {qw}) has length {squared_norm**0.5:.4g}, "
-                f"expected 1 within {QUATERNION_NORM_TOLERANCE}"
-            )
+        if not _is_pose(*position, *quat_xyzw):
+            raise _what_is_wrong(position, quat_xyzw)
         waiting = self._streams[stream]
         if waiting.is_full:
             self._make_room()
         elif waiting.is_crowded:
             self._make_pairs()
         return waiting.add(stamp_ns, position, quat_xyzw)
+
+    def add_poses(self, stream, stamps_ns, positions, quats_xyzw):
+        """Take many poses: what :meth:`add_pose` does with one after the other, to the last bit, but quicker.
+
+        Parameters
+        ----------
+        stream : str, or sequence of N str
+            "parent" or "child": of all the poses, or of each.
+        stamps_ns : (N,) int64 array
+        positions : (N, 3) array
+        quats_xyzw : (N, 4) array
+
+        Returns
+        -------
+        (N,) bool array
+            False where a pose was refused.
+
+        Raises
+        ------
+        UnusablePose
+            At the first pose that :meth:`add_pose` has an error for; those before it have been taken.
+        """
+        stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
+        poses = np.concatenate([positions, quats_xyzw], axis=1, dtype=float)
+        names = np.broadcast_to(np.asarray(stream), len(stamps_ns))
+        with np.errstate(over="ignore", invalid="ignore"):
+            is_usable = _is_pose(*poses.T)
+        is_plain, columns = np.zeros(len(stamps_ns), dtype=bool), []
+        for name, waiting in self._streams.items():
+            rows = np.flatnonzero(names == name)
+            is_plain[rows] = is_usable[rows] & waiting.are_newer(stamps_ns[rows])
+            columns.append((waiting, rows.tolist(), stamps_ns[rows], poses[rows]))
+        others = [*np.flatnonzero(~is_plain).tolist(), len(stamps_ns)]
+        taken = np.ones(len(stamps_ns), dtype=bool)
+        first = 0
+        while first < len(stamps_ns):
+            # Up to the next pose that is not plain, or with which the engine has more to do, they need only be stored.
+            begins = [bisect_left(rows, first) for _, rows, *_ in columns]
+            stop = others[bisect_left(others, first)]
+            for begin, (waiting, rows, *_) in zip(begins, columns, strict=True):
+                if (busy := begin + waiting.quiet_for) < len(rows):
+                    stop = min(stop, rows[busy])
+            for begin, (waiting, rows, own_stamps_ns, own_poses) in zip(begins, columns, strict=True):
+                end = bisect_left(rows, stop)
+                if begin < end:
+                    waiting.extend(own_stamps_ns[begin:end], own_poses[begin:end])
+            if stop < len(stamps_ns):
+                pose = poses[stop].tolist()
+                try:
+                    taken[stop] = self.add_pose(str(names[stop]), int(stamps_ns[stop]), pose[:3], pose[3:])
+                except InputError as error:
+                    raise UnusablePose(stop, error) from None
+            first = stop + 1
+        return taken
 
     def snapshot(self):
         """What is known now, for an estimate in this or another thread."""
@@ -532,6 +632,25 @@ class Calibrator:
             except NotEnoughDataError:
                 return None
         return dataclasses.replace(self._config, time_offset=self._time_offset.seconds)
+
+
+def _is_pose(x, y, z, qx, qy, qz, qw):
+    """Whether these numbers are a pose, or for each row of these arrays."""
+    norm2 = qx * qx + qy * qy + qz * qz + qw * qw
+    # A sum is finite only if all its terms are; nan fails every comparison.
+    return (abs(x + y + z) < np.inf) & (norm2 >= _LEAST_NORM2) & (norm2 <= _MOST_NORM2)
+
+
+def _what_is_wrong(position, quat_xyzw):
+    """The InputError for what is no pose."""
+    x, y, z = position
+    if not abs(x + y + z) < np.inf:
+        return InputError(f"position ({x}, {y}, {z}) is not finite")
+    qx, qy, qz, qw = quat_xyzw
+    length = (qx * qx + qy * qy + qz * qz + qw * qw) ** 0.5
+    return InputError(
+        f"quaternion (x {qx}, y {qy}, z {qz}, w {qw}) has length {length:.4g}, expected 1 within {QUATERNION_NORM_TOLERANCE}"
+    )
 
 
 def calibrate(parent, child, **options):

@@ -10,8 +10,9 @@ import shutil
 import struct
 import tempfile
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
-from itertools import chain, islice, repeat
+from itertools import chain, islice
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
@@ -118,6 +119,64 @@ class StampedPose(NamedTuple):
     position: tuple
     quat_xyzw: tuple
     bag_ns: int
+
+
+@dataclass(frozen=True)
+class PoseBlock:
+    """N StampedPoses in columns: what is quickly made of many messages, and quickly handed on.
+
+    Attributes
+    ----------
+    streams, world_frames, sensor_frames : (N,) arrays of str or None
+    numbers : (N,) int array
+    stamps_ns, bag_ns : (N,) int64 arrays
+    poses : (N, 7) array
+        x y z qx qy qz qw.
+    """
+
+    streams: np.ndarray
+    numbers: np.ndarray
+    stamps_ns: np.ndarray
+    world_frames: np.ndarray
+    sensor_frames: np.ndarray
+    poses: np.ndarray
+    bag_ns: np.ndarray
+
+    def __len__(self):
+        return len(self.stamps_ns)
+
+    def __getitem__(self, index):
+        return PoseBlock(*(column[index] for column in vars(self).values()))
+
+    @classmethod
+    def concatenate(cls, blocks):
+        """One after the other."""
+        return cls(*map(np.concatenate, zip(*(vars(block).values() for block in blocks), strict=True)))
+
+    @classmethod
+    def of_columns(cls, stream, numbers, columns, bag_ns):
+        """Of PoseColumns."""
+        streams = np.full(len(numbers), stream, dtype=object)
+        frames = (np.array(names, dtype=object) for names in (columns.world_frames, columns.sensor_frames))
+        return cls(streams, numbers, columns.stamps_ns, *frames, columns.numbers, bag_ns)
+
+    @classmethod
+    def of_rows(cls, rows):
+        """Of a list of StampedPose."""
+        streams, numbers, stamps_ns, world_frames, sensor_frames, positions, quats_xyzw, bag_ns = zip(*rows, strict=True)
+        names = (np.array(column, dtype=object) for column in (streams, world_frames, sensor_frames))
+        streams, world_frames, sensor_frames = names
+        stamps_ns, bag_ns = np.array(stamps_ns, dtype=np.int64), np.array(bag_ns, dtype=np.int64)
+        poses = np.concatenate([positions, quats_xyzw], axis=1)
+        return cls(streams, np.array(numbers), stamps_ns, world_frames, sensor_frames, poses, bag_ns)
+
+    def rows(self):
+        """An iterator of StampedPose."""
+        rows = zip(
+            self.streams.tolist(), self.numbers.tolist(), self.stamps_ns.tolist(), self.world_frames.tolist(),
+            self.sensor_frames.tolist(), _tuples(self.poses[:, :3]), _tuples(self.poses[:, 3:]), self.bag_ns.tolist(), strict=True,
+        )  # fmt: skip
+        return map(_make_stamped_pose, rows)
 
 
 class PoseBag:
@@ -293,7 +352,12 @@ class PoseBag:
     # ---- poses
 
     def poses(self, parent, child, max_gap_s=0.5):
-        """Iterate over the poses of both streams in the order of the bag's time.
+        """Iterate over the poses of both streams, StampedPose by StampedPose; as :meth:`blocks` otherwise."""
+        for block in self.blocks(parent, child, max_gap_s):
+            yield from block.rows()
+
+    def blocks(self, parent, child, max_gap_s=0.5):
+        """Iterate over the poses of both streams in the order of the bag's time, many at once.
 
         A path's poses are those of its newest message, and before its first stamp those of older ones; they count as recorded when they first
         appeared. Transforms are composed at the stamps of the slowest moving one of the chain.
@@ -307,7 +371,7 @@ class PoseBag:
 
         Yields
         ------
-        StampedPose
+        PoseBlock
 
         Raises
         ------
@@ -318,53 +382,53 @@ class PoseBag:
         types = {topic.name: topic.type for topic in self.topics()}
         self._watches = {str(source): PoseWatch() for source in sources.values()}
         direct = {source: stream for stream, source in sources.items() if types.get(source) in POSE_TYPES}
-        streams = [self._direct_poses(direct)] if direct else []
+        streams = [self._direct_blocks(direct)] if direct else []
         transforms = {stream: source for stream, source in sources.items() if isinstance(source, TfSource)}
         if transforms:
-            streams += self._transformed_poses(transforms, max_gap_s)
-        streams += [self._path_poses(stream, source) for stream, source in sources.items() if types.get(source) == PATH_TYPE]
-        yield from streams[0] if len(streams) == 1 else heapq.merge(*streams, key=_bag_time)
+            streams += [[block] for block in self._transformed_poses(transforms, max_gap_s)]
+        streams += [[self._path_poses(stream, source)] for stream, source in sources.items() if types.get(source) == PATH_TYPE]
+        if len(streams) == 1:
+            yield from filter(len, streams[0])
+        else:
+            rows = (chain.from_iterable(map(PoseBlock.rows, blocks)) for blocks in streams)
+            yield from map(PoseBlock.of_rows, _blocks(heapq.merge(*rows, key=_bag_time), _BLOCK))
 
-    def _direct_poses(self, streams):
+    def _direct_blocks(self, streams):
         """Poses of topics that carry one in each message."""
         counts = dict.fromkeys(streams, 0)
-        for block in self._messages(streams):
-            indices_of = {}
-            for index, message in enumerate(block):
-                indices_of.setdefault(message[0], []).append(index)
-            poses = [None] * len(block)
-            for kind, indices in indices_of.items():
-                made = self._unpacked_poses(
-                    kind, streams[kind.topic], counts[kind.topic] + 1, [block[index] for index in indices]
+        for messages in self._messages(streams):
+            rows_of = {}
+            for row, message in enumerate(messages):
+                rows_of.setdefault(message[0], []).append(row)
+            parts, rows_kept = [], []
+            for kind, rows in rows_of.items():
+                part, keep = self._unpacked_poses(
+                    kind, streams[kind.topic], counts[kind.topic] + 1, [messages[row] for row in rows]
                 )
-                counts[kind.topic] += len(indices)
-                for index, pose in zip(indices, made, strict=True):
-                    poses[index] = pose
-            yield from poses if None not in poses else filter(None, poses)
+                counts[kind.topic] += len(rows)
+                parts.append(part[keep])
+                rows_kept.append(np.array(rows)[keep])
+            yield PoseBlock.concatenate(parts)[np.argsort(np.concatenate(rows_kept))]
 
     def _unpacked_poses(self, kind, stream, first_number, messages):
-        bag_ns = [message[1] for message in messages]
+        """PoseBlock of messages, and which of them to keep."""
         try:
             columns = unpack_poses([message[2] for message in messages], kind.type, kind.is_ros1)
         except MalformedMessage as error:
             raise _unreadable(kind, first_number + error.index, error) from error
         numbers = first_number + np.arange(len(messages))
-        keep = self._watches[kind.topic].believable(first_number, columns.stamps_ns, np.array(bag_ns, dtype=np.int64))
-        made = self._stamped_poses(kind.topic, stream, columns, bag_ns, numbers, keep)
-        return made if keep.all() else (pose if kept else None for pose, kept in zip(made, keep, strict=True))
+        bag_ns = np.array([message[1] for message in messages], dtype=np.int64)
+        keep = self._watches[kind.topic].believable(first_number, columns.stamps_ns, bag_ns)
+        return self._watched(kind.topic, stream, columns, bag_ns, numbers, keep), keep
 
-    def _stamped_poses(self, name, stream, columns, bag_ns, numbers=None, keep=slice(None)):
-        """StampedPoses of PoseColumns, all of them; only those to keep are looked at more closely."""
+    def _watched(self, name, stream, columns, bag_ns, numbers=None, keep=slice(None)):
+        """PoseBlock of PoseColumns, all of them; only those to keep are looked at more closely."""
         numbers = 1 + np.arange(len(bag_ns)) if numbers is None else numbers
         try:
             self._watches[name].add(numbers[keep], columns.stamps_ns[keep], columns.numbers[keep])
         except InputError as error:
             raise InputError(f"{name}, {error}") from None
-        rows = zip(
-            repeat(stream), numbers.tolist(), columns.stamps_ns.tolist(), columns.world_frames, columns.sensor_frames,
-            _tuples(columns.numbers[:, :3]), _tuples(columns.numbers[:, 3:]), bag_ns,
-        )  # fmt: skip
-        return map(_make_stamped_pose, rows)
+        return PoseBlock.of_columns(stream, numbers, columns, bag_ns)
 
     def _path_poses(self, stream, topic):
         """Poses of a path that is published again and again as it grows, perhaps with all poses corrected."""
@@ -388,11 +452,11 @@ class PoseBag:
                 f"the poses of path {topic} have no stamps: all are zero; use the odometry that the path was made from"
             )
         columns = PoseColumns(stamps_ns, [world_frame] * len(stamps_ns), [None] * len(stamps_ns), numbers)
-        bag_ns = [first_seen[stamp_ns] for stamp_ns in stamps_ns.tolist()]
-        return sorted(self._stamped_poses(topic, stream, columns, bag_ns), key=_bag_time)
+        bag_ns = np.array([first_seen[stamp_ns] for stamp_ns in stamps_ns.tolist()], dtype=np.int64)
+        return self._watched(topic, stream, columns, bag_ns)[np.argsort(bag_ns, kind="stable")]
 
     def _transformed_poses(self, sources, max_gap_s):
-        """A list of poses for each stream whose poses come from the transform tree."""
+        """A PoseBlock for each stream whose poses come from the transform tree."""
         tree = self.transforms()
         needed = {frame for source in sources.values() for side in tree.chain(source) for frame in side}
         for transform, is_static, bag_ns in self._transforms(needed):
@@ -408,7 +472,7 @@ class PoseBag:
             frames = [[frame] * len(trajectory) for frame in source]
             numbers = np.concatenate([trajectory.poses[:, :3, 3], se3.to_quat_xyzw(trajectory.poses)], axis=1)
             columns = PoseColumns(trajectory.stamps_ns, *frames, numbers)
-            found.append(sorted(self._stamped_poses(str(source), stream, columns, bag_ns.tolist()), key=_bag_time))
+            found.append(self._watched(str(source), stream, columns, bag_ns)[np.argsort(bag_ns, kind="stable")])
         return found
 
     def transforms(self):
@@ -626,24 +690,25 @@ def read_bag_trajectory(path, topic=None, tf=None):
     source = TfSource.parse(tf) if tf else topic
     with PoseBag(path) as bag:
         bag.check(source)
-        poses = list(bag.poses(source, None))
+        blocks = list(bag.blocks(source, None))
         notes = bag.warnings
-    if not poses:
+    if not blocks:
         raise InputError(f"no poses on {source} of {path}")
-    stamps_ns, first = np.unique(np.array([pose.stamp_ns for pose in poses], dtype=np.int64), return_index=True)
+    poses = PoseBlock.concatenate(blocks)
+    stamps_ns, first = np.unique(poses.stamps_ns, return_index=True)
     if len(first) < len(poses):
         notes.append(
             f"{source}: {len(poses) - len(first)} of {len(poses)} poses had a stamp that was there already and were dropped"
         )
     if (np.diff(first) < 0).any():
         notes.append(f"{source}: stamps were not in the order of the bag and were sorted")
-    chosen = [poses[index] for index in first.tolist()]
+    poses = poses[first]
     return Trajectory.from_quat_xyzw(
         stamps_ns,
-        [pose.position for pose in chosen],
-        [pose.quat_xyzw for pose in chosen],
-        sensor_frame=chosen[0].sensor_frame or "",
-        world_frame=chosen[0].world_frame,
+        poses.poses[:, :3],
+        poses.poses[:, 3:],
+        sensor_frame=poses.sensor_frames[0] or "",
+        world_frame=poses.world_frames[0],
     ), notes
 
 

@@ -20,12 +20,11 @@ from decimal import Decimal, InvalidOperation
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hand_eye_calib.config import STAMP_UNITS
+from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, ROTATION_TOLERANCE, Trajectory
-
-FORMATS = ("tum", "kitti", "euroc", "csv")
-STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 _TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _EUROC_COLUMNS = "timestamp, px, py, pz, qw, qx, qy, qz"

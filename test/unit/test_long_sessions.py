@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from faults import reordered
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, feed, planar_poses, wandering_poses
 
 from hand_eye_calib import calibrator as engine
@@ -169,3 +170,16 @@ def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
     extra = as_trajectory(wandering_poses(900))[400:]
     feed(calibrator, "parent", extra)
     assert calibrator.estimate().time_offset_s == snapshot.found_time_offset.seconds
+
+
+@pytest.mark.parametrize("max_pairs", [5000, 300])
+def test_the_whole_session_is_checked_not_only_its_end(max_pairs):
+    poses = wandering_poses(400)
+    parked = np.concatenate([poses, np.repeat(poses[-1:], 200, axis=0)])
+    parent, child = (as_trajectory(disturbed(each, seed, 1e-4, 1e-4)) for seed, each in enumerate((parked, child_of(parked))))
+    sound = play(by_stamp(parent, child), max_pairs=max_pairs).snapshot()
+    assert sound.check().findings == ()
+    assert len(sound.parent) < 150 < 250 < len(sound.streams[0])
+    late = play(by_stamp(parent, reordered(child)), max_pairs=max_pairs, time_offset=0.5).snapshot()
+    assert [finding.code for finding in late.check().findings][0] == "quaternion_order"
+    assert late.streams[1].stamps_ns[0] in child.stamps_ns
