@@ -26,7 +26,7 @@ setup(
     maintainer_email=manifest.find("maintainer").get("email"),
     license=manifest.findtext("license"),
     packages=find_packages(include=[name, f"{name}.*"]),
-    package_data={f"{name}.report": ["templates/*.html"]},
+    package_data={f"{name}.report": ["templates/*.html", "templates/*.css"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
         (f"share/{name}", ["package.xml"]),

@@ -29,10 +29,11 @@ from hand_eye_calib.pairing.stream_checks import (
     Severity,
     check_stamps,
     check_stream,
+    coarse_poses,
     frozen_share,
 )
 from hand_eye_calib.pairing.synchronise import synchronise
-from hand_eye_calib.pairing.time_offset import LEAST_VARIATION, Correlation, correlate_turning
+from hand_eye_calib.pairing.time_offset import LEAST_VARIATION, NO_CORRELATION, Correlation, correlate_turning
 from hand_eye_calib.solvers.alignment import estimate_scale, indices_after, refine_time_offset
 from hand_eye_calib.solvers.separable import align_rotation_vectors
 from hand_eye_calib.solvers.similarity import SimilarityFit, fit_similarity
@@ -44,6 +45,9 @@ _FEWEST_PAIRS = 12
 # A hypothesis holds where it leaves at most this share of the motion unexplained, and it replaces the plain one where it leaves this many times less.
 HOLDS, DECISIVE = 0.12, 3.0
 
+# Streams that clearly turn together are on one body; where so much of their motion stays unexplained at most, their noise is to blame.
+_NOISY = 0.3
+
 # Of hypotheses about equally good the simpler one, or that about the child, is taken.
 _ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
 
@@ -51,10 +55,16 @@ _ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
 _INVERTED, _LIKELY_INVERTED = 0.3, 1.0
 _WAY_STEP_S = 0.3
 
+# Frames this near to each other (m, rad) are one.
+_NO_LEVER_M, _NO_TURN_RAD = 0.01, 0.01
+
 # Offsets (s) that are worth a warning, a note; scales are significant by alignment.SCALE_IS_SIGNIFICANT.
 _OFFSET_WARNING_S, _OFFSET_NOTE_S, _OFFSET_SIGMAS = 0.03, 0.005, 5.0
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
 _UNIT_TOLERANCE = 0.1
+
+# What it takes at least to tell faults while driving.
+ENOUGH_S, ENOUGH_TURNED_RAD = 20.0, np.radians(30.0)
 
 # Part of the time a stream may repeat its pose while the other moves.
 _FROZEN = 0.02
@@ -111,7 +121,7 @@ def check_streams(parent, child, time_offset_s=0.0, scale=1.0, max_gap_s=0.5):
     for name, stream in (("parent", parent), ("child", child)):
         findings += check_stream(stream, name, max_gap_s)
     if any(finding.severity is Severity.ERROR for finding in findings):
-        return _agreement(findings, correlate_turning(parent, child, max_gap_s))
+        return _agreement(findings, NO_CORRELATION)
     child = child.shifted(time_offset_s).scaled(scale)
     correlation = correlate_turning(parent, child, max_gap_s)
     aligned = child.shifted(correlation.offset_s) if correlation.is_clear else child
@@ -142,6 +152,19 @@ def check_streams(parent, child, time_offset_s=0.0, scale=1.0, max_gap_s=0.5):
     findings += _scale(estimate_scale(pose_pairs), scale)
     excitation, turned = _excitation(pose_pairs, verdict.fit)
     return _agreement(findings + excitation, correlation, verdict.fit, turned)
+
+
+def tell_enough(parent, child):
+    """Whether two streams last so long, and turn so far, that the checks mean something: while one is still driving.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+    """
+    return min(stream.duration_s for stream in (parent, child)) >= ENOUGH_S and any(
+        se3.rotation_angle(stream.poses[0, :3, :3].T @ stream.poses[:, :3, :3]).max() >= ENOUGH_TURNED_RAD
+        for stream in (parent, child)
+    )
 
 
 def _agreement(findings, correlation, fit=None, turned=None):
@@ -176,10 +199,11 @@ class _Verdict:
     hypothesis: _Hypothesis
     fit: SimilarityFit
     findings: list
+    limit: float = HOLDS
 
     @property
     def holds(self):
-        return _unexplained(self.fit) < HOLDS
+        return _unexplained(self.fit) < self.limit
 
     def undo(self, parent, child):
         return self.hypothesis.undo(parent, child)
@@ -243,32 +267,53 @@ _AXES = _axis_hypotheses()
 def _best_hypothesis(parent, child, max_gap_s, thorough):
     """The Verdict on the mistake that explains the streams, or on none; over shorter motions where jumps spoil the longer ones.
 
-    Wrong axes are tried only on a ``thorough`` search: there are many of them, and streams that do not turn together need none.
+    Wrong axes are tried only on a ``thorough`` search, and at most twice: there are many of them, and streams that do not turn
+    together need none.
     """
-    failed = None
+    failed = []
     for lag_s in _LAGS_S:
-        chosen = _chosen(parent, child, max_gap_s, lag_s, thorough)
+        try:
+            chosen = _plain_or_usual(parent, child, max_gap_s, lag_s)
+        except NotEnoughDataError as error:
+            too_few = error
+            continue
+        if not chosen.holds and thorough and not failed:
+            chosen = _or_other_axes(chosen, parent, child, max_gap_s, lag_s)
         if chosen.holds:
             return _attribute(chosen, parent, child, max_gap_s, lag_s)
-        failed = failed or chosen
-    return dataclasses.replace(failed, findings=[_not_one_body(failed.fit)])
+        failed.append((lag_s, chosen))
+    if not failed:
+        raise too_few
+    lag_s, best = min(failed, key=lambda tried: _unexplained(tried[1].fit))
+    if thorough and lag_s != failed[0][0]:
+        best = _or_other_axes(best, parent, child, max_gap_s, lag_s)
+        if best.holds:
+            return _attribute(best, parent, child, max_gap_s, lag_s)
+    if thorough and _unexplained(best.fit) < _NOISY:
+        return dataclasses.replace(best, findings=[_noisy(best.fit)], limit=_NOISY)
+    return dataclasses.replace(best, findings=[_not_one_body(best.fit)])
 
 
-def _chosen(parent, child, max_gap_s, lag_s, thorough):
+def _plain_or_usual(parent, child, max_gap_s, lag_s):
     plain = _judge(_PLAIN, parent, child, max_gap_s, lag_s)
     usual = _simplest_of_the_best([_judge(hypothesis, parent, child, max_gap_s, lag_s) for hypothesis in _USUAL])
-    if _is_decisive(plain, usual):
-        return usual
-    if thorough and not plain.holds and _rotations_agree(parent, child, max_gap_s, lag_s):
-        rough = [_judge(hypothesis, parent, child, max_gap_s, lag_s, _PAIRS_FOR_AXES) for hypothesis in _AXES]
-        axes = _simplest_of_the_best(rough)
-        if _is_decisive(plain, axes):
-            return axes
-    return plain
+    return usual if _is_decisive(plain, usual) else plain
 
 
-def _judge(hypothesis, parent, child, max_gap_s, lag_s, most=_PAIRS):
-    return _Verdict(hypothesis, fit_similarity(_pairs(*hypothesis.undo(parent, child), max_gap_s, lag_s, most)), [])
+def _or_other_axes(plain, parent, child, max_gap_s, lag_s):
+    """The Verdict on wrong axes where they are to blame, or the one that is given."""
+    rotation = _agreed_rotation(parent, child, max_gap_s, lag_s)
+    if rotation is None:
+        return plain
+    start = dataclasses.replace(plain.fit, T_parent_child=se3.from_rotation_translation(rotation, np.zeros(3)))
+    rough = [_judge(hypothesis, parent, child, max_gap_s, lag_s, _PAIRS_FOR_AXES, start) for hypothesis in _AXES]
+    axes = _simplest_of_the_best(rough)
+    return axes if _is_decisive(plain, axes) else plain
+
+
+def _judge(hypothesis, parent, child, max_gap_s, lag_s, most=_PAIRS, start=None):
+    pairs = _pairs(*hypothesis.undo(parent, child), max_gap_s, lag_s, most)
+    return _Verdict(hypothesis, fit_similarity(pairs, start=start), [])
 
 
 def _pairs(parent, child, max_gap_s, lag_s, most=_PAIRS):
@@ -279,13 +324,14 @@ def _pairs(parent, child, max_gap_s, lag_s, most=_PAIRS):
     return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i, j)
 
 
-def _rotations_agree(parent, child, max_gap_s, lag_s):
-    """Whether the rotations alone fit: wrong axes of the positions do not touch them."""
+def _agreed_rotation(parent, child, max_gap_s, lag_s):
+    """The rotation on which the rotations alone agree, or None: wrong axes of the positions do not touch them."""
     pairs = _pairs(parent, child, max_gap_s, lag_s)
     rotation = align_rotation_vectors(pairs)
     rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
     errors = se3.rotation_angle(np.swapaxes(rotation_a @ rotation, 1, 2) @ (rotation @ rotation_b))
-    return np.median(errors) < 2 * HOLDS * np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2))
+    agree = np.median(errors) < 2 * HOLDS * np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2))
+    return rotation if agree else None
 
 
 def _unexplained(fit):
@@ -333,14 +379,22 @@ def _evidence_for_inverse(parent, child, fit, max_gap_s, lag_s):
     """How much shorter ways and lever are (sum of logarithms) where both streams are inverted, and the fit then."""
     inverted = _judge(_BothInverted("", "both", _inverted), parent, child, max_gap_s, lag_s).fit
     ways = sum(np.log(_way(stream) / _way(_inverted(stream))) for stream in (parent, child))
+    if any(_is_none(each) for each in (fit, inverted)):
+        return float(ways), inverted  # one world for both streams: no lever between worlds tells anything
     levers = [max(float(np.linalg.norm(f.T_parent_child[:3, 3])), 3 * f.sigma_translation, 1e-3) for f in (fit, inverted)]
     return float(ways + 0.5 * np.log(levers[0] / levers[1])), inverted
 
 
+def _is_none(fit):
+    """Whether a fit's transform is no more than noise."""
+    far = np.linalg.norm(fit.T_parent_child[:3, 3]) > max(_NO_LEVER_M, 3 * fit.sigma_translation)
+    return not far and se3.rotation_angle(fit.T_parent_child[:3, :3]) < max(_NO_TURN_RAD, 3 * fit.sigma_rotation)
+
+
 def _way(trajectory):
     """Length of the way, in coarse steps so that noise does not count."""
-    at_ns = np.arange(trajectory.stamps_ns[0], trajectory.stamps_ns[-1], round(_WAY_STEP_S * 1e9))
-    return float(np.linalg.norm(np.diff(trajectory.at(at_ns)[:, :3, 3], axis=0), axis=1).sum()) + 1e-9
+    places = coarse_poses(trajectory, _WAY_STEP_S)[:, :3, 3]
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()) + 1e-9
 
 
 # ------------------------------------------------------------------ findings
@@ -374,6 +428,14 @@ def _not_one_body(fit):
         f"no extrinsic, scale or usual mistake explains both streams: {_unexplained(fit):.0%} of the motion remain (at most "
         f"{HOLDS:.0%} would be good)",
         "check that both sensors are on one rigid body and that the poses are those of the sensors",
+    )  # fmt: skip
+
+
+def _noisy(fit):
+    return _finding(
+        "noisy", "both", Severity.NOTE, Confidence.LIKELY,
+        f"the streams turn together, but {_unexplained(fit):.0%} of the motion stay unexplained: noise or jumps are strong",
+        "expect large standard deviations; drive longer and livelier, or repair the source",
     )  # fmt: skip
 
 
@@ -463,7 +525,8 @@ def _scale(scale, known):
 
 def _excitation(pose_pairs, fit):
     """A note where nearly all turning is about one axis, and how much the parent turned about each of its axes."""
-    i, j = indices_after(pose_pairs.stamps_ns, _LAGS_S[0], _PAIRS)
+    spans = (indices_after(pose_pairs.stamps_ns, lag_s, _PAIRS) for lag_s in _LAGS_S)
+    i, j = next(span for span in spans if len(span[0]) >= _FEWEST_PAIRS)  # one there is: the fit is over it
     rotation = pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i, j).Ts_parenti_parentj[:, :3, :3]
     vectors = se3.rotation_log(rotation)
     turned = dict(zip("xyz", np.sqrt((vectors**2).mean(axis=0)).tolist(), strict=True))
@@ -480,6 +543,6 @@ def _excitation(pose_pairs, fit):
             f"nearly all turning is about one axis, ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f}) in the parent sensor's frame: the "
             f"translation along it, {name}, will be unobservable",
             f"drive over slopes or kerbs, or measure {name} and give it",
-            prior=f"{name}=VALUE+/-SIGMA",
+            **{f"prior.{name}": "VALUE+/-SIGMA"},
         )
     ], turned  # fmt: skip

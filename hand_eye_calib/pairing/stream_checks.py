@@ -87,6 +87,9 @@ _WAY_STEP_S = 0.2
 # An interval is a gap when it is longer than the limit and than so many usual ones.
 _GAP_INTERVALS = 5.0
 
+# No recording pauses for so long (s): a stamp is wrong.
+_LEAP_S = 86_400.0
+
 # A step is a jump when it differs from the steps around it by this many times the usual difference, and by so many times the usual step.
 _JUMP_SIGMAS, _JUMP_STEPS = 12.0, 3.0
 _JUMPS_MATTER = 0.002
@@ -105,10 +108,7 @@ _DATE_NS = 1e17
 def summarise(trajectory):
     """StreamSummary of a trajectory of at least two poses."""
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    step_ns = round(max(_WAY_STEP_S, float(np.median(intervals_s))) * 1e9)
-    coarse = trajectory.poses[
-        np.unique(np.searchsorted(trajectory.stamps_ns, np.arange(trajectory.stamps_ns[0], trajectory.stamps_ns[-1], step_ns)))
-    ]
+    coarse = coarse_poses(trajectory, max(_WAY_STEP_S, float(np.median(intervals_s))))
     steps = np.linalg.norm(np.diff(coarse[:, :3, 3], axis=0), axis=1)
     angles = se3.rotation_angle(np.swapaxes(coarse[:-1, :3, :3], 1, 2) @ coarse[1:, :3, :3])
     return StreamSummary(
@@ -119,6 +119,12 @@ def summarise(trajectory):
         float(steps.sum()),
         float(angles.sum()),
     )
+
+
+def coarse_poses(trajectory, step_s):
+    """The first pose of every step of ``step_s`` seconds that has one: (M, 4, 4) array."""
+    steps = (trajectory.stamps_ns - trajectory.stamps_ns[0]) // round(step_s * 1e9)
+    return trajectory.poses[np.unique(steps, return_index=True)[1]]
 
 
 def tidy(stamps_ns, translations, quats_xyzw, stream, **frames):
@@ -162,7 +168,7 @@ def tidy(stamps_ns, translations, quats_xyzw, stream, **frames):
 
 
 def check_stream(trajectory, stream, max_gap_s=0.5):
-    """Findings about one stream: too short, gaps, jumps.
+    """Findings about one stream: too short, a leap in time, gaps, jumps.
 
     Parameters
     ----------
@@ -182,6 +188,8 @@ def check_stream(trajectory, stream, max_gap_s=0.5):
                 f"the {stream} stream has {len(trajectory)} poses", "record longer, or check the topic",
             )
         ]  # fmt: skip
+    if leaps := check_leap(trajectory, stream):
+        return leaps
     findings = []
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     gaps = intervals_s > max(max_gap_s, _GAP_INTERVALS * float(np.median(intervals_s)))
@@ -205,6 +213,34 @@ def check_stream(trajectory, stream, max_gap_s=0.5):
             )
         )  # fmt: skip
     return findings
+
+
+def check_leap(trajectory, stream):
+    """Finding about stamps that lie days apart from the others, or none; for a trajectory of at least two poses.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    stream : str
+        "parent" or "child".
+
+    Returns
+    -------
+    list of Finding
+    """
+    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
+    before = int(np.argmax(intervals_s)) + 1
+    if intervals_s[before - 1] <= _LEAP_S:
+        return []
+    after = len(trajectory) - before
+    few = f"the first {before}" if before < after else f"the last {after}"
+    return [
+        Finding(
+            "leap", stream, Severity.ERROR, Confidence.CERTAIN,
+            f"the {stream} stream's stamps leap by {intervals_s[before - 1] / _LEAP_S:,.0f} days after pose {before} of {len(trajectory)}",
+            f"repair the stamps, or remove {few} of its poses",
+        )
+    ]  # fmt: skip
 
 
 def _jumps(trajectory):

@@ -107,8 +107,8 @@ def correlate_turning(parent, child, max_gap_s=0.5):
     step_s = float(np.clip(max(_interval_s(parent), _interval_s(child)), _SHORTEST_STEP_S, _LONGEST_STEP_S))
     step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MOST_SAMPLES)
     window_s = max(_WINDOW_STEPS * step_s, _SHORTEST_WINDOW_S)
-    start_parent, rate_parent = _turning_rates(parent, window_s, step_s, max_gap_s)
-    start_child, rate_child = _turning_rates(child, window_s, step_s, max_gap_s)
+    start_parent, rate_parent = turning_rates(parent, window_s, step_s, max_gap_s)
+    start_child, rate_child = turning_rates(child, window_s, step_s, max_gap_s)
     if min(np.isfinite(rate_parent).sum(), np.isfinite(rate_child).sum()) * step_s < _LEAST_OVERLAP_S:
         return NO_CORRELATION
     variation = min(float(np.nanstd(rate)) for rate in (rate_parent, rate_child))
@@ -132,7 +132,7 @@ def _interval_s(trajectory):
     return float(np.median(np.diff(trajectory.stamps_ns))) * 1e-9
 
 
-def _turning_rates(trajectory, window_s, step_s, max_gap_s):
+def turning_rates(trajectory, window_s, step_s, max_gap_s):
     """Start stamp and angular speeds (M,), rad/s, over windows that start every ``step_s``; nan where a window touches a gap."""
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)

@@ -13,8 +13,10 @@ from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+from hand_eye_calib.pairing.time_offset import turning_rates
 
 # Poses that a method solves again with, at most, in each of many and in each of few solves: by how long it takes.
 _MANY_TIMES, _FEW_TIMES = {"dnlo": 20_000, "dnl": 20_000, "adaptive": 600}, {"dnlo": 50_000, "dnl": 50_000, "adaptive": 600}
@@ -26,6 +28,15 @@ _PARTS, _FEWER_PARTS = 10, {"adaptive": 4}
 _COMPARED_METHODS = ("dnlo", "dnl", "park")
 _COMPARED_BASELINES = (1, 5, 10, 20)
 _FEWEST_POSES = 20
+
+# Angular speeds are shown at most so many times, over at least this long each (s).
+_MOST_RATES, _SHORTEST_WINDOW_S = 1500, 0.2
+
+# Motions of both streams that are compared: over this long (s; where poses are rarer, over shorter times), at most so many.
+_LAGS_S, _MOST_MOTIONS, _FEWEST_MOTIONS = (3.0, 1.0, 0.4), 400, 12
+
+# Where a sensor turns less (rad), the axis it turns about is chance.
+_HAS_AXIS = np.radians(2.0)
 
 # Time over which turning is shown (s); where poses are rarer than that, from one to the next.
 _TURNING_S = 2.0
@@ -94,6 +105,32 @@ class Tracks:
 
 
 @dataclass(frozen=True)
+class StreamsSeen:
+    """What the streams say before any solve, on the parent's clock and in its unit of length; first the parent, then the child.
+
+    Attributes
+    ----------
+    rates : 2 x (times_s, rates)
+        Angular speeds, rad/s; nan in gaps.
+    spans_s : 2 x (M, 2) arrays
+        When each stream has poses, without longer gaps.
+    lag_s : float
+        How long the motions compared are.
+    angles, slides : (K, 2), (L, 2) arrays
+        Rotation angles of the motions, rad, and how far each goes along the axis it turns about, m (of those that have one).
+    moved_m : float
+        Root mean square length of the parent's motions, m.
+    """
+
+    rates: tuple
+    spans_s: tuple
+    lag_s: float
+    angles: np.ndarray
+    slides: np.ndarray
+    moved_m: float
+
+
+@dataclass(frozen=True)
 class Evidence:
     """Everything that the figures show, beside the Calibration itself.
 
@@ -109,9 +146,10 @@ class Evidence:
     convergence: tuple
     comparison: tuple
     halves: tuple
+    streams: StreamsSeen
 
 
-def gather(calibration, config, pose_pairs, estimate):
+def gather(calibration, config, pose_pairs, estimate, streams=None):
     """Collect the evidence.
 
     Parameters
@@ -124,6 +162,8 @@ def gather(calibration, config, pose_pairs, estimate):
         The poses that gave it, on one clock, in their own scales.
     estimate : callable
         The engine: ``estimate(pose_pairs, config)`` gives a Calibration, or raises HandEyeCalibError.
+    streams : mapping, optional
+        "parent" and "child" to Trajectory, as they were read; the synchronised poses stand for them where they are left out.
 
     Returns
     -------
@@ -143,7 +183,22 @@ def gather(calibration, config, pose_pairs, estimate):
         ask.growing(settled),
         ask.others(without_prior),
         ask.halves(without_prior),
+        _streams(calibration, config, scaled, streams),
     )
+
+
+def see_streams(parent, child, max_gap_s):
+    """The StreamsSeen of two trajectories on one clock, in one unit of length."""
+    start_ns = min(parent.stamps_ns[0], child.stamps_ns[0])
+    step_s = max(_interval_s(parent), _interval_s(child), max(parent.duration_s, child.duration_s) / _MOST_RATES)
+    rates, spans = [], []
+    for stream in (parent, child):
+        first_ns, rate = turning_rates(stream, max(3 * step_s, _SHORTEST_WINDOW_S), step_s, max_gap_s)
+        rates.append(((first_ns - start_ns) * 1e-9 + np.arange(len(rate)) * step_s, rate))
+        gaps = np.flatnonzero(np.diff(stream.stamps_ns) > max_gap_s * 1e9)
+        edges = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
+        spans.append((edges.reshape(-1, 2) - start_ns) * 1e-9)
+    return StreamsSeen(tuple(rates), tuple(spans), *_compared_motions(synchronise(parent, child, max_gap_s)))
 
 
 def deviation(T_parent_child, T_reference):
@@ -269,11 +324,48 @@ def _tracks(calibration, pose_pairs):
     return Tracks(_seconds(pose_pairs, pose_pairs.stamps_ns), parent - parent[0], child - parent[0])
 
 
+def _streams(calibration, config, pose_pairs, streams):
+    if streams:
+        child = streams["child"].shifted(calibration.time_offset_s).scaled(calibration.scale)
+        return see_streams(streams["parent"], child, config.max_gap)
+    parent, child = (Trajectory(pose_pairs.stamps_ns, poses) for poses in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c))
+    return see_streams(parent, child, config.max_gap)
+
+
+def _interval_s(trajectory):
+    return float(np.median(np.diff(trajectory.stamps_ns))) * 1e-9
+
+
+def _compared_motions(pose_pairs):
+    """Lag, rotation angles and translations along the axes of motions of both sensors, and the length of the parent's."""
+    for lag_s in _LAGS_S:
+        start, end = _spans(pose_pairs, lag_s)
+        if len(start) >= _FEWEST_MOTIONS:
+            break
+    chosen = np.unique(np.linspace(0, max(len(start) - 1, 0), min(len(start), _MOST_MOTIONS)).astype(int))
+    angles, slides, lengths = [], [], []
+    for poses in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c):
+        motions = se3.inverse(poses[start[chosen]]) @ poses[end[chosen]]
+        vectors = se3.rotation_log(motions[:, :3, :3])
+        angles.append(np.linalg.norm(vectors, axis=1))
+        lengths.append(np.linalg.norm(motions[:, :3, 3], axis=1))
+        slides.append(np.einsum("ki,ki->k", vectors, motions[:, :3, 3]) / np.maximum(angles[-1], 1e-12))
+    angles, slides = np.stack(angles, axis=1), np.stack(slides, axis=1)
+    moved_m = float(np.sqrt(np.mean(lengths[0] ** 2))) if len(chosen) else 0.0
+    return lag_s, angles, slides[(angles > _HAS_AXIS).all(axis=1)], moved_m
+
+
+def _spans(pose_pairs, span_s):
+    """Indices of poses and of those about ``span_s`` later."""
+    times_s = _seconds(pose_pairs, pose_pairs.stamps_ns)
+    ends = np.searchsorted(times_s, times_s + span_s - 1e-9)
+    start = np.flatnonzero(ends < len(times_s))
+    return start, np.maximum(ends[start], start + 1)
+
+
 def _turning(pose_pairs):
     times_s = _seconds(pose_pairs, pose_pairs.stamps_ns)
-    ends = np.searchsorted(times_s, times_s + _TURNING_S - 1e-9)
-    start = np.flatnonzero(ends < len(times_s))
-    end = np.maximum(ends[start], start + 1)
+    start, end = _spans(pose_pairs, _TURNING_S)
     rotation = pose_pairs.Ts_pw_p[:, :3, :3]
     vectors = se3.rotation_log(np.swapaxes(rotation[start], 1, 2) @ rotation[end])
     span_s = float(np.median(times_s[end] - times_s[start])) if len(start) else _TURNING_S

@@ -2,7 +2,6 @@
 
 import math
 import platform
-import warnings
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -17,8 +16,6 @@ from hand_eye_calib.pairing.stream_checks import summarise
 from hand_eye_calib.report.evidence import deviation, gather, sigmas
 from hand_eye_calib.report.report_figures import draw_all, time_axis
 
-FILE_NAME = "report.html"
-
 _TITLES = {
     "trajectories": "Both trajectories, brought together",
     "residuals": "Residuals over time",
@@ -26,6 +23,7 @@ _TITLES = {
     "excitation": "Excitation",
     "methods": "Other methods and references",
     "halves": "The two halves of the drive",
+    "streams": "Both streams before any solve",
 }
 _WORDS = {
     DofVerdict.OBSERVED: "the motion reveals it",
@@ -69,55 +67,46 @@ def render(calibration, config, pose_pairs, estimate, *, inputs=None, findings=(
     -------
     str
     """
-    evidence = gather(calibration, config, pose_pairs, estimate)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")  # text is drawn by the browser, with its own fonts
-        svgs = draw_all(calibration, evidence)
+    evidence = gather(calibration, config, pose_pairs, estimate, streams)
+    svgs = draw_all(calibration, evidence)
     said = {name: _SENTENCES[name](calibration, evidence) for name in _TITLES}
     document = calibration.to_dict()
-    template = _environment().get_template("report.html")
-    return template.render(
-        calibration=calibration,
-        document=document,
-        verdict=_verdict(calibration),
-        badge=_badge(calibration),
-        directions=[document["T_parent_child"], document["T_child_parent"]],
-        axes=_axes(calibration),
-        advice=what_is_missing(evidence.excitation, calibration),
-        command=command,
-        figures=[{"name": name, "title": title, "said": said[name], "svg": svgs.get(name)} for name, title in _TITLES.items()],
-        findings=list(findings),
-        summary=_summary(calibration, evidence),
-        streams=_streams(inputs or {}, streams or {}),
-        provenance=_provenance(inputs or {}),
-        options={name: value for name, value in config.to_options().items() if value != ""},
+    return (
+        environment()
+        .get_template("report.html")
+        .render(
+            calibration=calibration,
+            document=document,
+            verdict=_verdict(calibration),
+            badge=_badge(calibration),
+            directions=[document["T_parent_child"], document["T_child_parent"]],
+            axes=_axes(calibration),
+            advice=what_is_missing(evidence.excitation, calibration),
+            command=command,
+            figures=[
+                {"name": name, "title": title, "said": said[name], "svg": svgs.get(name)} for name, title in _TITLES.items()
+            ],
+            findings=list(findings),
+            summary=_summary(calibration, evidence),
+            streams=_streams(inputs or {}, streams or {}),
+            provenance=_provenance(inputs or {}),
+            options={name: value for name, value in config.to_options().items() if value != ""},
+        )
     )
 
 
-def write_report(directory, *arguments, **more):
-    """Write :func:`render`'s page as ``report.html`` into a directory that exists; returns the file's path.
-
-    Raises
-    ------
-    OSError
-        Where it cannot be written.
-    """
-    path = Path(directory) / FILE_NAME
-    path.write_text(render(*arguments, **more), encoding="utf-8")
-    return path
-
-
-def _environment():
-    environment = jinja2.Environment(
+def environment():
+    """Where the templates of pages are found, and what they may use."""
+    made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["number"] = _fixed
-    environment.filters["plain"] = _plain
-    return environment
+    made.filters["number"] = _fixed
+    made.filters["plain"] = _plain
+    return made
 
 
 def _fixed(value, digits=4):
@@ -320,6 +309,22 @@ def _said_of_halves(calibration, evidence):
     return f"From each half alone, without priors: they differ by {_worst(apart, known)}, {judged}.{missing}{_thinned(evidence.halves)}"
 
 
+def said_of_streams(seen):
+    """What there is to see in the picture of both streams, in words."""
+    text = (
+        "Two sensors on one rigid body turn equally fast at every moment; each motion turns both by the same angle and moves both equally far "
+        "along the axis it turns about, however they are mounted. So the two curves must be one, and the dots must lie on the line (on flat ground, where nothing moves along the axis, near zero). "
+    )
+    if not len(seen.angles):
+        return text + "Here the streams have 0 motions in common, and there is nothing to compare."
+    apart = np.abs(np.diff(seen.angles, axis=1))
+    text += f"Here half of the {len(seen.angles)} motions over {seen.lag_s:g} s differ by less than {_size(np.median(apart), 'yaw')}"
+    if len(seen.slides):
+        text += f" and {_size(np.median(np.abs(np.diff(seen.slides, axis=1))), 'x')}"
+    gaps = [len(spans) - 1 for spans in seen.spans_s]
+    return f"{text}. The bars below the curves show when there are poses: {gaps[0]} gaps in the parent's stream, {gaps[1]} in the child's."
+
+
 _SENTENCES = {
     "trajectories": _said_of_trajectories,
     "residuals": _said_of_residuals,
@@ -327,6 +332,7 @@ _SENTENCES = {
     "excitation": _said_of_excitation,
     "methods": _said_of_methods,
     "halves": _said_of_halves,
+    "streams": lambda calibration, evidence: said_of_streams(evidence.streams),
 }
 
 

@@ -2,6 +2,8 @@
 
 import io
 import re
+import warnings
+from contextlib import contextmanager
 
 import matplotlib
 import numpy as np
@@ -31,6 +33,9 @@ _STYLE = {
 # Points drawn of a line, and of dots that each stand alone.
 _MOST_ON_A_LINE, _MOST_DOTS, _MOST_OUTLIERS = 1500, 600, 300
 
+# Share of a motion's length that may well be noise.
+_NOISE_SHARE = 0.3
+
 _SMALLEST_CM, _SMALLEST_DEG = 1e-4, 1e-5
 
 
@@ -40,9 +45,30 @@ def draw_all(calibration, evidence):
         "trajectories": _trajectories, "residuals": _residuals, "convergence": _convergence,
         "excitation": _excitation, "methods": _methods, "halves": _halves,
     }  # fmt: skip
-    with house_style(), matplotlib.rc_context(_STYLE):
+    with _page_style():
         drawn = {name: make(calibration, evidence) for name, make in makers.items()}
+        drawn["streams"] = _streams(evidence.streams, (calibration.parent_frame, calibration.child_frame))
         return {name: _svg(figure, name) for name, figure in drawn.items() if figure}
+
+
+def draw_streams(seen, names):
+    """SVG of what the streams say before any solve.
+
+    Parameters
+    ----------
+    seen : StreamsSeen
+    names : (str, str)
+        Of the parent and the child.
+    """
+    with _page_style():
+        return _svg(_streams(seen, names), "streams")
+
+
+@contextmanager
+def _page_style():
+    with house_style(), matplotlib.rc_context(_STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # text is drawn by the browser, with its own fonts
+        yield
 
 
 def _svg(figure, name):
@@ -224,6 +250,54 @@ def _rows(calibration, rows):
         panel.grid(axis="y", visible=False)
         panel.spines["left"].set_visible(False)
     return figure
+
+
+def _streams(seen, names):
+    factor, unit = time_axis(max(times[-1] if len(times) else 0.0 for times, _ in seen.rates))
+    figure = Figure(figsize=(WIDTH, 6.6))
+
+    def panel(left, bottom, width, height, **options):
+        return figure.add_axes((left / WIDTH, bottom / 6.6, width / WIDTH, height / 6.6), **options)
+
+    across = WIDTH - 0.8 - 0.12
+    speed = panel(0.8, 4.6, across, 1.7)
+    strip = panel(0.8, 4.15, across, 0.32, sharex=speed)
+    looks = ((PARENT, "-", 2.6), (CHILD, "-", 1.0))
+    for row, ((times, rates), spans, name, (colour, dashes, width)) in enumerate(
+        zip(seen.rates, seen.spans_s, names, looks, strict=True)
+    ):
+        speed.plot(times * factor, np.degrees(rates), color=colour, ls=dashes, lw=width, label=_plain(name))
+        strip.broken_barh(
+            [(start * factor, (end - start) * factor) for start, end in spans], (0.6 - row, 0.8), color=colour, lw=0
+        )
+    speed.set(ylabel="turning (deg/s)", ylim=(0, None))
+    speed.tick_params(labelbottom=False)
+    speed.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
+    strip.set(xlabel=f"time ({unit})", ylim=(-0.6, 1.6))
+    strip.set_yticks([1.0, 0.0], ["parent", "child"])
+    strip.tick_params(axis="y", length=0)
+    strip.grid(visible=False)
+    wide = (across - 0.75) / 2
+    below = [panel(0.8 + column * (wide + 0.75), 0.55, wide, 2.9) for column in range(2)]
+    below[0].set(title=f"Angle of motions over {seen.lag_s:g} s", xlabel="parent (deg)", ylabel="child (deg)")
+    below[1].set(title="How far they go along their axis", xlabel="parent (m)", ylabel="child (m)")
+    _identity(below[0], np.degrees(seen.angles))
+    # On flat ground nothing moves along the axis, and noise should not look like motion.
+    _identity(below[1], seen.slides, _NOISE_SHARE * seen.moved_m)
+    return figure
+
+
+def _identity(panel, values, least=0.0):
+    """Dots of the child's values over the parent's, and the line they should be on; the axes reach to ``least`` at least."""
+    if not len(values):
+        return _say(panel, "nothing to compare")
+    reach = max(1.15 * float(np.percentile(np.abs(values), 99)), least, 1e-6)
+    low = -reach if values.min() < 0 else 0.0
+    panel.plot([low, reach], [low, reach], color=MUTED, lw=1.0, ls="--", zorder=1)
+    beyond = (np.abs(values) > reach).any(axis=1)
+    panel.plot(*values[~beyond].T, "o", color=PARENT, ms=3.2, mew=0, alpha=0.5)
+    panel.plot(*np.clip(values[beyond], low, reach).T, "x", color=BAD, ms=5.5, mew=1.5, clip_on=False)
+    panel.set(xlim=(low, reach), ylim=(low, reach))
 
 
 def _dots(panel, first, second, limit, at=None, colour=PARENT):

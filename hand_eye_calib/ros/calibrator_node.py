@@ -4,6 +4,7 @@ Messages are converted and handed to the engine, solves run in a worker thread, 
 solve happens in the executor's one thread, so nothing here needs a lock.
 """
 
+import dataclasses
 import time
 import traceback
 from dataclasses import dataclass, field
@@ -31,10 +32,10 @@ from hand_eye_calib.io.results import keep_earlier_results
 from hand_eye_calib.ros import diagnostics
 from hand_eye_calib.ros.conversions import POSE_TYPES, to_ns, to_pose_with_covariance, to_time, to_transform
 from hand_eye_calib.ros.parameters import Parameters
-from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S, SessionJournal, resume
+from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S, DirectoryLock, SessionJournal, resume
 from hand_eye_calib.ros.stamp_guard import StampGuard, Verdict
 from hand_eye_calib.ros.tf import StaticBroadcaster, check_available
-from hand_eye_calib.ros.worker import SolveWorker
+from hand_eye_calib.ros.worker import Checked, SolveWorker
 
 # Best effort hears reliable publishers too; the queue holds seconds of a fast stream while a callback is busy.
 INPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
@@ -83,8 +84,9 @@ class CalibratorNode(Node):
         except ValueError as error:
             raise ConfigError(f"a parameter that was given has no usable value, such as []: {error}") from None
         self._last_logged = {}
+        self._lock = None
         self._streams = [_Stream(name, self.resolve_topic_name(f"{name}_odom")) for name in ("parent", "child")]
-        self._options = Parameters(self, set(self._qos_names()), self._on_parameters, _check_node_options)
+        self._options = Parameters(self, set(self._qos_names()), self._on_parameters, self._check_node_options)
         for line in self._options.unknown:
             self.get_logger().warning(line)
         self._calibrator = Calibrator(self._options.calibrator)
@@ -104,7 +106,8 @@ class CalibratorNode(Node):
         self._failure, self._failed_unexpectedly = "", False
         self._asked = []
         self._asked_in_flight = []
-        self._solved = self.create_guard_condition(self._on_solved)
+        self._checks = diagnostics.StreamChecks()
+        self._solved = self.create_guard_condition(self._on_ready)
         self._worker = SolveWorker(self._solved.trigger)
 
         self._extrinsic = self.create_publisher(TransformStamped, "~/extrinsic", RESULT_QOS)
@@ -130,11 +133,13 @@ class CalibratorNode(Node):
     def stop(self, timeout_s):
         """End the threads and save the newest result; False where a solve is still running after ``timeout_s`` seconds."""
         ended = self._worker.stop(timeout_s)
-        for outcome in self._worker.rest():
-            self._conclude(outcome)
+        for outcome in self._worker.ready():
+            if not isinstance(outcome, Checked):
+                self._conclude(outcome)
         if self._options.node.output_directory and self._result is not None:
             self._log_saved(*self._save())
-        return self._stop_journal() and ended
+        written = self._stop_journal()
+        return written and ended
 
     # ---------------------------------------------------------------- inputs
 
@@ -219,6 +224,7 @@ class CalibratorNode(Node):
         if added and self._journal is not None:
             self._journal.add_pose(stream.name, stamp_ns, position, quat_xyzw)
         self._new_poses |= added
+        self._checks.has_new_poses |= added
 
     def _set_frame(self, stream, sensor_frame):
         if sensor_frame == stream.sensor_frame and sensor_frame:
@@ -242,7 +248,8 @@ class CalibratorNode(Node):
         silent = [stream for stream in self._streams if stream.guard.last_ns is None]
         if silent and self._enabled and self._is_due("silent", 2 * LOG_PERIOD_S):
             self.get_logger().info("; ".join(self._say_silent(stream) for stream in silent))
-        if self._new_poses and not self._solving and time.monotonic() >= self._rest_until_s:
+        now_s = time.monotonic()
+        if (self._new_poses or self._checks.is_due(now_s)) and not self._solving and now_s >= self._rest_until_s:
             self._start_solve()
 
     def _say_silent(self, stream):
@@ -253,10 +260,36 @@ class CalibratorNode(Node):
         self._solving = True
         self._new_poses = False
         self._asked_in_flight, self._asked = self._asked, []
-        self._worker.submit(self._session, self._calibrator.snapshot())
+        now_s = time.monotonic()
+        check = self._checks.is_due(now_s)
+        if check:
+            self._checks.begin(now_s)
+        self._worker.submit(self._session, self._calibrator.snapshot(), check)
 
-    def _on_solved(self):
-        good, text = self._conclude(self._worker.take())
+    def _on_ready(self):
+        for outcome in self._worker.ready():
+            if isinstance(outcome, Checked):
+                self._on_checked(outcome)
+            else:
+                self._on_solved(outcome)
+
+    def _on_checked(self, checked):
+        if checked.session != self._session:
+            return
+        now_s = time.monotonic()
+        self._rest_until_s = max(self._rest_until_s, now_s + checked.seconds)
+        if checked.error is not None:
+            if self._is_due("unchecked"):
+                self.get_logger().warning(f"the streams cannot be checked: {type(checked.error).__name__}: {checked.error}")
+            return
+        new, gone = self._checks.take(checked.agreement, now_s)
+        for line in new:
+            self.get_logger().warning(line)
+        for line in gone:
+            self.get_logger().info(line)
+
+    def _on_solved(self, outcome):
+        good, text = self._conclude(outcome)
         self._solving = False
         for answer in self._asked_in_flight:
             answer.set_result((good, text))
@@ -316,6 +349,7 @@ class CalibratorNode(Node):
         self._new_poses = False
         self._result = self._outcome = self._solved_at_s = None
         self._failure, self._failed_unexpectedly = "", False
+        self._checks.restart()
         for stream in self._streams:
             stream.sensor_frame = ""
             stream.monitor.restart()
@@ -326,13 +360,9 @@ class CalibratorNode(Node):
 
     # --------------------------------------------------------------- journal
 
-    def _journal_directory(self):
-        """Where the journal is to be; None for nowhere."""
-        node = self._options.node
-        return Path(node.output_directory).expanduser() / "journal" if node.output_directory and node.journal != "off" else None
-
     def _start_journal(self, resuming=False):
-        directory = self._journal_directory()
+        directory = _journal_directory(self._options.node)
+        self._lock = DirectoryLock(directory.parent) if directory else None
         resumed = resuming and self._resume(directory)
         self._journal = SessionJournal(directory, self._calibrator.state(), resumed) if directory else None
 
@@ -371,13 +401,19 @@ class CalibratorNode(Node):
         ended = self._journal.stop(self._calibrator.state, JOURNAL_GRACE_S)
         self._log_journal()
         self._journal = None
+        self._lock.release()
         return ended
 
     # ----------------------------------------------------------- diagnostics
 
     def _publish_diagnostics(self):
         steady_s, clock_ns = time.monotonic(), self.get_clock().now().nanoseconds
-        statuses = [self._calibration_status(steady_s, clock_ns), *self._input_statuses(steady_s), self._journal_status()]
+        statuses = [
+            self._calibration_status(steady_s, clock_ns),
+            *self._input_statuses(steady_s),
+            diagnostics.status("stream checks", *self._checks.report(steady_s)),
+            self._journal_status(),
+        ]
         message = DiagnosticArray(status=statuses)
         message.header.stamp = to_time(clock_ns)
         self._diagnostics.publish(message)
@@ -395,6 +431,7 @@ class CalibratorNode(Node):
             calibration=self._result,
             solved_at_s=self._solved_at_s,
             stale_after_s=max(STALE_S, STALE_PERIODS * self._options.node.solve_period),
+            faults=self._checks.grave(),
         )
         return diagnostics.status("extrinsic", *diagnostics.calibration_report(state, steady_s, clock_ns))
 
@@ -463,7 +500,8 @@ class CalibratorNode(Node):
             if not self._earlier_results_kept:
                 keep_earlier_results(Path(directory).expanduser())
             self._earlier_results_kept = True
-            self._result.save(Path(directory).expanduser())
+            warnings = (*self._result.warnings, *self._checks.grave())
+            dataclasses.replace(self._result, warnings=warnings).save(Path(directory).expanduser())
         except (OSError, HandEyeCalibError) as error:
             return False, f"cannot save to {directory}: {error}"
         return True, f"result saved to {directory}"
@@ -480,6 +518,7 @@ class CalibratorNode(Node):
         if self._options.calibrator != self._calibrator.config:
             self._calibrator.reconfigure(self._options.calibrator)
             self._new_poses = True  # the same poses may now give another result
+            self._checks.hasten()
         self._follow_output_directory()
         if self._options.node.publish_tf != (self._broadcaster is not None):
             self._switch_broadcaster()
@@ -488,8 +527,18 @@ class CalibratorNode(Node):
             self._solve_timer.timer_period_ns = period_ns
             self._solve_timer.reset()
 
+    def _check_node_options(self, options):
+        """Raise ConfigError where options cannot be had together, or not on this machine."""
+        if options.publish_tf:
+            check_available()
+        if options.journal == "resume" and not options.output_directory:
+            raise ConfigError("journal resume needs output_directory: that is where the session to resume is")
+        directory = _journal_directory(options)
+        if directory and (self._lock is None or directory.parent != self._lock.directory):
+            DirectoryLock(directory.parent).release()
+
     def _follow_output_directory(self):
-        directory = self._journal_directory()
+        directory = _journal_directory(self._options.node)
         if directory == (self._journal.directory if self._journal else None):
             return
         self._stop_journal()
@@ -514,12 +563,10 @@ class CalibratorNode(Node):
         return True
 
 
-def _check_node_options(options):
-    """Raise ConfigError where options cannot be had together, or not on this machine."""
-    if options.publish_tf:
-        check_available()
-    if options.journal == "resume" and not options.output_directory:
-        raise ConfigError("journal resume needs output_directory: that is where the session to resume is")
+def _journal_directory(options):
+    """Where the journal is to be; None for nowhere."""
+    wanted = options.output_directory and options.journal != "off"
+    return Path(options.output_directory).expanduser() / "journal" if wanted else None
 
 
 def describe(calibration):

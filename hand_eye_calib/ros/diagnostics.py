@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from hand_eye_calib.assessment.agreement import ENOUGH_S, ENOUGH_TURNED_RAD
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.pairing.stream_checks import Confidence, Severity
 
 HARDWARE_ID = "hand_eye_calib"
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -19,6 +21,9 @@ BAD_INPUT_FOR_S = 10.0
 
 # Streams whose stamps differ by more than this (s) from what time_offset says are suspected of different clocks.
 SUSPICIOUS_OFFSET_S = 2.0
+
+# The streams are checked at most this often (s), which costs a second or two each time.
+CHECK_PERIOD_S = 30.0
 
 # Reports over which the rate is taken, and most delays looked at in one.
 _RATE_REPORTS = 5
@@ -99,6 +104,83 @@ class InputMonitor:
         return level, text, values
 
 
+class StreamChecks:
+    """When to check the streams, and what the last check found.
+
+    Errors count at once; warnings, and what is merely possible, where two checks in a row have them: over a short drive, odometry may
+    well be off by some per cent.
+
+    Attributes
+    ----------
+    has_new_poses : bool
+        Poses have come in since the last check was asked for.
+    """
+
+    def __init__(self):
+        self.restart()
+
+    def restart(self):
+        """A new session: nothing is known yet."""
+        self.has_new_poses = False
+        self._agreement = self._checked_at_s = None
+        self._suspected = set()
+        self._faults = {}
+        self._due_at_s = -np.inf
+
+    def hasten(self):
+        """Other options: what they change is to be seen at once."""
+        self.has_new_poses, self._due_at_s = True, -np.inf
+
+    def is_due(self, steady_s):
+        """Whether it is time for a check."""
+        return self.has_new_poses and steady_s >= self._due_at_s
+
+    def begin(self, steady_s):
+        """A check has been asked for."""
+        self.has_new_poses, self._due_at_s = False, steady_s + CHECK_PERIOD_S
+
+    def take(self, agreement, steady_s):
+        """What a check found, None where the poses did not suffice; lines for the log: new findings, and those that are gone."""
+        if agreement is None:
+            self._due_at_s = -np.inf
+            return [], []
+        before, self._agreement, self._checked_at_s = self._faults, agreement, steady_s
+        found = {(f.code, f.stream): f for f in agreement.findings if f.severity is not Severity.NOTE}
+        self._faults = {key: f for key, f in found.items() if _is_sure(f) or key in self._suspected}
+        self._suspected = set(found)
+        new = [in_parameters(finding) for key, finding in self._faults.items() if key not in before]
+        return new, [f"no longer so: {finding.what}" for key, finding in before.items() if key not in self._faults]
+
+    def grave(self):
+        """What speaks against calibrating with these streams, the gravest first, each in one line."""
+        return tuple(in_parameters(finding) for finding in self._faults.values())
+
+    def report(self, steady_s):
+        """Level, message and values."""
+        if self._agreement is None:
+            turned = f"{np.degrees(ENOUGH_TURNED_RAD):.0f} deg"
+            return WARN, f"not checked yet: that takes {ENOUGH_S:g} s of driving with turns of {turned}", {"checked": "not yet"}
+        correlation, grave = self._agreement.correlation, self.grave()
+        values = {
+            "checked": f"{steady_s - self._checked_at_s:.0f} s ago, again after {CHECK_PERIOD_S:g} s at the earliest",
+            "turning of both streams correlates by": f"{correlation.correlation:.3f}",
+            **{
+                f"{finding.severity.value} {finding.code} ({finding.stream})": in_parameters(finding)
+                for finding in self._agreement.findings
+            },
+        }
+        return (WARN, "; ".join(grave), values) if grave else (OK, "both streams can be of one rigid body", values)
+
+
+def _is_sure(finding):
+    return finding.severity is Severity.ERROR and finding.confidence is not Confidence.POSSIBLE
+
+
+def in_parameters(finding):
+    """A finding in one line, with what helps as parameters."""
+    return f"{finding}" + "".join(f": set {name} to {value}" for name, value in finding.options)
+
+
 def offset_between(parent, child):
     """Clock offset seen between two inputs, in s to be added to the child's stamps; None where one is silent."""
     if parent.delay_s is None or child.delay_s is None:
@@ -132,6 +214,7 @@ class SolverState:
     calibration: Calibration | None
     solved_at_s: float | None
     stale_after_s: float
+    faults: tuple = ()
 
 
 def calibration_report(state, steady_s, clock_ns):
@@ -187,6 +270,8 @@ def _judge(state, age_s, missing):
         return ERROR, state.failure
     if not state.enabled:
         return WARN, "not accepting poses: call ~/set_enabled to go on"
+    if state.faults:
+        return WARN, f"do not use the result: {state.faults[0]}"
     if calibration is None:
         return WARN, "; ".join(filter(None, (state.failure, missing))) or "no result yet"
     if calibration.status is SolveStatus.NOT_CONVERGED:

@@ -1,10 +1,13 @@
 """The journal of the node's session, written by a thread of its own: a slow or full disk never holds up a message."""
 
+import fcntl
+import os
 import queue
 import threading
 import time
 from pathlib import Path
 
+from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, keep_aside, read_journal
 
 # How often what came in is handed to the disk: what a crash can cost.
@@ -12,6 +15,9 @@ FLUSH_PERIOD_S = 0.25
 
 # After a failed write the journal is started anew this often.
 _RETRY_S = 5.0
+
+# Holds the process id of the node that writes into a directory.
+_LOCK_NAME = ".calibrator.lock"
 
 # Batches that may wait for a disk that does not answer: a minute.
 _MOST_WAITING = 240
@@ -30,6 +36,46 @@ def resume(directory, calibrator):
     for kind, *event in events:
         calibrator.add_pose(*event) if kind == "pose" else calibrator.set_frame(*event)
     return sum(calibrator.statistics(stream).received for stream in ("parent", "child"))
+
+
+class DirectoryLock:
+    """Keeps a directory for this process until :meth:`release`, or its end, however that comes.
+
+    Parameters
+    ----------
+    directory : path
+        Made if it does not exist. Where it cannot be written, nothing is locked: the journal will say so.
+
+    Raises
+    ------
+    ConfigError
+        Where another node has it.
+    """
+
+    def __init__(self, directory):
+        self.directory = Path(directory)
+        self._descriptor = None
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            self._descriptor = os.open(self.directory / _LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o644)
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.ftruncate(self._descriptor, 0)
+            os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
+        except BlockingIOError:
+            owner = os.pread(self._descriptor, 32, 0).decode(errors="replace")
+            self.release()
+            raise ConfigError(
+                f"output_directory {self.directory} is in use by another calibrator (process {owner or 'unknown'}): stop that one, or "
+                "choose another directory"
+            ) from None
+        except OSError:
+            return  # a disk that takes no lock, or nothing at all
+
+    def release(self):
+        """Leave the directory to others."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
 
 
 class SessionJournal:

@@ -1,4 +1,4 @@
-"""One thread that solves, so that solving never holds up receiving."""
+"""One thread that solves and checks, so that neither ever holds up receiving."""
 
 import multiprocessing
 import os
@@ -9,6 +9,7 @@ import time
 import traceback
 from dataclasses import dataclass
 
+from hand_eye_calib.assessment.agreement import Agreement, tell_enough
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.calibrator import Snapshot
@@ -29,13 +30,23 @@ class Outcome:
     error: Exception | None = None
 
 
+@dataclass(frozen=True)
+class Checked:
+    """How a check of a snapshot's streams ended, after how many seconds: with neither where its poses turn too little to tell."""
+
+    session: int
+    seconds: float
+    agreement: Agreement | None = None
+    error: Exception | None = None
+
+
 class SolveWorker:
-    """Runs ``snapshot.estimate()`` in a thread of its own.
+    """Runs ``snapshot.estimate()`` in a thread of its own, and ``snapshot.check()`` after it where that is asked for.
 
     Parameters
     ----------
     on_done : callable
-        Called in the worker's thread when an outcome can be taken.
+        Called in the worker's thread when an Outcome or Checked is ready; calls may come so close that one serves for two.
     """
 
     def __init__(self, on_done):
@@ -48,16 +59,12 @@ class SolveWorker:
         self._thread = threading.Thread(target=self._run, name="solve", daemon=True)
         self._thread.start()
 
-    def submit(self, session, snapshot):
-        """Solve a snapshot of the engine; ``session`` comes back with the outcome."""
-        self._snapshots.put((session, snapshot))
+    def submit(self, session, snapshot, check=False):
+        """Solve a snapshot of the engine, then check its streams if asked to; ``session`` comes back with what is ready."""
+        self._snapshots.put((session, snapshot, check))
 
-    def take(self):
-        """The next outcome, after ``on_done`` has announced it."""
-        return self._outcomes.get()
-
-    def rest(self):
-        """Outcomes that nobody has taken."""
+    def ready(self):
+        """Each Outcome and Checked that nobody has taken, in the order they came about."""
         while not self._outcomes.empty():
             yield self._outcomes.get()
 
@@ -71,12 +78,18 @@ class SolveWorker:
 
     def _run(self):
         while (job := self._snapshots.get()) is not None:
-            outcome = _solve(*job, self._apart)
+            session, snapshot, check = job
+            outcome = _solve(session, snapshot, self._apart)
             if self._stopping.is_set() and outcome.error is not None:
                 return  # nobody waits for it, and its process may have been ended
-            self._outcomes.put(outcome)
-            if not self._stopping.is_set():
-                self._on_done()
+            self._tell(outcome)
+            if check and not self._stopping.is_set():
+                self._tell(_check(outcome))
+
+    def _tell(self, outcome):
+        self._outcomes.put(outcome)
+        if not self._stopping.is_set():
+            self._on_done()
 
 
 class SolverProcess:
@@ -150,6 +163,17 @@ def _solve(session, snapshot, apart):
     except Exception as error:  # handed to the executor's thread, which reports it
         failure = error
     return Outcome(session, snapshot, time.monotonic() - start, seen, calibration, failure)
+
+
+def _check(outcome):
+    """Check the streams of a solve, with the time offset and the scale it found."""
+    start, snapshot, agreement, failure = time.monotonic(), outcome.snapshot, None, None
+    try:
+        if tell_enough(*snapshot.streams):
+            agreement = snapshot.check(outcome.calibration)
+    except Exception as error:  # as with a solve
+        failure = error
+    return Checked(outcome.session, time.monotonic() - start, agreement, failure)
 
 
 def _needs_process(snapshot):

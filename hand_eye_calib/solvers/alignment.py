@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import pairs_between
+from hand_eye_calib.pairing.stream_checks import check_leap
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.pairing.time_offset import Correlation, correlate_turning
 from hand_eye_calib.solvers.similarity import SimilarityFit, fit_similarity
@@ -107,7 +108,12 @@ def estimate_time_offset(parent, child, max_gap_s=0.5):
     ------
     NotEnoughDataError
         Where the evidence is weak; the message says why.
+    InputError
+        Where stamps lie days apart.
     """
+    for name, stream in (("parent", parent), ("child", child)):
+        if len(stream) > 1 and (leaps := check_leap(stream, name)):
+            raise InputError(str(leaps[0]))
     correlation = correlate_turning(parent, child, max_gap_s)
     if not correlation.is_clear:
         raise NotEnoughDataError(

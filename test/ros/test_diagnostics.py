@@ -5,11 +5,14 @@ import time
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from faults import inverted, reordered
 from ros_harness import RELIABLE_INPUTS, START_NS, drive, message
 
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.results import load_result
 
-NAMES = ["calibrator: extrinsic", "calibrator: parent input", "calibrator: child input", "calibrator: journal"]
+NAMES = [f"calibrator: {name}" for name in ("extrinsic", "parent input", "child input", "stream checks", "journal")]
 
 
 @pytest.fixture
@@ -147,3 +150,56 @@ def test_disabled_is_said(start_node, peer, heard):
     start_node()
     assert peer.set_enabled(False).success
     wait(peer, heard, "extrinsic", lambda status: "not accepting poses: call ~/set_enabled" in status.message)
+
+
+class TestStreamChecks:
+    """What the checks find is said while one still drives."""
+
+    @pytest.mark.parametrize(
+        ("damage", "said"),
+        [
+            (reordered, "the child stream's quaternions seem to be written w x y z"),
+            (inverted, "the child stream seems to hold inverse poses"),
+            (lambda child: child.scaled(1000.0), "the child's lengths are millimetres"),
+        ],
+    )
+    def test_faulty_streams_are_named(self, start_node, peer, heard, damage, said):
+        node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
+        stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
+        peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, damage(Trajectory(stamps_ns, Ts_cw_c)).poses)
+        status = wait(peer, heard, "stream checks", lambda status: said in status.message)
+        assert status.level == DiagnosticStatus.WARN
+        verdict = wait(peer, heard, "extrinsic", lambda status: said in status.message)
+        assert verdict.level == DiagnosticStatus.WARN
+        assert verdict.message.startswith("do not use the result: ")
+        node.wait_for_log(said)
+
+    def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(self, start_node, peer, heard, tmp_path):
+        node = start_node("-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS)
+        stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
+        Ts_cw_c[:, :3, 3] *= 1000.0
+        peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
+        wait(peer, heard, "stream checks", lambda status: status.message.endswith(": set scale to 0.001"))
+        assert peer.trigger("save").success
+        assert any("millimetres" in warning for warning in load_result(tmp_path).warnings)
+        assert peer.set_parameter("scale", 0.001).successful
+        status = wait(peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK)
+        assert status.message == "both streams can be of one rigid body"
+        wait(peer, heard, "extrinsic", lambda status: status.level == DiagnosticStatus.OK)
+        log = node.wait_for_log("no longer so: the child's lengths are millimetres")
+        assert log.count("set scale to 0.001") == 1
+
+    def test_sound_streams_raise_nothing(self, start_node, peer, heard):
+        node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
+        peer.feed(peer.publishers(), *drive(250))
+        status = wait(peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK)
+        assert not [key for key in values(status) if key.startswith(("warning", "error"))]
+        assert "[WARN]" not in node.log
+
+    def test_too_little_driving_is_said(self, start_node, peer, heard):
+        start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
+        peer.feed(peer.publishers(), *drive(60))
+        wait(peer, heard, "extrinsic", lambda status: "status" in values(status))
+        status = wait(peer, heard, "stream checks", lambda status: True)
+        assert status.level == DiagnosticStatus.WARN
+        assert status.message == "not checked yet: that takes 20 s of driving with turns of 30 deg"

@@ -1,6 +1,7 @@
 """Nothing is lost: the node killed, stopped, restarted, and with a disk that fails."""
 
 import hashlib
+import os
 import resource
 import signal
 
@@ -11,6 +12,7 @@ from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
 from hand_eye_calib.io.journal import count_poses, has_session, read_journal
 from hand_eye_calib.io.results import load_result
+from hand_eye_calib.ros.session_journal import DirectoryLock
 
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 
@@ -161,3 +163,31 @@ def test_the_journal_follows_the_output_directory(start_node, peer, tmp_path):
 
 def fingerprints(folder):
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
+
+
+def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):
+    used = tmp_path / "used"
+    first = start_node(*QUIET, *into(used))
+    peer.trigger("solve")
+    second = start_node(*QUIET, *into(used))
+    assert second.wait() == 1
+    line = f"output_directory {used} is in use by another calibrator (process {first.process.pid}): stop that one, or choose another"
+    assert second.log == f"calibrator: {line} directory\n"
+    first.process.kill()
+    first.wait()
+    third = start_node("-p solve_period:=0.2", *into(used))  # a node that was killed keeps nothing
+    third.wait_for_log("no pose yet on /parent_odom")
+
+
+def test_a_directory_in_use_is_refused_as_a_parameter(start_node, peer, tmp_path):
+    node = start_node(*QUIET, *into(tmp_path / "mine"))
+    peer.trigger("solve")
+    lock = DirectoryLock(tmp_path / "theirs")
+    result = peer.set_parameter("output_directory", str(tmp_path / "theirs"))
+    assert not result.successful
+    assert f"is in use by another calibrator (process {os.getpid()})" in result.reason
+    lock.release()
+    assert peer.set_parameter("output_directory", str(tmp_path / "theirs")).successful
+    wait_written(peer, tmp_path / "theirs", 0)
+    DirectoryLock(tmp_path / "mine").release()  # left to others
+    assert node.stop()[0] == 0

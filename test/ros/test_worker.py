@@ -16,8 +16,10 @@ from hand_eye_calib.ros.worker import SolverProcess, SolveWorker
 class Work:
     """Stands where a snapshot of the engine does: runs a function."""
 
-    def __init__(self, estimate):
+    def __init__(self, estimate, check=None, n_poses=250):
         self.estimate = estimate
+        self.check = check
+        self.streams = [as_trajectory(wandering_poses(n_poses))] * 2
         self.pose_pairs = PosePairs.empty
         self.config = CalibratorConfig()
 
@@ -37,9 +39,9 @@ def worker(announced):
 def test_outcomes_come_in_order_with_their_sessions(worker, announced):
     for session in range(3):
         worker.submit(session, Work(lambda session=session: f"result {session}"))
-    for session in range(3):
+    for _ in range(3):
         assert announced.acquire(timeout=30.0)
-        outcome = worker.take()
+    for session, outcome in enumerate(worker.ready()):
         assert (outcome.session, outcome.calibration, outcome.error) == (session, f"result {session}", None)
 
 
@@ -50,11 +52,30 @@ def test_any_exception_is_an_outcome_and_the_next_solve_runs(worker, announced):
     worker.submit(0, Work(fail))
     worker.submit(1, Work(lambda: "fine"))
     assert announced.acquire(timeout=30.0)
-    failed = worker.take()
+    assert announced.acquire(timeout=30.0)
+    failed, fine = worker.ready()
     assert isinstance(failed.error, ZeroDivisionError)
     assert failed.error.__traceback__ is not None
-    assert announced.acquire(timeout=30.0)
-    assert worker.take().calibration == "fine"
+    assert fine.calibration == "fine"
+
+
+@pytest.mark.parametrize(("n_poses", "agreement"), [(250, "checked after result"), (50, None)])
+def test_streams_are_checked_after_the_solve_where_asked_and_where_they_suffice(worker, announced, n_poses, agreement):
+    work = Work(lambda: "result", lambda calibration: f"checked after {calibration}", n_poses)
+    worker.submit(7, work)
+    worker.submit(8, work, check=True)
+    for _ in range(3):
+        assert announced.acquire(timeout=30.0)
+    *outcomes, checked = worker.ready()
+    assert [outcome.calibration for outcome in outcomes] == ["result", "result"]
+    assert (checked.session, checked.agreement, checked.error) == (8, agreement, None)
+
+
+def test_a_check_that_fails_says_why(worker, announced):
+    worker.submit(0, Work(lambda: "result", lambda calibration: 1 / 0), check=True)
+    for _ in range(2):
+        assert announced.acquire(timeout=30.0)
+    assert isinstance(list(worker.ready())[-1].error, ZeroDivisionError)
 
 
 def test_stop_does_not_wait_for_a_long_solve_and_silences_it(announced):

@@ -27,7 +27,7 @@ from hand_eye_calib.report import evidence
 from hand_eye_calib.report.report import render
 from hand_eye_calib.simulation.drive import simulate_drive
 
-FIGURES = ("trajectories", "residuals", "convergence", "excitation", "methods", "halves")
+FIGURES = ("trajectories", "residuals", "convergence", "excitation", "methods", "halves", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 
 
@@ -296,3 +296,16 @@ def test_without_out_nothing_is_drawn(files, capsys, monkeypatch):
 
     monkeypatch.setattr("hand_eye_calib.cli.reporting.write_report", never)
     assert cli.main(["calibrate", *files, "--parent-frame", "a", "--child-frame", "b"]) in (0, 3)
+
+
+def test_streams_are_shown_on_one_clock_and_in_one_unit():
+    drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=200))
+    seen = evidence.see_streams(drive.parent, drive.child, 0.5)
+    assert np.median(np.abs(np.diff(seen.angles, axis=1))) < 1e-3
+    assert np.median(np.abs(np.diff(seen.slides, axis=1))) < 5e-3
+    assert np.ptp(seen.slides) > 0.1
+    (times_p, rates_p), (times_c, rates_c) = seen.rates
+    assert np.median(np.abs(np.interp(times_p, times_c, rates_c) - rates_p)) < 0.01 < rates_p.max()
+    assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
+    holed = evidence.see_streams(drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5)
+    assert [len(spans) for spans in holed.spans_s] == [1, 2]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -10,11 +11,15 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 from hand_eye_calib.assessment.agreement import check_streams
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.pairing.stream_checks import Severity, check_stamps, check_stream, frozen_share, summarise, tidy
+from hand_eye_calib.simulation.drive import PUBLISHED_DRIVE, simulate_drive
+from hand_eye_calib.simulation.noise import MIXTURE, NoiseConfig
+from hand_eye_calib.solvers.alignment import estimate_time_offset
 
 
 def drive(seed=0, noise=0.001, wander=wandering_poses, n_poses=500):
@@ -40,6 +45,16 @@ def test_no_false_alarm(seed, wander):
     assert agreement.is_good
 
 
+def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
+    seconds = np.arange(400) * 0.05
+    turns = np.stack([0.3 * np.sin(0.7 * seconds), 0.2 * np.sin(0.9 * seconds + 1.0), 1.2 * np.sin(0.1 * seconds)], axis=1)
+    places = np.stack([20 * np.sin(0.05 * seconds), 20 * np.sin(0.07 * seconds), 0.5 * np.cos(0.8 * seconds)], axis=1)
+    poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
+    parent, child = as_trajectory(poses, 20), as_trajectory(child_of(poses, T_cw_pw=np.eye(4)), 20)
+    assert grave(check_streams(parent, child)) == []
+    assert grave(check_streams(inverted(parent), inverted(child))) == [("inverse_both", "both")]
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_every_fault_is_named(fault):
     damage, code = FAULTS[fault]
@@ -47,6 +62,13 @@ def test_every_fault_is_named(fault):
     agreement = check_streams(*damage(parent, child, drive(9)[1]))
     assert [found for found, _ in grave(agreement)] == [code]
     assert not agreement.is_good
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("noise", [MIXTURE, NoiseConfig(gaussian=0.01, outliers=0.1, drift=0.05)])
+def test_strong_noise_is_no_fault_of_the_rig(seed, noise):
+    simulated = simulate_drive((seed, 0), PUBLISHED_DRIVE, noise)
+    assert {code for code, _ in grave(check_streams(simulated.parent, simulated.child))} <= {"jumps"}
 
 
 class TestWhichStreamAndWhatToDo:
@@ -86,7 +108,7 @@ class TestWhichStreamAndWhatToDo:
         note = check_streams(as_trajectory(parent.poses @ lying), child).findings[0]
         assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
         assert "translation along it, y, will be unobservable" in note.what
-        assert dict(note.options) == {"prior": "y=VALUE+/-SIGMA"}
+        assert dict(note.options) == {"prior.y": "VALUE+/-SIGMA"}
 
     def test_motion_without_turns(self):
         poses = np.tile(np.eye(4), (300, 1, 1))
@@ -124,6 +146,23 @@ class TestOneStream:
         assert frozen_share(frozen(child, 0.75), parent) == pytest.approx(0.25, abs=0.01)
         assert frozen_share(child, parent) == 0.0
         assert frozen_share(frozen(child, 0.75), frozen(parent, 0.75)) == 0.0
+
+    @pytest.mark.parametrize(("at", "few"), [(3, "the first 3"), (497, "the last 3")])
+    def test_a_stamp_years_away_is_one_line_and_takes_no_memory(self, at, few):
+        parent, child = drive()
+        stamps_ns = child.stamps_ns.copy()
+        stamps_ns[at:] += 3 * 365 * 86_400 * 10**9
+        far = Trajectory(stamps_ns, child.poses)
+        tracemalloc.start()
+        (finding,) = check_streams(parent, far).findings
+        summarise(far)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+        tracemalloc.stop()
+        assert (finding.code, finding.stream, finding.severity) == ("leap", "child", Severity.ERROR)
+        assert f"leap by 1,095 days after pose {at} of 500" in finding.what
+        assert finding.advice == f"repair the stamps, or remove {few} of its poses"
+        with pytest.raises(InputError, match="leap by 1,095 days"):
+            estimate_time_offset(parent, far)
 
     def test_too_short(self):
         parent, child = drive()
@@ -187,6 +226,18 @@ class TestCommand:
         write_bag(tmp_path / "bag", streams)
         assert main(["check", str(tmp_path / "bag"), "--parent-topic", "/a", "--child-topic", "/b", "--json"]) == 1
         assert [f["code"] for f in json.loads(capsys.readouterr().out)["findings"]] == ["quaternion_order"]
+
+    def test_out_is_a_page_with_a_picture(self, files, tmp_path, capsys):
+        pytest.importorskip("matplotlib")
+        parent, child = drive()
+        out = tmp_path / "out"
+        assert main(["check", *files(parent, reordered(child).shifted(-100.0)), "--out", str(out)]) == 1
+        assert f"wrote {out / 'check.html'}" in capsys.readouterr().err
+        page = (out / "check.html").read_text(encoding="utf-8")
+        assert "Not as they are" in page
+        assert "<code>quaternion_order</code> (child, likely)" in page
+        assert "100.0" in page.split("<figcaption>")[1].split("added to the child")[0]
+        assert page.count("<svg") == 1
 
     def test_three_inputs_are_too_many(self, capsys):
         assert main(["check", "a", "b", "c"]) == 2
