@@ -14,6 +14,8 @@ from hand_eye_calib.errors import ConfigError
 METHODS = ("dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive")
 BACKENDS = ("fast", "ipopt")
 REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]*|C([2-9]|[1-9][0-9]+)"
+TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
+STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (
     "auto",
     "nav_msgs/msg/Odometry",

@@ -32,8 +32,10 @@ import yaml
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.console import note, with_progress
+from hand_eye_calib.cli.findings import with_findings
 from hand_eye_calib.cli.options import options_from
-from hand_eye_calib.cli.replay import fingerprints, replay
+from hand_eye_calib.cli.replaying import fingerprints, replay
+from hand_eye_calib.cli.reporting import REPORT, can_draw, rendered, save_page
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
 
@@ -52,6 +54,7 @@ class Task:
     options: dict = field(default_factory=dict)
     sources: dict = field(default_factory=dict)
     with_fingerprints: bool = False
+    with_report: bool = False
 
     def key(self):
         """Changes where the task, the bag or its options change, so that an older result is not taken for this one's."""
@@ -69,7 +72,8 @@ def run_batch(arguments):
     """
     defaults = {name: str(getattr(arguments, name)) for name in ("parent_topic", "child_topic") if getattr(arguments, name)}
     defaults |= {name: ":".join(getattr(arguments, name)) for name in ("parent_tf", "child_tf") if getattr(arguments, name)}
-    tasks = read_batch(arguments.batch, options_from(arguments), defaults, bool(arguments.out))
+    with_report = bool(arguments.out) and can_draw(REPORT)
+    tasks = read_batch(arguments.batch, options_from(arguments), defaults, bool(arguments.out), with_report)
     documents = {task.name: _stored(task, arguments.out) for task in tasks} if arguments.out else {}
     waiting = [task for task in tasks if not documents.get(task.name)]
     if len(waiting) < len(tasks):
@@ -77,9 +81,10 @@ def run_batch(arguments):
     run = _on_dask(arguments.dask) if arguments.dask else _on_cores(arguments.jobs or os.cpu_count())
     with run as outcomes:
         for task, document in with_progress(outcomes(waiting), len(waiting), "calibrating"):
+            page = document.pop("page", None)
             documents[task.name] = document
             if arguments.out:
-                _store(task, document, arguments.out)
+                _store(task, document, page, arguments.out)
     rows = [documents[task.name] for task in tasks]
     summary = {"batch": str(arguments.batch), "results": rows, "failures": [row["name"] for row in rows if row["error"]]}
     if arguments.out:
@@ -96,7 +101,7 @@ def run_batch(arguments):
     return 3 if any(row["calibration"]["status"] != "ok" for row in rows) else 0
 
 
-def read_batch(path, options, sources, with_fingerprints=False):
+def read_batch(path, options, sources, with_fingerprints=False, with_report=False):
     """The tasks of a batch file.
 
     Parameters
@@ -106,6 +111,8 @@ def read_batch(path, options, sources, with_fingerprints=False):
         What holds where the file says nothing else.
     with_fingerprints : bool
         Whether the results shall say which bytes were read.
+    with_report : bool
+        Whether they shall come with a report.
 
     Returns
     -------
@@ -135,7 +142,7 @@ def read_batch(path, options, sources, with_fingerprints=False):
         entry = _checked(path, entry if isinstance(entry, dict) else {"bag": entry}, f"entry {number}")
         merged = _merged(defaults, entry)
         for bags in _expanded(path, entry, number):
-            tasks.append(_task(path, number, bags, merged, {task.name for task in tasks}, with_fingerprints))
+            tasks.append(_task(path, number, bags, merged, {task.name for task in tasks}, with_fingerprints, with_report))
     return tasks
 
 
@@ -171,7 +178,7 @@ def _expanded(path, entry, number):
     return [[place] for place in sorted(glob(places[0]))]
 
 
-def _task(path, number, bags, entry, taken, with_fingerprints):
+def _task(path, number, bags, entry, taken, *extras):
     from hand_eye_calib.io.transforms import TfSource
 
     try:
@@ -185,7 +192,7 @@ def _task(path, number, bags, entry, taken, with_fingerprints):
     while name in taken:
         name = f"{base}_{1 + sum(other.startswith(base) for other in taken)}" if name == base else name + "_"
     sources = {source: str(entry[source]) for source in _SOURCES if source in entry}
-    return Task(name, tuple(bags), entry["options"], sources, with_fingerprints)
+    return Task(name, tuple(bags), entry["options"], sources, *extras)
 
 
 def work(task):
@@ -194,25 +201,29 @@ def work(task):
     Returns
     -------
     dict
-        ``name``, ``bags``, ``calibration`` (Calibration.to_dict or None), ``inputs``, ``error`` (text or None), and a ``traceback`` for errors
-        that are defects of the program.
+        ``name``, ``bags``, ``calibration`` (Calibration.to_dict or None), ``findings`` of the stream checks, ``inputs``, ``error`` (text or
+        None), the ``page`` of the report where the task wants one, and a ``traceback`` for errors that are defects of the program.
     """
     from hand_eye_calib.io.transforms import TfSource
 
-    outcome = {"name": task.name, "bags": list(task.bags), "calibration": None, "inputs": {}, "error": None}
+    outcome = _failed(task, None)
     frames = {stream: task.sources.get(f"{stream}_tf") for stream in ("parent", "child")}
     sources = [task.sources.get(f"{stream}_topic") or (text and TfSource.parse(text)) for stream, text in frames.items()]
     try:
         replayed = replay(list(task.bags), *sources, CalibratorConfig.from_options(task.options), quiet=True)
         if task.with_fingerprints:
             replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
+        snapshot = replayed.calibrator.snapshot()
+        calibration, findings = with_findings(replayed.calibration, snapshot)
+        if task.with_report:
+            outcome["page"] = rendered(calibration, snapshot, replayed.inputs, findings)
     except HandEyeCalibError as error:
         return outcome | {"error": str(error)}
     except Exception as error:
         text = " ".join(f"unexpected {type(error).__name__}: {error}".split())
         return outcome | {"error": text, "traceback": traceback.format_exc()}
-    outcome |= {"calibration": replayed.calibration.to_dict(), "inputs": replayed.inputs}
-    if replayed.calibration.status.value == "not_converged":
+    outcome |= {"calibration": calibration.to_dict(), "findings": findings, "inputs": replayed.inputs}
+    if calibration.status.value == "not_converged":
         outcome["error"] = "the solver did not converge"
     return outcome
 
@@ -235,7 +246,7 @@ def _on_cores(jobs):
             try:
                 yield task, future.result()
             except BrokenProcessPool:
-                yield task, _died(task, "a worker process died, perhaps for want of memory; try --jobs 1")
+                yield task, _failed(task, "a worker process died, perhaps for want of memory; try --jobs 1")
 
     try:
         yield outcomes
@@ -270,14 +281,14 @@ def _on_dask(address):
         for future in as_completed_on_dask(futures):
             task = futures[future]
             error = future.exception()
-            yield task, _died(task, f"the cluster lost it: {' '.join(str(error).split())}") if error else future.result()
+            yield task, _failed(task, f"the cluster lost it: {' '.join(str(error).split())}") if error else future.result()
 
     with client:
         yield outcomes
 
 
-def _died(task, reason):
-    return {"name": task.name, "bags": list(task.bags), "calibration": None, "inputs": {}, "error": reason}
+def _failed(task, reason):
+    return {"name": task.name, "bags": list(task.bags), "calibration": None, "findings": [], "inputs": {}, "error": reason}
 
 
 def _ignore_interrupts():
@@ -304,11 +315,13 @@ def _stored(task, directory):
     return None
 
 
-def _store(task, outcome, directory):
+def _store(task, outcome, page, directory):
     from hand_eye_calib.io.results import save_result
 
     if outcome["calibration"]:
         save_result(Calibration.from_dict(outcome["calibration"]), directory / task.name, outcome["inputs"])
+    if page:
+        save_page(directory / task.name / REPORT, page)
     _write(directory / task.name / _STATE, {"key": task.key(), "outcome": outcome})
 
 

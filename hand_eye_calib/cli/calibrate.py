@@ -2,16 +2,13 @@
 
 from pathlib import Path
 
-from hand_eye_calib.calibrator import calibrate, offline_config, whole_snapshot
 from hand_eye_calib.cli.console import note, waiting_for
-from hand_eye_calib.cli.findings import with_findings
 from hand_eye_calib.cli.options import add_config_arguments, add_output_arguments, options_from
-from hand_eye_calib.cli.present import deliver
-from hand_eye_calib.io.trajectory_files import FORMATS, STAMP_UNITS, read_trajectory_file
+from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
 
 STREAMS = ("parent", "child")
 _FILE_OPTIONS = {
-    "format": dict(choices=FORMATS, help="tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; csv: columns by "
+    "format": dict(choices=TRAJECTORY_FORMATS, help="tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; csv: columns by "
                    "the names in the header, or with --columns. Default: tum"),
     "columns": dict(metavar="NAMES", help="names of the columns of a csv file without a header: t,x,y,z,qw,qx,qy,qz in their order"),
     "times": dict(metavar="FILE", type=Path, help="stamps of the poses of a kitti file, one a line"),
@@ -60,6 +57,8 @@ def read_files(arguments):
     HandEyeCalibError
         Where a file cannot be read.
     """
+    from hand_eye_calib.io.trajectory_files import read_trajectory_file
+
     trajectories, notes = {}, []
     for stream in STREAMS:
         given = {name: getattr(arguments, f"{stream}_{name}") or getattr(arguments, name) for name in _FILE_OPTIONS}
@@ -87,6 +86,10 @@ def _is_of_other(arguments, stream, file_format):
 
 def run(arguments):
     """Calibrate from files; returns the exit code."""
+    from hand_eye_calib.calibrator import calibrate, offline_config, whole_snapshot
+    from hand_eye_calib.cli.findings import with_findings
+    from hand_eye_calib.cli.present import deliver
+
     options = options_from(arguments)
     trajectories, notes = read_files(arguments)
     for text in notes:
@@ -95,18 +98,19 @@ def run(arguments):
     options = config.to_options()
     with waiting_for("solving"):
         calibration = calibrate(trajectories["parent"], trajectories["child"], **options)
+    snapshot = whole_snapshot(config, **trajectories)
     with waiting_for("checking"):
-        calibration, findings = with_findings(calibration, trajectories["parent"], trajectories["child"], options["max_gap"])
+        calibration, findings = with_findings(calibration, snapshot)
     inputs = {"options": options}
     for stream in STREAMS:
         inputs[stream] = {"file": str(getattr(arguments, stream)), **_extent(trajectories[stream])}
     if arguments.out:
-        from hand_eye_calib.cli.replay import fingerprints
+        from hand_eye_calib.cli.replaying import fingerprints
 
         files = [getattr(arguments, stream) for stream in STREAMS]
         files += [times for times in (arguments.times, arguments.parent_times, arguments.child_times) if times]
         inputs["files"] = fingerprints(files)
-    return deliver(calibration, arguments, inputs, whole_snapshot(config, **trajectories), findings=findings)
+    return deliver(calibration, arguments, inputs, snapshot, findings=findings)
 
 
 def _extent(trajectory):

@@ -1,6 +1,7 @@
 """``check BAG`` or ``check PARENT CHILD``: look at both streams before believing them."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from hand_eye_calib.cli.calibrate import add_file_arguments, read_files
 from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
 from hand_eye_calib.cli.findings import table
 from hand_eye_calib.cli.options import add_config_arguments, add_json_argument, config_from
+from hand_eye_calib.cli.reporting import write_check
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.pairing.stream_checks import Confidence, Finding, Severity, summarise, tidy
 
@@ -23,6 +25,12 @@ def add_arguments(parser):
         parser.add_argument(f"--{stream}-topic", metavar="TOPIC", help=f"of a bag: poses of the {stream} sensor")
     add_file_arguments(parser)
     add_config_arguments(parser)
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="write check.html into this directory: the findings, and a picture of both streams",
+    )
     add_json_argument(parser)
 
 
@@ -33,21 +41,20 @@ def run(arguments):
     config = config_from(arguments)
     trajectories, findings = _read_bag(arguments) if len(arguments.inputs) == 1 else _read_files(arguments)
     parent, child = (trajectories[stream] for stream in STREAMS)
+    # What is to be estimated is not known yet: the checks say what it is.
+    offset_s = 0.0 if config.time_offset == ESTIMATE else config.time_offset
+    scale = config.scale if isinstance(config.scale, float) else 1.0
     with waiting_for("checking"):
-        # What is to be estimated is not known yet: the checks say what it is.
-        agreement = check_streams(
-            parent,
-            child,
-            0.0 if config.time_offset == ESTIMATE else config.time_offset,
-            config.scale if isinstance(config.scale, float) else 1.0,
-            config.max_gap,
-        )
+        agreement = check_streams(parent, child, offset_s, scale, config.max_gap)
     findings = [*agreement.findings, *findings]
     streams = {name: summarise(trajectory) for name, trajectory in trajectories.items() if len(trajectory) > 1}
     if arguments.json:
         print(json.dumps(_document(streams, findings, agreement), indent=2, allow_nan=False))
     else:
         print(_text(streams, findings, agreement))
+    if arguments.out:
+        corrected = child.shifted(offset_s).scaled(scale)
+        write_check(arguments.out, parent, corrected, agreement, findings, arguments.inputs, config.max_gap)
     if all(finding.severity is Severity.NOTE for finding in findings):
         return 0
     return fail(f"{findings[0].what}; {findings[0].advice}", 1)

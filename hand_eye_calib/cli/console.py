@@ -33,7 +33,7 @@ def waiting_for(what):
             print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
 
 
-def with_progress(items, total, doing):
+def with_progress(items, total, doing, size=lambda item: 1):
     """Pass on ``items``; on a terminal, once that has taken two seconds, show how far, how fast and how long still.
 
     Parameters
@@ -42,15 +42,17 @@ def with_progress(items, total, doing):
     total : int or None
         How many there are, as far as one knows.
     doing : str
+    size : callable
+        For how many an item counts.
     """
     if not sys.stderr.isatty():
         yield from items
         return
     started = redraw_at = time.monotonic()
     redraw_at += _SILENT_S
-    progress = None
+    progress, done = None, 0
     try:
-        for done, item in enumerate(items):
+        for item in items:
             if (now := time.monotonic()) >= redraw_at:
                 if progress is None:
                     progress = _progress_bar()
@@ -59,6 +61,7 @@ def with_progress(items, total, doing):
                 progress.update(task, completed=done, rate=f"{done / max(now - started, 1e-9):,.0f}/s")
                 redraw_at = now + _REDRAW_S
             yield item
+            done += size(item)
     finally:
         if progress is not None:
             progress.stop()

@@ -17,7 +17,7 @@ from hand_eye_calib.calibrator import Calibrator
 from hand_eye_calib.cli.console import fail, note
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.cli.present import EXIT_CODES
-from hand_eye_calib.cli.replay import feed
+from hand_eye_calib.cli.replaying import feed
 from hand_eye_calib.cli.reporting import write_report
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
@@ -104,25 +104,23 @@ def _write_bag(out, drive):
     return path
 
 
-@contextmanager
-def _poses(bag_path):
+def _opened(bag_path):
     from hand_eye_calib.io.bags import PoseBag
 
-    with PoseBag(bag_path) as bag:
-        yield bag.poses(TOPICS["parent"], TOPICS["child"])
+    return PoseBag(bag_path)
 
 
 def _replay(bag_path):
     calibrator = Calibrator()
-    with _poses(bag_path) as poses:
-        feed(calibrator, poses, TOPICS)
+    with _opened(bag_path) as bag:
+        feed(calibrator, bag.blocks(*TOPICS.values()), TOPICS)
     return calibrator
 
 
 def _play(Player, bag_path, log_path, stamp_ns):
     _keep_to_ourselves()
-    with _node(log_path) as check, Player(TOPICS, check) as player, _poses(bag_path) as poses:
-        player.play(poses, PLAY_SPEED)
+    with _node(log_path) as check, Player(TOPICS, check) as player, _opened(bag_path) as bag:
+        player.play(bag.poses(*TOPICS.values()), PLAY_SPEED)
         return player.wait_for_extrinsic(stamp_ns)
 
 

@@ -3,27 +3,26 @@
 import dataclasses
 import textwrap
 
-from hand_eye_calib.assessment.agreement import check_streams
+from hand_eye_calib.cli.options import flag
 from hand_eye_calib.pairing.stream_checks import Severity
 
 _MARKS = {Severity.ERROR: "ERROR", Severity.WARNING: "WARNING", Severity.NOTE: "note"}
 _WIDTH = 100
 
 
-def with_findings(calibration, parent, child, max_gap_s):
+def with_findings(calibration, snapshot):
     """A calibration whose warnings hold what is wrong with its streams, and all findings as plain values.
 
     Parameters
     ----------
     calibration : Calibration
-    parent, child : Trajectory
-        The streams it comes from, as they were read.
-    max_gap_s : float
+    snapshot : Snapshot
+        The poses it comes from.
     """
-    agreement = check_streams(parent, child, calibration.time_offset_s, calibration.scale, max_gap_s)
-    grave = [str(finding) for finding in agreement.findings if finding.severity is not Severity.NOTE]
+    findings = snapshot.check(calibration).findings
+    grave = [str(finding) for finding in findings if finding.severity is not Severity.NOTE]
     calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *grave))
-    return calibration, [finding.to_dict() for finding in agreement.findings]
+    return calibration, [finding.to_dict() for finding in findings]
 
 
 def table(findings):
@@ -40,5 +39,5 @@ def table(findings):
 
 def _typed(finding):
     """The options as they are typed."""
-    typed = [f"--{name.replace('_', '-')} {value}" for name, value in finding.options]
+    typed = [f"--{flag(name)} {value}" for name, value in finding.options]
     return f": {' '.join(typed)}" if typed else ""

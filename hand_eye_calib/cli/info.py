@@ -1,8 +1,6 @@
 """``info RESULT``: show a saved calibration."""
 
 from hand_eye_calib.cli.options import add_json_argument
-from hand_eye_calib.cli.present import as_json, as_text
-from hand_eye_calib.io.results import load_result
 
 
 def add_arguments(parser):
@@ -13,6 +11,9 @@ def add_arguments(parser):
 
 def run(arguments):
     """Print a saved calibration; returns the exit code, 0 whatever the calibration is worth."""
+    from hand_eye_calib.cli.present import as_json, as_text
+    from hand_eye_calib.io.results import load_result
+
     calibration = load_result(arguments.result)
     print(as_json(calibration) if arguments.json else as_text(calibration))
     return 0

@@ -2,9 +2,8 @@
 
 import argparse
 import dataclasses
+import re
 from pathlib import Path
-
-import yaml
 
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, check_value, option_name
@@ -20,6 +19,8 @@ _PRIOR = "prior."
 
 def add_config_arguments(parser):
     """Add ``--config`` and an option for every field of CalibratorConfig."""
+    # argparse takes -1e-3, -90deg+/-2deg and the like for options otherwise.
+    parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
     group.add_argument(
         "--config", metavar="FILE", type=Path, help="YAML file with these options by name, or a ROS parameter file"
@@ -126,6 +127,8 @@ def _from_text(field, text):
 
 
 def _read_config(path):
+    import yaml
+
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:

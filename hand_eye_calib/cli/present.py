@@ -1,13 +1,12 @@
 """A calibration on the screen: as text for people, as JSON for programs, and as an exit code."""
 
 import json
-import math
-import shlex
 
 import numpy as np
 
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.cli.console import fail, note
+from hand_eye_calib.cli.publishing import static_transform_command
 
 EXIT_CODES = {SolveStatus.OK: 0, SolveStatus.NOT_CONVERGED: 1, SolveStatus.UNOBSERVABLE: 3}
 
@@ -63,7 +62,7 @@ def as_text(calibration):
         f"{calibration.n_inliers} of {calibration.n_pairs} motion pairs are inliers, from {calibration.n_poses} poses; "
         f"objective {calibration.objective:.6g}",
         *([f"  reference {calibration.reference_reason}"] if calibration.reference_reason else []),
-        *([f"  {line}" for line in noise_lines(calibration.noise)] if calibration.noise else []),
+        *(f"  {line}" for line in (calibration.noise or {}).get("in_words", ())),
         f"  time offset {_with_sigma(calibration.time_offset_s, calibration.time_offset_sigma_s, 4)} s, "
         f"scale {_with_sigma(calibration.scale, calibration.scale_sigma, 4)}",
         f"Status: {_status(calibration)}",
@@ -72,29 +71,6 @@ def as_text(calibration):
         f"  {static_transform_command(calibration)}",
     ]
     return "\n".join(lines)
-
-
-def noise_lines(noise):
-    """What the adaptive estimator found about the noise, in words a person understands."""
-    yield (
-        f"each pose is off by {100 * noise['translation_white_m']:.2g} cm and {_degrees(noise['rotation_white_rad'])} per axis, "
-        f"and what stays grows by {100 * noise['translation_drift_m_per_pose']:.2g} cm and "
-        f"{_degrees(noise['rotation_drift_rad_per_pose'])} from pose to pose (both sensors together)"
-    )
-    if noise["systematic"] == "scale":
-        yield f"the child's lengths are {100 * noise['systematic_parameters'][0]:+.2f} % short of the parent's"
-    elif noise["systematic"] == "bias":
-        along = ", ".join(
-            f"{name} {1000 * value:.2g}" for name, value in zip("xyz", noise["systematic_parameters"], strict=True)
-        )
-        yield f"the child's path is off by {along} mm per metre travelled, along its own axes"
-    if jumps := noise["jumps_before_stamp_ns"]:
-        shown = ", ".join(f"{stamp_ns * 1e-9:.3f}" for stamp_ns in jumps[:5])
-        yield f"{len(jumps)} jumps of a trajectory, just before {shown}{' ...' if len(jumps) > 5 else ''} s"
-
-
-def _degrees(angle_rad):
-    return f"{math.degrees(angle_rad):.2g} deg"
 
 
 def convergence_line(entry):
@@ -106,18 +82,6 @@ def convergence_line(entry):
     values = [f"{name} {value:.3f}" for name, value in zip("xyz", transform["translation"], strict=True)]
     values += [f"{name} {value:.2f}" for name, value in zip(_ROTATIONS, transform["rpy_deg"], strict=True)]
     return f"{at} {' '.join(values[:3])} m, {' '.join(values[3:])} deg, {calibration['n_poses']} poses, {calibration['status']}"
-
-
-def static_transform_command(calibration):
-    """The shell command that publishes the calibration as a static transform from parent to child."""
-    transform = calibration.to_dict()["T_parent_child"]
-    values = dict(zip(("x", "y", "z"), transform["translation"], strict=True))
-    values |= dict(zip(("qx", "qy", "qz", "qw"), transform["quat_xyzw"], strict=True))
-    numbers = " ".join(f"--{name} {round(value, 9) + 0.0:.9f}" for name, value in values.items())
-    return (
-        f"ros2 run tf2_ros static_transform_publisher {numbers} "
-        f"--frame-id {shlex.quote(calibration.parent_frame)} --child-frame-id {shlex.quote(calibration.child_frame)}"
-    )
 
 
 def _transform_lines(transform):

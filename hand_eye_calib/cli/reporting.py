@@ -1,12 +1,14 @@
-"""``report.html`` beside the other files of ``--out``."""
+"""``report.html`` beside the other files of ``--out``, and ``check.html`` of the command ``check``."""
 
 import dataclasses
+from pathlib import Path
 
 from hand_eye_calib.cli.console import note, waiting_for
-from hand_eye_calib.cli.present import static_transform_command
+from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.estimation import estimate_extrinsic
 
+REPORT, CHECK = "report.html", "check.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 
 
@@ -17,6 +19,59 @@ def write_report(directory, calibration, snapshot, inputs, findings=()):
     ----------
     directory : path-like
         One that exists.
+    calibration, snapshot, inputs, findings
+        As for :func:`rendered`.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be written.
+    """
+    if can_draw(REPORT):
+        with waiting_for("writing the report"):
+            path = save_page(Path(directory) / REPORT, rendered(calibration, snapshot, inputs, findings))
+        note(f"wrote {path}")
+
+
+def write_check(directory, *arguments):
+    """Write the page of the stream checks into a directory, which is made; without the libraries, say so and go on.
+
+    Parameters
+    ----------
+    directory : path-like
+    *arguments
+        Those of :func:`~hand_eye_calib.report.check_page.render_check`.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be written.
+    """
+    if can_draw(CHECK):
+        from hand_eye_calib.report.check_page import render_check
+
+        path = save_page(Path(directory) / CHECK, render_check(*arguments))
+        note(f"wrote {path}")
+
+
+def can_draw(file_name):
+    """Whether the libraries for pages are there; says which is missing."""
+    try:
+        import hand_eye_calib.report.report  # noqa: F401
+    except ModuleNotFoundError as error:
+        library = error.name.partition(".")[0]
+        if library not in _OPTIONAL:
+            raise
+        note(f"no {file_name}: {library} is missing; pip install 'hand_eye_calib[plot]'")
+        return False
+    return True
+
+
+def rendered(calibration, snapshot, inputs, findings=()):
+    """The report as HTML.
+
+    Parameters
+    ----------
     calibration : Calibration
     snapshot : Snapshot
         The poses and options that gave it.
@@ -25,36 +80,37 @@ def write_report(directory, calibration, snapshot, inputs, findings=()):
     findings : sequence of dict
         What the stream checks found.
 
+    Returns
+    -------
+    str
+    """
+    from hand_eye_calib.report.report import render
+
+    # The clock is settled; estimating it again would cost time.
+    config = dataclasses.replace(snapshot.config, time_offset=calibration.time_offset_s)
+    return render(
+        calibration,
+        snapshot.config,
+        dataclasses.replace(snapshot, config=config).pose_pairs(),
+        estimate_extrinsic,
+        inputs=inputs,
+        findings=findings,
+        streams=dict(zip(("parent", "child"), snapshot.streams, strict=True)),
+        command=static_transform_command(calibration),
+    )
+
+
+def save_page(path, text):
+    """Write a page, in a directory that is made where it is missing; returns its path.
+
     Raises
     ------
     InputError
         Where it cannot be written.
     """
     try:
-        from hand_eye_calib.report import report
-    except ModuleNotFoundError as error:
-        library = error.name.partition(".")[0]
-        if library not in _OPTIONAL:
-            raise
-        note(f"no report.html: {library} is missing; pip install 'hand_eye_calib[plot]'")
-        return
-    # The clock is settled; estimating it again would cost time.
-    config = dataclasses.replace(snapshot.config, time_offset=calibration.time_offset_s)
-    pose_pairs = dataclasses.replace(snapshot, config=config).pose_pairs()
-    streams = {} if len(snapshot.kept) else {"parent": snapshot.parent, "child": snapshot.child}
-    try:
-        with waiting_for("writing the report"):
-            path = report.write_report(
-                directory,
-                calibration,
-                snapshot.config,
-                pose_pairs,
-                estimate_extrinsic,
-                inputs=inputs,
-                findings=findings,
-                streams=streams,
-                command=static_transform_command(calibration),
-            )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"cannot write {error.filename or directory}: {error.strerror}; choose another directory") from None
-    note(f"wrote {path}")
+        raise InputError(f"cannot write {error.filename or path}: {error.strerror}; choose another directory") from None
+    return path

@@ -367,6 +367,11 @@ def test_help_lists_every_option_with_its_default(run, command):
         (["--keyframe-min-translation", "0.5"], {"keyframe_min_translation": 0.5}),
         (["--time-offset", "-0.25"], {"time_offset": -0.25}),
         (["--time-offset=-1e-3"], {"time_offset": -1e-3}),
+        (["--time-offset", "-1e-3"], {"time_offset": -1e-3}),
+        (
+            ["--prior-z", "-1.85+/-0.02", "--prior", "yaw=-90deg+/-2deg"],
+            {"prior_z": "-1.85+/-0.02", "prior_yaw": "-90deg+/-2deg"},
+        ),
         (["--scale", "2"], {"scale": 2.0}),
         (["--scale", "none"], {}),
         (

@@ -217,6 +217,7 @@ def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, mon
     assert_is_result_of_the_fleet(*run("--batch", fleet, "--out", out_dir, "--json", "--jobs", "2"))
     np.testing.assert_allclose(load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-6)
     assert (out_dir / "drive1" / "static_transform.launch.py").exists()
+    assert "Both streams before any solve" in (out_dir / "drive1" / "report.html").read_text(encoding="utf-8")
     done = []
     monkeypatch.setattr(batch, "_on_cores", lambda jobs: here(done))
     code, out, err = run("--batch", fleet, "--out", out_dir, "--json")
@@ -243,6 +244,19 @@ def here(done):
             yield task, batch.work(task)
 
     return nullcontext(outcomes)
+
+
+def test_a_batch_checks_the_streams_as_a_single_bag_does(run, tmp_path):
+    poses = wandering_poses(300)
+    streams = [as_trajectory(each, sensor_frame=name) for each, name in ((poses, "lidar"), (child_of(poses), "camera"))]
+    write_bag(tmp_path / "short", {"/a": (streams[0], ODOMETRY), "/b": (streams[1].scaled(1000.0), ODOMETRY)})
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text(yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": ["short"]}))
+    (row,) = json.loads(run("--batch", fleet, "--json", "--jobs", "1")[1])["results"]
+    alone = json.loads(run(tmp_path / "short", *STREAMS, "--json")[1])
+    assert [finding["code"] for finding in row["findings"]] == ["units"]
+    assert row["findings"] == alone["findings"]
+    assert row["calibration"]["warnings"] == alone["warnings"]
 
 
 def test_a_batch_on_a_dask_cluster(run, fleet):
