@@ -3,7 +3,7 @@
 #   make test          the whole test suite
 #   make test-oldest   the same, slow tests left out, on the oldest supported versions
 #   make lint          style
-#   make bench         benchmarks against the baseline
+#   make bench         benchmarks against the baseline; about four minutes (BENCH_ARGS=--full: fifteen)
 #   make bench-node    load, soak and crashes of the node, measured; about seven minutes
 #   make clean         remove everything the above made
 # PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest.
@@ -34,7 +34,7 @@ test: $(VENV)/.ready-test
 test-oldest: $(OLDEST)/.ready-test
 	$(OLDEST)/bin/python -m pytest -m 'not slow' $(PYTEST_ARGS)
 
-bench: $(VENV)/.ready-test
+bench: $(VENV)/.ready-bench
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py $(BENCH_ARGS)
 
 bench-node: $(VENV)/.ready-test
@@ -59,6 +59,11 @@ $(VENV)/.ready-test: EXTRAS := ros,plot,cluster,test,lint
 $(OLDEST)/.ready-test: EXTRAS := ros,plot,cluster,test
 $(OLDEST)/.ready-test: CONSTRAINTS := --constraint requirements/oldest.txt
 $(OLDEST)/.ready-test: requirements/oldest.txt
+
+# What the benchmarks compare with, and nothing else needs.
+$(VENV)/.ready-bench: $(VENV)/.ready-test requirements/bench.txt
+	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --requirement requirements/bench.txt
+	@touch $@
 
 $(VENV)/.ready-demo $(VENV)/.ready-test $(OLDEST)/.ready-test: $(SETUP_FILES)
 	@PYTHON="$(PYTHON)" sh requirements/make_venv.sh $(@D)

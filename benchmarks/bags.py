@@ -22,7 +22,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from hand_eye_calib.calibrator import Calibrator
-from hand_eye_calib.cli.replay import feed
+from hand_eye_calib.cli.replaying import feed
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
@@ -74,12 +74,12 @@ def with_ours(path):
     """Seconds to read, to hand everything to the engine as well, and to solve."""
     start = time.process_time()
     with PoseBag(path) as bag:
-        for _ in bag.poses(*TOPICS.values()):
+        for _ in bag.blocks(*TOPICS.values()):
             pass
     read = time.process_time()
     calibrator = Calibrator()
     with PoseBag(path) as bag:
-        feed(calibrator, bag.poses(*TOPICS.values()), TOPICS)
+        feed(calibrator, bag.blocks(*TOPICS.values()), TOPICS)
     fed = time.process_time()
     calibrator.estimate()
     return read - start, fed - read, time.process_time() - fed

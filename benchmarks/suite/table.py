@@ -1,0 +1,113 @@
+"""The tables, on the terminal and in the documentation."""
+
+import sys
+from typing import NamedTuple
+
+import numpy as np
+from rich import box, table
+from rich.console import Console
+
+from suite.baseline import FLOOR, aims, ratios
+from suite.data import LONG, REFERENCE, SHORT
+
+_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"))
+_BEGIN, _END = "<!-- tables of benchmarks/run.py: begin -->\n", "<!-- tables of benchmarks/run.py: end -->\n"
+
+
+class Table(NamedTuple):
+    """A title, the headings of the columns after the first, and rows of text."""
+
+    title: str
+    headings: list
+    rows: list
+
+
+def tables(source, rows, memory):
+    """Everything that was measured, a list of Table."""
+    sizes = {row.size for row in rows if row.name == FLOOR}
+    of_pairs = [row for row in rows if row.size in sizes]
+    found = [_growth(source, [row for row in of_pairs if not row.name.startswith("opencv")])]
+    for size, name in ((SHORT, "short"), (LONG, "long")):
+        found.append(
+            _side_by_side(f"Side by side: {source} {name} drive, {size:,} pairs", [row for row in of_pairs if row.size == size])
+        )
+    found.append(_others([row for row in rows if row.size not in sizes], memory))
+    compared = ratios(rows, memory).items()
+    found.append(
+        Table("Times faster", ["ratio"], [[name, f"{ratio:.3g}"] for name, ratio in compared if not name.startswith(FLOOR)])
+    )
+    aimed_at = [[what, aim, measured, "yes" if is_met else "no"] for what, aim, measured, is_met in aims(rows, memory)]
+    return [*found, Table("What is aimed at", ["aim", "measured", "met"], aimed_at)]
+
+
+def show(found):
+    """Print tables."""
+    console = Console(width=None if sys.stdout.isatty() else 150)
+    for each in found:
+        shown = table.Table(title=each.title, box=box.SIMPLE_HEAD)
+        for index, heading in enumerate(["", *each.headings]):
+            shown.add_column(heading, justify="right" if index else "left")
+        for row in each.rows:
+            shown.add_row(*row)
+        console.print(shown)
+
+
+def write(found, page, note):
+    """Put tables, and a note before them, into a Markdown page in place of those of an earlier run."""
+    before, _, rest = page.read_text(encoding="utf-8").partition(_BEGIN)
+    _, _, after = rest.partition(_END)
+    parts = [_BEGIN, note]
+    for each in found:
+        lines = [["", *each.headings], ["---", *["---:"] * len(each.headings)], *each.rows]
+        parts.append(f"### {each.title}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines))
+    page.write_text(before + "\n".join([*parts, _END]) + after, encoding="utf-8")
+
+
+def _readable(seconds):
+    """A time in three digits."""
+    size, unit = next((unit for unit in _UNITS if seconds >= unit[0]), _UNITS[-1])
+    return f"{seconds / size:.3g} {unit}"
+
+
+def _cell(row):
+    return f"{_readable(row.seconds)} ± {row.spread:.0%}"
+
+
+def _growth(source, rows):
+    sizes = sorted({row.size for row in rows})
+    cells = {}
+    for row in rows:
+        cells.setdefault(row.name, {})[row.size] = _cell(row)
+    return Table(
+        f"Processor time by number of motion pairs ({REFERENCE}; {SHORT} and {LONG:,} {source}, others simulated)",
+        [f"{size:,}" for size in sizes],
+        [[name, *(found.get(size, "") for size in sizes)] for name, found in cells.items()],
+    )
+
+
+def _side_by_side(title, rows):
+    own = next(row.seconds for row in rows if row.name == "dnlo fast")
+    return Table(
+        title,
+        ["time", "times dnlo fast", "objective", "e_at, m", "e_aR, deg"],
+        [
+            [
+                row.name,
+                _cell(row),
+                f"{row.seconds / own:.3g}",
+                f"{row.objective:.6f}" if row.name.startswith("dnl") else "",
+                f"{row.error_m:.3f}",
+                f"{np.degrees(row.error_rad):.3f}",
+            ]
+            for row in rows
+            if row.error_m is not None and not row.name.startswith("opencv,")
+        ],
+    )
+
+
+def _others(rows, memory):
+    lines = [[row.name, f"{row.size:,}" if row.size else "", _cell(row)] for row in rows]
+    for size, (before, peak, data) in memory.items():
+        sizes = f"{peak / 1e6:.0f} MB, {before / 1e6:.0f} before and {data / 1e6:.0f} for the pairs among it"
+        lines.append(["peak memory of dnlo fast", f"{size:,}", sizes])
+    return Table("Processes, bags, messages", ["size", "measured"], lines)
