@@ -4,24 +4,36 @@ Instead of choosing which poses to compare, all evidence is weighed as the noise
 favours long baselines, drift short ones, and a jump cuts the trajectory. docs/adaptive.md derives and tests it.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri  # the quantile of scipy.stats.chi2, which takes a third of a second to import
 
 from hand_eye_calib.adaptive.block_tridiagonal import BLOCK
-from hand_eye_calib.adaptive.increments import NUISANCES, Increments
+from hand_eye_calib.adaptive.increments import (
+    ALL_SYSTEMATIC,
+    CENTRES,
+    NUISANCES,
+    Increments,
+    nuisance_columns,
+    nuisance_values,
+)
 from hand_eye_calib.adaptive.noise import (
     LOWEST_VARIANCE,
     NoiseLevels,
+    Solve,
     covariance_factor,
     fit_rotation_variances,
     fit_translation_variances,
     generalised_least_squares,
     join_variances,
+    joined_columns,
+    solve_normal_equations,
     solve_weighted,
     starting_variances,
 )
+from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers import dnlo
@@ -43,66 +55,33 @@ _PROBABLE = 0.01
 _MOST_JUMPS = 0.5
 
 # Noise levels need no more increments than this; longer drives lend evenly spread stretches of them.
-_MOST_NOISE_INCREMENTS = 600
-_STRETCH = 100
+_MOST_NOISE_INCREMENTS = 2400
+_STRETCH = 400
 
 # Noise levels and X are improved in turn until X moves by less than this share of its sigma and no jump appears.
 _MAX_ROUNDS, _SETTLED_SIGMAS = 4, 0.1
+
+# Rotation noise turns about the origin of a world if residuals seen from there are so much smaller than at the sensors.
+_DECISIVE = 0.7
+
+# Rotation noise this large beside the rotation between poses is not small. Then every so many poses are tried, if enough of them remain.
+_DROWNED = 0.2
+_STRIDES = (3, 10, 30)
+_FEWEST_STRIDES = 50
+
+# Systematic errors larger than this (of the length, m/m, s) are none: a wrong unit, a clock that was not aligned, or noise. Nor is one
+# assumed that can hardly be told from X: on flat ground a child that slips sideways looks like one that is mounted askew.
+_MOST_SCALE_ERROR, _MOST_BIAS, _MOST_OFFSET_S = 0.5, 0.2, 0.5
+_MOST_GROWTH = 5.0
+
+# Errors that outlast the model show in sums of so many innovations; an excess below this many standard deviations may be chance.
+_SUMMED, _CHANCE_SIGMAS = 16, 3.0
 
 _MAX_STEPS = 20
 _CONVERGED_SIGMAS, _CONVERGED_STEP = 1e-4, 1e-10
 
 
-@dataclass(frozen=True)
-class AdaptiveSolution:
-    """Answer of the adaptive estimator.
-
-    Attributes
-    ----------
-    T_parent_child : (4, 4) array
-    cov_parent_child_in_child : (6, 6) array
-        Covariance of xi = (rho, phi) in ``X exp(xi)`` under the model, nuisance parameters accounted for.
-    unseen : (6, U) array
-        Directions of xi that no increment says anything about.
-    noise : NoiseLevels
-    nuisance : {"none", "scale", "bias"}
-        Which systematic error the data asks for.
-    parameters : (k,) array
-        Its parameters: the scale error, or the child's bias per metre along its axes.
-    jumps : (n,) bool array
-        Increments (from pose i to i + 1) across which a trajectory jumped.
-    objective : float
-        Negative log likelihood.
-    converged : bool
-    iterations : int
-        Generalised least-squares steps.
-    """
-
-    T_parent_child: np.ndarray
-    cov_parent_child_in_child: np.ndarray
-    unseen: np.ndarray
-    noise: NoiseLevels
-    nuisance: str
-    parameters: np.ndarray
-    jumps: np.ndarray
-    objective: float
-    converged: bool
-    iterations: int
-
-    def describe(self, stamps_ns):
-        """The noise in plain numbers and strings: levels per axis, the systematic error, and when trajectories jumped (ns)."""
-        return {
-            "rotation_white_rad": self.noise.rotation_white,
-            "translation_white_m": self.noise.translation_white,
-            "rotation_drift_rad_per_pose": self.noise.rotation_drift,
-            "translation_drift_m_per_pose": self.noise.translation_drift,
-            "systematic": self.nuisance,
-            "systematic_parameters": self.parameters.tolist(),
-            "jumps_before_stamp_ns": stamps_ns[1:][self.jumps].tolist(),
-        }
-
-
-def solve(stamps_ns, Ts_pw_p, Ts_cw_c, nuisances=("none", "scale", "bias")):
+def solve(stamps_ns, Ts_pw_p, Ts_cw_c, nuisances=NUISANCES):
     """Estimate T_parent_child, the noise of the trajectories, and their covariance.
 
     Parameters
@@ -111,27 +90,32 @@ def solve(stamps_ns, Ts_pw_p, Ts_cw_c, nuisances=("none", "scale", "bias")):
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of both sensors in their own worlds at these stamps.
     nuisances : sequence of str
-        Systematic errors to choose from, by Schwarz's criterion (BIC).
+        Systematic errors to choose from, by Schwarz's criterion (BIC); the first is fitted in any case, and should be "none" if there are others.
 
     Returns
     -------
     AdaptiveSolution
     """
-    increments = Increments(stamps_ns, Ts_pw_p, Ts_cw_c)
-    T_start = dnlo.solve(motion_pairs(Ts_pw_p, Ts_cw_c, _START_REFERENCE)).T_parent_child
-    fits = []
-    start = _Start(T_start, _robust_jumps(increments.residuals(T_start)))
-    for nuisance in nuisances:
-        fits.append(_fit(increments, start, nuisance))
-        start = _Start(fits[0].T_parent_child, fits[0].jumps, fits[0].noise.variances())
-    # The jumps found under different models differ; the criterion needs the same evidence for all.
-    jumps = np.logical_or.reduce([fit.jumps for fit in fits]) if len(fits) > 1 else fits[0].jumps
-    scores = [_criterion(increments, fit, jumps) for fit in fits]
-    return fits[int(np.argmin(scores))]
+    poses, first = _Poses(stamps_ns, Ts_pw_p, Ts_cw_c), nuisances[0]
+    plain = _at_best_stride(_fit(_start(poses, np.arange(len(stamps_ns)), first)))
+    chosen = _with_systematic_errors(plain, nuisances) if len(nuisances) > 1 else plain
+    if chosen.nuisance != first:
+        solution = _polished(_fit(chosen))
+        if solution.converged and _is_plausible(solution.nuisance, solution.parameters):
+            return solution
+    # What does not lead to an answer is given up in turn: systematic errors, then noise that turns about the origin of a world.
+    solution = _polished(plain)
+    if not solution.converged and solution.centre != "sensors":
+        solution = _polished(_fit(_start(poses, np.arange(len(stamps_ns)), first, centres=("sensors",))))
+    return solution
 
 
 def solve_without(stamps_ns, Ts_pw_p, Ts_cw_c, solution, left_out):
-    """Answers near a given one when some increments are left out, for resampling. The noise levels are kept.
+    """Answers near a given one without the evidence of some increments, for resampling. The noise levels are kept.
+
+    Leaving increments out as such would cut the trajectory there, and with white noise most is known across the gap: the spread of the
+    answers would overstate the error. Left out is what each increment adds to those before it: its innovations. These are
+    independent of each other if the model is right.
 
     Parameters
     ----------
@@ -146,59 +130,221 @@ def solve_without(stamps_ns, Ts_pw_p, Ts_cw_c, solution, left_out):
     -------
     (B, 4, 4) array
     """
-    increments = Increments(stamps_ns, Ts_pw_p, Ts_cw_c)
+    kept = np.flatnonzero(solution.used)
+    increments = _Poses(stamps_ns, Ts_pw_p, Ts_cw_c).increments(kept, solution.centre)
     linearisation = increments.linearise(solution.T_parent_child, solution.nuisance, solution.parameters)
-    variances = solution.noise.variances()
-    steps = [generalised_least_squares(linearisation, variances, solution.jumps | row).step[:6] for row in left_out]
+    factor = covariance_factor(linearisation.components, solution.noise.variances(), _across(kept, solution.jumps))
+    innovations = factor.whiten(joined_columns(linearisation.residuals, linearisation.jacobian))
+    innovations = innovations.reshape(len(increments), BLOCK, -1)
+    per_increment = np.swapaxes(innovations, 1, 2) @ innovations
+    steps = [solve_normal_equations(per_increment[~row].sum(axis=0)).step[:6] for row in _across(kept, left_out)]
     return solution.T_parent_child @ se3.exp(np.array(steps))
 
 
+def _across(kept, flags):
+    """Whether any of the increments (..., n) is flagged between each kept pose and the next."""
+    return np.logical_or.reduceat(flags[..., : kept[-1]], kept[:-1], axis=-1)
+
+
 @dataclass(frozen=True)
-class _Start:
-    T_parent_child: np.ndarray
+class _Poses:
+    stamps_ns: np.ndarray
+    Ts_pw_p: np.ndarray
+    Ts_cw_c: np.ndarray
+
+    def increments(self, kept, centre):
+        typical_ns = float(np.median(np.diff(self.stamps_ns)))
+        return Increments(self.stamps_ns[kept], self.Ts_pw_p[kept], self.Ts_cw_c[kept], centre, typical_ns)
+
+
+@dataclass(frozen=True)
+class _State:
+    """Where the search stands."""
+
+    poses: _Poses
+    kept: np.ndarray
+    increments: Increments
     jumps: np.ndarray
+    spikes: np.ndarray
+    T: np.ndarray
+    nuisance: str
+    parameters: np.ndarray
     variances: np.ndarray | None = None
+    solve: Solve | None = None
+    iterations: int = 0
+
+    @property
+    def arguments(self):
+        return self.T, self.nuisance, self.parameters
+
+    def moved(self, step):
+        return dataclasses.replace(self, T=self.T @ se3.exp(step[:6]), parameters=self.parameters + step[6:])
+
+    def without_spikes(self):
+        """Without poses between two jumps. The increments that bridge them count as jumps until shown to be none."""
+        jumps, kept = self.jumps, self.kept
+        spikes = np.r_[False, jumps[:-1] & jumps[1:], False]
+        if not spikes.any():
+            return self
+        remaining = np.flatnonzero(~spikes)
+        increments = self.poses.increments(kept[remaining], self.increments.centre)
+        return dataclasses.replace(
+            self,
+            kept=kept[remaining],
+            increments=increments,
+            jumps=_across(remaining, jumps),
+            spikes=np.union1d(self.spikes, kept[spikes]),
+        )
 
 
-def _fit(increments, start, nuisance):
-    T, parameters, jumps, variances = start.T_parent_child, np.zeros(NUISANCES[nuisance]), start.jumps, start.variances
-    sample = _noise_sample(len(increments))
-    sampled = increments.rows(sample)
-    iterations = 0
-    while iterations < _MAX_ROUNDS:
-        iterations += 1
-        variances = _fit_noise(sampled.linearise(T, nuisance, parameters), jumps[sample], variances)
-        linearisation = increments.linearise(T, nuisance, parameters)
-        solve = generalised_least_squares(linearisation, variances, jumps)
-        T, parameters = T @ se3.exp(solve.step[:6]), parameters + solve.step[6:]
-        known_jumps = jumps
-        residuals = increments.residuals(T, nuisance, parameters)
-        jumps = _jumps(residuals, linearisation.components, variances, solve.factor, jumps)
+def _start(poses, kept, nuisance, spikes=(), centres=CENTRES):
+    """Robust first answer from some of the poses, and what it says about jumps and the centre of the rotation noise."""
+    T = dnlo.solve(motion_pairs(poses.Ts_pw_p[kept], poses.Ts_cw_c[kept], _START_REFERENCE)).T_parent_child
+    increments = [poses.increments(kept, centre) for centre in centres]
+    sizes = [np.median(np.linalg.norm(each.seen_from_centre(T)[:, 3:], axis=1)) for each in increments]
+    best = int(np.argmin(sizes))
+    increments = increments[best if sizes[best] < _DECISIVE * sizes[0] else 0]
+    jumps = _robust_jumps(increments.seen_from_centre(T))
+    parameters = np.zeros(len(nuisance_columns(nuisance)))
+    return _State(poses, kept, increments, jumps, np.array(spikes, dtype=int), T, nuisance, parameters)
+
+
+def _at_best_stride(state):
+    """The fit to every pose, or to every third, tenth ... where that states the smaller covariance.
+
+    Where noise drowns the rotation between poses, the first order that all of this rests on does not hold, and fast cameras repeat
+    their errors from pose to pose. Longer steps cure both.
+    """
+    angles = se3.rotation_angle(state.increments.rotation_a)
+    if state.variances[0] < (_DROWNED * np.median(angles)) ** 2:
+        return state
+    best, kept = state, state.kept
+    for stride in _STRIDES:
+        if len(kept) < stride * _FEWEST_STRIDES:
+            break
+        rival = _fit(_start(state.poses, kept[::stride], state.nuisance, state.spikes))
+        if _log_volume(rival) < _log_volume(best):
+            best = rival
+    return best
+
+
+def _log_volume(state):
+    """Logarithm of the size of the stated covariance; infinite if there are directions it says nothing about."""
+    return np.inf if state.solve.unseen.size else float(np.linalg.slogdet(state.solve.covariance)[1])
+
+
+def _fit(state):
+    """Noise levels, jumps and X of a model in turn, until they agree."""
+    for _ in range(_MAX_ROUNDS):
+        state = state.without_spikes()
+        linearisation, variances = _noise_levels(state, *state.arguments)
+        solve = generalised_least_squares(linearisation, variances, state.jumps)
+        known_jumps = state.jumps
+        state = dataclasses.replace(state.moved(solve.step), variances=variances, iterations=state.iterations + 1, solve=solve)
+        residuals = state.increments.residuals(*state.arguments)
+        jumps = _jumps(residuals, linearisation.components, variances, solve.factor, known_jumps)
+        state = dataclasses.replace(state, jumps=jumps)
         settled = np.abs(solve.step) < _SETTLED_SIGMAS * np.sqrt(np.diag(solve.covariance))
         if np.array_equal(jumps, known_jumps) and settled.all():
             break
-    # The covariance is settled; what is left is to follow the residuals to the minimum.
-    factor = covariance_factor(linearisation.components, variances, jumps)
-    converged = False
+    return state
+
+
+def _with_systematic_errors(state, nuisances):
+    """The model of systematic errors that Schwarz's criterion asks for, one step from the fit without.
+
+    All models are judged on the same evidence: the same jumps, and the noise levels that are left when all systematic errors are accounted for.
+    """
+    zeros = np.zeros(len(nuisance_columns(ALL_SYSTEMATIC)))
+    linearisation, variances = _noise_levels(state, state.T, ALL_SYSTEMATIC, zeros)
+    factor = covariance_factor(linearisation.components, variances, state.jumps)
+    n_observations = 6 * int((~state.jumps).sum())
+
+    def solve(nuisance):
+        columns = nuisance_columns(nuisance)
+        jacobian = linearisation.jacobian[:, :, [*range(6), *(6 + column for column in columns)]]
+        return solve_weighted(linearisation.residuals, jacobian, factor)
+
+    solves = {nuisance: solve(nuisance) for nuisance in nuisances}
+    known = solves[nuisances[0]].covariance[:6, :6]
+    credible = [name for name, solved in solves.items() if _is_credible(solved, name, known)]
+    best = min(credible, key=lambda name: solves[name].cost + len(nuisance_columns(name)) * np.log(max(n_observations, 2)))
+    chosen = dataclasses.replace(state, nuisance=best, parameters=np.zeros(len(nuisance_columns(best))), variances=variances)
+    return chosen.moved(solves[best].step)
+
+
+def _is_plausible(nuisance, parameters):
+    """Whether systematic errors are of a size that sensors have."""
+    scale, bias, offset_s = nuisance_values(nuisance, parameters)
+    return max(abs(scale) / _MOST_SCALE_ERROR, np.abs(bias).max() / _MOST_BIAS, abs(offset_s) / _MOST_OFFSET_S) < 1.0
+
+
+def _is_credible(solve, nuisance, known):
+    """Whether a model's systematic errors are of a plausible size, and X can be told from them."""
+    if not _is_plausible(nuisance, solve.step[6:]):
+        return False
+    growth = np.linalg.eigvals(np.linalg.pinv(known, hermitian=True) @ solve.covariance[:6, :6]).real.max()
+    return growth < _MOST_GROWTH**2
+
+
+def _polished(state):
+    """The covariance is settled; what is left is to follow the residuals to the minimum."""
+    increments, variances, jumps = state.increments, state.variances, state.jumps
+    factor = covariance_factor(increments.components(*state.arguments), variances, jumps)
+    converged, iterations = False, state.iterations
     while not converged and iterations < _MAX_STEPS:
         iterations += 1
-        arguments = (T, nuisance, parameters)
-        solve = solve_weighted(increments.residuals(*arguments), increments.jacobian(*arguments), factor)
-        T, parameters = T @ se3.exp(solve.step[:6]), parameters + solve.step[6:]
+        solve = solve_weighted(increments.residuals(*state.arguments), increments.jacobian(*state.arguments), factor)
+        state = state.moved(solve.step)
         tolerance = np.maximum(_CONVERGED_SIGMAS * np.sqrt(np.diag(solve.covariance)), _CONVERGED_STEP)
         converged = bool((np.abs(solve.step) < tolerance).all())
+    used, spikes = np.zeros((2, len(state.poses.stamps_ns)), dtype=bool)
+    used[state.kept] = spikes[state.spikes] = True
+    misfit = _misfit(factor.whiten(increments.residuals(*state.arguments).reshape(-1, 1)).reshape(-1, 6)[~jumps])
+    all_jumps = np.zeros(len(spikes) - 1, dtype=bool)
+    # A jump across poses left out is said to be before the next pose that is not.
+    all_jumps[state.kept[1:][jumps] - 1] = True
     return AdaptiveSolution(
-        T,
-        solve.covariance[:6, :6],
+        state.T,
+        misfit * solve.covariance[:6, :6],
         solve.unseen[:6],
         NoiseLevels.from_variances(variances),
-        nuisance,
-        parameters,
-        jumps,
+        increments.centre,
+        state.nuisance,
+        state.parameters,
+        all_jumps,
+        spikes,
+        used,
+        misfit,
+        _metres(state.poses.Ts_pw_p[used]) / len(used),
         solve.loss(),
         converged,
         iterations,
     )
+
+
+def _noise_levels(state, *arguments):
+    """Linearisation at given arguments, and variances (4,) from it or, for long drives, from evenly spread stretches."""
+    linearisation, jumps = state.increments.linearise(*arguments), state.jumps
+    sampled = linearisation
+    if len(jumps) > _MOST_NOISE_INCREMENTS:
+        sample = _stretches(len(jumps))
+        sampled, jumps = state.increments.rows(sample).linearise(*arguments), jumps[sample]
+    return linearisation, _fit_noise(sampled, jumps, state.variances)
+
+
+def _metres(poses):
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+
+
+def _misfit(innovations):
+    """By how much the variance of sums of successive innovations (n, 6) exceeds that of independent ones; 1 if it may be chance."""
+    n_sums = len(innovations) // _SUMMED
+    if n_sums == 0:
+        return 1.0
+    sums = innovations[: n_sums * _SUMMED].reshape(n_sums, _SUMMED, 6).sum(axis=1)
+    excess = max((sums[:, part] ** 2).mean() / _SUMMED for part in (slice(0, 3), slice(3, 6)))
+    return float(excess) if excess > 1.0 + _CHANCE_SIGMAS * np.sqrt(2.0 / (3 * n_sums)) else 1.0
 
 
 def _fit_noise(linearisation, jumps, variances):
@@ -210,19 +356,6 @@ def _fit_noise(linearisation, jumps, variances):
         rotation, translation = variances[::2], variances[1::2]
     rotation = fit_rotation_variances(linearisation, jumps, rotation)
     return join_variances(rotation, fit_translation_variances(linearisation, jumps, rotation, translation))
-
-
-def _criterion(increments, fit, jumps):
-    """Schwarz's criterion of a fit on the evidence outside the given jumps."""
-    noise = fit.noise
-    variances = np.maximum(
-        np.square([noise.rotation_white, noise.translation_white, noise.rotation_drift, noise.translation_drift]),
-        LOWEST_VARIANCE,
-    )
-    linearisation = increments.linearise(fit.T_parent_child, fit.nuisance, fit.parameters)
-    loss = generalised_least_squares(linearisation, variances, jumps).loss()
-    n_observations = 6 * int((~jumps).sum())
-    return 2.0 * loss + NUISANCES[fit.nuisance] * np.log(max(n_observations, 2))
 
 
 def _robust_jumps(residuals):
@@ -240,13 +373,13 @@ def _jumps(residuals, components, variances, factor, known_jumps):
     huge; it stays one unless its whole size is quite probable after all.
     """
     innovations = factor.whiten(residuals.reshape(-1, 1)).reshape(-1, 6)
-    surprising = (innovations**2).sum(axis=1) > chi2.isf(_FALSE_ALARMS / len(residuals), 6)
+    surprising = (innovations**2).sum(axis=1) > chdtri(6, _FALSE_ALARMS / len(residuals))
     bands = np.tensordot(variances, components[:, :BLOCK], axes=1).reshape(BLOCK, -1, BLOCK)
     blocks = np.empty((len(residuals), BLOCK, BLOCK))
     for column in range(BLOCK):
         blocks[:, column:, column] = blocks[:, column, column:] = bands[: BLOCK - column, :, column].T
     sizes = (residuals * np.linalg.solve(blocks, residuals[:, :, None])[:, :, 0]).sum(axis=1)
-    jumps = surprising | (known_jumps & (sizes > chi2.isf(_PROBABLE, 6)))
+    jumps = surprising | (known_jumps & (sizes > chdtri(6, _PROBABLE)))
     excess = int(jumps.sum()) - int(_MOST_JUMPS * len(jumps))
     if excess > 0:
         flagged = np.flatnonzero(jumps)
@@ -254,10 +387,7 @@ def _jumps(residuals, components, variances, factor, known_jumps):
     return jumps
 
 
-def _noise_sample(n_increments):
-    """Indices of the increments to judge the noise by: all, or evenly spread stretches."""
-    if n_increments <= _MOST_NOISE_INCREMENTS:
-        return np.arange(n_increments)
-    n_stretches = _MOST_NOISE_INCREMENTS // _STRETCH
-    starts = np.linspace(0, n_increments - _STRETCH, n_stretches).astype(int)
+def _stretches(n_increments):
+    """Indices of evenly spread stretches of the increments."""
+    starts = np.linspace(0, n_increments - _STRETCH, _MOST_NOISE_INCREMENTS // _STRETCH).astype(int)
     return (starts[:, None] + np.arange(_STRETCH)).ravel()

@@ -14,6 +14,10 @@ and positions n_p, n_c of the two sensors, all turned into the axes of the paren
 
 with the lever l = Rp t and the step g_i = Rp_i R t_B. Noise that is isotropic at the sensor is isotropic in any axes, so these
 residuals are stationary but for the known levers, and their covariance is block tridiagonal.
+
+Odometry is wrong about the sensor's own place. A camera that sees a target is not: it is right about where the target is, and where it
+is wrong about the target's rotation, its own place swings about the target. Its position error then contains Phi x d, d being the way
+from the origin of its world to the sensor.
 """
 
 from dataclasses import dataclass
@@ -24,7 +28,27 @@ from hand_eye_calib.adaptive.block_tridiagonal import BLOCK, to_bands
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 
-NUISANCES = {"none": 0, "scale": 1, "bias": 3}
+# Systematic errors of the child, and which parameters are theirs: by how much its lengths are short, bias per metre along its axes (m/m),
+# time to add to its stamps (s).
+_SYSTEMATIC = {"none": [], "scale": [0], "bias": [1, 2, 3], "time": [4]}
+NUISANCES = ("none", "scale", "bias", "time", "scale+time", "bias+time")
+ALL_SYSTEMATIC = "scale+bias+time"
+_SHARED_WITH_ALL = 5
+
+# What white rotation noise turns a trajectory about: either sensor itself, or the origin of the child's or of the parent's world.
+CENTRES = ("sensors", "child", "parent")
+
+
+def nuisance_columns(nuisance):
+    """Which of the parameters of all systematic errors are those of a model."""
+    return [index for name in nuisance.split("+") for index in _SYSTEMATIC[name]]
+
+
+def nuisance_values(nuisance, parameters):
+    """Scale error, bias per metre (3,) and time offset (s); zero where the model has none."""
+    values = np.zeros(_SHARED_WITH_ALL)
+    values[nuisance_columns(nuisance)] = parameters
+    return values[0], values[1:4], values[4]
 
 
 @dataclass(frozen=True)
@@ -58,99 +82,135 @@ class Increments:
     ----------
     stamps_ns : (N,) int64 array
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
+    centre : {"sensors", "child", "parent"}
+        What white rotation noise turns the trajectories about, see ``CENTRES``.
+    typical_ns : float, optional
+        Interval in which drift has unit variance; the median one by default.
     """
 
-    def __init__(self, stamps_ns, Ts_pw_p, Ts_cw_c):
+    def __init__(self, stamps_ns, Ts_pw_p, Ts_cw_c, centre="sensors", typical_ns=None):
         pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
-        self.rotation_p = Ts_pw_p[:, :3, :3]
+        intervals = np.diff(stamps_ns).astype(float)
+        self.centre = centre
+        self.rotation_i, self.rotation_j = Ts_pw_p[:-1, :3, :3], Ts_pw_p[1:, :3, :3]
         self.steps_p = np.diff(Ts_pw_p[:, :3, 3], axis=0)
         self.rotation_a = pairs.Ts_parenti_parentj[:, :3, :3]
         self.rotation_b = pairs.Ts_childi_childj[:, :3, :3]
         self.translation_b = pairs.Ts_childi_childj[:, :3, 3]
         self.metres_b = np.linalg.norm(self.translation_b, axis=1)
-        intervals = np.diff(stamps_ns).astype(float)
+        self.per_second_r, self.per_second_t = _per_second_later(pairs.Ts_childi_childj, intervals * 1e-9)
+        # Ways from the origins of their worlds to the sensors, in the axes of the parent's world and of the child.
+        self.from_origin_p, self.from_origin_c = Ts_pw_p[:-1, :3, 3], -se3.inverse(Ts_cw_c[:-1])[:, :3, 3]
         # A random walk's variance grows with time; bounded, so that no gap or twin stamp dominates.
-        self.relative_interval = np.clip(intervals / np.median(intervals), 0.1, 100.0)
+        self.relative_interval = np.clip(intervals / (typical_ns or np.median(intervals)), 0.1, 100.0)
+        self.index = np.arange(len(intervals))
 
     def __len__(self):
-        return len(self.steps_p)
+        return len(self.index)
 
     def rows(self, selected):
         """Some of the increments; neighbours that were not neighbours before are independent of each other."""
         part = object.__new__(Increments)
-        part.rotation_p = self.rotation_p
-        part.__dict__.update({name: value[selected] for name, value in self.__dict__.items() if name != "rotation_p"})
-        part.selected = selected
+        part.__dict__.update({name: value[selected] for name, value in self.__dict__.items() if name != "centre"})
+        part.centre = self.centre
         return part
 
-    @property
-    def first_pose(self):
-        """(n,) indices of the pose each increment starts from."""
-        return getattr(self, "selected", np.arange(len(self)))
-
-    def corrected_steps(self, nuisance, parameters):
-        """The child's translations (n, 3) with a scale error or a bias per metre taken out."""
-        if nuisance == "scale":
-            return self.translation_b * (1.0 + parameters[0])
-        if nuisance == "bias":
-            return self.translation_b - parameters * self.metres_b[:, None]
-        return self.translation_b
+    def _corrected(self, nuisance, parameters):
+        """The child's motions with systematic errors taken out: rotations (n, 3, 3) and translations (n, 3)."""
+        scale, bias, offset_s = nuisance_values(nuisance, parameters)
+        rotation_b = self.rotation_b @ se3.rotation_exp(offset_s * self.per_second_r) if offset_s else self.rotation_b
+        translation_b = (1.0 + scale) * (self.translation_b + offset_s * self.per_second_t)
+        return rotation_b, translation_b - bias * self.metres_b[:, None]
 
     def residuals(self, T_parent_child, nuisance="none", parameters=()):
         """(n, 6) array: (r_R, r_t), see the module."""
-        rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
-        rotation_i, rotation_j = self.rotation_p[self.first_pose], self.rotation_p[self.first_pose + 1]
-        steps = (rotation_i @ rotation @ self.corrected_steps(nuisance, parameters)[:, :, None])[:, :, 0]
-        mismatch = self.rotation_a @ rotation @ np.swapaxes(self.rotation_b, 1, 2) @ rotation.T
-        residual_r = (rotation_i @ se3.rotation_log(mismatch)[:, :, None])[:, :, 0]
-        residual_t = (rotation_j - rotation_i) @ translation + self.steps_p - steps
+        rotation = T_parent_child[:3, :3]
+        rotation_b, translation_b = self._corrected(nuisance, parameters)
+        mismatch = self.rotation_a @ rotation @ np.swapaxes(rotation_b, 1, 2) @ rotation.T
+        residual_r = _turned(self.rotation_i, se3.rotation_log(mismatch))
+        residual_t = self._steps_by_parent(T_parent_child) - _turned(self.rotation_i @ rotation, translation_b)
         return np.concatenate([residual_r, residual_t], axis=1)
+
+    def seen_from_centre(self, T_parent_child):
+        """Residuals (n, 6) at the point that white rotation noise leaves in place: r_t is then that of translation noise alone."""
+        residuals = self.residuals(T_parent_child)
+        if self.centre == "child":
+            way = _turned(self.rotation_i @ T_parent_child[:3, :3], self.from_origin_c)
+        elif self.centre == "parent":
+            way = self.from_origin_p + self.rotation_i @ T_parent_child[:3, 3]
+        else:
+            return residuals
+        residuals[:, 3:] -= np.cross(residuals[:, :3], way)
+        return residuals
+
+    def _steps_by_parent(self, T_parent_child):
+        """The child's steps (n, 3), in the axes of the parent's world, as the parent's motion has them."""
+        return (self.rotation_j - self.rotation_i) @ T_parent_child[:3, 3] + self.steps_p
 
     def jacobian(self, T_parent_child, nuisance="none", parameters=()):
         """(n, 6, 6 + k) array, see :class:`Linearisation`."""
         rotation = T_parent_child[:3, :3]
-        rotation_i, rotation_j = self.rotation_p[self.first_pose], self.rotation_p[self.first_pose + 1]
-        turned = (rotation_j - rotation_i) @ rotation
-        into_world = rotation_i @ rotation
-        jacobian = np.zeros((len(self), 6, 6 + NUISANCES[nuisance]))
+        turned = (self.rotation_j - self.rotation_i) @ rotation
+        into_world = self.rotation_i @ rotation
+        rotation_b, translation_b = self._corrected(nuisance, parameters)
+        columns = nuisance_columns(nuisance)
+        jacobian = np.zeros((len(self), 6, 6 + len(columns)))
         jacobian[:, :3, 3:6] = turned
         jacobian[:, 3:, :3] = turned
-        jacobian[:, 3:, 3:6] = into_world @ se3.skew(self.corrected_steps(nuisance, parameters))
-        if nuisance == "scale":
-            jacobian[:, 3:, 6] = -(into_world @ self.translation_b[:, :, None])[:, :, 0]
-        elif nuisance == "bias":
-            jacobian[:, 3:, 6:] = into_world * self.metres_b[:, None, None]
+        jacobian[:, 3:, 3:6] = into_world @ se3.skew(translation_b)
+        if columns:
+            scale, _, offset_s = nuisance_values(nuisance, parameters)
+            systematic = np.zeros((len(self), 6, _SHARED_WITH_ALL))
+            systematic[:, 3:, 0] = -self._fair_steps(T_parent_child, scale, offset_s)
+            systematic[:, 3:, 1:4] = into_world * self.metres_b[:, None, None]
+            systematic[:, :3, 4] = -_turned(into_world @ rotation_b, self.per_second_r)
+            systematic[:, 3:, 4] = -(1.0 + scale) * _turned(into_world, self.per_second_t)
+            jacobian[:, :, 6:] = systematic[:, :, columns]
         return jacobian
+
+    def _fair_steps(self, T_parent_child, scale, offset_s):
+        """The child's steps (n, 3) in its own unit and the axes of the parent's world, for the derivative by scale.
+
+        Taken from the child alone, they would be correlated with the residuals through its noise, and a child whose steps drown in
+        noise would seem to be shrinking. The mean of what both sensors say is not, where both are as noisy.
+        """
+        by_parent = self._steps_by_parent(T_parent_child) / (1.0 + scale)
+        by_child = _turned(self.rotation_i @ T_parent_child[:3, :3], self.translation_b + offset_s * self.per_second_t)
+        return {"sensors": 0.5 * (by_parent + by_child), "child": by_parent, "parent": by_child}[self.centre]
 
     def components(self, T_parent_child, nuisance="none", parameters=()):
         """(4, 12, 6 n) array, see :class:`Linearisation`.
 
-        The white rotation noise is split evenly between the sensors; only the parent's half has the lever l, which decides how it
-        enters the translation residual.
+        White rotation noise about the sensors is split evenly between them, that about the origin of a world is its sensor's; this
+        decides how it enters the translation residual.
         """
         n_rows = len(self)
         rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
-        rotation_i, rotation_j = self.rotation_p[self.first_pose], self.rotation_p[self.first_pose + 1]
-        step = se3.skew((rotation_i @ rotation @ self.corrected_steps(nuisance, parameters)[:, :, None])[:, :, 0])
-        lever_i, lever_j = se3.skew(rotation_i @ translation), se3.skew(rotation_j @ translation)
-        eye, zero = np.broadcast_to(np.eye(3), (n_rows, 3, 3)), np.zeros((n_rows, 3, 3))
-        half = np.sqrt(0.5)
+        step = _turned(self.rotation_i @ rotation, self._corrected(nuisance, parameters)[1])
+        # Ways from what each sensor's rotation noise turns about to the child.
+        parent_i, parent_j = self.rotation_i @ translation, self.rotation_j @ translation
+        child_i, child_j = np.zeros((n_rows, 3)), np.zeros((n_rows, 3))
+        shares = {"sensors": (0.5, 0.5), "child": (0.0, 1.0), "parent": (1.0, 0.0)}[self.centre]
+        if self.centre == "parent":
+            parent_i, parent_j = parent_i + self.from_origin_p, parent_j + self.from_origin_p + self.steps_p
+        elif self.centre == "child":
+            child_i = _turned(self.rotation_i @ rotation, self.from_origin_c)
+            child_j = child_i + step
+        eye = np.broadcast_to(np.eye(3), (n_rows, 3, 3))
         # How noise of pose i and of pose j enters an increment: (rotation rows, translation rows) for each source.
-        parent_i, parent_j = half * _stack(-eye, lever_i + step), half * _stack(eye, -lever_j)
-        child_i, child_j = half * _stack(eye, -step), half * _stack(-eye, zero)
-        position_i, position_j = _stack(zero, -eye), _stack(zero, eye)
-        adjacent = np.diff(self.first_pose) == 1
-        drift = np.zeros((2, n_rows, 6, 6))
-        drift[0, :, range(3), range(3)] = drift[1, :, range(3, 6), range(3, 6)] = self.relative_interval
-        nothing = np.zeros((n_rows - 1, 6, 6))
-        return np.stack(
-            [
-                _white([parent_i, child_i], [parent_j, child_j], adjacent),
-                _white([position_i], [position_j], adjacent),
-                to_bands(drift[0], nothing),
-                to_bands(drift[1], nothing),
-            ]
-        )
+        at_i = [_stack(-eye, se3.skew(parent_i + step)), _stack(eye, -se3.skew(child_i + step))]
+        at_j = [_stack(eye, -se3.skew(parent_j)), _stack(-eye, se3.skew(child_j))]
+        at_i, at_j = ([np.sqrt(share) * block for share, block in zip(shares, at, strict=True) if share] for at in (at_i, at_j))
+        # Increments k - 1 and k share pose k: the first ends there, the second starts there.
+        adjacent = (np.diff(self.index) == 1).astype(float)
+        diagonal = sum(block @ np.swapaxes(block, 1, 2) for block in (*at_i, *at_j))
+        below = sum(start[1:] @ np.swapaxes(end[:-1], 1, 2) for start, end in zip(at_i, at_j, strict=True))
+        white_rotation, others = to_bands(diagonal, below * adjacent[:, None, None]), np.zeros((3, 2 * BLOCK, n_rows, BLOCK))
+        white_translation, drift_r, drift_t = others
+        white_translation[0, :, 3:] = 2.0
+        white_translation[BLOCK, :-1, 3:] = -adjacent[:, None]
+        drift_r[0, :, :3] = drift_t[0, :, 3:] = self.relative_interval[:, None]
+        return np.concatenate([white_rotation[None], others.reshape(3, 2 * BLOCK, -1)])
 
     def linearise(self, T_parent_child, nuisance="none", parameters=()):
         """All three at one X."""
@@ -158,13 +218,24 @@ class Increments:
         return Linearisation(self.residuals(*arguments), self.jacobian(*arguments), self.components(*arguments))
 
 
+def _per_second_later(Ts_childi_childj, intervals_s):
+    """Change of motions per second by which both their ends are taken later: rotation vectors (n, 3) in axes j, translations (n, 3).
+
+    The velocity at a pose is the mean of the middle two of the four increments around it, component by component: jumps are no
+    velocity.
+    """
+    velocities = se3.log(Ts_childi_childj) / np.maximum(intervals_s, 1e-9)[:, None]
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(velocities, ((2, 2), (0, 0)), mode="edge"), 4, axis=0)
+    velocities = np.sort(around, axis=2)[:, :, 1:3].mean(axis=2)
+    (at_i, at_j), rotation = (velocities[:-1], velocities[1:]), Ts_childi_childj[:, :3, :3]
+    per_second_r = at_j[:, 3:] - _turned(np.swapaxes(rotation, 1, 2), at_i[:, 3:])
+    per_second_t = _turned(rotation, at_j[:, :3]) - at_i[:, :3] - np.cross(at_i[:, 3:], Ts_childi_childj[:, :3, 3])
+    return per_second_r, per_second_t
+
+
+def _turned(rotations, vectors):
+    return (rotations @ vectors[:, :, None])[:, :, 0]
+
+
 def _stack(upper, lower):
     return np.concatenate([upper, lower], axis=1)
-
-
-def _white(at_i, at_j, adjacent):
-    """Bands of the covariance of increments whose poses carry independent noise of unit variance from each source."""
-    diagonal = sum(block @ np.swapaxes(block, 1, 2) for block in (*at_i, *at_j))
-    # Increments k - 1 and k share pose k: the first ends there, the second starts there.
-    below = sum(start[1:] @ np.swapaxes(end[:-1], 1, 2) for start, end in zip(at_i, at_j, strict=True))
-    return to_bands(diagonal, below * adjacent[:, None, None])

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.optimize import minimize
 
 from hand_eye_calib.adaptive.block_tridiagonal import Factor
 
@@ -16,11 +15,17 @@ LOWEST_VARIANCE, _HIGHEST_VARIANCE = 1e-14, 1e6
 # not change with it.
 _JUMP_VARIANCE = 1e8
 
+# Variances are raised by this share, so that rounding cannot make them negative.
+_ROUNDING = 1e-11
+
 # Information below this share of what the parameter's own diagonal promises is rounding.
 _RANK_TOLERANCE = 1e-12
 
-_MAX_SEARCH_STEPS = 40
-_SEARCH_TOLERANCE = 1e-7
+# The search for the variances works on their logarithms and ends when a step lowers the loss by less than this: noise levels need no more
+# than a few per cent.
+_MAX_SEARCH_STEPS = 20
+_FIRST_RADIUS, _SETTLED_RADIUS, _SETTLED_LOSS = 2.0, 1e-3, 0.01
+_DIFFERENCE, _LEAST_BEND = 0.1, 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,9 +71,7 @@ class Solve:
         Those directions, of unit length.
     cost : float
         Weighted squared residual after the step.
-    log_determinant : float
-        log |V|.
-    factor : Factor
+    factor : Factor or None
         Of V.
     """
 
@@ -77,16 +80,15 @@ class Solve:
     log_information: float
     unseen: np.ndarray
     cost: float
-    log_determinant: float
-    factor: Factor
+    factor: Factor | None
 
     def restricted_loss(self):
         """Negative restricted log likelihood, constants left out (Patterson, Thompson, Biometrika 58, 1971)."""
-        return 0.5 * (self.log_determinant + self.cost + self.log_information)
+        return 0.5 * (self.factor.log_determinant() + self.cost + self.log_information)
 
     def loss(self):
         """Negative log likelihood, constants left out: comparable between models with different parameters."""
-        return 0.5 * (self.log_determinant + self.cost)
+        return 0.5 * (self.factor.log_determinant() + self.cost)
 
 
 def covariance_factor(components, variances, jumps):
@@ -106,20 +108,29 @@ def covariance_factor(components, variances, jumps):
         Where it is not positive definite to rounding.
     """
     bands = np.tensordot(variances, components, axes=1)
+    bands[0] *= 1.0 + _ROUNDING
     bands[0].reshape(len(jumps), 6)[jumps] += _JUMP_VARIANCE
     return Factor(bands)
 
 
 def solve_weighted(residuals, jacobian, factor):
     """Least squares of residuals (n, 6) over the parameters of their jacobian (n, 6, 6 + k), weighted by a covariance's factor."""
-    columns = np.concatenate([jacobian.reshape(-1, jacobian.shape[2]), residuals.reshape(-1, 1)], axis=1)
-    whitened = factor.whiten(columns)
-    products = whitened.T @ whitened
+    whitened = factor.whiten(joined_columns(residuals, jacobian))
+    return solve_normal_equations(whitened.T @ whitened, factor)
+
+
+def joined_columns(residuals, jacobian):
+    """(6 n, 6 + k + 1) array: derivatives and, last, residuals."""
+    return np.concatenate([jacobian.reshape(-1, jacobian.shape[2]), residuals.reshape(-1, 1)], axis=1)
+
+
+def solve_normal_equations(products, factor=None):
+    """Solve from the products (6 + k + 1, 6 + k + 1) of whitened derivatives and residuals, the latter last."""
     covariance, log_information, unseen = _invert(products[:-1, :-1])
     gradient = products[:-1, -1]
     step = -covariance @ gradient
     cost = float(products[-1, -1] + gradient @ step)
-    return Solve(step, covariance, log_information, unseen, cost, factor.log_determinant(), factor)
+    return Solve(step, covariance, log_information, unseen, cost, factor)
 
 
 def generalised_least_squares(linearisation, variances, jumps):
@@ -198,6 +209,30 @@ def join_variances(rotation, translation):
 
 
 def _search(loss, start):
-    bounds = [(np.log(LOWEST_VARIANCE), np.log(_HIGHEST_VARIANCE))] * len(start)
-    options = {"maxiter": _MAX_SEARCH_STEPS, "ftol": _SEARCH_TOLERANCE}
-    return np.exp(minimize(loss, np.log(start), method="L-BFGS-B", bounds=bounds, options=options).x)
+    """Variances (2,) that minimise a loss of their logarithms: Newton's method within a radius, derivatives by differences."""
+    lowest, highest = np.log(LOWEST_VARIANCE), np.log(_HIGHEST_VARIANCE)
+    here, radius = np.log(start), _FIRST_RADIUS
+    value = loss(here)
+    first, second = _DIFFERENCE * np.eye(2)
+    for _ in range(_MAX_SEARCH_STEPS):
+        ahead = np.array([loss(here + first), loss(here + second)])
+        behind = np.array([loss(here - first), loss(here - second)])
+        curvature = np.diag(ahead + behind - 2 * value)
+        curvature[0, 1] = curvature[1, 0] = loss(here + first + second) - ahead.sum() + value
+        bends, axes = np.linalg.eigh(curvature / _DIFFERENCE**2)
+        # Downhill where the loss bends the wrong way, too.
+        newton = -axes @ ((axes.T @ (ahead - behind)) / (2 * _DIFFERENCE) / np.maximum(np.abs(bends), _LEAST_BEND))
+        length = np.linalg.norm(newton)
+        while True:
+            there = np.clip(here + newton * min(1.0, radius / max(length, 1e-300)), lowest, highest)
+            lower = loss(there)
+            if lower <= value or radius < _SETTLED_RADIUS:
+                break
+            radius = min(radius, length) / 4
+        if lower > value:
+            break
+        gain, here, value = value - lower, there, lower
+        if gain < _SETTLED_LOSS and min(length, _FIRST_RADIUS) <= radius:
+            break
+        radius *= 2
+    return np.exp(here)

@@ -38,14 +38,16 @@ class ReferencePredictor:
         self._poses = Ts_pw_p, Ts_cw_c
         self._solution = solution
         self._rejection = threshold, min_inlier_fraction
-        increments = Increments(stamps_ns, Ts_pw_p, Ts_cw_c)
+        increments = Increments(stamps_ns, Ts_pw_p, Ts_cw_c, solution.centre)
         # As the method sees them: systematic errors are part of the residual, not taken out.
         T_parent_child = solution.T_parent_child
         self._bands = np.tensordot(solution.noise.variances(), increments.components(T_parent_child), axes=1)
         modelled = increments.residuals(T_parent_child, solution.nuisance, solution.parameters)
         plain = increments.residuals(T_parent_child)
-        self._systematic = np.where(solution.jumps[:, None], 0.0, plain - modelled)
-        self._jumps = np.where(solution.jumps[:, None], plain, 0.0)
+        self._systematic = np.where(solution.left_out[:, None], 0.0, plain - modelled)
+        self._jumps = np.where(solution.left_out[:, None], plain, 0.0)
+        # The way to a pose that is wrong by itself and the way back are one event.
+        self._events = np.flatnonzero(np.r_[True, ~solution.spikes[1:-1]])
         self._into_world = Ts_pw_p[:, :3, :3] @ T_parent_child[:3, :3]
         steps = (self._into_world[:-1] @ increments.translation_b[:, :, None])[:, :, 0]
         self._path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
@@ -62,7 +64,7 @@ class ReferencePredictor:
         flat = gain.reshape(6, -1)
         expected = flat @ _band_product(self._bands, flat.T)
         systematic = np.einsum("anb,nb->a", gain, self._systematic)
-        jumps = np.einsum("anb,nb->na", gain, self._jumps)
+        jumps = np.add.reduceat(np.einsum("anb,nb->na", gain, self._jumps), self._events, axis=0)
         pull = self._pull(pairs, weights)
         return expected + np.outer(systematic, systematic) + jumps.T @ jumps + np.outer(pull, pull)
 
