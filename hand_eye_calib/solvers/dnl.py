@@ -18,28 +18,30 @@ def solve(pairs):
     -------
     Solution
     """
-    minimum = quadratic_form.minimise(quadratic_form.weighted_sum(pairs, np.ones(len(pairs))), start_rotations(pairs))
+    numbers, weights = quadratic_form.numbers(pairs), np.ones(len(pairs))
+    minimum = quadratic_form.minimise(quadratic_form.weighted_sum(numbers, weights), start_rotations(pairs))
     best = int(np.argmin(minimum.value))
     T_parent_child = minimum.T_parent_child[best]
     return Solution(
         T_parent_child,
-        float(pair_costs(pairs, T_parent_child).sum()),
+        float(quadratic_form.costs(numbers, T_parent_child).sum()),
         bool(minimum.converged[best]),
         minimum.iterations,
-        np.ones(len(pairs)),
+        weights,
     )
 
 
 def solve_without(pairs, solution, left_out):
     """Answers (B, 4, 4) near a given one when the pairs of each row of ``left_out`` (B, K) are left out, for resampling."""
-    forms = np.stack([quadratic_form.weighted_sum(pairs, kept) for kept in (~left_out).astype(float)])
+    numbers = quadratic_form.numbers(pairs)
+    forms = np.stack([quadratic_form.weighted_sum(numbers, kept) for kept in (~left_out).astype(float)])
     starts = np.repeat(solution.T_parent_child[None, :3, :3], len(left_out), axis=0)
     return quadratic_form.minimise(forms, starts).T_parent_child
 
 
 def pair_costs(pairs, T_parent_child):
     """Costs ``|A X - X B|_F^2`` (K,) straight from the matrices: exact to the last digit where the condensed forms cancel."""
-    return quadratic_form.costs(pairs, T_parent_child)
+    return quadratic_form.costs(quadratic_form.numbers(pairs), T_parent_child)
 
 
 def start_rotations(pairs):

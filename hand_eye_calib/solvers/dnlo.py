@@ -138,17 +138,20 @@ def truncate(costs, threshold, floor):
     objective : (...) array
         Eq. (5).
     """
-    below = costs < threshold
-    weights = below.astype(float)
-    too_few = np.count_nonzero(below, axis=-1) < floor
-    if np.any(too_few):
-        last = math.ceil(floor) - 1
-        short = costs[too_few]
-        dearest = np.partition(short, last, axis=-1)[..., last, None]
-        cheaper, tied = short < dearest, short == dearest
-        missing = floor - np.count_nonzero(cheaper, axis=-1)
-        weights[too_few] = cheaper + tied * (missing / np.count_nonzero(tied, axis=-1))[..., None]
-    return weights, (weights * costs + (1.0 - weights) * threshold).sum(axis=-1)
+    counted = costs < threshold
+    too_few = np.count_nonzero(counted, axis=-1) < floor
+    if not np.any(too_few):
+        weights = counted.astype(float)
+    else:
+        limit = np.full(costs.shape[:-1], threshold)
+        limit[too_few] = np.partition(costs[too_few], math.ceil(floor) - 1, axis=-1)[..., math.ceil(floor) - 1]
+        counted |= too_few[..., None] & (costs <= limit[..., None])
+        weights = counted.astype(float)
+        excess = np.where(too_few, np.count_nonzero(counted, axis=-1) - floor, 0.0)
+        if np.any(excess):
+            tied = costs == limit[..., None]
+            weights -= tied * (excess / np.maximum(np.count_nonzero(tied, axis=-1), 1))[..., None]
+    return weights, np.einsum("...k,...k->...", weights, costs) + threshold * (costs.shape[-1] - weights.sum(axis=-1))
 
 
 def _search(pairs, threshold, floor):
@@ -242,16 +245,20 @@ def _settle(condensed, Ts, threshold, floor):
 
 def _finish(pairs, T_start, threshold, floor):
     """Weights and X in turn on all pairs until the objective falls no more. The costs come from the matrices, which cancel least."""
+    numbers = quadratic_form.numbers(pairs)
     T = T_start
-    weights, objective = truncate(quadratic_form.costs(pairs, T), threshold, floor)
+    weights, objective = truncate(quadratic_form.costs(numbers, T), threshold, floor)
+    Q = quadratic_form.weighted_sum(numbers, weights)
     converged, iterations = False, 0
     while not converged and iterations < _MAX_ROUNDS:
         iterations += 1
-        Q, T_new = quadratic_form.weighted_sum(pairs, weights), T[None]
+        T_new = T[None]
         for _ in range(_STEPS_PER_FIT):
             T_new = quadratic_form.gauss_newton_step(Q, T_new)
-        weights_new, objective_new = truncate(quadratic_form.costs(pairs, T_new[0]), threshold, floor)
+        weights_new, objective_new = truncate(quadratic_form.costs(numbers, T_new[0]), threshold, floor)
         converged = bool(objective_new >= objective * (1 - _CONVERGED))
         if objective_new <= objective:
+            changed = np.flatnonzero(weights_new != weights)
+            Q = Q + quadratic_form.weighted_sum(numbers[changed], weights_new[changed] - weights[changed])
             T, weights, objective = T_new[0], weights_new, objective_new
     return Solution(T, float(objective), converged, iterations, weights)

@@ -66,41 +66,45 @@ def condense(pairs):
     condensed = np.empty((len(pairs), len(_UPPER)))
     # New large arrays are slow to get from the system: these are used for every block.
     residuals, forms = np.empty((_BLOCK, 12, DIMENSION)), np.empty((_BLOCK, DIMENSION, DIMENSION))
-    for block, numbers in _blocks(pairs, _BLOCK):
-        part = slice(len(numbers))
-        np.matmul(numbers, _RESIDUAL.reshape(24, -1), out=residuals[part].reshape(-1, 12 * DIMENSION))
+    pair_numbers = numbers(pairs)
+    for start in range(0, len(pairs), _BLOCK):
+        block = slice(start, min(start + _BLOCK, len(pairs)))
+        part = slice(block.stop - start)
+        np.matmul(pair_numbers[block], _RESIDUAL.reshape(24, -1), out=residuals[part].reshape(-1, 12 * DIMENSION))
         np.matmul(np.swapaxes(residuals[part], 1, 2), residuals[part], out=forms[part])
         np.take(forms[part].reshape(-1, DIMENSION**2), _UPPER, axis=1, out=condensed[block], mode="clip")
     return condensed
 
 
-def costs(pairs, T_parent_child):
-    """Costs ``|A X - X B|_F^2`` (K,) at one X."""
+def numbers(pairs):
+    """What the residual is linear in, (K, 24): the top three rows of A - I, then of B - I, of every pair."""
+    found = np.empty((len(pairs), 2, 12))
+    for side, Ts in enumerate((pairs.Ts_parenti_parentj, pairs.Ts_childi_childj)):
+        np.subtract(Ts.reshape(-1, 16)[:, :12], _IDENTITY, out=found[:, side])
+    return found.reshape(-1, 24)
+
+
+_IDENTITY = np.eye(4)[:3].ravel()
+
+
+def costs(numbers, T_parent_child):
+    """Costs ``|A X - X B|_F^2`` (K,) at one X, from the :func:`numbers` of the pairs."""
     residual = _RESIDUAL @ T_parent_child.ravel()[_X_IN_T]
-    found = np.empty(len(pairs))
-    for block, numbers in _blocks(pairs, _SUMMED_BLOCK):
-        residuals = numbers @ residual
+    found = np.empty(len(numbers))
+    for start in range(0, len(numbers), _SUMMED_BLOCK):
+        block = slice(start, start + _SUMMED_BLOCK)
+        residuals = numbers[block] @ residual
         np.einsum("ki,ki->k", residuals, residuals, out=found[block])
     return found
 
 
-def weighted_sum(pairs, weights):
-    """Sum (13, 13) of all forms, each with its weight (K,): as ``expand(weights @ condense(pairs))``, without making the forms."""
+def weighted_sum(numbers, weights):
+    """Sum (13, 13) of the forms, each with its weight (K,), from the :func:`numbers` of the pairs: the forms are not made for it."""
     moments = np.zeros((24, 24))
-    for block, numbers in _blocks(pairs, _SUMMED_BLOCK):
-        moments += (numbers * weights[block, None]).T @ numbers
+    for start in range(0, len(numbers), _SUMMED_BLOCK):
+        block = slice(start, start + _SUMMED_BLOCK)
+        moments += (numbers[block] * weights[block, None]).T @ numbers[block]
     return np.einsum("uim,uin->mn", _RESIDUAL, np.tensordot(moments, _RESIDUAL, 1), optimize=True)
-
-
-def _blocks(pairs, size):
-    """Slices of the pairs, and their numbers u (., 24): the top three rows of A - I, then of B - I."""
-    tops = [Ts.reshape(-1, 16)[:, :12] for Ts in (pairs.Ts_parenti_parentj, pairs.Ts_childi_childj)]
-    for start in range(0, len(pairs), size):
-        block = slice(start, start + size)
-        yield block, np.concatenate([top[block] for top in tops], axis=1) - _IDENTITIES
-
-
-_IDENTITIES = np.tile(np.eye(4)[:3].ravel(), 2)
 
 
 def monomials(T_parent_child):
