@@ -76,6 +76,9 @@ class Calibration:
         Why ``auto`` chose the reference; empty where it was given.
     noise : dict or None
         What the adaptive estimator found out about the trajectories' noise; None with other methods.
+    consistency : dict or None
+        Per axis, how far other methods and references and the drive's halves lie from this answer
+        (:class:`~hand_eye_calib.assessment.consistency.Consistency`); None where they were not asked.
     stamp_ns : int
         Stamp of the newest pose used, parent clock.
     parent_frame, child_frame : str
@@ -100,6 +103,7 @@ class Calibration:
     scale_sigma: float = 0.0
     reference_reason: str = ""
     noise: dict | None = None
+    consistency: dict | None = None
     stamp_ns: int = 0
     parent_frame: str = "parent"
     child_frame: str = "child"
@@ -148,6 +152,7 @@ class Calibration:
             "scale_sigma": self.scale_sigma,
             "reference_reason": self.reference_reason,
             "noise": self.noise,
+            "consistency": self.consistency,
             "stamp_ns": self.stamp_ns,
             "warnings": list(self.warnings),
         }
@@ -181,6 +186,7 @@ class Calibration:
                 **{name: data.get(name, 0.0) for name in ("time_offset_sigma_s", "scale_sigma")},
                 reference_reason=data.get("reference_reason", ""),
                 noise=data.get("noise"),
+                consistency=data.get("consistency"),
             )
         except KeyError as error:
             raise InputError(f"the calibration lacks {error}; it is not as it was written") from None

@@ -138,14 +138,13 @@ def _solve_adaptive(pose_pairs, config):
     if config.backend != "fast":
         raise ConfigError(f"method adaptive has no {config.backend} backend; only dnl and dnlo do")
     solution = adaptive_estimator.solve(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
-    correction = 1.0 + solution.parameters[0] if solution.nuisance == "scale" else 1.0
     return _Evaluation(
         solution,
         assess_adaptive(pose_pairs, solution),
         "increments",
         (~solution.jumps).astype(float),
         noise=solution.describe(pose_pairs.stamps_ns),
-        scale_correction=float(correction),
+        scale_correction=solution.scale,
     )
 
 

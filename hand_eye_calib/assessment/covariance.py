@@ -2,25 +2,22 @@
 
 Two estimates are made and the larger one holds, direction by direction:
 
-- the model's: motion pairs with independent, equally large errors, carried through the cost to first order;
-- the delete-a-block jackknife: the answer with each tenth of the drive left out in turn. It needs no noise model, and sees what
-  lasts for many pairs (drift, bad stretches), to which the model is blind.
+- the model's: of the adaptive estimator its own; of other methods that of motion pairs with independent, equally large errors, carried
+  through the cost to first order;
+- the delete-a-block jackknife: the answer with each tenth of the drive left out in turn. It does not believe the noise model, and sees
+  what lasts for many pairs (drift, bad stretches), to which the model is blind.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive import estimator as adaptive_estimator
+from hand_eye_calib.adaptive.estimator import solve_without
 from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
 
 _BLOCKS = 10
 _FEWEST_BLOCKS, _FEWEST_PAIRS_PER_BLOCK = 4, 3
-
-# Against a model that is right, a jackknife of ten blocks finds some direction this much larger in one drive of a hundred. The adaptive
-# estimator's model is estimated from the data itself and is believed up to there.
-_SIGNIFICANT_RATIO = 4.1
 
 # Standard deviations that say "unknown" in the covariance: far larger than any vehicle's sensor mount, still finite, so that the
 # matrix stays usable. The verdicts carry the plain statement.
@@ -108,13 +105,11 @@ def assess_adaptive(pose_pairs, solution):
     """
     poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     resampled = jackknife_covariance(
-        len(solution.jumps),
-        solution.T_parent_child,
-        lambda left_out: adaptive_estimator.solve_without(*poses, solution, left_out),
+        len(solution.jumps), solution.T_parent_child, lambda left_out: solve_without(*poses, solution, left_out)
     )
     unseen = [*solution.unseen.T, *_noise_driven_baselines(pose_pairs.Ts_pw_p, solution)]
     covariance = solution.cov_parent_child_in_child
-    return _combine(solution.T_parent_child, covariance, resampled, _basis(unseen), _SIGNIFICANT_RATIO)
+    return _combine(solution.T_parent_child, covariance, resampled, _basis(unseen))
 
 
 def _noise_driven_baselines(Ts_pw_p, solution):
@@ -141,9 +136,9 @@ def _noise_driven_over(baseline, rotation, solution):
     return _noise_driven_translations(weights, moved, variance * np.eye(3))
 
 
-def _combine(T_parent_child, model, resampled, unknown, least_ratio=1.0):
+def _combine(T_parent_child, model, resampled, unknown):
     known = np.eye(6) - unknown @ unknown.T
-    covariance = known @ larger_by_direction(model, resampled, least_ratio) @ known + _unknown_variance(unknown)
+    covariance = known @ larger_by_direction(model, resampled) @ known + _unknown_variance(unknown)
     return Assessment(covariance, _verdicts(T_parent_child[:3, :3], covariance, unknown))
 
 
@@ -235,8 +230,8 @@ def jackknife_covariance(n_pairs, T_parent_child, solve_without):
     return (n_blocks - 1) / n_blocks * deviations.T @ deviations
 
 
-def larger_by_direction(first, second, least_ratio=1.0):
-    """The first covariance, lifted to the second in every direction where that is larger by ``least_ratio``; second may be None."""
+def larger_by_direction(first, second):
+    """The first covariance, lifted to the second in every direction where that is larger; second may be None."""
     if second is None:
         return first
     # In the coordinates where the first is the identity, the eigenvalues of the second are the ratios.
@@ -244,7 +239,7 @@ def larger_by_direction(first, second, least_ratio=1.0):
     root = axes * np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE))
     values, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, second).T))
     lifted = root @ vectors
-    return (lifted * np.where(values > least_ratio, np.maximum(values, 1.0), 1.0)) @ lifted.T
+    return (lifted * np.maximum(values, 1.0)) @ lifted.T
 
 
 def _verdicts(rotation_parent_child, covariance, unknown):

@@ -27,7 +27,10 @@ table2     KITTI 2011_10_03_drive_0027, two cameras
 s-figures  S1-S5: as fig3, for the other methods
 s-tables   S1-S12: every method and reference on both drives
 adaptive   past the article: the adaptive estimator and reference auto against the best choice with hindsight
-all        all but the last, the article's conclusions checked, and what is wrong with the published results
+repeats    the stated sigmas against the spread of repeats on real drives, and against KITTI's ground truth; zxl19 and asl_tango_easy count
+           too where they lie beside the published data
+unlike     drives that are not like the article's (--data simulated): where the estimators fail
+all        everything in the article, its conclusions checked, and what is wrong with the published results
 
 Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV; beside each, *_comparison.csv and *_comparison.md say
 cell by cell how it compares with the published results. What was solved is kept in DIR/solved: an interrupted run goes on from there.
@@ -155,6 +158,11 @@ def _agreement(rows, method):
 
 def _text(document, files):
     lines = []
+    if len(files) == 1:
+        # One artefact alone: what it says is read here and now.
+        lines += [
+            path.read_text(encoding="utf-8") for name, paths in files.items() for path in paths if path.name == f"{name}.md"
+        ]
     for agreement in document.get("agreement", ()):
         reasons = "; ".join(f"{count} {why}" for why, count in agreement["differing"].items())
         lines.append(

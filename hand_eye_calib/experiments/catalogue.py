@@ -5,7 +5,17 @@ from functools import cached_property
 from pathlib import Path
 
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.experiments import conclusions, figures, findings, past_the_paper, runner, statistics, tables
+from hand_eye_calib.experiments import (
+    conclusions,
+    figures,
+    findings,
+    past_the_paper,
+    repeats,
+    runner,
+    statistics,
+    tables,
+    unlike,
+)
 from hand_eye_calib.experiments.published import KITTI, LEVELS, METHODS, SIMULATED
 from hand_eye_calib.experiments.rows import ALI_AS_PUBLISHED, cells
 
@@ -24,11 +34,18 @@ class Artefact:
         What must be solved for it.
     write : callable
         Given :class:`Results`, writes the files and returns their paths.
+    data : tuple of str
+        The kinds of source it can be made from.
     """
 
     name: str
     cells: list
     write: object
+    data: tuple = ("published", "simulated")
+
+    def fits(self, source):
+        """Whether a source has what it needs."""
+        return source.data in self.data and all(cell.dataset in source.datasets for cell in self.cells)
 
 
 def _artefacts():
@@ -49,6 +66,8 @@ def _artefacts():
     found["conclusions"] = Artefact("conclusions", everything, conclusions.write)
     found["findings"] = Artefact("findings", everything, findings.write)
     found["adaptive"] = Artefact("adaptive", [], lambda results: past_the_paper.write("adaptive", results))
+    found["repeats"] = Artefact("repeats", [], lambda results: repeats.write("repeats", results), ("published",))
+    found["unlike"] = Artefact("unlike", [], lambda results: unlike.write("unlike", results), ("simulated",))
     return found
 
 
@@ -59,6 +78,8 @@ EXPERIMENTS = {
     "s-figures": _S_FIGURES,
     "s-tables": tuple(tables.VARIANT_TABLES),
     "adaptive": ("adaptive",),
+    "repeats": ("repeats",),
+    "unlike": ("unlike",),
     "all": ("fig3", "fig4", "fig5", *_S_FIGURES, "table1", "table2", *tables.VARIANT_TABLES, "conclusions", "findings"),
 }
 
@@ -74,12 +95,15 @@ class Results:
         Whose published results ours are compared with.
     rows : list of Row
     out : pathlib.Path
+    jobs : int
+        Number of processes, for what is not solved cell by cell.
     """
 
     source: object
     theirs_source: object
     rows: list
     out: Path
+    jobs: int = 1
 
     @property
     def same_cases(self):
@@ -132,10 +156,15 @@ class Experiment:
 
     def __init__(self, name, source, theirs_source=None):
         artefacts = [ARTEFACTS[artefact] for artefact in EXPERIMENTS[name]]
-        self.artefacts = [artefact for artefact in artefacts if all(cell.dataset in source.datasets for cell in artefact.cells)]
+        self.artefacts = [artefact for artefact in artefacts if artefact.fits(source)]
         self.left_out = [artefact.name for artefact in artefacts if artefact not in self.artefacts]
         if not self.artefacts:
-            raise ConfigError(f"{name} is about KITTI drives, which are not simulated; use --data published")
+            only = artefacts[0].data[0]
+            raise ConfigError(
+                f"{name} is about simulated drives; use --data simulated"
+                if only == "simulated"
+                else f"{name} is about recorded drives (KITTI), which are not simulated; use --data published"
+            )
         self.cells = list(dict.fromkeys(cell for artefact in self.artefacts for cell in artefact.cells))
         self._source, self._theirs_source = source, theirs_source
 
@@ -167,7 +196,7 @@ class Experiment:
             from hand_eye_calib.report import paper_figures  # noqa: F401
         store = runner.Store(out / "solved", self._source.configuration())
         solved = runner.run(self._source, self.cells, store, jobs, on_solved)
-        results = Results(self._source, self._theirs_source, [row for rows in solved.values() for row in rows], out)
+        results = Results(self._source, self._theirs_source, [row for rows in solved.values() for row in rows], out, jobs)
         files = {}
         for artefact in self.artefacts:
             try:

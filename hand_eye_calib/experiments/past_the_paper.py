@@ -1,10 +1,6 @@
 """``experiment adaptive``: the adaptive estimator and ``reference: auto`` against the best that hindsight could choose."""
 
-import multiprocessing
-import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy.stats import norm
@@ -14,6 +10,7 @@ from hand_eye_calib.assessment import metrics
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.assessment.reference_selection import CANDIDATES, select_reference
 from hand_eye_calib.experiments.published import LEVELS, SIMULATED
+from hand_eye_calib.experiments.runner import in_parallel
 from hand_eye_calib.experiments.writing import markdown_table, write_csv, write_text
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -61,10 +58,8 @@ class LevelStudy:
 
 def write(name, results):
     """Study every level and write ``NAME.md`` and ``NAME.csv``; returns their paths."""
-    tasks = [(dataset, level) for dataset in SIMULATED for level in LEVELS.get(dataset, (None,))]
-    count = min(len(os.sched_getaffinity(0)), len(tasks))
-    with ProcessPoolExecutor(count, multiprocessing.get_context("spawn")) as executor:
-        studies = list(executor.map(partial(study_level, results.source), *zip(*tasks, strict=True)))
+    tasks = [(results.source, dataset, level) for dataset in SIMULATED for level in LEVELS.get(dataset, (None,))]
+    studies = in_parallel(study_level, tasks, results.jobs)
     header = [
         "set", "level", "e_at (m)", "best published", "ratio", "e_aR (deg)", "best published", "ratio", "median NEES",
         "90 % interval covers", "systematic error chosen", "DNLO auto e_at (m)", "best fixed reference", "ratio",

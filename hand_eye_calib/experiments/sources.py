@@ -23,6 +23,7 @@ class PublishedSource:
     """
 
     folder: str
+    data = "published"
     datasets = (*published.SIMULATED, *published.KITTI)
     runs = published.N_RUNS
 
@@ -40,7 +41,7 @@ class PublishedSource:
             for path in sorted((folder / name).rglob("*.[ct]*")):
                 status = path.stat()
                 listing.update(f"{path.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
-        return {"data": "published", "files": listing.hexdigest()}
+        return {"data": self.data, "files": listing.hexdigest()}
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class SimulatedSource:
 
     seed: int = 0
     runs: int = published.N_RUNS
+    data = "simulated"
     datasets = published.SIMULATED
 
     def cases(self, dataset, level):
@@ -69,7 +71,7 @@ class SimulatedSource:
 
     def configuration(self):
         """What the cases depend on."""
-        return {"data": "simulated", **asdict(self), "drive": PUBLISHED_DRIVE.to_options(), "mixture": MIXTURE.to_options()}
+        return {"data": self.data, **asdict(self), "drive": PUBLISHED_DRIVE.to_options(), "mixture": MIXTURE.to_options()}
 
 
 def find_folder(folder):

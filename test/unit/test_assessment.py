@@ -1,11 +1,17 @@
+from functools import partial
+from itertools import accumulate
+
 import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering_poses
 
+from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.assessment.covariance import assess, jackknife_covariance, larger_by_direction, model_covariance
+from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method
 
 DNL = Method("dnl")
@@ -68,6 +74,29 @@ def test_jackknife_of_a_mean_is_its_standard_error():
     assert np.sqrt(covariance[0, 0]) == pytest.approx(values.std() / np.sqrt(1000), rel=0.5)
 
 
+@pytest.mark.parametrize("kind", ["white", "drift"])
+def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_right(kind):
+    ratios = []
+    for run in range(12):
+        parent = wandering_poses(150, seed=run)
+        child = disturbed(child_of(parent), run, 0.005, 0.005) if kind == "white" else drifting(child_of(parent), run)
+        stamps_ns = np.arange(len(parent)) * 100_000_000
+        solution = estimator.solve(stamps_ns, parent, child, nuisances=("none",))
+        model = solution.cov_parent_child_in_child / solution.misfit
+        resampled = jackknife_covariance(
+            len(solution.jumps), solution.T_parent_child, partial(estimator.solve_without, stamps_ns, parent, child, solution)
+        )
+        ratios.append(np.trace(np.linalg.solve(model, resampled)) / 6)
+    # Cutting the trajectory around what is left out would give 2 and more under white noise.
+    assert 0.7 < np.mean(ratios) < 1.4
+
+
+def drifting(poses, seed):
+    steps = se3.inverse(poses[:-1]) @ poses[1:]
+    steps = steps @ se3.exp(np.random.default_rng(seed).normal(0.0, 0.003, (len(steps), 6)))
+    return np.array(list(accumulate([poses[0], *steps], np.matmul)))
+
+
 def test_too_few_pairs_for_blocks_leave_the_model():
     assert jackknife_covariance(9, np.eye(4), None) is None
 
@@ -107,3 +136,39 @@ def test_good_motion_shows_everything():
     parent = wandering_poses(200)
     _, assessment = solve_and_assess(disturbed(parent, 1, 1e-3, 1e-3), disturbed(child_of(parent), 2, 1e-3, 1e-3), "B5")
     assert {dof.verdict for dof in assessment.observability} == {DofVerdict.OBSERVED}
+
+
+def test_of_references_that_promise_alike_the_one_nearest_to_the_adaptive_answer_is_chosen():
+    parent = wandering_poses(150)
+    poses = PosePairs(
+        np.arange(150) * 100_000_000, disturbed(parent, 1, 0.003, 0.003), disturbed(child_of(parent), 2, 0.003, 0.003)
+    )
+    method = Method("dnlo")
+    choice = select_reference(poses, method)
+    least = min(choice.predicted_m.values())
+    assert 1 < len(choice.alike) < len(choice.predicted_m)
+    assert max(choice.predicted_m[reference] for reference in choice.alike) <= 1.3 * least
+    best = estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c).T_parent_child
+
+    def distance(reference):
+        return np.linalg.norm(
+            (method.solve(motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, reference)).T_parent_child - best)[:3, 3]
+        )
+
+    assert choice.reference == min(choice.alike, key=distance)
+    assert f"of {', '.join(choice.alike)} its answer is nearest" in choice.reason()
+
+
+def test_the_jackknife_of_dnlo_sees_the_inliers_change_sides():
+    # Two halves of the drive with different mounts: which of them counts as inliers hangs on a few pairs.
+    parent = wandering_poses(240)
+    child = child_of(parent)
+    moved = child_of(parent, T_PARENT_CHILD @ se3.exp(np.r_[0.5, np.zeros(5)]))
+    child[121:] = moved[121:]
+    pairs = motion_pairs(parent, disturbed(child, 3, 1e-3, 1e-3), "B10")
+    method = Method("dnlo", threshold=1e-4)
+    solution = method.solve(pairs)
+    deviations = jackknife_covariance(
+        len(pairs), solution.T_parent_child, lambda left_out: method.solve_without(pairs, solution, left_out)
+    )
+    assert 0.1 < np.sqrt(np.trace(deviations[:3, :3])) < 2.0

@@ -1,0 +1,118 @@
+"""Repeats on real data, drives unlike the article's: on drives of our own."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from published_data import data_folder
+
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.experiments import repeats, unlike
+from hand_eye_calib.experiments.recordings import RecordedSet, Recording, recorded_sets
+from hand_eye_calib.geometry import se3
+
+
+def recording(seed, noise=0.004):
+    parent = wandering_poses(400, seed)
+    child = disturbed(child_of(parent), seed, noise, noise)
+    return Recording(as_trajectory(parent), as_trajectory(child))
+
+
+def test_ratios_of_right_sigmas_lie_in_the_band():
+    ratios = []
+    for seed in range(8):
+        found = RecordedSet("ours", (recording(seed),))
+        ratios += repeats._set_ratios(found, "adaptive")
+    assert {ratio.axis for ratio in ratios} == {"x", "y", "z", "roll", "pitch", "yaw"}
+    assert {ratio.freedom for ratio in ratios} == {3}
+    pooled = np.sqrt(np.mean([ratio.ratio**2 for ratio in ratios]))
+    assert 0.6 < pooled < 1.4
+    low, high = repeats.band(3)
+    assert np.mean([low < ratio.ratio < high for ratio in ratios]) > 0.8
+
+
+def test_drives_are_repeats_of_each_other_and_a_changed_mount_shows():
+    still = RecordedSet("still", (recording(0), recording(1)))
+    shifted = dataclasses.replace(
+        recording(1), child=as_trajectory(child_of(wandering_poses(400, 1), T_PARENT_CHILD @ se3.exp([0.3, 0, 0, 0, 0, 0])))
+    )
+    moved = RecordedSet("moved", (recording(0), shifted))
+    by_axis = [{ratio.axis: ratio for ratio in repeats._set_ratios(found, "dnlo B10")} for found in (still, moved)]
+    assert {ratio.freedom for found in by_axis for ratio in found.values()} == {1}
+    assert by_axis[0]["x"].ratio < 3
+    assert max(ratio.ratio for ratio in by_axis[1].values()) > 10
+
+
+def test_parts_share_no_child_pose_and_cover_them_all():
+    whole = recording(0)
+    for count in (2, 3):
+        parts = whole.parts(count, 0.0)
+        stamps = np.concatenate([part.child.stamps_ns for part in parts])
+        assert len(parts) == count
+        assert len(np.unique(stamps)) == len(whole.child)
+        assert len(stamps) - len(whole.child) < count
+
+
+def test_band_is_that_of_chi_square():
+    # chi2 of two degrees of freedom is exponential: its quantiles are -2 ln(1 - p).
+    np.testing.assert_allclose(repeats.band(2), np.sqrt(-np.log([0.975, 0.025])), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("error", "of_thirds", "of_others", "said"),
+    [
+        (0.02, [0.0, 0.02, 0.04], [0.02, 0.02], ""),
+        (0.2, [-0.2, 0.2, 0.6], [0.2, 0.21], "scatter of the thirds"),
+        (0.2, [0.19, 0.2, 0.21], [-0.1, 0.3], "depends on the reference"),
+        (0.2, [0.19, 0.2, 0.21], [0.19, 0.21], "ground truth"),
+    ],
+)
+def test_reasons_of_large_z_scores(error, of_thirds, of_others, said):
+    reason = repeats._reason(error, 0.01, np.array(of_thirds), np.array(of_others))
+    assert said in reason
+    assert bool(reason) == bool(said)
+
+
+def test_sets_that_are_absent_are_named(tmp_path):
+    assert recorded_sets(tmp_path) == ([], ["valimaki2023", "zxl19", "asl_tango_easy"])
+
+
+def test_real_sets_are_read():
+    sets, absent = recorded_sets(data_folder())
+    names = [found.name for found in sets]
+    assert {"kitti_short", "kitti_long"} <= set(names)
+    assert not any(name in names for name in absent)
+    for found in sets:
+        for drive in found.drives:
+            assert len(drive.parent) > 100
+            assert len(drive.child) > 100
+
+
+@pytest.mark.parametrize("scenario", unlike.SCENARIOS)
+def test_scenarios_have_the_errors_they_claim(scenario):
+    source = unlike.UnlikeSource(seed=1, runs=1)
+    (case,) = source.cases(scenario, None)
+    (again,) = source.cases(scenario, None)
+    np.testing.assert_array_equal(case.child.poses, again.child.poses)
+    # The child's world in the parent's is constant but for the errors.
+    Ts_pw_cw = case.parent.poses @ case.T_parent_child @ se3.inverse(case.child.poses)
+    wander = se3.log(se3.inverse(Ts_pw_cw[:1]) @ Ts_pw_cw)
+    assert 1e-3 < np.abs(wander).max() < 50.0
+    motion = se3.log(se3.inverse(case.parent.poses[:1]) @ case.parent.poses)
+    assert np.linalg.norm(motion, axis=1).max() > 0.5
+
+
+def test_commands_are_told_which_data_they_need(tmp_path, capsys):
+    assert main(["experiment", "repeats", "--data", "simulated", "--out", str(tmp_path)]) == 2
+    assert "--data published" in capsys.readouterr().err
+
+
+def test_unlike_writes_and_prints_its_table(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(unlike, "SCENARIOS", {"handheld": unlike.SCENARIOS["handheld"]})
+    assert main(["experiment", "unlike", "--data", "simulated", "--runs", "2", "--jobs", "1", "--out", str(tmp_path)]) == 0
+    assert "| handheld |" in capsys.readouterr().out
+    with open(tmp_path / "unlike.csv", encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["adaptive e_at (m)"]) < 0.05
