@@ -36,6 +36,7 @@ class _Evaluation:
     reference_reason: str = ""
     noise: dict | None = None
     scale_correction: float = 1.0
+    time_correction_s: float = 0.0
 
 
 def estimate_extrinsic(pose_pairs, config, time_offset=None):
@@ -71,8 +72,8 @@ def estimate_extrinsic(pose_pairs, config, time_offset=None):
     status, warnings = _judge(solution, fused)
     if config.method == "adaptive" and np.mean(evaluation.weights < 0.5) > _MOST_JUMPS:
         warnings += (
-            f"{np.mean(evaluation.weights < 0.5):.0%} of the increments are jumps: these errors are not the noise that method adaptive "
-            "models, and its standard deviations are too small; compare with method dnlo",
+            f"{np.mean(evaluation.weights < 0.5):.0%} of the increments are jumps: these errors are hardly the noise that method adaptive "
+            "models; compare with method dnlo",
         )
     return Calibration(
         T_parent_child=fused.T_parent_child,
@@ -88,7 +89,7 @@ def estimate_extrinsic(pose_pairs, config, time_offset=None):
         n_poses=len(pose_pairs),
         n_pairs=len(evaluation.weights),
         n_inliers=int((evaluation.weights > 0.5).sum()),
-        time_offset_s=time_offset.seconds if time_offset else config.time_offset,
+        time_offset_s=(time_offset.seconds if time_offset else config.time_offset) + evaluation.time_correction_s,
         time_offset_sigma_s=time_offset.sigma_s if time_offset else 0.0,
         scale=scale.value * evaluation.scale_correction,
         scale_sigma=scale.sigma,
@@ -145,6 +146,7 @@ def _solve_adaptive(pose_pairs, config):
         (~solution.jumps).astype(float),
         noise=solution.describe(pose_pairs.stamps_ns),
         scale_correction=solution.scale,
+        time_correction_s=solution.time_offset_s,
     )
 
 

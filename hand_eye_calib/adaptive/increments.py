@@ -29,7 +29,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 
 # Systematic errors of the child, and which parameters are theirs: by how much its lengths are short, bias per metre along its axes (m/m),
-# time to add to its stamps (s).
+# by how much its stamps are late (s).
 _SYSTEMATIC = {"none": [], "scale": [0], "bias": [1, 2, 3], "time": [4]}
 NUISANCES = ("none", "scale", "bias", "time", "scale+time", "bias+time")
 ALL_SYSTEMATIC = "scale+bias+time"
@@ -45,7 +45,7 @@ def nuisance_columns(nuisance):
 
 
 def nuisance_values(nuisance, parameters):
-    """Scale error, bias per metre (3,) and time offset (s); zero where the model has none."""
+    """Scale error, bias per metre (3,) and lateness of the stamps (s); zero where the model has none."""
     values = np.zeros(_SHARED_WITH_ALL)
     values[nuisance_columns(nuisance)] = parameters
     return values[0], values[1:4], values[4]

@@ -79,7 +79,7 @@ class AdaptiveSolution:
     @property
     def time_offset_s(self):
         """Seconds to add to the child's stamps."""
-        return float(nuisance_values(self.nuisance, self.parameters)[2])
+        return -float(nuisance_values(self.nuisance, self.parameters)[2])
 
     @property
     def left_out(self):
@@ -125,8 +125,8 @@ class AdaptiveSolution:
             along = ", ".join(f"{name} {1000 * value:.2g}" for name, value in zip("xyz", self.bias, strict=True))
             said.append(f"the child's path is off by {along} mm per metre travelled, along its own axes")
         if "time" in self.nuisance:
-            lag_ms = 1000 * self.time_offset_s
-            said.append(f"the child's stamps are {abs(lag_ms):.1f} ms {'early' if lag_ms > 0 else 'late'}")
+            offset_ms = 1000 * self.time_offset_s
+            said.append(f"the child's stamps are {abs(offset_ms):.1f} ms {'early' if offset_ms > 0 else 'late'}")
         said += _when("jump of a trajectory, just before", "jumps of a trajectory, just before", stamps_ns[1:][self.jumps])
         said += _when(
             "pose wrong by itself and left out, at", "poses wrong by themselves and left out, at", stamps_ns[self.spikes]

@@ -19,9 +19,10 @@ from hand_eye_calib.geometry import se3
 _BLOCKS = 10
 _FEWEST_BLOCKS, _FEWEST_PAIRS_PER_BLOCK = 4, 3
 
-# Standard deviations that say "unknown" in the covariance: far larger than any vehicle's sensor mount, still finite, so that the
-# matrix stays usable. The verdicts carry the plain statement.
-UNKNOWN_TRANSLATION = 10.0
+# Standard deviations that say "unknown" in the covariance: as far as sensors are apart on a large machine. The unknown direction is never
+# quite an axis of the parent sensor, and what is assumed of it leaks into the other two; more than this would drown what is known of
+# them. The verdicts carry the plain statement.
+UNKNOWN_TRANSLATION = 3.0
 UNKNOWN_ROTATION = np.pi
 UNKNOWN_SIGMAS = np.r_[np.full(3, UNKNOWN_TRANSLATION), np.full(3, UNKNOWN_ROTATION)]
 

@@ -35,7 +35,7 @@ from hand_eye_calib.cli.console import note, with_progress
 from hand_eye_calib.cli.findings import with_findings
 from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.replaying import fingerprints, replay
-from hand_eye_calib.cli.reporting import REPORT, can_draw, rendered, save_page
+from hand_eye_calib.cli.reporting import REPORT, can_draw, rendered, save_page, with_consistency
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
 
@@ -215,8 +215,9 @@ def work(task):
             replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
         snapshot = replayed.calibrator.snapshot()
         calibration, findings = with_findings(replayed.calibration, snapshot)
+        calibration, evidence = with_consistency(calibration, snapshot)
         if task.with_report:
-            outcome["page"] = rendered(calibration, snapshot, replayed.inputs, findings)
+            outcome["page"] = rendered(calibration, evidence, snapshot.config, replayed.inputs, findings)
     except HandEyeCalibError as error:
         return outcome | {"error": str(error)}
     except Exception as error:

@@ -5,8 +5,9 @@ import json
 import numpy as np
 
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.cli.console import fail, note
+from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
+from hand_eye_calib.cli.reporting import with_consistency, write_report
 
 EXIT_CODES = {SolveStatus.OK: 0, SolveStatus.NOT_CONVERGED: 1, SolveStatus.UNOBSERVABLE: 3}
 
@@ -24,19 +25,21 @@ def deliver(calibration, arguments, inputs, snapshot=None, **more):
     inputs : dict
         Where the data came from, in plain values: part of the JSON document and of the saved file's provenance.
     snapshot : Snapshot, optional
-        The poses and options that gave it, for the report.
+        The poses and options that gave it: with them, ``--out`` also asks other methods and writes the report.
     **more
         What else the JSON document holds.
     """
+    evidence = None
     if arguments.out:
         from hand_eye_calib.io.results import save_result
 
+        if snapshot is not None:
+            with waiting_for("asking other methods and the drive's halves"):
+                calibration, evidence = with_consistency(calibration, snapshot)
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
     print(as_json(calibration, inputs=inputs, **more) if arguments.json else as_text(calibration))
-    if arguments.out and snapshot is not None:
-        from hand_eye_calib.cli.reporting import write_report
-
-        write_report(arguments.out, calibration, snapshot, inputs, more.get("findings", ()))
+    if evidence is not None:
+        write_report(arguments.out, calibration, evidence, snapshot.config, inputs, more.get("findings", ()))
     if calibration.status is SolveStatus.NOT_CONVERGED:
         fail("the solver did not converge; do not use this result, record more varied motion", 1)
     return EXIT_CODES[calibration.status]
@@ -58,6 +61,7 @@ def as_text(calibration):
         *_transform_lines(document["T_child_parent"]),
         f"One standard deviation of the pose of {child}, along and about the axes of {parent}",
         *(_observability_line(dof) for dof in calibration.observability),
+        *_consistency_lines(calibration.consistency),
         f"Solved with {calibration.method} ({calibration.backend}) on reference {calibration.reference}: "
         f"{calibration.n_inliers} of {calibration.n_pairs} motion pairs are inliers, from {calibration.n_poses} poses; "
         f"objective {calibration.objective:.6g}",
@@ -108,6 +112,19 @@ def _observability_line(dof):
         return f"  {dof.name:<6}          -      {dof.verdict.value}"
     sigma, unit = (np.degrees(dof.sigma), "deg") if is_rotation else (dof.sigma, "m")
     return f"  {dof.name:<6} {sigma:10.4f} {unit:<4} {dof.verdict.value}"
+
+
+def _consistency_lines(consistency):
+    """The same as other methods and references, and the drive's halves, suggest it."""
+    titles = {"of_methods": "Other methods and references suggest", "of_halves": "The two halves of the drive suggest"}
+    for kind, title in titles.items() if consistency else ():
+        told = [
+            f"{axis} {np.degrees(row[kind]):.3f} deg" if axis in _ROTATIONS else f"{axis} {row[kind]:.4f} m"
+            for axis, row in consistency.items()
+            if row[kind] is not None
+        ]
+        if told:
+            yield f"  {title}: {', '.join(told)}"
 
 
 def _status(calibration):

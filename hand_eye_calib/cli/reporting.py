@@ -1,26 +1,52 @@
-"""``report.html`` beside the other files of ``--out``, and ``check.html`` of the command ``check``."""
+"""What ``--out`` adds to a calibration: other answers to the same question, ``report.html``; and ``check.html`` of the command ``check``."""
 
 import dataclasses
 from pathlib import Path
 
+from hand_eye_calib.assessment.consistency import consistency
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.estimation import estimate_extrinsic
 
 REPORT, CHECK = "report.html", "check.html"
+_REJECT_OUTLIERS = ("dnlo", "adaptive")
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 
 
-def write_report(directory, calibration, snapshot, inputs, findings=()):
+def with_consistency(calibration, snapshot):
+    """A calibration with how far other methods, other references and the drive's halves lie from it; and the Evidence for a report.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    snapshot : Snapshot
+        The poses and options that gave it.
+    """
+    from hand_eye_calib.report.evidence import gather
+
+    # The clock is settled; estimating it again would cost time.
+    config = dataclasses.replace(snapshot.config, time_offset=calibration.time_offset_s)
+    pose_pairs = dataclasses.replace(snapshot, config=config).pose_pairs()
+    streams = dict(zip(("parent", "child"), snapshot.streams, strict=True))
+    evidence = gather(calibration, snapshot.config, pose_pairs, estimate_extrinsic, streams)
+    others, halves = ([one.calibration for one in answers] for answers in (evidence.comparison, evidence.halves))
+    # Where there are jumps, methods that use every pair disagree for a reason that says nothing about the result.
+    robust = [other for other in others if other.method in _REJECT_OUTLIERS]
+    found = consistency(calibration, robust, halves)
+    warnings = (*calibration.warnings, *found.warnings())
+    return dataclasses.replace(calibration, consistency=found.to_dict(), warnings=warnings), evidence
+
+
+def write_report(directory, *arguments):
     """Write the report; without the libraries that it takes, say so and go on.
 
     Parameters
     ----------
     directory : path-like
         One that exists.
-    calibration, snapshot, inputs, findings
-        As for :func:`rendered`.
+    *arguments
+        Those of :func:`rendered`.
 
     Raises
     ------
@@ -29,7 +55,7 @@ def write_report(directory, calibration, snapshot, inputs, findings=()):
     """
     if can_draw(REPORT):
         with waiting_for("writing the report"):
-            path = save_page(Path(directory) / REPORT, rendered(calibration, snapshot, inputs, findings))
+            path = save_page(Path(directory) / REPORT, rendered(*arguments))
         note(f"wrote {path}")
 
 
@@ -67,14 +93,15 @@ def can_draw(file_name):
     return True
 
 
-def rendered(calibration, snapshot, inputs, findings=()):
+def rendered(calibration, evidence, config, inputs, findings=()):
     """The report as HTML.
 
     Parameters
     ----------
-    calibration : Calibration
-    snapshot : Snapshot
-        The poses and options that gave it.
+    calibration, evidence
+        As :func:`with_consistency` returns them.
+    config : CalibratorConfig
+        The options that gave the result.
     inputs : dict
         Where the data came from, in plain values.
     findings : sequence of dict
@@ -86,18 +113,8 @@ def rendered(calibration, snapshot, inputs, findings=()):
     """
     from hand_eye_calib.report.report import render
 
-    # The clock is settled; estimating it again would cost time.
-    config = dataclasses.replace(snapshot.config, time_offset=calibration.time_offset_s)
-    return render(
-        calibration,
-        snapshot.config,
-        dataclasses.replace(snapshot, config=config).pose_pairs(),
-        estimate_extrinsic,
-        inputs=inputs,
-        findings=findings,
-        streams=dict(zip(("parent", "child"), snapshot.streams, strict=True)),
-        command=static_transform_command(calibration),
-    )
+    command = static_transform_command(calibration)
+    return render(calibration, config, evidence, inputs=inputs, findings=findings, command=command)
 
 
 def save_page(path, text):

@@ -135,7 +135,8 @@ class Evidence:
     """Everything that the figures show, beside the Calibration itself.
 
     ``convergence`` are answers from growing parts of the drive, ``comparison`` from other methods and references, ``halves`` from
-    the first and the second half alone: tuples of Estimate, without those that had too little data.
+    the first and the second half alone: tuples of Estimate, without those that had too little data. ``as_read`` are the streams before
+    they were synchronised, "parent" and "child" to Trajectory; it may be empty.
     """
 
     pose_pairs: PosePairs
@@ -147,6 +148,7 @@ class Evidence:
     comparison: tuple
     halves: tuple
     streams: StreamsSeen
+    as_read: dict
 
 
 def gather(calibration, config, pose_pairs, estimate, streams=None):
@@ -184,6 +186,7 @@ def gather(calibration, config, pose_pairs, estimate, streams=None):
         ask.others(without_prior),
         ask.halves(without_prior),
         _streams(calibration, config, scaled, streams),
+        streams or {},
     )
 
 

@@ -13,7 +13,7 @@ from hand_eye_calib.assessment.covariance import AXES, WEAK_ROTATION, WEAK_TRANS
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.pairing.stream_checks import summarise
-from hand_eye_calib.report.evidence import deviation, gather, sigmas
+from hand_eye_calib.report.evidence import deviation, sigmas
 from hand_eye_calib.report.report_figures import draw_all, time_axis
 
 _TITLES = {
@@ -42,7 +42,7 @@ _DISAGREE = 3.0
 _SETTLED = 3.0
 
 
-def render(calibration, config, pose_pairs, estimate, *, inputs=None, findings=(), streams=None, command=""):
+def render(calibration, config, evidence, *, inputs=None, findings=(), command=""):
     """The report as HTML.
 
     Parameters
@@ -50,16 +50,12 @@ def render(calibration, config, pose_pairs, estimate, *, inputs=None, findings=(
     calibration : Calibration
     config : CalibratorConfig
         The options that gave it.
-    pose_pairs : PosePairs
-        The synchronised poses that gave it.
-    estimate : callable
-        The engine; see :func:`~hand_eye_calib.report.evidence.gather`.
+    evidence : Evidence
+        See :func:`~hand_eye_calib.report.evidence.gather`.
     inputs : mapping, optional
         Where the data came from, in plain values.
     findings : sequence of dict
         What the stream checks found.
-    streams : mapping, optional
-        "parent" and "child" to Trajectory, as they were read.
     command : str
         Shell command that publishes the result.
 
@@ -67,7 +63,6 @@ def render(calibration, config, pose_pairs, estimate, *, inputs=None, findings=(
     -------
     str
     """
-    evidence = gather(calibration, config, pose_pairs, estimate, streams)
     svgs = draw_all(calibration, evidence)
     said = {name: _SENTENCES[name](calibration, evidence) for name in _TITLES}
     document = calibration.to_dict()
@@ -88,7 +83,7 @@ def render(calibration, config, pose_pairs, estimate, *, inputs=None, findings=(
             ],
             findings=list(findings),
             summary=_summary(calibration, evidence),
-            streams=_streams(inputs or {}, streams or {}),
+            streams=_streams(inputs or {}, evidence.as_read),
             provenance=_provenance(inputs or {}),
             options={name: value for name, value in config.to_options().items() if value != ""},
         )

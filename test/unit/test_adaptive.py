@@ -124,7 +124,7 @@ def test_the_derivative_by_time_is_what_a_lag_does():
         return Increments(stamps(200), parent, child_of(poses_at(times_s - late_s)))
 
     derivative = increments(0.0).jacobian(T_PARENT_CHILD, "time", [0.0])[2:-2, :, 6]
-    # Adding to the stamps undoes a lag.
+    # What is assumed of the stamps' lateness undoes it.
     undone = (increments(-lag_s).residuals(T_PARENT_CHILD) - increments(lag_s).residuals(T_PARENT_CHILD))[2:-2] / (2 * lag_s)
     # The estimator's velocities are medians: they cut the peaks, and agree everywhere else.
     np.testing.assert_allclose(derivative, undone, atol=0.06 * np.abs(undone).max())
@@ -263,9 +263,9 @@ def test_a_lag_is_not_taken_for_a_lever():
         child = late(child_of(parent), 0.02)
         noisy = disturbed(parent, 100 + seed, 1e-3, 1e-3), disturbed(child, 200 + seed, 1e-3, 1e-3)
         answers = [estimator.solve(stamps(300), *noisy, nuisances=models) for models in (("none",), NUISANCES)]
-        assert answers[1].time_offset_s == pytest.approx(0.02, abs=1e-3)
+        assert answers[1].time_offset_s == pytest.approx(-0.02, abs=1e-3)
         said = " ".join(answers[1].describe(stamps(300))["in_words"])
-        assert re.search(r"the child's stamps are (19|20|21)\.\d ms early", said)
+        assert re.search(r"the child's stamps are (19|20|21)\.\d ms late", said)
         errors.append([np.linalg.norm(answer.T_parent_child[:3, 3] - T_PARENT_CHILD[:3, 3]) for answer in answers])
     without, with_lag = np.median(errors, axis=0)
     assert with_lag < 0.3 * without

@@ -84,6 +84,14 @@ def disturb(trajectory):
     return dataclasses.replace(trajectory, poses=disturbed(trajectory.poses, 1, 0.002, 0.002))
 
 
+def test_adaptive_adds_the_lag_it_finds_to_the_time_offset():
+    parent = wandering_poses(400, 5)
+    child = as_trajectory(child_of(disturbed(parent, 1, 1e-4, 1e-4))).shifted(0.02)
+    for given in (0.0, -0.015):
+        result = calibrate(as_trajectory(parent), child, method="adaptive", time_offset=given)
+        assert result.time_offset_s == pytest.approx(-0.02, abs=1e-3)
+
+
 def test_time_offset_and_scale_are_applied_to_the_child():
     parent, child = drive()
     late = dataclasses.replace(child.shifted(-12.5), poses=child.scaled(1 / 2.5).poses)

@@ -17,7 +17,7 @@ from hand_eye_calib.calibrator import offline_config, whole_snapshot
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE, NOISE
 from hand_eye_calib.cli.present import static_transform_command
-from hand_eye_calib.cli.reporting import write_report
+from hand_eye_calib.cli.reporting import with_consistency, write_report
 from hand_eye_calib.estimation import estimate_extrinsic
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -77,7 +77,9 @@ def simulated(planar=False, poses=200, frames=("lidar", "camera"), **options):
 
 def page_of(snapshot, calibration, **more):
     more.setdefault("command", static_transform_command(calibration))
-    text = render(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic, **more)
+    streams = more.pop("streams", None)
+    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic, streams)
+    text = render(calibration, snapshot.config, found, **more)
     return text, Page(text)
 
 
@@ -187,7 +189,7 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
     drive = simulate_drive(1, dataclasses.replace(DRIVE, **({"poses": 60} | motion)), NOISE)
     snapshot = whole_snapshot(offline_config(drive.parent, drive.child, options), drive.parent, drive.child)
     calibration = snapshot.estimate()
-    write_report(tmp_path, calibration, snapshot, {})
+    write_report(tmp_path, *with_consistency(calibration, snapshot), snapshot.config, {})
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
     assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]
@@ -276,6 +278,7 @@ def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
     page = Page((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     saved = hec.load(tmp_path / "out")
     assert static_transform_command(saved) in page.text
+    assert list(saved.consistency) == [dof.name for dof in saved.observability]
     assert all(file in page.text for file in files)
 
 
@@ -294,7 +297,7 @@ def test_without_out_nothing_is_drawn(files, capsys, monkeypatch):
     def never(*_, **__):
         raise AssertionError("a report was written that nobody asked for")
 
-    monkeypatch.setattr("hand_eye_calib.cli.reporting.write_report", never)
+    monkeypatch.setattr("hand_eye_calib.cli.present.write_report", never)
     assert cli.main(["calibrate", *files, "--parent-frame", "a", "--child-frame", "b"]) in (0, 3)
 
 
