@@ -216,7 +216,7 @@ class CalibratorConfig(OptionSet):
     reference: str = option(
         "auto",
         "Which poses form motion pairs: A (all against the first), B<n> (against the n-th before), C<n> (segments of n), or auto "
-        "(the one with the smallest predicted translation error).",
+        "(one from which the noise of these trajectories promises the least error).",
         pattern=REFERENCE_PATTERN,
     )
     backend: str = option(
