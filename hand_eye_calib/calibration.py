@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
@@ -213,6 +212,6 @@ def _transform_dict(T_target_source, target, source):
         "maps": f"coordinates of {source} into {target}",
         "translation": T_target_source[:3, 3].tolist(),
         "quat_xyzw": se3.to_quat_xyzw(T_target_source).tolist(),
-        "rpy_deg": Rotation.from_matrix(T_target_source[:3, :3]).as_euler("xyz", degrees=True).tolist(),
+        "rpy_deg": np.degrees(se3.rotation_to_rpy(T_target_source[:3, :3])).tolist(),
         "matrix": T_target_source.tolist(),
     }

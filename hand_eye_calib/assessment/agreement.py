@@ -14,6 +14,7 @@ of the origin, seen from a turning sensor, is longer than the sensor's own, and 
 """
 
 import dataclasses
+import functools
 import itertools
 from dataclasses import dataclass
 
@@ -36,7 +37,7 @@ from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.pairing.time_offset import LEAST_VARIATION, NO_CORRELATION, Correlation, correlate_turning
 from hand_eye_calib.solvers.alignment import estimate_scale, indices_after, refine_time_offset
 from hand_eye_calib.solvers.separable import align_rotation_vectors
-from hand_eye_calib.solvers.similarity import SimilarityFit, fit_similarity
+from hand_eye_calib.solvers.similarity import EXPLAINED, SimilarityFit, fit_similarity
 
 # Motions over this long (s; shorter ones where those fail) tell the hypotheses apart, that many of them.
 _LAGS_S, _PAIRS, _PAIRS_FOR_AXES = (3.0, 1.0, 0.4), 400, 120
@@ -147,9 +148,9 @@ def check_streams(parent, child, time_offset_s=0.0, scale=1.0, max_gap_s=0.5):
     if not correlation.is_clear:
         correlation = dataclasses.replace(correlation, offset_s=0.0)
     parent_as_meant, child_as_meant = verdict.undo(parent, child)
-    findings += _offset(parent_as_meant, child_as_meant, correlation, time_offset_s, max_gap_s)
+    findings += _offset(parent_as_meant, child_as_meant, correlation, time_offset_s, max_gap_s, verdict.fit)
     pose_pairs = synchronise(parent_as_meant, child_as_meant.shifted(correlation.offset_s), max_gap_s)
-    findings += _scale(estimate_scale(pose_pairs), scale)
+    findings += _scale(estimate_scale(pose_pairs, start=verdict.fit), scale)
     excitation, turned = _excitation(pose_pairs, verdict.fit)
     return _agreement(findings + excitation, correlation, verdict.fit, turned)
 
@@ -203,7 +204,7 @@ class _Verdict:
 
     @property
     def holds(self):
-        return _unexplained(self.fit) < self.limit
+        return self.fit.unexplained < self.limit
 
     def undo(self, parent, child):
         return self.hypothesis.undo(parent, child)
@@ -240,6 +241,7 @@ _USUAL = [
 ]
 
 
+@functools.cache
 def _axis_hypotheses():
     """All ways to permute and flip the axes of the positions but for mirroring all three, the simplest first."""
     hypotheses = []
@@ -259,9 +261,6 @@ def _axis_hypotheses():
 def _changes(matrix):
     """Axes that do not stay where they are."""
     return int(3 - np.isclose(matrix.diagonal(), 1.0).sum())
-
-
-_AXES = _axis_hypotheses()
 
 
 def _best_hypothesis(parent, child, max_gap_s, thorough):
@@ -284,18 +283,20 @@ def _best_hypothesis(parent, child, max_gap_s, thorough):
         failed.append((lag_s, chosen))
     if not failed:
         raise too_few
-    lag_s, best = min(failed, key=lambda tried: _unexplained(tried[1].fit))
+    lag_s, best = min(failed, key=lambda tried: tried[1].fit.unexplained)
     if thorough and lag_s != failed[0][0]:
         best = _or_other_axes(best, parent, child, max_gap_s, lag_s)
         if best.holds:
             return _attribute(best, parent, child, max_gap_s, lag_s)
-    if thorough and _unexplained(best.fit) < _NOISY:
+    if thorough and best.fit.unexplained < _NOISY:
         return dataclasses.replace(best, findings=[_noisy(best.fit)], limit=_NOISY)
     return dataclasses.replace(best, findings=[_not_one_body(best.fit)])
 
 
 def _plain_or_usual(parent, child, max_gap_s, lag_s):
     plain = _judge(_PLAIN, parent, child, max_gap_s, lag_s)
+    if plain.fit.unexplained < EXPLAINED:
+        return plain
     usual = _simplest_of_the_best([_judge(hypothesis, parent, child, max_gap_s, lag_s) for hypothesis in _USUAL])
     return usual if _is_decisive(plain, usual) else plain
 
@@ -306,7 +307,7 @@ def _or_other_axes(plain, parent, child, max_gap_s, lag_s):
     if rotation is None:
         return plain
     start = dataclasses.replace(plain.fit, T_parent_child=se3.from_rotation_translation(rotation, np.zeros(3)))
-    rough = [_judge(hypothesis, parent, child, max_gap_s, lag_s, _PAIRS_FOR_AXES, start) for hypothesis in _AXES]
+    rough = [_judge(hypothesis, parent, child, max_gap_s, lag_s, _PAIRS_FOR_AXES, start) for hypothesis in _axis_hypotheses()]
     axes = _simplest_of_the_best(rough)
     return axes if _is_decisive(plain, axes) else plain
 
@@ -334,14 +335,9 @@ def _agreed_rotation(parent, child, max_gap_s, lag_s):
     return rotation if agree else None
 
 
-def _unexplained(fit):
-    """Share of the motion, of translation and rotation together, that a fit leaves unexplained."""
-    return float(np.hypot(fit.sigma_translation / max(fit.moved, 1e-12), fit.sigma_rotation / max(fit.turned, 1e-12)))
-
-
 def _simplest_of_the_best(verdicts):
-    limit = _ABOUT_EQUAL * min(_unexplained(verdict.fit) for verdict in verdicts)
-    return min((verdict for verdict in verdicts if _unexplained(verdict.fit) <= limit), key=_strangeness)
+    limit = _ABOUT_EQUAL * min(verdict.fit.unexplained for verdict in verdicts)
+    return min((verdict for verdict in verdicts if verdict.fit.unexplained <= limit), key=_strangeness)
 
 
 def _strangeness(verdict):
@@ -351,7 +347,7 @@ def _strangeness(verdict):
 
 
 def _is_decisive(plain, rival):
-    return rival.holds and DECISIVE * _unexplained(rival.fit) < _unexplained(plain.fit)
+    return rival.holds and DECISIVE * rival.fit.unexplained < plain.fit.unexplained
 
 
 def _attribute(verdict, parent, child, max_gap_s, lag_s):
@@ -425,7 +421,7 @@ def _not_together(correlation):
 def _not_one_body(fit):
     return _finding(
         "unrelated", "both", Severity.ERROR, Confidence.LIKELY,
-        f"no extrinsic, scale or usual mistake explains both streams: {_unexplained(fit):.0%} of the motion remain (at most "
+        f"no extrinsic, scale or usual mistake explains both streams: {fit.unexplained:.0%} of the motion remain (at most "
         f"{HOLDS:.0%} would be good)",
         "check that both sensors are on one rigid body and that the poses are those of the sensors",
     )  # fmt: skip
@@ -434,7 +430,7 @@ def _not_one_body(fit):
 def _noisy(fit):
     return _finding(
         "noisy", "both", Severity.NOTE, Confidence.LIKELY,
-        f"the streams turn together, but {_unexplained(fit):.0%} of the motion stay unexplained: noise or jumps are strong",
+        f"the streams turn together, but {fit.unexplained:.0%} of the motion stay unexplained: noise or jumps are strong",
         "expect large standard deviations; drive longer and livelier, or repair the source",
     )  # fmt: skip
 
@@ -484,8 +480,8 @@ def _left_handed(hypothesis):
 _MAKERS = {"quaternion_order": _quaternion_order, "axes": _axes, "left_handed": _left_handed}
 
 
-def _offset(parent, child, correlation, known_s, max_gap_s):
-    found = refine_time_offset(parent, child, correlation, max_gap_s)
+def _offset(parent, child, correlation, known_s, max_gap_s, fit):
+    found = refine_time_offset(parent, child, correlation, max_gap_s, fit)
     if abs(found.seconds) < max(_OFFSET_NOTE_S, _OFFSET_SIGMAS * found.sigma_s):
         return []
     total_s = round(known_s + found.seconds, 4)

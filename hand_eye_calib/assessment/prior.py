@@ -9,7 +9,6 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.assessment.covariance import (
     UNKNOWN_ROTATION,
@@ -185,10 +184,10 @@ def _errors(T, prior):
     errors = {axis: value - prior[axis][0] for axis, value in zip(TRANSLATIONS, T[:3, 3], strict=True) if axis in prior}
     angles = {axis: prior[axis][0] for axis in ROTATIONS if axis in prior}
     if len(angles) == 3:  # a whole rotation: no angle is singular
-        nominal = Rotation.from_euler("xyz", list(angles.values())).as_matrix()
+        nominal = se3.rotation_from_rpy(list(angles.values()))
         return errors | dict(zip(ROTATIONS, se3.rotation_log(T[:3, :3] @ nominal.T), strict=True))
     if angles:
-        found = dict(zip(ROTATIONS, Rotation.from_matrix(T[:3, :3]).as_euler("xyz"), strict=True))
+        found = dict(zip(ROTATIONS, se3.rotation_to_rpy(T[:3, :3]), strict=True))
         errors |= {axis: np.angle(np.exp(1j * (found[axis] - value))) for axis, value in angles.items()}
     return errors
 

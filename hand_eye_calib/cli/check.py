@@ -1,19 +1,13 @@
 """``check BAG`` or ``check PARENT CHILD``: look at both streams before believing them."""
 
 import json
+import math
 from pathlib import Path
 
-import numpy as np
-
-from hand_eye_calib.assessment.agreement import check_streams
-from hand_eye_calib.calibrator import ESTIMATE
 from hand_eye_calib.cli.calibrate import add_file_arguments, read_files
 from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
-from hand_eye_calib.cli.findings import table
 from hand_eye_calib.cli.options import add_config_arguments, add_json_argument, config_from
-from hand_eye_calib.cli.reporting import write_check
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.pairing.stream_checks import Confidence, Finding, Severity, summarise, tidy
 
 STREAMS = ("parent", "child")
 
@@ -36,6 +30,10 @@ def add_arguments(parser):
 
 def run(arguments):
     """Print what was found; returns 1 where something is wrong with the streams, otherwise 0."""
+    from hand_eye_calib.assessment.agreement import check_streams
+    from hand_eye_calib.calibrator import ESTIMATE
+    from hand_eye_calib.pairing.stream_checks import Severity, summarise
+
     if len(arguments.inputs) > 2:
         raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.inputs)}")
     config = config_from(arguments)
@@ -53,6 +51,8 @@ def run(arguments):
     else:
         print(_text(streams, findings, agreement))
     if arguments.out:
+        from hand_eye_calib.cli.reporting import write_check
+
         corrected = child.shifted(offset_s).scaled(scale)
         write_check(arguments.out, parent, corrected, agreement, findings, arguments.inputs, config.max_gap)
     if all(finding.severity is Severity.NOTE for finding in findings):
@@ -61,6 +61,8 @@ def run(arguments):
 
 
 def _read_files(arguments):
+    from hand_eye_calib.pairing.stream_checks import Confidence, Finding, Severity
+
     arguments.parent, arguments.child = arguments.inputs
     arguments.repair_stamps = True
     trajectories, notes = read_files(arguments)
@@ -70,7 +72,10 @@ def _read_files(arguments):
 
 
 def _read_bag(arguments):
+    import numpy as np
+
     from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.pairing.stream_checks import tidy
 
     columns = {stream: ([], [], []) for stream in STREAMS}
     with PoseBag(arguments.inputs[0]) as bag:
@@ -104,13 +109,15 @@ def _document(streams, findings, agreement):
 
 
 def _text(streams, findings, agreement):
+    from hand_eye_calib.cli.findings import table
+
     lines = [f"{'':<8} {'poses':>8} {'seconds':>9} {'per s':>7} {'longest gap':>12} {'way':>10} {'turned':>10}"]
     for name, summary in streams.items():
         lines.append(
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} {summary.longest_interval_s:10.3f} s "
-            f"{summary.way_m:8.1f} m {np.degrees(summary.turned_rad):6.0f} deg"
+            f"{summary.way_m:8.1f} m {math.degrees(summary.turned_rad):6.0f} deg"
         )
     if agreement.turned_rad:
-        turned = "  ".join(f"{axis} {np.degrees(angle):.2f}" for axis, angle in agreement.turned_rad.items())
+        turned = "  ".join(f"{axis} {math.degrees(angle):.2f}" for axis, angle in agreement.turned_rad.items())
         lines.append(f"The parent turns about its axes, in 3 s and root mean square:  {turned}  deg")
     return "\n".join([*lines, "", table(findings)])

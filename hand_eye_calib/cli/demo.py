@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import shutil
 import signal
@@ -10,19 +11,10 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from hand_eye_calib.calibrator import Calibrator
 from hand_eye_calib.cli.console import fail, note
 from hand_eye_calib.cli.options import add_json_argument
-from hand_eye_calib.cli.present import EXIT_CODES
-from hand_eye_calib.cli.replaying import feed
-from hand_eye_calib.cli.reporting import write_report
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.simulation.drive import HILLY_DRIVE, simulate_drive
-from hand_eye_calib.simulation.noise import NoiseConfig
+from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 
@@ -52,6 +44,10 @@ def add_arguments(parser):
 
 def run(arguments):
     """Run the demo; returns the exit code."""
+    from hand_eye_calib.cli.present import EXIT_CODES
+    from hand_eye_calib.cli.reporting import with_consistency, write_report
+    from hand_eye_calib.simulation.drive import simulate_drive
+
     Player = _import_player()
     if arguments.seed < 0:
         raise InputError(f"--seed must not be negative; got {arguments.seed}")
@@ -65,7 +61,8 @@ def run(arguments):
     document = _document(drive, bag_path, offline, live)
     print(json.dumps(document, indent=2, allow_nan=False) if arguments.json else _text(document))
     inputs = {"bag": str(bag_path)} | {stream: {"topic": topic} for stream, topic in TOPICS.items()}
-    write_report(arguments.out, offline, calibrator.snapshot(), inputs)
+    snapshot = calibrator.snapshot()
+    write_report(arguments.out, *with_consistency(offline, snapshot), snapshot.config, inputs)
     if max(document["agreement"].values()) > AGREEMENT:
         return fail(
             f"offline and online differ by more than {AGREEMENT}: {document['agreement']}; the same messages must give the same",
@@ -111,6 +108,9 @@ def _opened(bag_path):
 
 
 def _replay(bag_path):
+    from hand_eye_calib.calibrator import Calibrator
+    from hand_eye_calib.cli.replaying import feed
+
     calibrator = Calibrator()
     with _opened(bag_path) as bag:
         feed(calibrator, bag.blocks(*TOPICS.values()), TOPICS)
@@ -181,13 +181,16 @@ def _estimate(T_parent_child, truth):
 
 
 def _both_directions(T_parent_child):
+    from hand_eye_calib.geometry import se3
+
     return {"T_parent_child": T_parent_child.tolist(), "T_child_parent": se3.inverse(T_parent_child).tolist()}
 
 
 def _errors(T_parent_child, truth):
     """Distance between the translations (m) and angle between the rotations (rad)."""
-    distance = np.linalg.norm(T_parent_child[:3, 3] - truth[:3, 3])
-    return float(distance), float(se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3]))
+    from hand_eye_calib.geometry import se3
+
+    return math.dist(T_parent_child[:3, 3], truth[:3, 3]), float(se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3]))
 
 
 def _text(document):
@@ -202,14 +205,17 @@ def _text(document):
     lines.append(f"Error of the pose of {child} in {parent}")
     for key in ("offline", "online"):
         error = document[key]["error"]
-        lines.append(f"  {rows[key]:<24}{1e3 * error['translation_m']:10.2f} mm {np.degrees(error['rotation_rad']):10.4f} deg")
+        lines.append(
+            f"  {rows[key]:<24}{1e3 * error['translation_m']:10.2f} mm {math.degrees(error['rotation_rad']):10.4f} deg"
+        )
     lines.append(
-        f"Offline and online differ by {agreement['translation_m']:.1e} m and {np.degrees(agreement['rotation_rad']):.1e} deg"
+        f"Offline and online differ by {agreement['translation_m']:.1e} m and {math.degrees(agreement['rotation_rad']):.1e} deg"
     )
     return "\n".join(lines)
 
 
 def _row(matrix):
-    matrix = np.array(matrix)
-    angles = Rotation.from_matrix(matrix[:3, :3]).as_euler("xyz", degrees=True)
-    return "".join(f"{value:10.4f}" for value in matrix[:3, 3]) + "   " + "".join(f"{value:10.3f}" for value in angles)
+    from hand_eye_calib.geometry import se3
+
+    angles = se3.rotation_to_rpy([row[:3] for row in matrix[:3]])
+    return "".join(f"{row[3]:10.4f}" for row in matrix[:3]) + "   " + "".join(f"{math.degrees(a):10.3f}" for a in angles)

@@ -12,30 +12,33 @@ from pathlib import Path
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.experiments import sources
-from hand_eye_calib.experiments.catalogue import EXPERIMENTS, Experiment
-from hand_eye_calib.experiments.rows import TITLES
 
 _SILENT_S = 2.0
 
-_EPILOG = """\
-fig3       DNLO's errors for every reference, against noise, outliers, drift and with all three
-fig4       components of the relative motions
-fig5       the best variant of every method
-table1     KITTI 2011_09_30_drive_0027, lidar and camera
-table2     KITTI 2011_10_03_drive_0027, two cameras
-s-figures  S1-S5: as fig3, for the other methods
-s-tables   S1-S12: every method and reference on both drives
-adaptive   past the article: the adaptive estimator and reference auto against the best choice with hindsight
-repeats    the stated sigmas against the spread of repeats on real drives, and against KITTI's ground truth; zxl19 and asl_tango_easy count
-           too where they lie beside the published data
-unlike     drives that are not like the article's (--data simulated): where the estimators fail
-all        everything in the article, its conclusions checked, and what is wrong with the published results
+EXPERIMENTS = {
+    "fig3": "DNLO's errors for every reference, against noise, outliers, drift and with all three",
+    "fig4": "components of the relative motions",
+    "fig5": "the best variant of every method",
+    "table1": "KITTI 2011_09_30_drive_0027, lidar and camera",
+    "table2": "KITTI 2011_10_03_drive_0027, two cameras",
+    "s-figures": "S1-S5: as fig3, for the other methods",
+    "s-tables": "S1-S12: every method and reference on both drives",
+    "adaptive": "past the article: the adaptive estimator and reference auto against the best choice with hindsight",
+    "repeats": "the stated sigmas against the spread of repeats on real drives, and against KITTI's ground truth; zxl19 and asl_tango_easy "
+    "count\n           too where they lie beside the published data",
+    "unlike": "drives that are not like the article's (--data simulated): where the estimators fail",
+    "all": "everything in the article, its conclusions checked, and what is wrong with the published results",
+}
+
+_EPILOG = (
+    "\n".join(f"{name:<11}{about}" for name, about in EXPERIMENTS.items())
+    + """
 
 Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV; beside each, *_comparison.csv and *_comparison.md say
 cell by cell how it compares with the published results. What was solved is kept in DIR/solved: an interrupted run goes on from there.
 
 Published data: clone https://github.com/tau-alma/trajectory_calibration_experiments and name its folder with --data-folder."""
+)
 
 
 def add_arguments(parser):
@@ -69,6 +72,8 @@ def add_arguments(parser):
 
 def run(arguments):
     """Run the experiment; returns the exit code."""
+    from hand_eye_calib.experiments.catalogue import Experiment
+
     source, theirs = _sources(arguments)
     jobs = _cores() if arguments.jobs is None else arguments.jobs
     if jobs < 1:
@@ -85,6 +90,8 @@ def run(arguments):
 
 def _sources(arguments):
     """The source of the cases, and that of the published results to compare with (None without)."""
+    from hand_eye_calib.experiments import sources
+
     folder = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
     published = sources.PublishedSource(sources.find_folder(folder)) if folder else None
     if arguments.data == "published":
@@ -157,6 +164,8 @@ def _agreement(rows, method):
 
 
 def _text(document, files):
+    from hand_eye_calib.experiments.rows import TITLES
+
     lines = []
     if len(files) == 1:
         # One artefact alone: what it says is read here and now.

@@ -7,10 +7,7 @@ from pathlib import Path
 
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import write_trajectory
-from hand_eye_calib.simulation.drive import HILLY_DRIVE, PUBLISHED_DRIVE, simulate_drive
-from hand_eye_calib.simulation.noise import MIXTURE, NoiseConfig
+from hand_eye_calib.simulation.options import HILLY_DRIVE, MIXTURE, PUBLISHED_DRIVE, NoiseConfig
 
 # The layout of the published simulations: sensor 1 is the parent.
 PARENT_FILE, CHILD_FILE, TRUTH_FILE = "T_S1_W1.txt", "T_S2_W2.txt", "T_S2_S1.txt"
@@ -61,6 +58,8 @@ def add_arguments(parser):
 
 def run(arguments):
     """Simulate and write; returns the exit code."""
+    from hand_eye_calib.simulation.drive import simulate_drive
+
     config, noise = _configs(arguments)
     _make_empty(arguments.out)
     digits = max(2, len(str(arguments.runs)))
@@ -90,6 +89,9 @@ def write_drive(folder, drive, bag=None):
     InputError
         Where it cannot be written.
     """
+    from hand_eye_calib.geometry.trajectory import Trajectory
+    from hand_eye_calib.io.trajectory_files import write_trajectory
+
     _make_empty(folder)
     write_trajectory(folder / PARENT_FILE, drive.parent)
     write_trajectory(folder / CHILD_FILE, drive.child)

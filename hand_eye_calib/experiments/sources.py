@@ -6,8 +6,8 @@ from pathlib import Path
 
 from hand_eye_calib.experiments import published
 from hand_eye_calib.experiments.published import Case
-from hand_eye_calib.simulation.drive import PUBLISHED_DRIVE, simulate_drive
-from hand_eye_calib.simulation.noise import MIXTURE, NoiseConfig
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
 
 _KITTI_LOADERS = {"kitti_short": published.load_kitti_short, "kitti_long": published.load_kitti_long}
 

@@ -10,8 +10,9 @@ from hand_eye_calib.experiments.runner import in_parallel
 from hand_eye_calib.experiments.writing import markdown_table, write_csv, write_text
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.simulation.drive import DriveConfig, simulate_drive
-from hand_eye_calib.simulation.noise import MIXTURE, add_drift, add_gaussian, add_noise
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.noise import add_drift, add_gaussian, add_noise
+from hand_eye_calib.simulation.options import MIXTURE, DriveConfig
 
 # Handheld motion: every component of twist and place is the sum of this many sines of up to so many Hz.
 _SINES, _FASTEST_HZ = 4, 0.4

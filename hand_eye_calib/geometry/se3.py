@@ -2,15 +2,17 @@
 
 Transforms are ``(..., 4, 4)`` arrays named ``T_target_source``: they map coordinates of ``source`` into ``target``. Tangent
 vectors are ``(..., 6)`` arrays ``(rho, phi)``, translation (m) before rotation (rad), acting on the right:
-``T_target_source @ exp(xi_in_source)``. Rotation conversions are SciPy's but for the logarithm.
+``T_target_source @ exp(xi_in_source)``. Rotation conversions are written out: SciPy's, as good, take a tenth of a second to import.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 # Below this angle the coefficients of exp and log come from their Taylor series. At 1e-2 rad the first term left out is
 # of order angle^6, about 1e-16 relative, whereas the closed forms lose digits to cancellation.
 _SERIES_ANGLE = 1e-2
+
+# Cosine of the pitch below which roll and yaw turn about the same axis, but for rounding.
+_SINGULAR_COSINE = 1e-7
 
 
 def skew(vectors):
@@ -32,6 +34,14 @@ def skew(vectors):
     return matrices
 
 
+def cross(left, right):
+    """Cross products (..., 3) of vectors, two arrays of the same shape (..., 3): numpy.cross takes several times as long for a few hundred."""
+    (x, y, z), (u, v, w) = (vectors.T for vectors in (left, right))
+    products = np.empty(left.shape)
+    products.T[0], products.T[1], products.T[2] = y * w - z * v, z * u - x * w, x * v - y * u
+    return products
+
+
 def from_rotation_translation(rotation, translation):
     """Transforms from rotation matrices (..., 3, 3) and translations (..., 3) in metres; returns (..., 4, 4)."""
     rotation, translation = np.asarray(rotation, dtype=float), np.asarray(translation, dtype=float)
@@ -47,33 +57,64 @@ def from_quat_xyzw(translation, quat_xyzw):
     """Transforms from translations (..., 3) in metres and quaternions (..., 4), scalar last; returns (..., 4, 4).
 
     Quaternions are normalised; whether they were close enough to unit length is for the caller to judge.
+
+    Raises
+    ------
+    ValueError
+        For a quaternion of length zero.
     """
-    quat_xyzw = np.asarray(quat_xyzw, dtype=float)
-    matrices = _converted(lambda quats: Rotation.from_quat(quats).as_matrix(), quat_xyzw.reshape(-1, 4), (3, 3))
-    return from_rotation_translation(matrices.reshape(quat_xyzw.shape[:-1] + (3, 3)), translation)
+    quats = np.asarray(quat_xyzw, dtype=float)
+    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
+    if not norms.all():
+        raise ValueError("found a quaternion of length zero")
+    return from_rotation_translation(_matrices(*np.moveaxis(quats / norms, -1, 0)), translation)
 
 
 def to_quat_xyzw(transforms):
-    """Quaternions (..., 4), scalar last and not negative, of the rotations of transforms (..., 4, 4)."""
-    transforms = np.asarray(transforms, dtype=float)
-    rotations = transforms[..., :3, :3].reshape(-1, 3, 3)
-    quat_xyzw = _converted(lambda matrices: Rotation.from_matrix(matrices).as_quat(), rotations, (4,))
-    quat_xyzw[quat_xyzw[:, 3] < 0] *= -1.0
-    return quat_xyzw.reshape(transforms.shape[:-2] + (4,))
+    """Quaternions (..., 4), scalar last and not negative, of the rotations of transforms (..., 4, 4), or of rotations (..., 3, 3)."""
+    rotations = np.asarray(transforms, dtype=float)[..., :3, :3]
+    quats = _scaled_quats(rotations.reshape(-1, 3, 3))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return quats.reshape(rotations.shape[:-2] + (4,))
+
+
+def rotation_from_rpy(rpy):
+    """Rotation matrices (..., 3, 3) of roll, pitch and yaw (..., 3), rad, about the fixed axes x, y and z in this order (REP 103, URDF)."""
+    rpy = np.asarray(rpy, dtype=float)
+    roll, pitch, yaw = (rotation_exp(rpy[..., axis, None] * np.eye(3)[axis]) for axis in range(3))
+    return yaw @ pitch @ roll
+
+
+def rotation_to_rpy(rotation):
+    """Roll, pitch and yaw (..., 3), rad, of rotation matrices (..., 3, 3): the inverse of :func:`rotation_from_rpy`.
+
+    The pitch is from -pi/2 to pi/2. Where it is one of these, only the sum or difference of the others is defined, and the yaw is 0.
+    """
+    R = np.asarray(rotation, dtype=float)
+    cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
+    singular = cosine < _SINGULAR_COSINE
+    roll = np.where(singular, np.arctan2(-R[..., 1, 2], R[..., 1, 1]), np.arctan2(R[..., 2, 1], R[..., 2, 2]))
+    yaw = np.where(singular, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
 
 
 def rotation_log(rotation):
     """Rotation vectors (..., 3), in rad and of length at most pi, of rotation matrices (..., 3, 3)."""
     rotation = np.asarray(rotation, dtype=float)
-    quats = _scaled_quats(rotation.reshape(-1, 3, 3))
-    sine = np.linalg.norm(quats[:, :3], axis=1)  # of half the angle, times the quaternion's length
-    angle = 2.0 * np.arctan2(sine, quats[:, 3])
-    vectors = quats[:, :3] * (angle / np.where(sine > 0.0, sine, 1.0))[:, None]
-    return vectors.reshape(rotation.shape[:-1])
+    return quat_log(_scaled_quats(rotation.reshape(-1, 3, 3))).reshape(rotation.shape[:-1])
+
+
+def quat_log(quat_xyzw):
+    """Rotation vectors (N, 3), rad, of quaternions (N, 4), scalar last, of any length and sign."""
+    sine = np.sqrt(
+        np.einsum("ni,ni->n", quat_xyzw[:, :3], quat_xyzw[:, :3])
+    )  # of half the angle, times the quaternion's length
+    angle = np.copysign(2.0, quat_xyzw[:, 3]) * np.arctan2(sine, np.abs(quat_xyzw[:, 3]))
+    return quat_xyzw[:, :3] * (angle / np.where(sine > 0.0, sine, 1.0))[:, None]
 
 
 def _scaled_quats(rotations):
-    """Quaternions (N, 4), scalar last and not negative, of rotations (N, 3, 3), but of any length: many times quicker than SciPy's.
+    """Quaternions (N, 4), scalar last and not negative, of rotations (N, 3, 3), but of any length.
 
     From the largest of their numbers, so that no digits are lost: S. W. Shepperd, *Quaternion from rotation matrix*, 1978.
     """
@@ -96,18 +137,24 @@ def _scaled_quats(rotations):
 def rotation_exp(rotation_vector):
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad."""
     rotation_vector = np.asarray(rotation_vector, dtype=float)
-    matrices = _converted(lambda vectors: Rotation.from_rotvec(vectors).as_matrix(), rotation_vector.reshape(-1, 3), (3, 3))
-    return matrices.reshape(rotation_vector.shape + (3,))
+    half = 0.5 * np.sqrt(np.einsum("...i,...i", rotation_vector, rotation_vector))
+    shrunk = 0.5 * np.where(half > 0.0, np.sin(half) / np.where(half > 0.0, half, 1.0), 1.0)
+    return _matrices(*(shrunk * rotation_vector[..., axis] for axis in range(3)), np.cos(half))
 
 
-# SciPy holds the interpreter's lock while it converts, and messages that come in meanwhile have to wait.
-_AT_A_TIME = 1000
-
-
-def _converted(convert, rotations, shape):
-    """A stack of rotations in another form of the given shape. Older SciPy (1.11) refuses an empty stack."""
-    parts = [convert(rotations[first : first + _AT_A_TIME]) for first in range(0, len(rotations), _AT_A_TIME)]
-    return np.concatenate(parts) if parts else np.empty((0, *shape))
+def _matrices(x, y, z, w):
+    """Rotation matrices (..., 3, 3) of quaternions of length 1, each number of them (...)."""
+    matrices = np.empty((*np.shape(w), 3, 3))
+    twice_x, twice_y, twice_z = 2.0 * x, 2.0 * y, 2.0 * z
+    xx, yy, zz = twice_x * x, twice_y * y, twice_z * z
+    matrices[..., 0, 0], matrices[..., 1, 1], matrices[..., 2, 2] = 1.0 - (yy + zz), 1.0 - (xx + zz), 1.0 - (xx + yy)
+    for row, column, product, other in (
+        (1, 0, twice_x * y, twice_z * w),
+        (0, 2, twice_x * z, twice_y * w),
+        (2, 1, twice_y * z, twice_x * w),
+    ):
+        matrices[..., row, column], matrices[..., column, row] = product + other, product - other
+    return matrices
 
 
 def inverse(transforms):
@@ -149,8 +196,8 @@ def exp(xi):
         1 / 6 - squared / 120 + squared**2 / 5040,
         (safe - np.sin(safe)) / safe**3,
     )
-    cross_once = np.cross(phi, rho)
-    translation = rho + first[..., None] * cross_once + second[..., None] * np.cross(phi, cross_once)
+    cross_once = cross(phi, rho)
+    translation = rho + first[..., None] * cross_once + second[..., None] * cross(phi, cross_once)
     return from_rotation_translation(rotation_exp(phi), translation)
 
 
@@ -182,8 +229,8 @@ def log(transforms):
         1 / 12 + squared / 720 + squared**2 / 30240,
         (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2,
     )
-    cross_once = np.cross(phi, translation)
-    rho = translation - 0.5 * cross_once + coefficient[..., None] * np.cross(phi, cross_once)
+    cross_once = cross(phi, translation)
+    rho = translation - 0.5 * cross_once + coefficient[..., None] * cross(phi, cross_once)
     return np.concatenate([rho, phi], axis=-1)
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import yaml
-from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
 
 FILE_NAME = "extrinsic.yaml"
 XACRO_NAME = "extrinsic.urdf.xacro"
@@ -232,7 +232,7 @@ def _remarks(calibration):
 
 def _rpy_rad(calibration):
     """Rotation about the parent's fixed axes x, y, z, as URDF has it."""
-    return Rotation.from_matrix(calibration.T_parent_child[:3, :3]).as_euler("xyz").tolist()
+    return se3.rotation_to_rpy(calibration.T_parent_child[:3, :3]).tolist()
 
 
 def _xacro_attribute(text):

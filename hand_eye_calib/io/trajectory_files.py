@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
@@ -386,7 +385,8 @@ def _poses(path, table):
             (deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotations) < 0),
             lambda index: f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check what the numbers are",
         )
-        return matrices[:, :, 3], Rotation.from_matrix(rotations).as_quat()
+        left, _, right = np.linalg.svd(rotations)  # their product is the nearest rotation: files have few digits
+        return matrices[:, :, 3], se3.to_quat_xyzw(left @ right)
     norms = np.linalg.norm(values[:, 3:], axis=1)
     refuse(
         np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE,

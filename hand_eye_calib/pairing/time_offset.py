@@ -8,7 +8,6 @@ quaternion order (reordering or inverting quaternions leaves the angles alone).
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
 
 from hand_eye_calib.geometry import se3
 
@@ -156,20 +155,20 @@ def _compressed(rates):
 
 def _masked_correlation(first, second):
     """Lags, correlation coefficients and numbers of common samples; first[i + lag] is compared with second[i], nans are left out."""
-    size = fft.next_fast_len(len(first) + len(second), real=True)
+    size = 1 << (len(first) + len(second) - 1).bit_length()
 
     def spectra(signal):
         mask = np.isfinite(signal)
         filled = np.where(mask, signal, 0.0)
-        return [fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]
+        return [np.fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]
 
     one_a, a, aa = spectra(first)
     one_b, b, bb = (np.conj(part) for part in spectra(second))
-    count = np.round(fft.irfft(one_a * one_b, size))
+    count = np.round(np.fft.irfft(one_a * one_b, size))
     divisor = np.maximum(count, 1.0)
-    sum_a, sum_b = fft.irfft(a * one_b, size), fft.irfft(one_a * b, size)
-    covariance = fft.irfft(a * b, size) - sum_a * sum_b / divisor
-    square_a, square_b = fft.irfft(aa * one_b, size), fft.irfft(one_a * bb, size)
+    sum_a, sum_b = np.fft.irfft(a * one_b, size), np.fft.irfft(one_a * b, size)
+    covariance = np.fft.irfft(a * b, size) - sum_a * sum_b / divisor
+    square_a, square_b = np.fft.irfft(aa * one_b, size), np.fft.irfft(one_a * bb, size)
     variance_a, variance_b = square_a - sum_a**2 / divisor, square_b - sum_b**2 / divisor
     varied = (variance_a > 1e-9 * square_a.max(initial=0.0)) & (variance_b > 1e-9 * square_b.max(initial=0.0))
     coefficients = np.where(varied, covariance / np.sqrt(np.where(varied, variance_a * variance_b, 1.0)), 0.0)

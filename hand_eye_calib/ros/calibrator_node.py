@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -21,12 +22,12 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.task import Future
-from scipy.spatial.transform import Rotation
 from std_srvs.srv import SetBool, Trigger
 
 from hand_eye_calib.calibration import SolveStatus
 from hand_eye_calib.calibrator import Calibrator
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, NotEnoughDataError
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import has_session
 from hand_eye_calib.io.results import keep_earlier_results
 from hand_eye_calib.ros import diagnostics
@@ -572,7 +573,7 @@ def _journal_directory(options):
 def describe(calibration):
     """One line for a log: whose pose in whose frame, how good, from how much."""
     x, y, z = calibration.T_parent_child[:3, 3]
-    roll, pitch, yaw = Rotation.from_matrix(calibration.T_parent_child[:3, :3]).as_euler("xyz", degrees=True)
+    roll, pitch, yaw = np.degrees(se3.rotation_to_rpy(calibration.T_parent_child[:3, :3]))
     return (
         f"{calibration.child_frame} in {calibration.parent_frame}: xyz = ({x:.4f}, {y:.4f}, {z:.4f}) m, "
         f"rpy = ({roll:.3f}, {pitch:.3f}, {yaw:.3f}) deg; status {calibration.status.value}; "

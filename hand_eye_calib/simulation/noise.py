@@ -4,45 +4,12 @@ Where the article's text and its published trajectories differ, this follows the
 standard deviation, jumps last until the end, drift affects the child sensor only.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.config import OptionSet, option
 from hand_eye_calib.geometry import se3
 
 JUMP_VARIANCE = 0.02
-
-
-@dataclass(frozen=True)
-class NoiseConfig(OptionSet):
-    """How strong each kind of noise is; the default is none."""
-
-    gaussian: float = option(
-        0.0,
-        "Standard deviation of each pose's translation error per axis (published: 0 to 0.010).",
-        unit="m",
-        minimum=0.0,
-        maximum=10.0,
-    )
-    rotation_per_metre: float = option(
-        2.0,
-        "Standard deviation of each pose's Euler angles over that of its translation.",
-        unit="rad/m",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    outliers: float = option(
-        0.0, "Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).", minimum=0.0, maximum=1.0
-    )
-    drift: float = option(
-        0.0, "Drift of the child sensor along one of its axes (published: 0 to 0.05).", unit="m/m", minimum=0.0, maximum=10.0
-    )
-
-
-# The article's mixture: the middle of each range.
-MIXTURE = NoiseConfig(gaussian=0.005, outliers=0.05, drift=0.025)
 
 
 def add_noise(Ts_pw_p, Ts_cw_c, noise, rng):

@@ -122,11 +122,14 @@ def estimate_time_offset(parent, child, max_gap_s=0.5):
     return refine_time_offset(parent, child, correlation, max_gap_s)
 
 
-def refine_time_offset(parent, child, correlation, max_gap_s=0.5):
-    """TimeOffset from a coarse one: the fine offset where the fit explains the motion, otherwise the coarse one with a wide sigma."""
+def refine_time_offset(parent, child, correlation, max_gap_s=0.5, start=None):
+    """TimeOffset from a coarse one: the fine offset where the fit explains the motion, otherwise the coarse one with a wide sigma.
+
+    A SimilarityFit of the same streams as ``start`` spares the search for one.
+    """
     interval_s = max(float(np.median(np.diff(stream.stamps_ns))) * 1e-9 for stream in (parent, child))
     reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * interval_s)
-    best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation, None), None
+    best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation, None), start
     for lag_s in _OFFSET_LAGS_S:
         offset_s, fit = _fine_offset(parent, child, correlation.offset_s, lag_s, max_gap_s, fit)
         if fit is None:
@@ -146,8 +149,8 @@ def _fine_offset(parent, child, offset_s, lag_s, max_gap_s, fit):
         if len(i) < _FEWEST_PAIRS:
             return offset_s, None
         pairs = pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i, j)
-        twists_i, twists_j = (_twists(shifted, pose_pairs.stamps_ns[index], span_s) for index in (i, j))
-        fit = fit_similarity(pairs, twists_i, twists_j, start=fit)
+        twists = _twists(shifted, pose_pairs.stamps_ns[np.r_[i, j]], span_s)
+        fit = fit_similarity(pairs, *np.split(twists, 2), start=fit)
         offset_s += fit.offset_s
         if abs(fit.offset_s) < _OFFSET_SETTLED_S:
             break
@@ -163,7 +166,7 @@ def _twists(trajectory, stamps_ns, span_s):
     return steps / ((after - before) * 1e-9)[:, None]
 
 
-def estimate_scale(pose_pairs, held=None):
+def estimate_scale(pose_pairs, held=None, start=None):
     """Factor from the child's unit of length to the parent's.
 
     Parameters
@@ -171,6 +174,8 @@ def estimate_scale(pose_pairs, held=None):
     pose_pairs : PosePairs
     held : float, optional
         Hold the scale here and only see how well it fits.
+    start : SimilarityFit, optional
+        Of the same streams: spares the search for one.
 
     Returns
     -------
@@ -181,7 +186,7 @@ def estimate_scale(pose_pairs, held=None):
     NotEnoughDataError
         Where there are too few poses.
     """
-    best = fit = None
+    best, fit = None, start
     for lag_s in _SCALE_LAGS_S:
         i, j = indices_after(pose_pairs.stamps_ns, lag_s)
         if len(i) < _FEWEST_PAIRS:

@@ -31,6 +31,9 @@ _INLIER_WEIGHT = 0.25
 
 _BLOCKS = 10
 
+# Where a fit leaves no more than this share of the motion unexplained, it is not worth looking for another.
+EXPLAINED = 0.03
+
 # Rotation errors are not believed to be smaller (rad), nor translation errors as a share of the motion: rounding.
 _LEAST_SIGMA_ROTATION, _LEAST_SIGMA_TRANSLATION = 1e-7, 1e-9
 
@@ -79,6 +82,11 @@ class SimilarityFit:
     inliers: np.ndarray
 
     @property
+    def unexplained(self):
+        """Share of the motion, of translation and rotation together, that is left unexplained."""
+        return _share(self.sigma_translation, self.moved, self.sigma_rotation, self.turned)
+
+    @property
     def scale_sigma(self):
         """Standard deviation of the scale."""
         return self.scale * float(np.sqrt(self.covariance[_SCALE, _SCALE]))
@@ -109,7 +117,12 @@ def fit_similarity(pairs, twists_i=None, twists_j=None, scale=None, start=None):
     """
     problem = _Problem(pairs, twists_i, twists_j, scale)
     starts = [(start.T_parent_child, start.scale if scale is None else scale)] if start else _starts(pairs, scale)
-    return problem.describe(min((problem.refine(*guess) for guess in starts), key=problem.badness))
+    states = []
+    for guess in starts:
+        states.append(problem.refine(*guess))
+        if problem.unexplained(states[-1]) < EXPLAINED:
+            break
+    return problem.describe(min(states, key=problem.badness))
 
 
 def _starts(pairs, scale):
@@ -128,9 +141,10 @@ def _starts(pairs, scale):
     guesses = [(form, rotation) for form, rotation in zip(forms, _relaxed_rotations(forms), strict=True)]
     guesses += [(forms[0], rotation) for rotation in dnl.start_rotations(judged)]
     candidates = [_with_translation(form, rotation, held) for form, rotation in guesses]
+    numbers = quadratic_form.numbers(judged)
     # A cost in the unit of the smaller length, or a scale of zero would fit best.
     costs = [
-        np.median(dnl.pair_costs(_in_units(judged, 1.0, 1.0 / factor), T)) / min(factor, 1.0) ** 2 for T, factor in candidates
+        np.median(quadratic_form.costs(numbers * _child_lengths(factor), T)) / min(factor, 1.0) ** 2 for T, factor in candidates
     ]
     starts = []
     for index in np.argsort(costs)[:_REFINED_STARTS]:
@@ -149,6 +163,13 @@ def _in_units(pairs, parent_unit, child_unit):
     parent[:, :3, 3] /= parent_unit
     child[:, :3, 3] /= child_unit
     return dataclasses.replace(pairs, Ts_parenti_parentj=parent, Ts_childi_childj=child)
+
+
+def _child_lengths(factor):
+    """What the :func:`quadratic_form.numbers` of pairs are to be multiplied by (24,) where the child's lengths are by ``factor``."""
+    factors = np.ones((2, 3, 4))
+    factors[1, :, 3] = factor
+    return factors.ravel()
 
 
 def _relaxed_rotations(forms):
@@ -189,58 +210,81 @@ class _Problem:
     """Residuals of all pairs, their derivatives, and the iteration."""
 
     def __init__(self, pairs, twists_i, twists_j, scale):
-        self.rotation_a, self.translation_a = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_parenti_parentj[:, :3, 3]
-        self.rotation_b, self.translation_b = pairs.Ts_childi_childj[:, :3, :3], pairs.Ts_childi_childj[:, :3, 3]
-        self.moved = _rms(self.translation_a)
-        self.turned = float(np.sqrt(np.mean(se3.rotation_angle(self.rotation_a) ** 2)))
+        rotation_a, self.translation_a = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_parenti_parentj[:, :3, 3]
+        rotation_b, self.translation_b = pairs.Ts_childi_childj[:, :3, :3], pairs.Ts_childi_childj[:, :3, 3]
+        self.turn_a, self.turn_b = rotation_a - np.eye(3), rotation_b - np.eye(3)
+        self.quats_a, self.quats_b = se3.to_quat_xyzw(rotation_a), se3.to_quat_xyzw(rotation_b)
+        self.skew_b = se3.skew(self.translation_b)
+        self.moved, self.moved_b = _rms(self.translation_a), _rms(self.translation_b)
+        self.turned = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
         self.free = np.ones(_UNKNOWNS, dtype=bool)
         self.free[_SCALE], self.free[_OFFSET] = scale is None, twists_i is not None
         if twists_i is None:
             twists_i = twists_j = np.zeros((len(pairs), 6))
         # Derivative of B by d: the child's stamps move on, so its poses at given instants move back.
-        turned_i = np.einsum("kji,kj->ki", self.rotation_b, twists_i[:, 3:])
+        turned_i = np.einsum("kji,kj->ki", rotation_b, twists_i[:, 3:])
         self.turn_by_offset = turned_i - twists_j[:, 3:]
-        moved_i = twists_i[:, :3] + np.cross(twists_i[:, 3:], self.translation_b)
-        self.move_by_offset = moved_i - np.einsum("kij,kj->ki", self.rotation_b, twists_j[:, :3])
+        moved_i = twists_i[:, :3] + se3.cross(twists_i[:, 3:], self.translation_b)
+        self.move_by_offset = moved_i - np.einsum("kij,kj->ki", rotation_b, twists_j[:, :3])
 
     def residuals(self, state):
         """Translation residuals (K, 3) in m and rotation residuals (K, 3) in rad, both in the parent's axes."""
         rotation, translation = state.T[:3, :3], state.T[:3, 3]
         moved_b = self.translation_b + self.move_by_offset * state.offset_s
-        translations = self.rotation_a @ translation - translation + self.translation_a - state.scale * moved_b @ rotation.T
-        error = np.swapaxes(self.rotation_a, 1, 2) @ (rotation @ self.rotation_b @ rotation.T)
-        return translations, se3.rotation_log(error) + (self.turn_by_offset * state.offset_s) @ rotation.T
+        translations = self.turn_a @ translation + self.translation_a - state.scale * moved_b @ rotation.T
+        # R_A^T R R_B R^T, by quaternions.
+        va, vb, wa, wb = self.quats_a[:, :3], self.quats_b[:, :3] @ rotation.T, self.quats_a[:, 3:], self.quats_b[:, 3:]
+        error = np.concatenate([wa * vb - wb * va + se3.cross(vb, va), wa * wb + (va * vb).sum(axis=1, keepdims=True)], axis=1)
+        return translations, se3.quat_log(error) + (self.turn_by_offset * state.offset_s) @ rotation.T
 
-    def jacobians(self, state):
-        """Derivatives (K, 3, 8) of both residuals by (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``."""
-        rotation, n_pairs = state.T[:3, :3], len(self.translation_a)
-        of_translation, of_rotation = np.zeros((n_pairs, 3, _UNKNOWNS)), np.zeros((n_pairs, 3, _UNKNOWNS))
-        of_translation[:, :, :3] = (self.rotation_a - np.eye(3)) @ rotation
-        of_translation[:, :, 3:6] = state.scale * rotation @ se3.skew(self.translation_b)
+    def linearised(self, state):
+        """Derivatives of both residuals by (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``, and the residuals behind them.
+
+        Two (K, 3, 9) arrays.
+        """
+        rotation = state.T[:3, :3]
+        of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, _UNKNOWNS + 1))
+        of_translation[:, :, :3] = _times(self.turn_a, rotation)
+        of_translation[:, :, 3:6] = -state.scale * np.swapaxes(_times(self.skew_b, rotation.T), 1, 2)
         of_translation[:, :, _SCALE] = -state.scale * self.translation_b @ rotation.T
         of_translation[:, :, _OFFSET] = -state.scale * self.move_by_offset @ rotation.T
-        of_rotation[:, :, 3:6] = rotation @ (np.swapaxes(self.rotation_b, 1, 2) - np.eye(3))
+        of_rotation[:, :, 3:6] = np.swapaxes(_times(self.turn_b, rotation.T), 1, 2)
         of_rotation[:, :, _OFFSET] = self.turn_by_offset @ rotation.T
+        of_translation[:, :, -1], of_rotation[:, :, -1] = self.residuals(state)
         return of_translation, of_rotation
 
     def sigmas(self, translations, rotations):
-        """Robust standard deviations per axis, m and rad."""
+        """Robust standard deviations per axis, m and rad, of residuals of these lengths (K,)."""
         return (
-            max(_sigma(translations), _LEAST_SIGMA_TRANSLATION * self.moved, 1e-12),
-            max(_sigma(rotations), _LEAST_SIGMA_ROTATION),
+            max(float(np.median(translations)) / _MEDIAN_LENGTH, _LEAST_SIGMA_TRANSLATION * self.moved, 1e-12),
+            max(float(np.median(rotations)) / _MEDIAN_LENGTH, _LEAST_SIGMA_ROTATION),
         )
+
+    def sigmas_at(self, state):
+        """:meth:`sigmas` of a state."""
+        return self.sigmas(*(np.linalg.norm(residuals, axis=1) for residuals in self.residuals(state)))
 
     def badness(self, state):
         """Small for a good fit: the logarithm of the volume of the residuals' spread, in the smaller unit of length."""
-        sigma_t, sigma_r = self.sigmas(*self.residuals(state))
+        sigma_t, sigma_r = self.sigmas_at(state)
         return np.log(sigma_t / min(state.scale, 1.0)) + np.log(sigma_r)
+
+    def moved_at(self, scale):
+        """What translation residuals are to be compared with, m: the smaller of the two streams' motions."""
+        return min(self.moved, scale * self.moved_b)
+
+    def unexplained(self, state):
+        """Share of the motion that a state leaves unexplained."""
+        sigma_t, sigma_r = self.sigmas_at(state)
+        return _share(sigma_t, self.moved_at(state.scale), sigma_r, self.turned)
 
     def refine(self, T, scale):
         """Gauss-Newton steps with robust weights from a start until they are small."""
         state = _State(T, scale, 0.0)
         for _ in range(_MAX_STEPS):
-            normal, gradient, _ = self.normal_equations(state)
-            step = _solve(normal.sum(axis=0), -gradient.sum(axis=0), self.free)
+            rows = self.whitened(state)[0].reshape(-1, _UNKNOWNS + 1)
+            moments = rows.T @ rows
+            step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
             rotation = state.T[:3, :3]
             T = se3.from_rotation_translation(rotation @ se3.rotation_exp(step[3:6]), state.T[:3, 3] + rotation @ step[:3])
@@ -249,41 +293,43 @@ class _Problem:
                 break
         return state
 
-    def normal_equations(self, state):
-        """Normal matrices (B, 8, 8) and gradients (B, 8) of blocks of time, and the robust weights (K,)."""
-        residuals, jacobians = self.residuals(state), self.jacobians(state)
-        sigmas = self.sigmas(*residuals)
-        squared = sum((r**2).sum(axis=1) / sigma**2 for r, sigma in zip(residuals, sigmas, strict=True))
-        robust = 1.0 / (1.0 + squared / (6 * _TUNING**2)) ** 2
-        blocks = np.array_split(np.arange(len(robust)), min(_BLOCKS, len(robust)))
-        normal, gradient = np.zeros((len(blocks), _UNKNOWNS, _UNKNOWNS)), np.zeros((len(blocks), _UNKNOWNS))
-        for residual, jacobian, sigma in zip(residuals, jacobians, sigmas, strict=True):
-            weighted = jacobian * (robust / sigma**2)[:, None, None]
-            for row, block in enumerate(blocks):
-                part = weighted[block].reshape(-1, _UNKNOWNS)
-                normal[row] += part.T @ jacobian[block].reshape(-1, _UNKNOWNS)
-                gradient[row] += part.T @ residual[block].ravel()
-        return normal, gradient, robust
+    def whitened(self, state):
+        """The rows of :meth:`linearised` in standard deviations and with their robust weights (K, 6, 9), and these weights (K,)."""
+        parts = self.linearised(state)
+        lengths = [np.linalg.norm(part[:, :, -1], axis=1) for part in parts]
+        sigmas = self.sigmas(*lengths)
+        squared = sum((length / sigma) ** 2 for length, sigma in zip(lengths, sigmas, strict=True))
+        root = 1.0 / (1.0 + squared / (6 * _TUNING**2))
+        return np.concatenate(
+            [part * (root / sigma)[:, None, None] for part, sigma in zip(parts, sigmas, strict=True)], axis=1
+        ), root**2
 
     def describe(self, state):
         """The state as a result, with its uncertainty."""
-        normal, gradient, robust = self.normal_equations(state)
+        rows, robust = self.whitened(state)
+        blocks = [block.reshape(-1, _UNKNOWNS + 1) for block in np.array_split(rows, min(_BLOCKS, len(rows)))]
+        moments = np.array([block.T @ block for block in blocks])
+        normal, gradient = moments[:, :-1, :-1], moments[:, :-1, -1]
         return SimilarityFit(
             state.T,
             state.scale,
             state.offset_s,
             _jackknife(normal, gradient, self.free),
             _sensitivity(normal.sum(axis=0)),
-            *self.sigmas(*self.residuals(state)),
-            min(self.moved, state.scale * _rms(self.translation_b)),
+            *self.sigmas_at(state),
+            self.moved_at(state.scale),
             self.turned,
             robust > _INLIER_WEIGHT,
         )
 
 
-def _sigma(vectors):
-    """Robust standard deviation per axis of vectors (K, 3)."""
-    return float(np.median(np.linalg.norm(vectors, axis=1))) / _MEDIAN_LENGTH
+def _share(sigma_translation, moved, sigma_rotation, turned):
+    return float(np.hypot(sigma_translation / max(moved, 1e-12), sigma_rotation / max(turned, 1e-12)))
+
+
+def _times(matrices, right):
+    """``matrices @ right`` for (K, 3, 3) and (3, 3), in one product."""
+    return (matrices.reshape(-1, 3) @ right).reshape(-1, 3, 3)
 
 
 def _solve(normal, right, free):

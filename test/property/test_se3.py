@@ -1,6 +1,7 @@
 """The group axioms, with samples deliberately near zero and near half a turn."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -65,6 +66,64 @@ def test_interpolation_runs_at_constant_twist(start_xi, step_xi, fraction):
     )
 
 
+def unit_quat(direction, angle):
+    direction = np.array(direction) / np.linalg.norm(direction)
+    return np.r_[np.sin(angle / 2) * direction, np.cos(angle / 2)]
+
+
+@given(DIRECTIONS, st.one_of(ANGLES, st.just(np.pi)))
+def test_conversions_agree_with_scipy(direction, angle):
+    from scipy.spatial.transform import Rotation
+
+    quat = unit_quat(direction, angle)
+    rotation = Rotation.from_quat(quat)
+    np.testing.assert_allclose(se3.from_quat_xyzw(np.zeros(3), 3.0 * quat)[:3, :3], rotation.as_matrix(), atol=1e-14, rtol=0)
+    np.testing.assert_allclose(se3.rotation_exp(rotation.as_rotvec()), rotation.as_matrix(), atol=1e-14, rtol=0)
+    found, expected = se3.to_quat_xyzw(rotation.as_matrix()), Rotation.from_matrix(rotation.as_matrix()).as_quat()
+    assert found[3] >= 0.0
+    np.testing.assert_allclose(found * np.sign(found @ expected), expected, atol=1e-14, rtol=0)
+
+
+@given(
+    st.floats(-np.pi, np.pi),
+    st.one_of(st.floats(-1.5, 1.5), st.sampled_from([-np.pi / 2, np.pi / 2])),
+    st.floats(-np.pi, np.pi),
+)
+def test_roll_pitch_yaw_agree_with_scipy_up_to_gimbal_lock(roll, pitch, yaw):
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+    np.testing.assert_allclose(se3.rotation_from_rpy([roll, pitch, yaw]), rotation, atol=1e-14, rtol=0)
+    found = se3.rotation_to_rpy(rotation)
+    np.testing.assert_allclose(se3.rotation_from_rpy(found), rotation, atol=1e-14, rtol=0)
+    if abs(pitch) < 1.51:
+        # Half a turn may come out with either sign; near gimbal lock the digits of roll and yaw go.
+        np.testing.assert_allclose(
+            np.exp(1j * found), np.exp(1j * np.array([roll, pitch, yaw])), atol=1e-14 / np.cos(pitch), rtol=0
+        )
+    else:
+        assert found[2] == 0.0
+
+
+def test_a_quaternion_of_length_zero_is_refused():
+    with pytest.raises(ValueError, match="length zero"):
+        se3.from_quat_xyzw(np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, 0]])
+
+
+def test_conversions_of_a_stack_are_those_of_each_and_empty_stacks_stay_empty():
+    vectors = np.random.default_rng(1).normal(size=(4, 5, 3)) * 2
+    rotations = se3.rotation_exp(vectors)
+    transforms = se3.from_rotation_translation(rotations, np.zeros(3))
+    for convert, stack in (
+        (se3.rotation_exp, vectors),
+        (se3.to_quat_xyzw, transforms),
+        (se3.rotation_to_rpy, rotations),
+        (se3.rotation_from_rpy, vectors),
+    ):
+        np.testing.assert_allclose(convert(stack), [[convert(one) for one in row] for row in stack], rtol=0, atol=1e-15)
+        assert len(convert(stack[:0])) == 0
+
+
 @given(DIRECTIONS, st.one_of(ANGLES, st.just(np.pi)))
 def test_rotation_log_agrees_with_scipy_up_to_exact_half_turns(direction, angle):
     from scipy.spatial.transform import Rotation
@@ -84,3 +143,16 @@ def test_rotation_log_of_a_stack_is_that_of_each():
     one_by_one = [[se3.rotation_log(rotation) for rotation in row] for row in rotations]
     np.testing.assert_array_equal(se3.rotation_log(rotations), one_by_one)
     assert se3.rotation_log(np.empty((0, 3, 3))).shape == (0, 3)
+
+
+def test_cross_products_are_numpys():
+    left, right = np.random.default_rng(2).normal(size=(2, 4, 5, 3))
+    np.testing.assert_allclose(se3.cross(left, right), np.cross(left, right), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(se3.cross(left[0, 0], right[0, 0]), np.cross(left[0, 0], right[0, 0]), rtol=0, atol=1e-15)
+
+
+@given(DIRECTIONS, st.floats(1e-6, np.pi - 1e-6), st.sampled_from([-3.0, -1.0, 0.5]))
+def test_quat_log_takes_any_length_and_sign(direction, angle, factor):
+    quat = unit_quat(direction, angle)
+    expected = angle * quat[:3] / np.linalg.norm(quat[:3])
+    np.testing.assert_allclose(se3.quat_log(factor * quat[None])[0], expected, rtol=0, atol=1e-14)

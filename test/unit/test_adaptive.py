@@ -408,3 +408,10 @@ def test_no_motion_at_all_is_no_number():
     assessment = assess_adaptive(PosePairs(stamps(40), parent, child), solution)
     verdicts = {dof.name: dof.verdict for dof in assessment.observability}
     assert all(verdicts[axis] is DofVerdict.UNOBSERVABLE for axis in "xyz")
+
+
+@pytest.mark.parametrize("tail", [0.99, 0.5, 0.01, 1e-5, 1e-12, 1e-30])
+def test_quantile_of_chi_square_is_scipys(tail):
+    from scipy.stats import chi2
+
+    assert estimator._chi2_quantile(tail) == pytest.approx(chi2.isf(tail, 6), rel=1e-12)

@@ -15,8 +15,8 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.trajectory_files import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.simulation import noise, terrain
-from hand_eye_calib.simulation.drive import HILLY_DRIVE, PUBLISHED_DRIVE, DriveConfig, simulate_drive
-from hand_eye_calib.simulation.noise import MIXTURE, NoiseConfig
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE, MIXTURE, PUBLISHED_DRIVE, DriveConfig, NoiseConfig
 
 REFERENCES = ("A", "B1", "B5", "B10", "C5", "C10")
 N_PUBLISHED = 38

@@ -17,8 +17,8 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.pairing.stream_checks import Severity, check_stamps, check_stream, frozen_share, summarise, tidy
-from hand_eye_calib.simulation.drive import PUBLISHED_DRIVE, simulate_drive
-from hand_eye_calib.simulation.noise import MIXTURE, NoiseConfig
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
 from hand_eye_calib.solvers.alignment import estimate_time_offset
 
 
