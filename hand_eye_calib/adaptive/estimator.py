@@ -54,8 +54,8 @@ _PROBABLE = 0.01
 _MOST_JUMPS = 0.5
 
 # Noise levels need no more increments than this; longer drives lend evenly spread stretches of them.
-_MOST_NOISE_INCREMENTS = 2400
-_STRETCH = 400
+_MOST_NOISE_INCREMENTS = 800
+_STRETCH = 100
 
 # Noise levels and X are improved in turn until X moves by less than this share of its sigma and no jump appears.
 _MAX_ROUNDS, _SETTLED_SIGMAS = 4, 0.1
