@@ -43,11 +43,9 @@ _FIRST_ROUNDS, _FOLLOWED, _MAX_GENERATIONS = 3, 4, 3
 _DECISIVE = 0.99
 _HARDLY = 1e-6
 
-# Rounds of weights and X in turn, and the share by which the objective falls when they end: in the search, and on all pairs, where X
-# is refitted by a few steps for each choice of weights.
+# Rounds of weights and X in turn, and the share by which the objective falls when they end: in the search, and on all pairs.
 _MAX_ROUNDS = 100
 _SETTLED, _CONVERGED = 1e-5, 1e-9
-_STEPS_PER_FIT = 3
 
 # Leaving pairs out: rounds of refitting, and a finite cost that never counts as an inlier's.
 _ROUNDS_WITHOUT = 8
@@ -252,13 +250,11 @@ def _finish(pairs, T_start, threshold, floor):
     converged, iterations = False, 0
     while not converged and iterations < _MAX_ROUNDS:
         iterations += 1
-        T_new = T[None]
-        for _ in range(_STEPS_PER_FIT):
-            T_new = quadratic_form.gauss_newton_step(Q, T_new)
-        weights_new, objective_new = truncate(quadratic_form.costs(numbers, T_new[0]), threshold, floor)
+        T_new = quadratic_form.gauss_newton_step(Q, T[None])[0]
+        weights_new, objective_new = truncate(quadratic_form.costs(numbers, T_new), threshold, floor)
         converged = bool(objective_new >= objective * (1 - _CONVERGED))
         if objective_new <= objective:
             changed = np.flatnonzero(weights_new != weights)
             Q = Q + quadratic_form.weighted_sum(numbers[changed], weights_new[changed] - weights[changed])
-            T, weights, objective = T_new[0], weights_new, objective_new
+            T, weights, objective = T_new, weights_new, objective_new
     return Solution(T, float(objective), converged, iterations, weights)
