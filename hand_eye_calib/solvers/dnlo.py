@@ -137,19 +137,19 @@ def truncate(costs, threshold, floor):
         Eq. (5).
     """
     counted = costs < threshold
-    too_few = np.count_nonzero(counted, axis=-1) < floor
-    if not np.any(too_few):
+    too_few = counted.sum(axis=-1) < floor
+    if not too_few.any():
         weights = counted.astype(float)
     else:
-        limit = np.full(costs.shape[:-1], threshold)
-        limit[too_few] = np.partition(costs[too_few], math.ceil(floor) - 1, axis=-1)[..., math.ceil(floor) - 1]
-        counted |= too_few[..., None] & (costs <= limit[..., None])
+        last = math.ceil(floor) - 1
+        dearest = np.partition(costs, last, axis=-1)[..., last, None]
+        counted |= costs <= dearest  # where they are not too few, these count already
         weights = counted.astype(float)
-        excess = np.where(too_few, np.count_nonzero(counted, axis=-1) - floor, 0.0)
-        if np.any(excess):
-            tied = costs == limit[..., None]
-            weights -= tied * (excess / np.maximum(np.count_nonzero(tied, axis=-1), 1))[..., None]
-    return weights, np.einsum("...k,...k->...", weights, costs) + threshold * (costs.shape[-1] - weights.sum(axis=-1))
+        excess = too_few * (counted.sum(axis=-1) - floor)
+        if excess.any():
+            tied = costs == dearest
+            weights -= tied * (excess / np.maximum(tied.sum(axis=-1), 1))[..., None]
+    return weights, np.einsum("...k,...k", weights, costs) + threshold * (costs.shape[-1] - weights.sum(axis=-1))
 
 
 def _search(pairs, threshold, floor):
@@ -212,7 +212,7 @@ def _anneal(condensed, Ts, threshold, floor, left_out=None):
     sharpness = np.maximum(cut / np.maximum(2 * largest - cut, cut), 1e-4)
     while sharpness.min() < _SHARP:
         ratio = np.sqrt((cut * sharpness * (sharpness + 1))[:, None] / np.maximum(costs, 1e-300)) - sharpness[:, None]
-        Ts = _refit(condensed, np.clip(ratio, 0.0, 1.0), Ts)
+        Ts = _refit(condensed, ratio.clip(0.0, 1.0), Ts)
         costs, cut = judge(Ts)
         sharpness = sharpness * _SHARPENING
     return Ts

@@ -104,7 +104,7 @@ def weighted_sum(numbers, weights):
     for start in range(0, len(numbers), _SUMMED_BLOCK):
         block = slice(start, start + _SUMMED_BLOCK)
         moments += (numbers[block] * weights[block, None]).T @ numbers[block]
-    return np.einsum("uim,uin->mn", _RESIDUAL, np.tensordot(moments, _RESIDUAL, 1), optimize=True)
+    return _RESIDUAL.reshape(-1, DIMENSION).T @ (moments @ _RESIDUAL.reshape(24, -1)).reshape(-1, DIMENSION)
 
 
 def monomials(T_parent_child):
