@@ -113,6 +113,11 @@ class Calibration:
         """(4, 4) array: pose of the parent sensor in the child sensor's frame."""
         return se3.inverse(self.T_parent_child)
 
+    @property
+    def sigmas(self):
+        """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's frame; infinite where unobservable."""
+        return np.array([dof.sigma for dof in self.observability])
+
     def unobservable(self):
         """Names of the degrees of freedom the motion did not reveal."""
         return [dof.name for dof in self.observability if dof.verdict is DofVerdict.UNOBSERVABLE]

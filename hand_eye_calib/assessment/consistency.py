@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.calibration import DofVerdict
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.assessment.metrics import deviation
 
 # Answers this many of their joint standard deviations apart are not what the covariances allow.
 _TOO_FAR = 3.0
@@ -20,8 +19,6 @@ _FEWEST_OTHERS = 3
 
 # Median absolute value of a normal variable, in standard deviations.
 _MEDIAN_OF_NORMAL = 0.6745
-
-_KNOWN = (DofVerdict.OBSERVED, DofVerdict.WEAK, DofVerdict.PRIOR)
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def consistency(calibration, others=(), halves=()):
     -------
     Consistency
     """
-    sigma, known = _sigmas(calibration)
+    known = np.isfinite(calibration.sigmas)
     of_methods, excess_of_methods = _spread(calibration, others)
     of_halves = excess_of_halves = np.full(6, np.nan)
     if len(halves) == 2:
@@ -101,7 +98,7 @@ def consistency(calibration, others=(), halves=()):
     axes = tuple(dof.name for dof in calibration.observability)
     return Consistency(
         axes,
-        np.where(known, sigma, np.inf),
+        calibration.sigmas,
         *(np.where(known, values, np.nan) for values in (of_methods, of_halves, excess_of_methods, excess_of_halves)),
     )
 
@@ -122,14 +119,7 @@ def _median(values):
 
 def _apart(first, second):
     """Distance (6,) of two answers and their joint standard deviation; NaN where either does not know the axis."""
-    (sigma_1, known_1), (sigma_2, known_2) = _sigmas(first), _sigmas(second)
-    T_1, T_2 = first.T_parent_child, second.T_parent_child
-    rotation = se3.rotation_log(T_1[:3, :3] @ T_2[:3, :3].T)
-    distance = np.abs(np.r_[T_1[:3, 3] - T_2[:3, 3], rotation])
-    known = known_1 & known_2
-    return np.where(known, distance, np.nan), np.where(known, np.hypot(sigma_1, sigma_2), np.nan)
-
-
-def _sigmas(calibration):
-    known = np.array([dof.verdict in _KNOWN for dof in calibration.observability])
-    return np.array([dof.sigma for dof in calibration.observability]), known
+    distance = np.abs(deviation(first.T_parent_child, second.T_parent_child))
+    joint = np.hypot(first.sigmas, second.sigmas)
+    known = np.isfinite(joint)
+    return np.where(known, distance, np.nan), np.where(known, joint, np.nan)

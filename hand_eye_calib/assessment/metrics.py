@@ -61,5 +61,11 @@ def absolute_errors(T_parent_child, truth_T_parent_child):
     return float(translation), float(_angle_between(T_parent_child[:3, :3], truth_T_parent_child[:3, :3]))
 
 
+def deviation(T_parent_child, T_reference):
+    """How far one answer is from another: (6,) array, m along and rad about the axes of the parent sensor's frame."""
+    rotation = se3.rotation_log(T_parent_child[:3, :3] @ T_reference[:3, :3].T)
+    return np.r_[T_parent_child[:3, 3] - T_reference[:3, 3], rotation]
+
+
 def _angle_between(first, second):
     return se3.rotation_angle(np.swapaxes(first, -1, -2) @ second)

@@ -28,12 +28,10 @@ from dataclasses import asdict, dataclass, field
 from glob import glob
 from pathlib import Path
 
-import yaml
-
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.console import note, with_progress
 from hand_eye_calib.cli.findings import with_findings
-from hand_eye_calib.cli.options import options_from
+from hand_eye_calib.cli.options import options_from, read_yaml
 from hand_eye_calib.cli.replaying import fingerprints, replay
 from hand_eye_calib.cli.reporting import REPORT, can_draw, rendered, save_page, with_consistency
 from hand_eye_calib.config import CalibratorConfig
@@ -125,12 +123,7 @@ def read_batch(path, options, sources, with_fingerprints=False, with_report=Fals
     ConfigError
         Where it says something that cannot be.
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
+    document = read_yaml(path)
     if isinstance(document, list):
         document = {"bags": document}
     if not isinstance(document, dict) or not isinstance(document.get("bags"), list) or not document["bags"]:

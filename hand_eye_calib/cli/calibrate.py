@@ -86,7 +86,7 @@ def _is_of_other(arguments, stream, file_format):
 
 def run(arguments):
     """Calibrate from files; returns the exit code."""
-    from hand_eye_calib.calibrator import calibrate, offline_config, whole_snapshot
+    from hand_eye_calib.calibrator import offline_config, whole_snapshot
     from hand_eye_calib.cli.findings import with_findings
     from hand_eye_calib.cli.present import deliver
 
@@ -95,13 +95,12 @@ def run(arguments):
     for text in notes:
         note(text)
     config = offline_config(trajectories["parent"], trajectories["child"], options)
-    options = config.to_options()
-    with waiting_for("solving"):
-        calibration = calibrate(trajectories["parent"], trajectories["child"], **options)
     snapshot = whole_snapshot(config, **trajectories)
+    with waiting_for("solving"):
+        calibration = snapshot.estimate()
     with waiting_for("checking"):
         calibration, findings = with_findings(calibration, snapshot)
-    inputs = {"options": options}
+    inputs = {"options": config.to_options()}
     for stream in STREAMS:
         inputs[stream] = {"file": str(getattr(arguments, stream)), **_extent(trajectories[stream])}
     if arguments.out:

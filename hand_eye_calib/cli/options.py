@@ -126,15 +126,26 @@ def _from_text(field, text):
         return text
 
 
-def _read_config(path):
+def read_yaml(path):
+    """What a YAML file holds.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be read, or is not YAML.
+    """
     import yaml
 
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
+
+
+def _read_config(path):
+    document = read_yaml(path)
     if document is None:
         return {}
     if not isinstance(document, dict):

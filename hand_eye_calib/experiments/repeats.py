@@ -12,12 +12,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.calibrator import calibrate
 from hand_eye_calib.experiments.recordings import PARTS, recorded_sets
 from hand_eye_calib.experiments.runner import in_parallel
 from hand_eye_calib.experiments.writing import markdown_table, write_csv, write_text
-from hand_eye_calib.geometry import se3
 
 METHODS = {
     "adaptive": {"method": "adaptive"},
@@ -119,15 +119,9 @@ def _band_text(freedom):
     return "{:.2f} to {:.2f}".format(*band(freedom))
 
 
-def deviation(T_parent_child, T_reference):
-    """(6,) array: m along and rad about the axes of the parent sensor's frame from one answer to another."""
-    rotation = se3.rotation_log(T_parent_child[:3, :3] @ T_reference[:3, :3].T)
-    return np.r_[T_parent_child[:3, 3] - T_reference[:3, 3], rotation]
-
-
 def spread_and_sigma(calibrations):
     """Variance (6,) of several answers, mean stated variance (6,), and which axes (6,) all of them know."""
-    sigmas = np.array([[dof.sigma for dof in answer.observability] for answer in calibrations])
+    sigmas = np.array([answer.sigmas for answer in calibrations])
     known = np.array([[dof.verdict in _KNOWN for dof in answer.observability] for answer in calibrations]).all(axis=0)
     deviations = np.array([deviation(answer.T_parent_child, calibrations[0].T_parent_child) for answer in calibrations])
     stated = np.where(known, (np.where(known, sigmas, 0.0) ** 2).mean(axis=0), np.inf)
@@ -221,7 +215,7 @@ def _against_truth(found, method):
 
     error, without_offset, without_scale = errors([answer, as_given, unscaled])
     of_thirds, of_others = errors(thirds), errors(others)
-    sigma = np.array([dof.sigma for dof in answer.observability]) * _UNITS
+    sigma = answer.sigmas * _UNITS
     return [
         {
             "drive": found.name, "method": method, "axis": axis, "unit": unit, "error": float(error[k]), "sigma": float(sigma[k]),

@@ -204,17 +204,6 @@ def see_streams(parent, child, max_gap_s):
     return StreamsSeen(tuple(rates), tuple(spans), *_compared_motions(synchronise(parent, child, max_gap_s)))
 
 
-def deviation(T_parent_child, T_reference):
-    """How far one answer is from another: (6,) array, m along and rad about the axes of the parent sensor's frame."""
-    rotation = se3.rotation_log(T_parent_child[:3, :3] @ T_reference[:3, :3].T)
-    return np.r_[T_parent_child[:3, 3] - T_reference[:3, 3], rotation]
-
-
-def sigmas(calibration):
-    """Standard deviations (6,) along and about the axes of the parent sensor's frame; infinite where unobservable."""
-    return np.array([dof.sigma for dof in calibration.observability])
-
-
 class _Questions:
     """The same question, put to parts of the poses."""
 

@@ -77,8 +77,7 @@ def draw_errors(title, note, panels, stem):
     """
     datasets = [name for name in _DATASET_TITLES if any(key[0] == name for key in panels)]
     with style.house_style():
-        figure = style.new_figure(style.PAGE_WIDTH, 2.05 * len(datasets) + 0.7)
-        figure.suptitle(title, fontsize=9, fontweight="bold", x=0.01, ha="left")
+        figure = style.new_page(2.05 * len(datasets) + 0.7, title, note)
         axes = figure.subplots(len(datasets), len(METRIC_TITLES), squeeze=False)
         for row, dataset in zip(axes, datasets, strict=True):
             for ax, metric in zip(row, METRIC_TITLES, strict=True):
@@ -90,7 +89,6 @@ def draw_errors(title, note, panels, stem):
             _legend(row[-1], panels[dataset, "e_at"])
         for ax, metric in zip(axes[0], METRIC_TITLES, strict=True):
             ax.set_title(METRIC_TITLES[metric], fontsize=6.8)
-        figure.supxlabel(note, fontsize=6.5, x=0.01, ha="left", color=style.GREY)
         return style.save(figure, stem)
 
 
@@ -202,8 +200,7 @@ def draw_components(title, note, components, stem):
     list of pathlib.Path
     """
     with style.house_style():
-        figure = style.new_figure(style.PAGE_WIDTH, 4.0)
-        figure.suptitle(title, fontsize=9, fontweight="bold", x=0.01, ha="left")
+        figure = style.new_page(4.0, title, note)
         axes = figure.subplots(2, 3, sharey="row")
         for ax, (name, summaries) in zip(axes.flat, components.items(), strict=True):
             for place, (reference, summary) in enumerate(summaries.items()):
@@ -217,5 +214,4 @@ def draw_components(title, note, components, stem):
             row[0].set_yscale("log")
             style.plain_decades(row[0].yaxis)
             row[0].set_ylim(bottom=least)
-        figure.supxlabel(note, fontsize=6.5, x=0.01, ha="left", color=style.GREY)
         return style.save(figure, stem)

@@ -27,8 +27,8 @@ def draw_ratios(title, ratios, chance, stem):
     list of pathlib.Path
     """
     with style.house_style():
-        figure = style.new_figure(style.PAGE_WIDTH, 2.6)
-        figure.suptitle(title, fontsize=9, fontweight="bold", x=0.01, ha="left")
+        note = "1: the sigma was right. Dotted: a factor of two. Grey: 95 % of all marks would be here by chance"
+        figure = style.new_page(2.6, title, note)
         axes = figure.subplots(1, len(ratios), sharey=True, squeeze=False)[0]
         for ax, (method, of_sets) in zip(axes, ratios.items(), strict=True):
             ax.axvspan(*chance, color=style.LIGHT_GREY, alpha=0.5, lw=0)
@@ -47,11 +47,4 @@ def draw_ratios(title, ratios, chance, stem):
         axes[0].invert_yaxis()
         handles = [style.handle(axis, colour, marker, "") for axis, (colour, marker) in _LOOKS.items()]
         figure.legend(handles=handles, loc="outside upper right", ncols=len(_LOOKS), frameon=False)
-        figure.supxlabel(
-            "1: the sigma was right. Dotted: a factor of two. Grey: 95 % of all marks would be here by chance",
-            fontsize=6.5,
-            x=0.01,
-            ha="left",
-            color=style.GREY,
-        )
         return style.save(figure, stem)

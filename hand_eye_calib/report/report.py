@@ -11,9 +11,9 @@ import numpy as np
 
 from hand_eye_calib.assessment.covariance import AXES, WEAK_ROTATION, WEAK_TRANSLATION
 from hand_eye_calib.assessment.excitation import what_is_missing
+from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.pairing.stream_checks import summarise
-from hand_eye_calib.report.evidence import deviation, sigmas
 from hand_eye_calib.report.report_figures import draw_all, time_axis
 
 _TITLES = {
@@ -216,9 +216,9 @@ def _said_of_convergence(calibration, evidence):
     estimates = evidence.convergence
     if len(estimates) < 3:
         return "The drive is too short to be looked at in parts."
-    known = np.isfinite(sigmas(calibration))
+    known = np.isfinite(calibration.sigmas)
     moved = np.array([deviation(one.calibration.T_parent_child, calibration.T_parent_child) for one in estimates])[:, known]
-    spread = np.array([sigmas(one.calibration) for one in estimates])[:, known]
+    spread = np.array([one.calibration.sigmas for one in estimates])[:, known]
     if not known.any():
         return "No axis is revealed, however much of the drive is used."
     names = [name for name, is_known in zip(AXES, known, strict=True) if is_known]
@@ -256,13 +256,13 @@ def _said_of_excitation(calibration, evidence):
 def _said_of_methods(calibration, evidence):
     if not evidence.comparison:
         return "The drive is too short to compare methods."
-    known = np.isfinite(sigmas(calibration))
+    known = np.isfinite(calibration.sigmas)
     if not known.any():
         return "No axis is revealed, so there is nothing to compare."
     # What a method itself calls unobservable is not held against it.
     moved = {
         one.label: np.where(
-            np.isfinite(sigmas(one.calibration)), deviation(one.calibration.T_parent_child, calibration.T_parent_child), 0.0
+            np.isfinite(one.calibration.sigmas), deviation(one.calibration.T_parent_child, calibration.T_parent_child), 0.0
         )
         for one in evidence.comparison
     }
@@ -287,11 +287,11 @@ def _said_of_halves(calibration, evidence):
     if len(evidence.halves) < 2:
         return "The drive is too short to be cut in halves."
     first, second = (half.calibration for half in evidence.halves)
-    known = np.isfinite(sigmas(first)) & np.isfinite(sigmas(second))
+    known = np.isfinite(first.sigmas) & np.isfinite(second.sigmas)
     if not known.any():
         return "The halves reveal no axis in common."
     apart = deviation(first.T_parent_child, second.T_parent_child)
-    ratio = np.abs(apart[known]) / np.maximum(np.hypot(sigmas(first), sigmas(second))[known], 1e-12)
+    ratio = np.abs(apart[known]) / np.maximum(np.hypot(first.sigmas, second.sigmas)[known], 1e-12)
     worst = int(np.argmax(ratio))
     name = np.array(AXES)[known][worst]
     judged = (
@@ -299,7 +299,7 @@ def _said_of_halves(calibration, evidence):
         if ratio[worst] > _DISAGREE
         else f"no more than chance: the farthest, {name}, lies {ratio[worst]:.1f} of their standard deviations apart"
     )
-    less = [name for name, is_known in zip(AXES, known | ~np.isfinite(sigmas(calibration)), strict=True) if not is_known]
+    less = [name for name, is_known in zip(AXES, known | ~np.isfinite(calibration.sigmas), strict=True) if not is_known]
     missing = f" {_list(less)} is not revealed by half of the drive." if less else ""
     return f"From each half alone, without priors: they differ by {_worst(apart, known)}, {judged}.{missing}{_thinned(evidence.halves)}"
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import ENOUGH_TURNING
-from hand_eye_calib.report.evidence import deviation, sigmas
+from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.report.style import house_style, plain_decades
 
 # Colours as drawn, each with the name of the page's own colour that replaces it.
@@ -158,13 +158,13 @@ def _convergence(calibration, evidence):
     factor, unit = time_axis(estimates[-1].until_s)
     times = np.array([estimate.until_s for estimate in estimates]) * factor
     moved = np.array([deviation(estimate.calibration.T_parent_child, calibration.T_parent_child) for estimate in estimates])
-    spread = np.array([sigmas(estimate.calibration) for estimate in estimates])
+    spread = np.array([estimate.calibration.sigmas for estimate in estimates])
     figure, panels = _figure(4.4, 2, 3, left=0.7, bottom=0.5, gap=0.15, between=0.4, sharex=True)
     for kind, row in enumerate(panels):
         columns = slice(3 * kind, 3 * kind + 3)
         unit_factor = (100, 180 / np.pi)[kind]
         limit = _limit(
-            moved[:, columns] * unit_factor, spread[:, columns] * unit_factor, sigmas(calibration)[columns] * unit_factor
+            moved[:, columns] * unit_factor, spread[:, columns] * unit_factor, calibration.sigmas[columns] * unit_factor
         )
         for axis, panel in enumerate(row):
             index = 3 * kind + axis
@@ -225,7 +225,7 @@ def _rows(calibration, rows):
     figure, panels = _figure(0.85 + 0.235 * len(rows), 1, 6, left=0.25 + 0.068 * longest, bottom=0.5, gap=0.1, sharey=True)
     places = np.arange(len(rows))
     moved = np.array([deviation(answer.T_parent_child, calibration.T_parent_child) for _, answer in rows])
-    spread = np.array([sigmas(answer) for _, answer in rows])
+    spread = np.array([answer.sigmas for _, answer in rows])
     for index, panel in enumerate(panels):
         unit_factor = 100 if index < 3 else 180 / np.pi
         columns = slice(0, 3) if index < 3 else slice(3, 6)

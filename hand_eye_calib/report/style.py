@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 # Okabe, Ito 2008, without the yellow that vanishes on white.
-BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7"
+BLACK, SKY, GREEN, BLUE, VERMILION, PURPLE = "#000000", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7"
 GREY, LIGHT_GREY = "#666666", "#DDDDDD"
 
 PAGE_WIDTH = 7.2  # inches
@@ -40,6 +40,14 @@ def new_figure(width, height):
     """A figure of so many inches, laid out by itself."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def new_page(height, title, note):
+    """A figure as wide as a page, with a title above and a note below."""
+    figure = new_figure(PAGE_WIDTH, height)
+    figure.suptitle(title, fontsize=9, fontweight="bold", x=0.01, ha="left")
+    figure.supxlabel(note, fontsize=6.5, x=0.01, ha="left", color=GREY)
     return figure
 
 

@@ -12,6 +12,7 @@ pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
 import hand_eye_calib as hec
+from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.calibrator import offline_config, whole_snapshot
 from hand_eye_calib.cli import main as cli
@@ -243,7 +244,7 @@ def test_tracks_of_perfect_odometry_coincide():
     found = evidence.gather(calibration, config, synchronise(parent, child, 0.5), estimate_extrinsic)
     np.testing.assert_allclose(found.tracks.child, found.tracks.parent, atol=1e-7)
     np.testing.assert_allclose(found.residuals.translation_m, 0, atol=1e-7)
-    np.testing.assert_allclose(evidence.deviation(calibration.T_parent_child, X), 0, atol=1e-6)
+    np.testing.assert_allclose(deviation(calibration.T_parent_child, X), 0, atol=1e-6)
 
 
 def test_long_drives_are_thinned(monkeypatch):
