@@ -1,11 +1,16 @@
 """What every test may use."""
 
+import signal
+
 import pytest
 from hypothesis import settings
 
 # Tests never time anything, and CI must not differ from run to run.
 settings.register_profile("hand_eye_calib", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("hand_eye_calib")
+
+# A shell starts what runs in the background with Ctrl-C ignored, and children inherit that: tests that send it would wait for ever.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
