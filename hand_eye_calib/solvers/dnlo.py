@@ -28,16 +28,16 @@ _MAX_SEARCHED = 512
 
 # Graduated non-convexity: Gauss-Newton steps to the minimum over all pairs, how much sharper the truncation gets each round, and
 # where it counts as sharp.
-_STEPS_OVER_ALL = 6
-_SHARPENING = 2.0
-_SHARP = 100.0
+_STEPS_OVER_ALL = 4
+_SHARPENING = 2.5
+_SHARP = 30.0
 
 # Rivals: shares of the inliers for those near an answer; sizes for those anywhere (small ones escape outliers, large ones resist
-# noise). Of each kind as many are started as make up so many pairs in all: a hundred where there are a hundred pairs.
-_INLIER_SHARES = (0.15, 0.33)
+# noise). Of each kind as many are started as make up so many pairs in all: fifty where there are a hundred pairs.
+_INLIER_SHARES = (0.2, 0.5)
 _SUBSET_SIZES = (4, 8, 16, 32)
-_STARTED_PAIRS = 10_000
-_FIRST_ROUNDS, _FOLLOWED, _MAX_GENERATIONS = 3, 4, 3
+_STARTED_PAIRS = 5000
+_FIRST_ROUNDS, _FOLLOWED, _MAX_GENERATIONS = 3, 3, 3
 
 # A rival from anywhere replaces the answer when its objective is below this share of it. A new answer that is hardly lower ends the search.
 _DECISIVE = 0.99
@@ -45,7 +45,7 @@ _HARDLY = 1e-6
 
 # Rounds of weights and X in turn, and the share by which the objective falls when they end: in the search, and on all pairs.
 _MAX_ROUNDS = 100
-_SETTLED, _CONVERGED = 1e-5, 1e-9
+_SETTLED, _CONVERGED = 1e-4, 1e-9
 
 # Leaving pairs out: rounds of refitting, and a finite cost that never counts as an inlier's.
 _ROUNDS_WITHOUT = 8
@@ -172,7 +172,7 @@ def _search(pairs, threshold, floor):
 
 
 def _rivals(condensed, T, threshold, floor, random):
-    """The most promising minima over random parts of the inliers of T (1, 4, 4), then over small random subsets: (8, 4, 4)."""
+    """The most promising minima over random parts of the inliers of T (1, 4, 4), then over small random subsets: (6, 4, 4)."""
     n_pairs = len(condensed)
     started = 4 * (1 + _STARTED_PAIRS // (4 * n_pairs))
     inliers, _ = truncate(_costs(condensed, T), threshold, floor)
@@ -251,6 +251,10 @@ def _finish(pairs, T_start, threshold, floor):
     while not converged and iterations < _MAX_ROUNDS:
         iterations += 1
         T_new = quadratic_form.gauss_newton_step(Q, T[None])[0]
+        # A step that promises nothing needs no pass over the pairs.
+        converged = bool(quadratic_form.fall(Q, T, T_new) < _CONVERGED * objective)
+        if converged:
+            break
         weights_new, objective_new = truncate(quadratic_form.costs(numbers, T_new), threshold, floor)
         converged = bool(objective_new >= objective * (1 - _CONVERGED))
         if objective_new <= objective:

@@ -78,13 +78,14 @@ def condense(pairs):
 
 def numbers(pairs):
     """What the residual is linear in, (K, 24): the top three rows of A - I, then of B - I, of every pair."""
-    found = np.empty((len(pairs), 2, 12))
-    for side, Ts in enumerate((pairs.Ts_parenti_parentj, pairs.Ts_childi_childj)):
-        np.subtract(Ts.reshape(-1, 16)[:, :12], _IDENTITY, out=found[:, side])
-    return found.reshape(-1, 24)
+    rows = [Ts.reshape(-1, 16)[:, :12] for Ts in (pairs.Ts_parenti_parentj, pairs.Ts_childi_childj)]
+    found = np.concatenate(rows, axis=1)
+    for one in _ONES:  # column by column: numpy is slow at many short rows
+        found[:, one] -= 1.0
+    return found
 
 
-_IDENTITY = np.eye(4)[:3].ravel()
+_ONES = np.flatnonzero(np.tile(np.eye(4)[:3].ravel(), 2))
 
 
 def costs(numbers, T_parent_child):
@@ -105,6 +106,12 @@ def weighted_sum(numbers, weights):
         block = slice(start, start + _SUMMED_BLOCK)
         moments += (numbers[block] * weights[block, None]).T @ numbers[block]
     return _RESIDUAL.reshape(-1, DIMENSION).T @ (moments @ _RESIDUAL.reshape(24, -1)).reshape(-1, DIMENSION)
+
+
+def fall(Q, T_parent_child, T_parent_child_new):
+    """By how much ``x^T Q x`` of one form (13, 13) falls from one transform (4, 4) to another; keeps the digits of small steps."""
+    x, x_new = T_parent_child.ravel()[_X_IN_T], T_parent_child_new.ravel()[_X_IN_T]
+    return (x - x_new) @ Q @ (x + x_new)
 
 
 def monomials(T_parent_child):
@@ -230,9 +237,10 @@ def gauss_newton_step(Q, Ts_parent_child):
     # Cayley's map: a rotation, equal to the exponential up to second order, and cheaper.
     twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
     shrink = 1 / (1 + 0.25 * (step[:, 3:] ** 2).sum(axis=1, keepdims=True))
-    return Ts_parent_child @ (np.eye(4) + shrink * (twist + 0.5 * twist @ twist))
+    return Ts_parent_child @ (_IDENTITY + shrink * (twist + 0.5 * twist @ twist))
 
 
+_IDENTITY = np.eye(4)
 # (6, 16): a tangent (rho, phi) times it gives the matrix D of ``X D``, the derivative of X along it.
 _TWISTS = np.zeros((6, 4, 4))
 _TWISTS[[0, 1, 2], [0, 1, 2], 3] = 1.0
