@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import BLOCK
+from hand_eye_calib.adaptive.block_tridiagonal import BLOCK, diagonal_blocks
 from hand_eye_calib.adaptive.increments import (
     ALL_SYSTEMATIC,
     CENTRES,
@@ -199,7 +199,8 @@ class _State:
 def _start(poses, kept, nuisance, spikes=(), centres=CENTRES):
     """Robust first answer from some of the poses, and what it says about jumps and the centre of the rotation noise."""
     T = dnlo.solve(motion_pairs(poses.Ts_pw_p[kept], poses.Ts_cw_c[kept], _START_REFERENCE)).T_parent_child
-    increments = [poses.increments(kept, centre) for centre in centres]
+    increments = poses.increments(kept, centres[0])
+    increments = [increments.about(centre) for centre in centres]
     sizes = [np.median(np.linalg.norm(each.seen_from_centre(T)[:, 3:], axis=1)) for each in increments]
     best = int(np.argmin(sizes))
     increments = increments[best if sizes[best] < _DECISIVE * sizes[0] else 0]
@@ -259,10 +260,12 @@ def _with_systematic_errors(state, nuisances):
     factor = covariance_factor(linearisation.components, variances, state.jumps)
     n_observations = 6 * int((~state.jumps).sum())
 
+    whitened = factor.whiten(joined_columns(linearisation.residuals, linearisation.jacobian))
+    products = whitened.T @ whitened
+
     def solve(nuisance):
-        columns = nuisance_columns(nuisance)
-        jacobian = linearisation.jacobian[:, :, [*range(6), *(6 + column for column in columns)]]
-        return solve_weighted(linearisation.residuals, jacobian, factor)
+        columns = [*range(6), *(6 + column for column in nuisance_columns(nuisance)), -1]
+        return solve_normal_equations(products[np.ix_(columns, columns)], factor)
 
     solves = {nuisance: solve(nuisance) for nuisance in nuisances}
     known = solves[nuisances[0]].covariance[:6, :6]
@@ -328,7 +331,7 @@ def _noise_levels(state, *arguments):
     sampled = linearisation
     if len(jumps) > _MOST_NOISE_INCREMENTS:
         sample = _stretches(len(jumps))
-        sampled, jumps = state.increments.rows(sample).linearise(*arguments), jumps[sample]
+        sampled, jumps = linearisation.rows(sample), jumps[sample]
     return linearisation, _fit_noise(sampled, jumps, state.variances)
 
 
@@ -373,10 +376,7 @@ def _jumps(residuals, components, variances, factor, known_jumps):
     """
     innovations = factor.whiten(residuals.reshape(-1, 1)).reshape(-1, 6)
     surprising = (innovations**2).sum(axis=1) > _chi2_quantile(_FALSE_ALARMS / len(residuals))
-    bands = np.tensordot(variances, components[:, :BLOCK], axes=1).reshape(BLOCK, -1, BLOCK)
-    blocks = np.empty((len(residuals), BLOCK, BLOCK))
-    for column in range(BLOCK):
-        blocks[:, column:, column] = blocks[:, column, column:] = bands[: BLOCK - column, :, column].T
+    blocks = diagonal_blocks(components.covariance(variances))
     sizes = (residuals * np.linalg.solve(blocks, residuals[:, :, None])[:, :, 0]).sum(axis=1)
     jumps = surprising | (known_jumps & (sizes > _chi2_quantile(_PROBABLE)))
     excess = int(jumps.sum()) - int(_MOST_JUMPS * len(jumps))

@@ -20,11 +20,12 @@ is wrong about the target's rotation, its own place swings about the target. Its
 from the origin of its world to the sensor.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import BLOCK, to_bands
+from hand_eye_calib.adaptive.block_tridiagonal import cut_below, to_bands
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 
@@ -52,6 +53,42 @@ def nuisance_values(nuisance, parameters):
 
 
 @dataclass(frozen=True)
+class Components:
+    """Where the covariance of the residuals comes from: white rotation, white translation, drift of rotation, drift of translation.
+
+    Attributes
+    ----------
+    white_rotation : (n, 6, 12) array
+        Bands of the covariance for unit variance of white rotation noise.
+    joined : (n - 1,) array
+        1 where an increment starts at the pose at which the one before it ends, 0 elsewhere.
+    relative_interval : (n,) array
+        Variance of the drift over each increment for unit variance over a typical one.
+    """
+
+    white_rotation: np.ndarray
+    joined: np.ndarray
+    relative_interval: np.ndarray
+
+    def covariance(self, variances):
+        """Bands (n, 6, 12) of the covariance for variances (4,) of the four."""
+        white_r, white_t, drift_r, drift_t = variances
+        bands = white_r * self.white_rotation
+        bands[:, :3, 0] += drift_r * self.relative_interval[:, None]
+        bands[:, 3:, 0] += 2.0 * white_t + drift_t * self.relative_interval[:, None]
+        bands[:-1, 3:, 6] -= white_t * self.joined[:, None]
+        return bands
+
+    def rows(self, selected):
+        """Those of some increments, in order; neighbours that were not neighbours before are independent of each other."""
+        apart = np.flatnonzero(np.diff(selected) != 1)
+        white_rotation, joined = self.white_rotation[selected], self.joined[selected[:-1]]
+        cut_below(white_rotation, apart)
+        joined[apart] = 0.0
+        return Components(white_rotation, joined, self.relative_interval[selected])
+
+
+@dataclass(frozen=True)
 class Linearisation:
     """Residuals, derivatives and noise components at one X.
 
@@ -61,18 +98,16 @@ class Linearisation:
         (r_R, r_t) of every increment.
     jacobian : (n, 6, 6 + k) array
         Derivatives by xi = (rho, phi) in ``X exp(xi)`` and by the k nuisance parameters.
-    components : (4, 12, 6 n) array
-        Bands of the covariance for unit variance of: white rotation, white translation, drift of rotation, drift of translation.
+    components : Components
     """
 
     residuals: np.ndarray
     jacobian: np.ndarray
-    components: np.ndarray
+    components: Components
 
-    @property
-    def rotation_bands(self):
-        """Covariance of one component of r_R: ((2, n) bands for unit white noise, (n,) diagonal for unit drift)."""
-        return self.components[0, ::BLOCK, ::BLOCK], self.components[2, 0, ::BLOCK]
+    def rows(self, selected):
+        """That of some increments, in order."""
+        return Linearisation(self.residuals[selected], self.jacobian[selected], self.components.rows(selected))
 
 
 class Increments:
@@ -103,17 +138,15 @@ class Increments:
         self.from_origin_p, self.from_origin_c = Ts_pw_p[:-1, :3, 3], -se3.inverse(Ts_cw_c[:-1])[:, :3, 3]
         # A random walk's variance grows with time; bounded, so that no gap or twin stamp dominates.
         self.relative_interval = np.clip(intervals / (typical_ns or np.median(intervals)), 0.1, 100.0)
-        self.index = np.arange(len(intervals))
 
     def __len__(self):
-        return len(self.index)
+        return len(self.relative_interval)
 
-    def rows(self, selected):
-        """Some of the increments; neighbours that were not neighbours before are independent of each other."""
-        part = object.__new__(Increments)
-        part.__dict__.update({name: value[selected] for name, value in self.__dict__.items() if name != "centre"})
-        part.centre = self.centre
-        return part
+    def about(self, centre):
+        """The same increments with their rotation noise about another centre."""
+        other = copy.copy(self)
+        other.centre = centre
+        return other
 
     def _corrected(self, nuisance, parameters):
         """The child's motions with systematic errors taken out: rotations (n, 3, 3) and translations (n, 3)."""
@@ -179,38 +212,34 @@ class Increments:
         return {"sensors": 0.5 * (by_parent + by_child), "child": by_parent, "parent": by_child}[self.centre]
 
     def components(self, T_parent_child, nuisance="none", parameters=()):
-        """(4, 12, 6 n) array, see :class:`Linearisation`.
+        """Components at one X.
 
         White rotation noise about the sensors is split evenly between them, that about the origin of a world is its sensor's; this
-        decides how it enters the translation residual.
+        decides how it enters the translation residual: psi_i as (-1, p x), psi_j as (1, -q x), in rows of rotation and of translation.
         """
-        n_rows = len(self)
         rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
         step = _turned(self.rotation_i @ rotation, self._corrected(nuisance, parameters)[1])
-        # Ways from what each sensor's rotation noise turns about to the child.
-        parent_i, parent_j = self.rotation_i @ translation, self.rotation_j @ translation
-        child_i, child_j = np.zeros((n_rows, 3)), np.zeros((n_rows, 3))
-        shares = {"sensors": (0.5, 0.5), "child": (0.0, 1.0), "parent": (1.0, 0.0)}[self.centre]
-        if self.centre == "parent":
-            parent_i, parent_j = parent_i + self.from_origin_p, parent_j + self.from_origin_p + self.steps_p
-        elif self.centre == "child":
-            child_i = _turned(self.rotation_i @ rotation, self.from_origin_c)
-            child_j = child_i + step
-        eye = np.broadcast_to(np.eye(3), (n_rows, 3, 3))
-        # How noise of pose i and of pose j enters an increment: (rotation rows, translation rows) for each source.
-        at_i = [_stack(-eye, se3.skew(parent_i + step)), _stack(eye, -se3.skew(child_i + step))]
-        at_j = [_stack(eye, -se3.skew(parent_j)), _stack(-eye, se3.skew(child_j))]
-        at_i, at_j = ([np.sqrt(share) * block for share, block in zip(shares, at, strict=True) if share] for at in (at_i, at_j))
-        # Increments k - 1 and k share pose k: the first ends there, the second starts there.
-        adjacent = (np.diff(self.index) == 1).astype(float)
-        diagonal = sum(block @ np.swapaxes(block, 1, 2) for block in (*at_i, *at_j))
-        below = sum(start[1:] @ np.swapaxes(end[:-1], 1, 2) for start, end in zip(at_i, at_j, strict=True))
-        white_rotation, others = to_bands(diagonal, below * adjacent[:, None, None]), np.zeros((3, 2 * BLOCK, n_rows, BLOCK))
-        white_translation, drift_r, drift_t = others
-        white_translation[0, :, 3:] = 2.0
-        white_translation[BLOCK, :-1, 3:] = -adjacent[:, None]
-        drift_r[0, :, :3] = drift_t[0, :, 3:] = self.relative_interval[:, None]
-        return np.concatenate([white_rotation[None], others.reshape(3, 2 * BLOCK, -1)])
+        # Ways to the child from what each source's noise turns about, at i (with the step that is still ahead) and at j.
+        if self.centre == "child":
+            from_origin = _turned(self.rotation_i @ rotation, self.from_origin_c) + step
+            sources = [(1.0, from_origin, from_origin)]
+        else:
+            parent_i, parent_j = self.rotation_i @ translation + step, self.rotation_j @ translation
+            if self.centre == "parent":
+                sources = [(1.0, parent_i + self.from_origin_p, parent_j + self.from_origin_p + self.steps_p)]
+            else:
+                sources = [(0.5, parent_i, parent_j), (0.5, step, np.zeros_like(step))]
+        diagonal, below = np.zeros((len(self), 6, 6)), np.zeros((len(self) - 1, 6, 6))
+        for share, p, q in sources:
+            skew_p, skew_q = np.sqrt(share) * se3.skew(p), np.sqrt(share) * se3.skew(q)
+            diagonal[:, 3:, 3:] -= skew_p @ skew_p + skew_q @ skew_q
+            diagonal[:, 3:, :3] -= np.sqrt(share) * (skew_p + skew_q)
+            # Increments k - 1 and k share pose k: the first ends there, the second starts there.
+            below[:, 3:, 3:] += skew_p[1:] @ skew_q[:-1]
+            below[:, 3:, :3] += np.sqrt(share) * skew_p[1:]
+            below[:, :3, 3:] -= np.sqrt(share) * skew_q[:-1]
+        diagonal[:, range(3), range(3)], below[:, range(3), range(3)] = 2.0, -1.0
+        return Components(to_bands(diagonal, below), np.ones(len(self) - 1), self.relative_interval)
 
     def linearise(self, T_parent_child, nuisance="none", parameters=()):
         """All three at one X."""
@@ -235,7 +264,3 @@ def _per_second_later(Ts_childi_childj, intervals_s):
 
 def _turned(rotations, vectors):
     return (rotations @ vectors[:, :, None])[:, :, 0]
-
-
-def _stack(upper, lower):
-    return np.concatenate([upper, lower], axis=1)

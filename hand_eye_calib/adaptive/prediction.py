@@ -15,6 +15,7 @@ the sensors turn between i and j. With noise of variance s^2 per axis in the rot
 
 import numpy as np
 
+from hand_eye_calib.adaptive.block_tridiagonal import BLOCK, blocks_below, diagonal_blocks
 from hand_eye_calib.adaptive.increments import Increments
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -41,7 +42,8 @@ class ReferencePredictor:
         increments = Increments(stamps_ns, Ts_pw_p, Ts_cw_c, solution.centre)
         # As the method sees them: systematic errors are part of the residual, not taken out.
         T_parent_child = solution.T_parent_child
-        self._bands = np.tensordot(solution.noise.variances(), increments.components(T_parent_child), axes=1)
+        bands = increments.components(T_parent_child).covariance(solution.noise.variances())
+        self._diagonal, self._below = diagonal_blocks(bands), blocks_below(bands)
         modelled = increments.residuals(T_parent_child, solution.nuisance, solution.parameters)
         plain = increments.residuals(T_parent_child)
         self._systematic = np.where(solution.left_out[:, None], 0.0, plain - modelled)
@@ -58,15 +60,22 @@ class ReferencePredictor:
         if len(pairs) < 6:
             return None
         weights = self._weights(pairs)
-        gain = self._gain(pairs, weights)
-        if gain is None:
+        hessian, pushes = self._pushes(pairs, weights)
+        if np.linalg.cond(hessian) > 1e12:
             return None
-        flat = gain.reshape(6, -1)
-        expected = flat @ _band_product(self._bands, flat.T)
-        systematic = np.einsum("anb,nb->a", gain, self._systematic)
-        jumps = np.add.reduceat(np.einsum("anb,nb->na", gain, self._jumps), self._events, axis=0)
+        flat = pushes.reshape(-1, BLOCK)
+        systematic = self._systematic.ravel() @ flat
+        jumps = np.add.reduceat((self._jumps[:, None] @ pushes)[:, 0], self._events, axis=0)
+        pushed = flat.T @ self._of_noise(pushes).reshape(-1, BLOCK) + np.outer(systematic, systematic) + jumps.T @ jumps
         pull = self._pull(pairs, weights)
-        return expected + np.outer(systematic, systematic) + jumps.T @ jumps + np.outer(pull, pull)
+        return np.linalg.solve(hessian, np.linalg.solve(hessian, pushed).T) + np.outer(pull, pull)
+
+    def _of_noise(self, columns):
+        """The increments' covariance times columns (n, 6, k)."""
+        product = self._diagonal @ columns
+        product[1:] += self._below @ columns[:-1]
+        product[:-1] += np.swapaxes(self._below, 1, 2) @ columns[1:]
+        return product
 
     def _pull(self, pairs, weights):
         """(6,) array: by how much rotation noise is expected to pull the translation towards zero."""
@@ -76,7 +85,7 @@ class ReferencePredictor:
         # The parent's share of the noise: half of either variance; white noise enters at both ends of a motion.
         total = float(weights.sum()) * noise.rotation_white**2 + 0.5 * spans * noise.rotation_drift**2
         moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-        turning = np.einsum("k,kai,kaj->ij", weights, moved, moved)
+        turning = (weights[:, None, None] * moved).reshape(-1, 3).T @ moved.reshape(-1, 3)
         return np.r_[-2.0 * total * (rotation.T @ np.linalg.pinv(turning, hermitian=True) @ translation), np.zeros(3)]
 
     def _weights(self, pairs):
@@ -85,39 +94,26 @@ class ReferencePredictor:
             return np.ones(len(pairs))
         return dnlo.truncate(dnl.pair_costs(pairs, self._solution.T_parent_child), threshold, fraction * len(pairs))[0]
 
-    def _gain(self, pairs, weights):
-        """(6, n, 6) array: change of xi by each increment's (r_R, r_t); None where the pairs do not determine xi."""
-        i, j = pairs.i, pairs.j
+    def _pushes(self, pairs, weights):
+        """Half the cost's second derivative by xi, (6, 6), and (n, 6, 6): by how much each increment's (r_R, r_t) pushes xi against it."""
+        i, j, path = pairs.i, pairs.j, self._path
         turned = self._into_world[j] - self._into_world[i]
-        jacobian_t = np.concatenate([turned, self._into_world[i] @ se3.skew(pairs.Ts_childi_childj[:, :3, 3])], axis=2)
-        jacobian_r = np.concatenate([np.zeros_like(turned), turned], axis=2)
-        per_t = weights[:, None, None] * np.swapaxes(jacobian_t, 1, 2)
-        per_r = 2 * weights[:, None, None] * np.swapaxes(jacobian_r, 1, 2)
-        hessian = (per_t @ jacobian_t + per_r @ jacobian_r).sum(axis=0)
-        if np.linalg.cond(hessian) > 1e12:
-            return None
-        path = self._path
-        over_t = _sum_over_spans(per_t, i, j, len(path) - 1)
-        over_r = _sum_over_spans(per_r - per_t @ se3.skew(path[j]), i, j, len(path) - 1)
-        from_r = over_r + over_t @ se3.skew(path[1:])
-        gain = -np.linalg.solve(hessian, np.concatenate([from_r, over_t], axis=2))
-        return np.swapaxes(gain, 0, 1)
+        jacobian = np.zeros((len(pairs), 6, 6))  # of r_R before r_t, by xi
+        jacobian[:, :3, 3:] = jacobian[:, 3:, :3] = turned
+        jacobian[:, 3:, 3:] = self._into_world[i] @ se3.skew(pairs.Ts_childi_childj[:, :3, 3])
+        weighted = weights[:, None, None] * jacobian
+        weighted[:, :3] *= 2
+        hessian = weighted.reshape(-1, 6).T @ jacobian.reshape(-1, 6)
+        # What a rotation error does to the path still ahead, from its own increment's end to the pair's.
+        weighted[:, :3] += se3.skew(path[j]) @ weighted[:, 3:]
+        pushes = _sum_over_spans(weighted, i, j, len(path) - 1)
+        pushes[:, :3] -= se3.skew(path[1:]) @ pushes[:, 3:]
+        return hessian, pushes
 
 
 def _sum_over_spans(values, i, j, n_increments):
-    """For each increment the sum of the values (K, ...) of all pairs (i, j) that span it."""
-    changes = np.zeros((n_increments + 1, *values.shape[1:]))
-    np.add.at(changes, i, values)
-    np.subtract.at(changes, j, values)
-    return np.cumsum(changes[:-1], axis=0)
-
-
-def _band_product(bands, columns):
-    """Product of a symmetric matrix in lower bands with columns (m, k)."""
-    product = bands[0][:, None] * columns
-    size = len(columns)
-    for offset in range(1, len(bands)):
-        band = bands[offset, : size - offset, None]
-        product[offset:] += band * columns[: size - offset]
-        product[: size - offset] += band * columns[offset:]
-    return product
+    """For each increment the sum of the values (K, ...) of all pairs (i, j) that span it, both in order."""
+    sums = np.zeros((len(values) + 1, *values.shape[1:]))
+    np.cumsum(values, axis=0, out=sums[1:])
+    increments = np.arange(n_increments)
+    return sums[np.searchsorted(i, increments, side="right")] - sums[np.searchsorted(j, increments, side="right")]

@@ -47,6 +47,8 @@ def main(argv=None):
     SystemExit
         From argparse: code 2 for wrong usage, 0 after ``--help``.
     """
+    # The matrices are small: several threads only wait for each other, and three times as long where other programs run.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
         code = _run(sys.argv[1:] if argv is None else argv)
         sys.stdout.flush()

@@ -1,5 +1,6 @@
 """A sensor's trajectory: poses of one sensor in its own fixed frame, with their stamps."""
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +102,9 @@ class Trajectory:
 
     def shifted(self, offset_s):
         """The same poses with ``offset_s`` seconds added to every stamp."""
-        return Trajectory(self.stamps_ns + np.int64(round(offset_s * 1e9)), self.poses, self.sensor_frame, self.world_frame)
+        shifted = copy.copy(self)  # poses and order have been checked
+        object.__setattr__(shifted, "stamps_ns", self.stamps_ns + np.int64(round(offset_s * 1e9)))
+        return shifted
 
     def scaled(self, scale):
         """The same rotations with every translation multiplied by ``scale``."""
@@ -142,10 +145,10 @@ class Trajectory:
         before = after - 1
         span = (self.stamps_ns[after] - self.stamps_ns[before]).astype(float)
         fraction = (stamps_ns - self.stamps_ns[before]).astype(float) / span
-        poses = se3.interpolate(self.poses[before], self.poses[after], fraction)
-        exact_before, exact_after = fraction == 0.0, fraction == 1.0
-        poses[exact_before] = self.poses[before[exact_before]]
-        poses[exact_after] = self.poses[after[exact_after]]
+        poses = self.poses[np.where(fraction == 1.0, after, before)]
+        between = (fraction != 0.0) & (fraction != 1.0)
+        if between.any():
+            poses[between] = se3.interpolate(self.poses[before[between]], self.poses[after[between]], fraction[between])
         return poses
 
 

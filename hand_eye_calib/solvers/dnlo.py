@@ -47,8 +47,7 @@ _HARDLY = 1e-6
 _MAX_ROUNDS = 100
 _SETTLED, _CONVERGED = 1e-4, 1e-9
 
-# Leaving pairs out: rounds of refitting, and a finite cost that never counts as an inlier's.
-_ROUNDS_WITHOUT = 8
+# The cost of a pair that is left out: finite, and never an inlier's.
 _NEVER = 1e100
 
 
@@ -69,9 +68,7 @@ def solve(pairs, threshold=0.01, min_inlier_fraction=0.5):
     Solution
         ``objective`` is eq. (5) with the outliers' c included; ``weights`` are alpha.
     """
-    searched = pairs
-    if len(pairs) > _MAX_SEARCHED:
-        searched = pairs[np.linspace(0, len(pairs) - 1, _MAX_SEARCHED).astype(int)]
+    searched = pairs[_searched(len(pairs))]
     T_found = _search(searched, threshold, min_inlier_fraction * len(searched))
     return _finish(pairs, T_found, threshold, min_inlier_fraction * len(pairs))
 
@@ -80,6 +77,7 @@ def solve_without(pairs, solution, left_out, threshold=0.01, min_inlier_fraction
     """Answers when some pairs are left out, for resampling.
 
     A few pairs less may tip the choice of the inliers, and the answer with it: the search starts at the full answer, and by annealing.
+    As in :func:`solve`, an even sample of many pairs is searched, and the answers are then improved on all.
 
     Parameters
     ----------
@@ -97,25 +95,21 @@ def solve_without(pairs, solution, left_out, threshold=0.01, min_inlier_fraction
     (B, 4, 4) array
     """
     condensed = quadratic_form.condense(pairs)
-    floor = min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    some = _searched(len(pairs))
+    condensed_some, left_out_some = condensed[some], left_out[:, some]
+    fewest_of_some = min_inlier_fraction * float((~left_out_some).sum(axis=1).min())
     near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
     everything = near
-    for _ in range(_ROUNDS_WITHOUT):
-        everything = _refit(condensed, (~left_out).astype(float), everything)
-    annealed = _anneal(condensed, everything, threshold, floor, left_out)
+    for _ in range(_STEPS_OVER_ALL):
+        everything = _refit(condensed_some, (~left_out_some).astype(float), everything)
+    annealed = _anneal(condensed_some, everything, threshold, fewest_of_some, left_out_some)
+    both = np.concatenate([left_out_some, left_out_some])
+    candidates, _ = _settle(condensed_some, np.concatenate([near, annealed]), threshold, fewest_of_some, _SETTLED, both)
     # An answer for some of the pairs may be better for others than what was found from there.
-    candidates = np.concatenate([_follow(condensed, Ts, threshold, floor, left_out) for Ts in (near, annealed)])
-    costs = _costs(condensed, candidates)
-    best = [np.argmin(truncate(costs[:, ~row], threshold, floor)[1]) for row in left_out]
-    return _follow(condensed, candidates[best], threshold, floor, left_out)
-
-
-def _follow(condensed, Ts, threshold, floor, left_out):
-    """A few rounds of weights and X in turn, without the pairs that are left out in each row."""
-    for _ in range(_ROUNDS_WITHOUT):
-        weights, _ = truncate(np.where(left_out, _NEVER, _costs(condensed, Ts)), threshold, floor)
-        Ts = _refit(condensed, weights, Ts)
-    return Ts
+    costs = _costs(condensed_some, candidates)
+    best = [np.argmin(truncate(costs[:, ~row], threshold, fewest_of_some)[1]) for row in left_out_some]
+    return _settle(condensed, candidates[best], threshold, fewest, _CONVERGED, left_out)[0]
 
 
 def truncate(costs, threshold, floor):
@@ -150,6 +144,11 @@ def truncate(costs, threshold, floor):
             tied = costs == dearest
             weights -= tied * (excess / np.maximum(tied.sum(axis=-1), 1))[..., None]
     return weights, np.einsum("...k,...k", weights, costs) + threshold * (costs.shape[-1] - weights.sum(axis=-1))
+
+
+def _searched(n_pairs):
+    """What of so many pairs is searched: all, or an even sample."""
+    return slice(None) if n_pairs <= _MAX_SEARCHED else np.linspace(0, n_pairs - 1, _MAX_SEARCHED).astype(int)
 
 
 def _search(pairs, threshold, floor):
@@ -202,9 +201,7 @@ def _anneal(condensed, Ts, threshold, floor, left_out=None):
     last = max(math.ceil(floor) - 1, 0)
 
     def judge(Ts):
-        costs = _costs(condensed, Ts)
-        if left_out is not None:
-            costs[left_out] = _NEVER
+        costs = _costs(condensed, Ts, left_out)
         return costs, np.maximum(threshold, np.partition(costs, last)[:, last])
 
     costs, cut = judge(Ts)
@@ -218,21 +215,24 @@ def _anneal(condensed, Ts, threshold, floor, left_out=None):
     return Ts
 
 
-def _costs(condensed, Ts_parent_child):
-    return quadratic_form.monomials(Ts_parent_child) @ condensed.T
+def _costs(condensed, Ts_parent_child, left_out=None):
+    costs = quadratic_form.monomials(Ts_parent_child) @ condensed.T
+    if left_out is not None:
+        costs[left_out] = _NEVER
+    return costs
 
 
 def _refit(condensed, weights, Ts):
     return quadratic_form.gauss_newton_step(quadratic_form.expand(weights @ condensed), Ts)
 
 
-def _settle(condensed, Ts, threshold, floor):
+def _settle(condensed, Ts, threshold, floor, tolerance=_SETTLED, left_out=None):
     """A Gauss-Newton step and new weights in turn until no objective of a batch falls: the best X (S, 4, 4) of each, and its objective."""
-    weights, objectives = truncate(_costs(condensed, Ts), threshold, floor)
+    weights, objectives = truncate(_costs(condensed, Ts, left_out), threshold, floor)
     for _ in range(_MAX_ROUNDS):
         Ts_new = _refit(condensed, weights, Ts)
-        weights, objectives_new = truncate(_costs(condensed, Ts_new), threshold, floor)
-        settled = objectives_new >= objectives * (1 - _SETTLED)
+        weights, objectives_new = truncate(_costs(condensed, Ts_new, left_out), threshold, floor)
+        settled = objectives_new >= objectives * (1 - tolerance)
         better = objectives_new < objectives
         Ts = np.where(better[:, None, None], Ts_new, Ts)
         objectives = np.where(better, objectives_new, objectives)

@@ -1,12 +1,13 @@
 """The command line is quick to start because it loads little: what is loaded is counted, not how long that takes."""
 
+import os
 import subprocess
 import sys
 
 import pytest
 
 from hand_eye_calib.cli.experiment import EXPERIMENTS
-from hand_eye_calib.cli.main import COMMANDS
+from hand_eye_calib.cli.main import COMMANDS, main
 
 # Each takes from a tenth of a second to a second to load.
 HEAVY = {"casadi", "matplotlib", "numpy", "rclpy", "rich", "rosbags", "scipy", "yaml"}
@@ -36,7 +37,20 @@ def test_the_engine_loads_only_what_it_computes_with():
     code = "import sys, hand_eye_calib.calibrator; print(*sys.modules, file=sys.stderr)"
     loaded = loaded_by(code)
     assert not {name.partition(".")[0] for name in loaded} & (HEAVY - {"numpy", "scipy"})
-    assert not loaded & {"scipy.stats", "scipy.spatial", "scipy.optimize"}  # scipy.stats takes as long as all the rest
+    # Any part of scipy takes as long as all the rest, but for the wrapper of LAPACK alone.
+    assert {name for name in loaded if name.startswith("scipy")} <= {"scipy.linalg._flapack"}
+
+
+def test_commands_use_one_thread_unless_told_otherwise(monkeypatch):
+    def threads():
+        with pytest.raises(SystemExit):
+            main(["--help"])
+        return os.environ["OMP_NUM_THREADS"]
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert threads() == "3"
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    assert threads() == "1"
 
 
 def test_the_help_names_every_experiment():
