@@ -412,11 +412,10 @@ def _ordered(path, table, stamps_ns, repair):
         )
     order = np.argsort(stamps_ns, kind="stable")
     repeated = np.diff(stamps_ns[order], prepend=stamps_ns[order[0]] - 1) == 0
-    backward = int((np.diff(stamps_ns) < 0).sum())
-    return order[~repeated], [
-        f"{path}: stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted; "
-        f"{int(repeated.sum())} with a stamp that was there already were dropped"
-    ]
+    backward, n_repeated = int((np.diff(stamps_ns) < 0).sum()), int(repeated.sum())
+    repairs = [f"stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted"] if backward else []
+    repairs += [f"dropped {n_repeated} whose stamp was there already"] if n_repeated else []
+    return order[~repeated], [f"{path}: {'; '.join(repairs)}"]
 
 
 # ---- writing
