@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.references import reference_indices
 
 
@@ -61,9 +60,10 @@ def pairs_between(Ts_pw_p, Ts_cw_c, i, j):
 
 
 def _relative(Ts_world_sensor, i, j):
+    start, end = Ts_world_sensor.take(i, axis=0), Ts_world_sensor.take(j, axis=0)
     # The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting first costs ten digits.
-    rotation_inverse = np.swapaxes(Ts_world_sensor[i, :3, :3], 1, 2)
-    step = Ts_world_sensor[j, :3, 3] - Ts_world_sensor[i, :3, 3]
-    return se3.from_rotation_translation(
-        rotation_inverse @ Ts_world_sensor[j, :3, :3], (rotation_inverse @ step[:, :, None])[:, :, 0]
-    )
+    end[:, :3, 3] -= start[:, :3, 3]
+    relative = np.empty_like(end)
+    np.matmul(np.swapaxes(start[:, :3, :3], 1, 2), end[:, :3], out=relative[:, :3])
+    relative[:, 3] = 0.0, 0.0, 0.0, 1.0
+    return relative
