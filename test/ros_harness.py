@@ -161,6 +161,10 @@ class Peer:
     def wait_matched(self, *publishers):
         self.spin_until(lambda: all(each.get_subscription_count() for each in publishers), "the node to subscribe")
 
+    def wait_left(self, *publishers):
+        """Wait until a node that has ended is forgotten: what is published before that is lost."""
+        self.spin_until(lambda: not any(each.get_subscription_count() for each in publishers), "the node to leave")
+
     def feed(self, publishers, stamps_ns, Ts_pw_p, Ts_cw_c, frames=("lidar", "camera")):
         """Publish both trajectories, interleaved."""
         self.wait_matched(*publishers)

@@ -104,12 +104,13 @@ def test_a_signal_saves_the_newest_result_and_the_whole_journal(start_node, peer
 
 
 def test_results_of_an_earlier_session_are_kept_when_they_are_replaced(start_node, peer, tmp_path):
-    node = start_node(*QUIET, *into(tmp_path, "off"))
-    peer.solve(peer.publishers(), *drive())
+    node, publishers = start_node(*QUIET, *into(tmp_path, "off")), peer.publishers()
+    peer.solve(publishers, *drive())
     assert node.stop()[0] == 0
+    peer.wait_left(*publishers)
     first = (tmp_path / "extrinsic.yaml").read_bytes()
     start_node(*QUIET, *into(tmp_path, "off"))
-    peer.solve(peer.publishers(), *drive(100))
+    peer.solve(publishers, *drive(100))
     assert peer.trigger("save").success
     assert peer.trigger("save").success
     assert (tmp_path / "previous" / "extrinsic.yaml").read_bytes() == first
