@@ -277,8 +277,8 @@ def _with_systematic_errors(state, nuisances):
 
 def _is_plausible(nuisance, parameters):
     """Whether systematic errors are of a size that sensors have."""
-    scale, bias, offset_s = nuisance_values(nuisance, parameters)
-    return max(abs(scale) / _MOST_SCALE_ERROR, np.abs(bias).max() / _MOST_BIAS, abs(offset_s) / _MOST_OFFSET_S) < 1.0
+    scale, biases, offset_s = nuisance_values(nuisance, parameters)
+    return max(abs(scale) / _MOST_SCALE_ERROR, np.abs(biases).max() / _MOST_BIAS, abs(offset_s) / _MOST_OFFSET_S) < 1.0
 
 
 def _is_credible(solve, nuisance, known):

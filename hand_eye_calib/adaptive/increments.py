@@ -29,12 +29,12 @@ from hand_eye_calib.adaptive.block_tridiagonal import cut_below, to_bands
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 
-# Systematic errors of the child, and which parameters are theirs: by how much its lengths are short, bias per metre along its axes (m/m),
-# by how much its stamps are late (s).
-_SYSTEMATIC = {"none": [], "scale": [0], "bias": [1, 2, 3], "time": [4]}
-NUISANCES = ("none", "scale", "bias", "time", "scale+time", "bias+time")
-ALL_SYSTEMATIC = "scale+bias+time"
-_SHARED_WITH_ALL = 5
+# Systematic errors, and which parameters are theirs: by how much the child's lengths are short, bias per metre of the child's or of the
+# parent's path along the axes of that sensor (m/m), by how much the child's stamps are late (s).
+_SYSTEMATIC = {"none": [], "scale": [0], "bias": [1, 2, 3], "parent bias": [4, 5, 6], "time": [7]}
+NUISANCES = ("none", "scale", "bias", "parent bias", "time", "scale+time", "bias+time", "parent bias+time")
+ALL_SYSTEMATIC = "scale+bias+parent bias+time"
+_N_SYSTEMATIC = 8
 
 # What white rotation noise turns a trajectory about: either sensor itself, or the origin of the child's or of the parent's world.
 CENTRES = ("sensors", "child", "parent")
@@ -46,10 +46,10 @@ def nuisance_columns(nuisance):
 
 
 def nuisance_values(nuisance, parameters):
-    """Scale error, bias per metre (3,) and lateness of the stamps (s); zero where the model has none."""
-    values = np.zeros(_SHARED_WITH_ALL)
+    """Scale error, biases per metre of child and parent (2, 3) and lateness of the stamps (s); zero where the model has none."""
+    values = np.zeros(_N_SYSTEMATIC)
     values[nuisance_columns(nuisance)] = parameters
-    return values[0], values[1:4], values[4]
+    return values[0], values[1:7].reshape(2, 3), values[7]
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,7 @@ class Increments:
         self.rotation_a = pairs.Ts_parenti_parentj[:, :3, :3]
         self.rotation_b = pairs.Ts_childi_childj[:, :3, :3]
         self.translation_b = pairs.Ts_childi_childj[:, :3, 3]
+        self.metres_a = np.linalg.norm(self.steps_p, axis=1)
         self.metres_b = np.linalg.norm(self.translation_b, axis=1)
         self.per_second_r, self.per_second_t = _per_second_later(pairs.Ts_childi_childj, intervals * 1e-9)
         # Ways from the origins of their worlds to the sensors, in the axes of the parent's world and of the child.
@@ -150,7 +151,7 @@ class Increments:
 
     def _corrected(self, nuisance, parameters):
         """The child's motions with systematic errors taken out: rotations (n, 3, 3) and translations (n, 3)."""
-        scale, bias, offset_s = nuisance_values(nuisance, parameters)
+        scale, (bias, _), offset_s = nuisance_values(nuisance, parameters)
         rotation_b = self.rotation_b @ se3.rotation_exp(offset_s * self.per_second_r) if offset_s else self.rotation_b
         translation_b = (1.0 + scale) * (self.translation_b + offset_s * self.per_second_t)
         return rotation_b, translation_b - bias * self.metres_b[:, None]
@@ -162,6 +163,8 @@ class Increments:
         mismatch = self.rotation_a @ rotation @ np.swapaxes(rotation_b, 1, 2) @ rotation.T
         residual_r = _turned(self.rotation_i, se3.rotation_log(mismatch))
         residual_t = self._steps_by_parent(T_parent_child) - _turned(self.rotation_i @ rotation, translation_b)
+        _, (_, bias), _ = nuisance_values(nuisance, parameters)
+        residual_t -= self.rotation_i @ bias * self.metres_a[:, None]
         return np.concatenate([residual_r, residual_t], axis=1)
 
     def seen_from_centre(self, T_parent_child):
@@ -193,11 +196,12 @@ class Increments:
         jacobian[:, 3:, 3:6] = into_world @ se3.skew(translation_b)
         if columns:
             scale, _, offset_s = nuisance_values(nuisance, parameters)
-            systematic = np.zeros((len(self), 6, _SHARED_WITH_ALL))
+            systematic = np.zeros((len(self), 6, _N_SYSTEMATIC))
             systematic[:, 3:, 0] = -self._fair_steps(T_parent_child, scale, offset_s)
             systematic[:, 3:, 1:4] = into_world * self.metres_b[:, None, None]
-            systematic[:, :3, 4] = -_turned(into_world @ rotation_b, self.per_second_r)
-            systematic[:, 3:, 4] = -(1.0 + scale) * _turned(into_world, self.per_second_t)
+            systematic[:, 3:, 4:7] = -self.rotation_i * self.metres_a[:, None, None]
+            systematic[:, :3, 7] = -_turned(into_world @ rotation_b, self.per_second_r)
+            systematic[:, 3:, 7] = -(1.0 + scale) * _turned(into_world, self.per_second_t)
             jacobian[:, :, 6:] = systematic[:, :, columns]
         return jacobian
 

@@ -31,7 +31,7 @@ class AdaptiveSolution:
     nuisance : str
         Which systematic errors the data asks for, one of ``increments.NUISANCES``.
     parameters : (k,) array
-        Their parameters, see :attr:`scale`, :attr:`bias` and :attr:`time_offset_s`.
+        Their parameters, see :attr:`scale`, :attr:`biases` and :attr:`time_offset_s`.
     jumps : (n,) bool array
         Increments (from pose i to i + 1) across which a trajectory jumped for good.
     spikes : (n + 1,) bool array
@@ -72,8 +72,8 @@ class AdaptiveSolution:
         return 1.0 + float(nuisance_values(self.nuisance, self.parameters)[0])
 
     @property
-    def bias(self):
-        """(3,) array: error of the child's path per metre travelled, along its axes."""
+    def biases(self):
+        """(2, 3) array: error of the child's and of the parent's path per metre travelled, each along the axes of its sensor."""
         return nuisance_values(self.nuisance, self.parameters)[1]
 
     @property
@@ -118,13 +118,15 @@ class AdaptiveSolution:
             f"{_length(noise.translation_drift * per_metre)} and {_angle(noise.rotation_drift * per_metre)} in the first metre, "
             "ten times that in a hundred",
         ]
-        if "scale" in self.nuisance:
+        systematic = self.nuisance.split("+")
+        if "scale" in systematic:
             off = 100 * (self.scale - 1)
             said.append(f"the child's lengths are {abs(off):.2f} % {'shorter' if off > 0 else 'longer'} than the parent's")
-        if "bias" in self.nuisance:
-            along = ", ".join(f"{name} {1000 * value:.2g}" for name, value in zip("xyz", self.bias, strict=True))
-            said.append(f"the child's path is off by {along} mm per metre travelled, along its own axes")
-        if "time" in self.nuisance:
+        for name, sensor, bias in zip(("bias", "parent bias"), ("child", "parent"), self.biases, strict=True):
+            if name in systematic:
+                along = ", ".join(f"{axis} {1000 * value:.2g}" for axis, value in zip("xyz", bias, strict=True))
+                said.append(f"the {sensor}'s path is off by {along} mm per metre travelled, along its own axes")
+        if "time" in systematic:
             offset_ms = 1000 * self.time_offset_s
             said.append(f"the child's stamps are {abs(offset_ms):.1f} ms {'early' if offset_ms > 0 else 'late'}")
         said += _when("jump of a trajectory, just before", "jumps of a trajectory, just before", stamps_ns[1:][self.jumps])

@@ -1,3 +1,4 @@
+import itertools
 import re
 import sys
 
@@ -17,9 +18,11 @@ PARAMETERS = {
     "none": np.zeros(0),
     "scale": np.array([0.03]),
     "bias": np.array([0.02, -0.01, 0.03]),
+    "parent bias": np.array([-0.02, 0.03, 0.01]),
     "time": np.array([0.02]),
     "scale+time": np.array([0.03, 0.02]),
     "bias+time": np.array([0.02, -0.01, 0.03, 0.02]),
+    "parent bias+time": np.array([-0.02, 0.03, 0.01, 0.02]),
 }
 
 
@@ -44,25 +47,29 @@ def late(poses, seconds, interval_s=0.1):
     return poses @ se3.exp(-seconds * np.concatenate([velocities[:1], velocities, velocities[-1:]]))
 
 
-def systematic(child, nuisance, parameters):
-    """Child poses with systematic errors built in, integrated step by step."""
-    nuisance, _, time = nuisance.partition("+")
-    if nuisance == "time" or time:
+def biased(poses, bias):
+    """Poses whose path is off by so much per metre, along their own axes."""
+    steps = se3.inverse(poses[:-1]) @ poses[1:]
+    # the estimator takes the bias out per metre of the disturbed path
+    disturbed_steps = true_steps = steps[:, :3, 3].copy()
+    for _ in range(50):
+        disturbed_steps = true_steps + bias * np.linalg.norm(disturbed_steps, axis=1, keepdims=True)
+    steps[:, :3, 3] = disturbed_steps
+    return np.array(list(itertools.accumulate(steps, np.matmul, initial=poses[0])))
+
+
+def systematic(parent, nuisance, parameters):
+    """Poses of parent and child with systematic errors built in."""
+    child, (kind, _, time) = child_of(parent), nuisance.partition("+")
+    if kind == "time" or time:
         child, parameters = late(child, parameters[-1]), parameters[:-1]
-    steps = se3.inverse(child[:-1]) @ child[1:]
-    metres = np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True)
-    if nuisance == "scale":
-        steps[:, :3, 3] /= 1 + parameters[0]
-    elif nuisance == "bias":
-        # the estimator takes the bias out per metre of the disturbed path
-        disturbed_steps = steps[:, :3, 3] + parameters * metres
-        for _ in range(50):
-            disturbed_steps = steps[:, :3, 3] + parameters * np.linalg.norm(disturbed_steps, axis=1, keepdims=True)
-        steps[:, :3, 3] = disturbed_steps
-    poses = [child[0]]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-    return np.array(poses)
+    if kind == "scale":
+        child[:, :3, 3] /= 1 + parameters[0]
+    elif kind == "bias":
+        child = biased(child, parameters)
+    elif kind == "parent bias":
+        parent = biased(parent, parameters)
+    return parent, child
 
 
 def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix():
@@ -103,9 +110,8 @@ def without_lag(nuisance):
 
 @pytest.mark.parametrize("nuisance", NUISANCES)
 def test_derivatives_are_the_numerical_ones(nuisance):
-    parent = wandering_poses(20)
     parameters = without_lag(nuisance)
-    increments = Increments(stamps(20), parent, systematic(child_of(parent), nuisance, parameters))
+    increments = Increments(stamps(20), *systematic(wandering_poses(20), nuisance, parameters))
     jacobian = increments.jacobian(T_PARENT_CHILD, nuisance, parameters)
     step = 1e-6
     for column in range(jacobian.shape[2]):
@@ -120,9 +126,8 @@ def test_derivatives_are_the_numerical_ones(nuisance):
 
 @pytest.mark.parametrize("nuisance", NUISANCES)
 def test_perfect_data_leaves_no_residual(nuisance):
-    parent = wandering_poses(30)
-    child = systematic(child_of(parent), nuisance, without_lag(nuisance))
-    residuals = Increments(stamps(30), parent, child).residuals(T_PARENT_CHILD, nuisance, without_lag(nuisance))
+    poses = systematic(wandering_poses(30), nuisance, without_lag(nuisance))
+    residuals = Increments(stamps(30), *poses).residuals(T_PARENT_CHILD, nuisance, without_lag(nuisance))
     np.testing.assert_allclose(residuals, 0, atol=1e-12)
 
 
@@ -283,8 +288,7 @@ def test_it_beats_dnl_where_the_noise_is_white():
 def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
     chosen, parameters = [], []
     for seed in range(6):
-        parent = wandering_poses(300, seed)
-        child = systematic(child_of(parent), nuisance, PARAMETERS[nuisance])
+        parent, child = systematic(wandering_poses(300, seed), nuisance, PARAMETERS[nuisance])
         solution = estimator.solve(
             stamps(300), disturbed(parent, 100 + seed, 1e-3, 1e-3), disturbed(child, 200 + seed, 1e-3, 1e-3)
         )
@@ -310,12 +314,21 @@ def test_a_lag_is_not_taken_for_a_lever():
     assert with_lag < 0.3 * without
 
 
-def test_on_flat_ground_no_sideways_slip_is_assumed():
+@pytest.mark.parametrize("slipping", ["bias", "parent bias"])
+def test_on_flat_ground_no_sideways_slip_is_assumed(slipping):
     # It could not be told from a child that is mounted askew.
-    parent = planar_poses(400)
-    child = systematic(child_of(parent), "bias", [0.0, 0.05, 0.0])
+    parent, child = systematic(planar_poses(400), slipping, [0.0, 0.05, 0.0])
     solution = estimator.solve(stamps(400), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3))
     assert "bias" not in solution.nuisance
+
+
+def test_the_sensor_whose_path_is_off_is_named():
+    for nuisance, sensor in (("bias", "child"), ("parent bias", "parent")):
+        parent, child = systematic(wandering_poses(300), nuisance, PARAMETERS[nuisance])
+        solution = estimator.solve(stamps(300), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3))
+        said = [line for line in solution.describe(stamps(300))["in_words"] if "mm per metre" in line]
+        assert len(said) == 1
+        assert said[0].startswith(f"the {sensor}'s path is off by x {'-' * (sensor == 'parent')}")
 
 
 def test_poses_wrong_by_themselves_are_bridged():
