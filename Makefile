@@ -3,8 +3,8 @@
 #   make test          the whole test suite
 #   make test-oldest   the same, slow tests left out, on the oldest supported versions
 #   make lint          style
-#   make bench         benchmarks against the baseline; about four minutes (BENCH_ARGS=--full: fifteen)
-#   make bench-node    load, soak and crashes of the node, measured; about seven minutes
+#   make bench         benchmarks against the baseline; about two minutes (BENCH_ARGS=--full: four)
+#   make bench-node    load, soak and crashes of the node, measured; about four minutes
 #   make clean         remove everything the above made
 # PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest.
 PYTHON ?= python3
