@@ -104,12 +104,16 @@ def solve_without(pairs, solution, left_out, threshold=0.01, min_inlier_fraction
     for _ in range(_STEPS_OVER_ALL):
         everything = _refit(condensed_some, (~left_out_some).astype(float), everything)
     annealed = _anneal(condensed_some, everything, threshold, fewest_of_some, left_out_some)
-    both = np.concatenate([left_out_some, left_out_some])
-    candidates, _ = _settle(condensed_some, np.concatenate([near, annealed]), threshold, fewest_of_some, _SETTLED, both)
+    twice = np.tile(left_out_some, (2, 1))
+    candidates, _ = _settle(condensed_some, np.concatenate([near, annealed]), threshold, fewest_of_some, _SETTLED, twice)
     # An answer for some of the pairs may be better for others than what was found from there.
     costs = _costs(condensed_some, candidates)
     best = [np.argmin(truncate(costs[:, ~row], threshold, fewest_of_some)[1]) for row in left_out_some]
-    return _settle(condensed, candidates[best], threshold, fewest, _CONVERGED, left_out)[0]
+    # The sample may be wrong about which of two minima is the lower one: all pairs decide between the best and the one nearby.
+    rivals, twice = np.concatenate([near, candidates[best]]), np.tile(left_out, (2, 1))
+    answers, objectives = _settle(condensed, rivals, threshold, fewest, _CONVERGED, twice)
+    nearby, other = np.split(answers, 2)
+    return np.where(np.less(*np.split(objectives, 2))[:, None, None], nearby, other)
 
 
 def truncate(costs, threshold, floor):
