@@ -8,6 +8,7 @@ import numpy as np
 # Seconds for one row, the shortest time that is told apart, and repeats at least and at most.
 _BUDGET_S, _SHORTEST_S = 1.0, 2e-3
 _FEWEST, _MOST = 2, 25
+_FEWEST_TURNS = 3
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,31 @@ def measure(name, size, work, budget_s=_BUDGET_S, clock=time.process_time):
             result = work()
         times.append((clock() - start) / calls)
     return row_of(name, size, times), result
+
+
+def measure_in_turn(size, slow, fast, clock=time.process_time):
+    """Rows for two named pieces of work, (name, work) each, and what their last calls returned.
+
+    A processor's speed changes within seconds: for the ratio to hold, every call of the slow one is followed by as many of the fast
+    one as take a tenth of its time.
+    """
+
+    def timed(work):
+        start = clock()
+        result = work()
+        return clock() - start, result
+
+    slow_s, fast_s = [], []
+    timed(fast[1])  # warms up
+    while len(slow_s) < _FEWEST_TURNS or sum(slow_s) < _BUDGET_S:
+        seconds, of_slow = timed(slow[1])
+        slow_s.append(seconds)
+        turn_s = []
+        while sum(turn_s) < seconds / 10:
+            turn_s.append(timed(fast[1])[0])
+        fast_s += turn_s
+    _, of_fast = timed(fast[1])
+    return (row_of(slow[0], size, slow_s), of_slow), (row_of(fast[0], size, fast_s), of_fast)
 
 
 def row_of(name, size, times):

@@ -18,7 +18,7 @@ from hand_eye_calib.solvers.registry import Method
 from suite import opencv
 from suite.baseline import FLOOR
 from suite.data import LONG, REFERENCE, SHORT
-from suite.measuring import measure, row_of
+from suite.measuring import measure, measure_in_turn, row_of
 
 # Up to these sizes a row is part of every run, and of a full one.
 _USUAL = {"other methods": 10_000, "adaptive": 10_000}
@@ -34,10 +34,11 @@ def solver_rows(drive, is_full):
 
     def row(name, work, answer=None):
         measured, result = measure(name, size, work)
-        if answer is None:
-            return measured
-        metres, radians = absolute_errors(answer(result), drive.T_parent_child)
-        return replace(measured, objective=getattr(result, "objective", None), error_m=metres, error_rad=radians)
+        return measured if answer is None else judged(measured, answer(result), getattr(result, "objective", None))
+
+    def judged(measured, T_parent_child, objective):
+        metres, radians = absolute_errors(T_parent_child, drive.T_parent_child)
+        return replace(measured, objective=objective, error_m=metres, error_rad=radians)
 
     def solved(method, backend="fast"):
         return lambda: Method(method, backend=backend).solve(pairs)
@@ -49,9 +50,13 @@ def solver_rows(drive, is_full):
     yield row("pairs", lambda: motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, REFERENCE))
     yield row("condense", lambda: quadratic_form.condense(pairs))
     for method in ("dnl", "dnlo"):
-        yield row(f"{method} fast", solved(method), extrinsic)
+        fast = (f"{method} fast", solved(method))
         if size in (SHORT, LONG):
-            yield row(f"{method} ipopt", solved(method, "ipopt"), extrinsic)
+            slow = (f"{method} ipopt", solved(method, "ipopt"))
+            for measured, solution in measure_in_turn(size, slow, fast):
+                yield judged(measured, solution.T_parent_child, solution.objective)
+        else:
+            yield row(*fast, extrinsic)
     if size <= most["other methods"]:
         for method in ("park", "taylor", "zhuang", "ali"):
             yield row(method, solved(method), extrinsic)
