@@ -62,7 +62,7 @@ def measure(name, size, work, budget_s=_BUDGET_S, clock=time.process_time):
 
 
 def measure_in_turn(size, slow, fast, clock=time.process_time):
-    """Rows for two named pieces of work, (name, work) each, and what their last calls returned.
+    """Rows for two named pieces of work, (name, work) each, and what they returned.
 
     A processor's speed changes within seconds: for the ratio to hold, every call of the slow one is followed by as many of the fast
     one as take a tenth of its time.
@@ -74,15 +74,13 @@ def measure_in_turn(size, slow, fast, clock=time.process_time):
         return clock() - start, result
 
     slow_s, fast_s = [], []
-    timed(fast[1])  # warms up
+    _, of_fast = timed(fast[1])  # does not count: it warms up
     while len(slow_s) < _FEWEST_TURNS or sum(slow_s) < _BUDGET_S:
         seconds, of_slow = timed(slow[1])
         slow_s.append(seconds)
-        turn_s = []
-        while sum(turn_s) < seconds / 10:
-            turn_s.append(timed(fast[1])[0])
-        fast_s += turn_s
-    _, of_fast = timed(fast[1])
+        end = clock() + seconds / 10
+        while clock() < end:
+            fast_s.append(timed(fast[1])[0])
     return (row_of(slow[0], size, slow_s), of_slow), (row_of(fast[0], size, fast_s), of_fast)
 
 
