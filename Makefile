@@ -2,7 +2,9 @@
 #   make demo          simulate a drive, calibrate it from its bag and on the live node, compare with the truth
 #   make test          the whole test suite
 #   make test-oldest   the same, slow tests left out, on the oldest supported versions
-#   make lint          style
+#   make lint          style and types
+#   make coverage      the test suite with the lines it leaves out
+#   make paper DATA=x  every figure and table of the paper from its published data in folder x, into reproduced/
 #   make bench         benchmarks against the baseline; about two minutes (BENCH_ARGS=--full: four)
 #   make bench-node    load, soak and crashes of the node, measured; about four minutes
 #   make clean         remove everything the above made
@@ -10,13 +12,15 @@
 PYTHON ?= python3
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
+PAPER_ARGS ?=
+DATA ?=
 DEMO_ARGS ?= --out demo_output
 
 VENV := .venv
 OLDEST := .venv-oldest
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help demo test test-oldest bench bench-node lint format clean
+.PHONY: help demo test test-oldest coverage paper bench bench-node lint format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -25,14 +29,20 @@ demo: $(VENV)/.ready-demo
 	$(VENV)/bin/hand_eye_calib demo $(DEMO_ARGS)
 
 # One thread per process: small matrices gain nothing from more, and the last digit does not depend on the number of cores.
-test test-oldest: export OMP_NUM_THREADS := 1
-test test-oldest: export OPENBLAS_NUM_THREADS := 1
+test test-oldest coverage paper: export OMP_NUM_THREADS := 1
+test test-oldest coverage paper: export OPENBLAS_NUM_THREADS := 1
 
 test: $(VENV)/.ready-test
 	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
 
 test-oldest: $(OLDEST)/.ready-test
 	$(OLDEST)/bin/python -m pytest -m 'not slow' $(PYTEST_ARGS)
+
+coverage: $(VENV)/.ready-test
+	$(VENV)/bin/python -m pytest --cov=hand_eye_calib --cov-report=term:skip-covered $(PYTEST_ARGS)
+
+paper: $(VENV)/.ready-test
+	$(VENV)/bin/python -m reproduction all $(if $(DATA),--data-folder $(DATA)) $(PAPER_ARGS)
 
 bench: $(VENV)/.ready-bench
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py $(BENCH_ARGS)
@@ -43,14 +53,15 @@ bench-node: $(VENV)/.ready-test
 lint: $(VENV)/.ready-test
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
 
 format: $(VENV)/.ready-test
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
 clean:
-	rm -rf $(VENV) $(OLDEST) build install log demo_output *.egg-info .pytest_cache .hypothesis .ruff_cache
-	find hand_eye_calib test benchmarks launch -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) $(OLDEST) build install log demo_output reproduced *.egg-info .pytest_cache .hypothesis .ruff_cache .mypy_cache .coverage
+	find hand_eye_calib reproduction test benchmarks launch -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The package is installed editable, so that what runs and what is tested is this work tree. A stamp is touched last: set-up
 # is repeated when it was interrupted or when one of the files that decide on it is newer.

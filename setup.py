@@ -1,11 +1,14 @@
-"""Build script for colcon (ament_python) and pip. Name, version, description, maintainer and licence come from package.xml."""
+"""Build script for colcon (ament_python) and pip. Name, version, description, maintainer and
+licence come from package.xml.
+"""
 
 from pathlib import Path
 from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
-# Resolved, because colcon build --symlink-install runs a link to this file in a folder that has little else.
+# Resolved, because colcon build --symlink-install runs a link to this file in a folder that has
+# little else.
 HERE = Path(__file__).resolve().parent
 manifest = ElementTree.parse(HERE / "package.xml").getroot()
 name = manifest.findtext("name")
@@ -26,7 +29,7 @@ setup(
     maintainer_email=manifest.find("maintainer").get("email"),
     license=manifest.findtext("license"),
     packages=find_packages(include=[name, f"{name}.*"]),
-    package_data={f"{name}.report": ["templates/*.html", "templates/*.css"]},
+    package_data={name: ["py.typed"], f"{name}.report": ["templates/*.html", "templates/*.css"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
         (f"share/{name}", ["package.xml"]),
@@ -47,8 +50,14 @@ setup(
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         "plot": ["jinja2>=3.1.2", "matplotlib>=3.6"],
         "cluster": ["distributed>=2024.1"],
-        "test": ["colcon-common-extensions", "hypothesis>=6.98", "packaging", "pytest>=7.4", "wheel"],
-        "lint": ["ruff==0.17.5"],
+        "test": [
+            "colcon-common-extensions",
+            "hypothesis>=6.98",
+            "packaging",
+            "pytest>=7.4",
+            "wheel",
+        ],
+        "lint": ["mypy==2.4.1", "ruff==0.17.5", "types-PyYAML"],
     },
     entry_points={
         "console_scripts": [

@@ -2,9 +2,11 @@
 
     OMP_NUM_THREADS=1 python benchmarks/bags.py [--messages 100000] [--images 2.0]
 
-For every storage: two topics of ``nav_msgs/Odometry``, read and solved by us, against rosbags' own iteration with every message deserialised, in
-one run and in processor time, so that other work on the machine counts little. More than 1.5 times rosbags' time is a failure. With ``--images``, a
-bag of that many GB whose bulk is camera images is replayed in a process of its own: more than 500 MB of memory is a failure.
+For every storage: two topics of ``nav_msgs/Odometry``, read and solved by us, against rosbags' own
+iteration with every message deserialised, in one run and in processor time, so that other work on
+the machine counts little. More than 1.5 times rosbags' time is a failure. With ``--images``, a bag
+of that many GB whose bulk is camera images is replayed in a process of its own: more than 500 MB of
+memory is a failure.
 """
 
 import argparse
@@ -21,8 +23,8 @@ from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from hand_eye_calib.calibrator import Calibrator
 from hand_eye_calib.cli.replaying import feed
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
@@ -46,19 +48,32 @@ def drive(count):
     """Trajectories of both sensors: 100 Hz, turning about all axes, stamps of their own."""
     phase = np.linspace(0, count / 300, count)
     twists = np.c_[
-        np.full(count, 0.01), np.zeros((count, 2)), 0.004 * np.sin(phase), 0.003 * np.sin(1.7 * phase), 0.008 * np.cos(phase)
+        np.full(count, 0.01),
+        np.zeros((count, 2)),
+        0.004 * np.sin(phase),
+        0.003 * np.sin(1.7 * phase),
+        0.008 * np.cos(phase),
     ]
     poses = [np.eye(4)]
     for step in se3.exp(twists[1:]):
         poses.append(poses[-1] @ step)
     parent = np.array(poses)
-    child = se3.exp(np.array([3.0, -2, 1, 0.5, 0.2, -2])) @ parent @ se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
+    child = (
+        se3.exp(np.array([3.0, -2, 1, 0.5, 0.2, -2]))
+        @ parent
+        @ se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
+    )
     stamps_ns = 1_700_000_000_000_000_000 + 10_000_000 * np.arange(count)
-    return Trajectory(stamps_ns, parent, "lidar", "map"), Trajectory(stamps_ns + 3_000_000, child, "camera", "odom")
+    return Trajectory(stamps_ns, parent, "lidar", "map"), Trajectory(
+        stamps_ns + 3_000_000, child, "camera", "odom"
+    )
 
 
 def streams(count):
-    return {topic: (trajectory, ODOMETRY) for topic, trajectory in zip(TOPICS.values(), drive(count), strict=True)}
+    return {
+        topic: (trajectory, ODOMETRY)
+        for topic, trajectory in zip(TOPICS.values(), drive(count), strict=True)
+    }
 
 
 def with_rosbags(path):
@@ -88,7 +103,14 @@ def with_ours(path):
 def compare(folder, count, console):
     """Table of all storages; how many are too slow."""
     table = Table(title=f"2 x {count:,} Odometry messages, seconds of processor time")
-    for heading in ("storage", "rosbags", "read", "read + engine", "solve", "read + engine + solve / rosbags"):
+    for heading in (
+        "storage",
+        "rosbags",
+        "read",
+        "read + engine",
+        "solve",
+        "read + engine + solve / rosbags",
+    ):
         table.add_column(heading, justify="left" if heading == "storage" else "right")
     too_slow = 0
     for storage in STORAGES:
@@ -97,7 +119,9 @@ def compare(folder, count, console):
         theirs, (read, fed, solved) = with_rosbags(path), with_ours(path)
         ratio = (fed + solved) / theirs
         too_slow += ratio > TOLERATED_RATIO
-        table.add_row(storage, *(f"{seconds:.2f}" for seconds in (theirs, read, fed, solved)), f"{ratio:.2f}")
+        table.add_row(
+            storage, *(f"{seconds:.2f}" for seconds in (theirs, read, fed, solved)), f"{ratio:.2f}"
+        )
     console.print(table)
     return too_slow
 
@@ -113,16 +137,22 @@ def images(folder, gigabytes, console):
     path = folder / "images"
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/image", IMAGE, typestore=TYPESTORE)
-        odometry = [writer.add_connection(topic, ODOMETRY, typestore=TYPESTORE) for topic in TOPICS.values()]
+        odometry = [
+            writer.add_connection(topic, ODOMETRY, typestore=TYPESTORE) for topic in TOPICS.values()
+        ]
         with PoseBag(_small_bag(folder, count)) as bag:
             messages = (message for block in bag._messages(TOPICS.values()) for message in block)
             for number, (kind, bag_ns, data) in enumerate(messages):
                 if number % (2 * count // n_images) == 0:
                     writer.write(connection, bag_ns, raw)
-                writer.write(next(known for known in odometry if known.topic == kind.topic), bag_ns, data)
+                writer.write(
+                    next(known for known in odometry if known.topic == kind.topic), bag_ns, data
+                )
     size = sum(file.stat().st_size for file in path.iterdir()) / 1e9
     arguments = [str(path), "--parent-topic", TOPICS["parent"], "--child-topic", TOPICS["child"]]
-    done = subprocess.run([sys.executable, "-c", REPLAY, *arguments], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", REPLAY, *arguments], capture_output=True, text=True, check=True
+    )
     code, seconds, megabytes = done.stderr.split()[-3:]
     console.print(
         f"replay of {size:.2f} GB with {n_images} images: exit code {code}, {float(seconds):.1f} s, peak memory {float(megabytes):.0f} MB"
@@ -138,9 +168,15 @@ def _small_bag(folder, count):
 def main(arguments=None):
     """Run everything; exit code."""
     parser = argparse.ArgumentParser(description="Benchmarks of reading bags.")
-    parser.add_argument("--messages", type=int, default=100_000, help="Odometry messages of each sensor")
     parser.add_argument(
-        "--images", type=float, default=0.0, metavar="GB", help="size of a bag with camera images to replay as well"
+        "--messages", type=int, default=100_000, help="Odometry messages of each sensor"
+    )
+    parser.add_argument(
+        "--images",
+        type=float,
+        default=0.0,
+        metavar="GB",
+        help="size of a bag with camera images to replay as well",
     )
     options = parser.parse_args(arguments)
     console = Console(width=None if sys.stdout.isatty() else 110)

@@ -1,14 +1,15 @@
 """Load, soak and crashes of the node, measured.
 
-    OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [ipopt] [soak] [kill] [--seconds 60] [--hours 10] [--kills 20]
+    OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [ipopt] [soak] [kill] [--seconds 60]
+    [--hours 10] [--kills 20]
 
-load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages lost, latency of the callbacks, CPU
-ipopt  the same while CasADi + Ipopt solves
-soak   10 hours of 2 x 100 Hz, simulated, through the engine: memory and solve time hour by hour
-kill   kill -9 of the node at random moments, and resuming: what is lost
+load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages lost,
+latency of the callbacks, CPU ipopt  the same while CasADi + Ipopt solves soak   10 hours of 2 x 100
+Hz, simulated, through the engine: memory and solve time hour by hour kill   kill -9 of the node at
+random moments, and resuming: what is lost
 
-Prints a table per part and fails (exit code 1) where a promise is broken. Latency is from just before ``publish()`` in one process
-to the beginning of the callback in the other.
+Prints a table per part and fails (exit code 1) where a promise is broken. Latency is from just
+before ``publish()`` in one process to the beginning of the callback in the other.
 """
 
 import argparse
@@ -34,8 +35,8 @@ from rich.table import Table
 PROJECT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(PROJECT))
 
-from hand_eye_calib.calibrator import Calibrator  # noqa: E402
 from hand_eye_calib.config import CalibratorConfig  # noqa: E402
+from hand_eye_calib.engine.calibrator import Calibrator  # noqa: E402
 from hand_eye_calib.errors import InputError  # noqa: E402
 from hand_eye_calib.geometry import se3  # noqa: E402
 from hand_eye_calib.io.journal import read_journal  # noqa: E402
@@ -45,7 +46,8 @@ PARTS = ("load", "ipopt", "soak", "kill")
 STREAMS = ("parent", "child")
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 START_NS = 1_700_000_000_000_000_000
-# Of each pose (m, rad). B5 at 400 Hz spans 12 ms: with a centimetre of noise there would be nothing to solve.
+# Of each pose (m, rad). B5 at 400 Hz spans 12 ms: with a centimetre of noise there would be nothing
+# to solve.
 NOISE = 2e-5, 5e-6
 
 MOST_LATENCY_S = 0.010
@@ -57,21 +59,30 @@ MOST_SLOWDOWN = 1.5
 
 
 def drive(first, n_poses, rate_hz, seed=0):
-    """Positions (N, 3) and quaternions (N, 4) of both sensors from pose number ``first`` on, with noise."""
+    """Positions (N, 3) and quaternions (N, 4) of both sensors from pose number ``first`` on, with
+    noise.
+    """
     s = (first + np.arange(n_poses)) / rate_hz
-    turns = np.stack([0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)], axis=1)
+    turns = np.stack(
+        [0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)], axis=1
+    )
     places = np.stack([20 * np.sin(0.05 * s), 20 * np.sin(0.07 * s), 0.5 * np.cos(0.8 * s)], axis=1)
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     noise = np.random.default_rng([seed, first]).normal(size=(2, n_poses, 6)) * np.repeat(NOISE, 3)
     poses = Ts_pw_p @ se3.exp(noise[0]), Ts_pw_p @ T_PARENT_CHILD @ se3.exp(noise[1])
-    return {stream: (Ts[:, :3, 3], se3.to_quat_xyzw(Ts)) for stream, Ts in zip(STREAMS, poses, strict=True)}
+    return {
+        stream: (Ts[:, :3, 3], se3.to_quat_xyzw(Ts))
+        for stream, Ts in zip(STREAMS, poses, strict=True)
+    }
 
 
 # ---------------------------------------------------------------------- load
 
 
 def measured_node(report, arguments):
-    """The node as it is, with a stopwatch at its pose callback; writes what it saw when it is told to end."""
+    """The node as it is, with a stopwatch at its pose callback; writes what it saw when it is told
+    to end.
+    """
     from hand_eye_calib.ros.calibrator_node import CalibratorNode
     from hand_eye_calib.ros.node import main
 
@@ -102,7 +113,9 @@ def measured_node(report, arguments):
             "solves": self._solves,
             "pairs": result.n_pairs if result else 0,
             "inliers": result.n_inliers if result else 0,
-            "error_m": float(np.linalg.norm(result.T_parent_child[:3, 3] - T_PARENT_CHILD[:3, 3])) if result else None,
+            "error_m": float(np.linalg.norm(result.T_parent_child[:3, 3] - T_PARENT_CHILD[:3, 3]))
+            if result
+            else None,
         }
         report.write_text(json.dumps(document), encoding="utf-8")
         return stop(self, timeout_s)
@@ -114,7 +127,10 @@ def measured_node(report, arguments):
 def cpu_seconds():
     """Of this process and of the solver's, which may run apart."""
     processes = [os.getpid(), *(process.pid for process in multiprocessing.active_children())]
-    stats = [Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split() for pid in processes]
+    stats = [
+        Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        for pid in processes
+    ]
     return sum(int(stat[11]) + int(stat[12]) for stat in stats) / os.sysconf("SC_CLK_TCK")
 
 
@@ -131,7 +147,10 @@ class Publisher:
         rclpy.init(args=[], context=self._context, domain_id=domain)
         self._node = rclpy.create_node("load", context=self._context)
         qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-        self._publishers = {stream: self._node.create_publisher(Odometry, f"{stream}_odom", qos) for stream in STREAMS}
+        self._publishers = {
+            stream: self._node.create_publisher(Odometry, f"{stream}_odom", qos)
+            for stream in STREAMS
+        }
         self._messages = {stream: Odometry() for stream in STREAMS}
         for stream, message in self._messages.items():
             message.header.frame_id, message.child_frame_id = "world", f"{stream}_sensor"
@@ -150,7 +169,10 @@ class Publisher:
 
     def run(self, n_poses, first=0, stop=None):
         """Publish poses ``first`` ... ``first + n_poses`` of both streams on time."""
-        poses = {stream: [values.tolist() for values in part] for stream, part in drive(first, n_poses, self.rate_hz).items()}
+        poses = {
+            stream: [values.tolist() for values in part]
+            for stream, part in drive(first, n_poses, self.rate_hz).items()
+        }
         begun = time.monotonic()
         for k in range(n_poses):
             if stop is not None and stop.is_set():
@@ -193,7 +215,9 @@ def start(domain, *words):
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1",
     }  # fmt: skip
-    return subprocess.Popen([sys.executable, *map(str, words)], env=environment, cwd=PROJECT, stderr=subprocess.STDOUT)
+    return subprocess.Popen(
+        [sys.executable, *map(str, words)], env=environment, cwd=PROJECT, stderr=subprocess.STDOUT
+    )
 
 
 def load(folder, seconds, backend):
@@ -203,7 +227,9 @@ def load(folder, seconds, backend):
     options = {"method": "dnlo", "reference": "B5", "backend": backend, "solve_period": 1.0, "max_pairs": 5005,
                "output_directory": folder / backend}  # fmt: skip
     parameters = [word for name, value in options.items() for word in ("-p", f"{name}:={value}")]
-    node = start(domain, __file__, "--node", report, "--ros-args", "--log-level", "warn", *parameters)
+    node = start(
+        domain, __file__, "--node", report, "--ros-args", "--log-level", "warn", *parameters
+    )
     n_poses = round(seconds * rate_hz)
     try:
         if start(domain, __file__, "--publish", rate_hz, n_poses).wait():
@@ -219,7 +245,12 @@ def load(folder, seconds, backend):
     lost = 2 * n_poses - seen["received"]
     return [
         ("messages lost", f"{lost} of {2 * n_poses}", "0", lost == 0),
-        ("latency p50 / p99 / p99.9 / max (ms)", _ms(latency), "p99 < 10", latency[1] < MOST_LATENCY_S),
+        (
+            "latency p50 / p99 / p99.9 / max (ms)",
+            _ms(latency),
+            "p99 < 10",
+            latency[1] < MOST_LATENCY_S,
+        ),
         ("callback p50 / p99 / p99.9 / max (ms)", _ms(duration), "", True),
         ("CPU (cores)", f"{seen['cpu']:.2f}", "< 1", seen["cpu"] < MOST_CPU),
         ("solves", str(seen["solves"]), "> 0", seen["solves"] > 0),
@@ -245,7 +276,10 @@ def soak(hours):
     for hour in range(hours):
         count = 0
         for first in range(hour * 60 * minute, (hour + 1) * 60 * minute, minute):
-            poses = {stream: [values.tolist() for values in part] for stream, part in drive(first, minute, rate_hz).items()}
+            poses = {
+                stream: [values.tolist() for values in part]
+                for stream, part in drive(first, minute, rate_hz).items()
+            }
             for k in range(minute):
                 stamp_ns = START_NS + (first + k) * 10_000_000
                 for stream in STREAMS:
@@ -321,7 +355,9 @@ def kill(folder, kills):
         count = sum(event[0] == "pose" for event in events)
         count += sum(int(checkpoint[f"{stream}.statistics"][0]) for stream in STREAMS)
         lost_s.append((newest_ns - min(newest(events, stream) for stream in STREAMS)) * 1e-9)
-        unchanged += before.items() <= fingerprints(output).items()  # the node adds files of its own
+        unchanged += (
+            before.items() <= fingerprints(output).items()
+        )  # the node adds files of its own
         load_result(output)
     node, log = start_logged(domain, output, folder / "last.log", "resume")
     resumed += f"{count} poses" in wait_for(log, "session resumed from")
@@ -331,7 +367,12 @@ def kill(folder, kills):
     return [
         ("journals read", f"{whole} of {kills}", "all, with poses", whole == kills and count > 0),
         ("sessions resumed with all of it", f"{resumed} of {kills}", "all", resumed == kills),
-        ("poses lost (s): mean, worst", f"{np.mean(lost_s):.3f}, {max(lost_s):.3f}", "< 1", max(lost_s) < MOST_LOST_S),
+        (
+            "poses lost (s): mean, worst",
+            f"{np.mean(lost_s):.3f}, {max(lost_s):.3f}",
+            "< 1",
+            max(lost_s) < MOST_LOST_S,
+        ),
         ("earlier result files unchanged", f"{unchanged} of {kills}", "all", unchanged == kills),
         ("poses in the session at the end", str(count), "", True),
         ("end after SIGTERM, code", str(code), "0", code == 0),
@@ -362,7 +403,11 @@ def earlier_result():
 
 
 def fingerprints(folder):
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.iterdir()
+        if path.is_file()
+    }
 
 
 def start_logged(domain, output, log, journal):

@@ -1,18 +1,23 @@
 """Benchmarks against a checked-in baseline.
 
-    OMP_NUM_THREADS=1 python benchmarks/run.py [--full] [--all] [--json FILE] [--figure FILE] [--page FILE] [--update]
+    OMP_NUM_THREADS=1 python benchmarks/run.py [--full] [--all] [--json FILE] [--figure FILE]
+    [--page FILE] [--update]
 
-One thread, because the matrices are small: the idle threads of a BLAS pool would widen the spread and save nothing. Processor time, so that
-other programs on the machine count little; of whole processes the wall time as well. Each row is the median of several repeats, with half their
-range beside it.
+One thread, because the matrices are small: the idle threads of a BLAS pool would widen the spread
+and save nothing. Processor time, so that other programs on the machine count little; of whole
+processes the wall time as well. Each row is the median of several repeats, with half their range
+beside it.
 
-Times depend on the machine, so what is compared with ``baseline.json`` is which rows there are and ratios within this one run: how many times
-faster the fast backend is than CasADi + Ipopt and OpenCV on the same pairs, how near everything is to the floor, one pass of numpy over the same
-bytes, and whether the fast backend ends no higher than Ipopt. A crash, a row that the baseline has and the run has not, or a ratio below a third of
-the baseline's is a failure (exit code 1). ``--update`` writes a new baseline, of a run without ``--full`` and ``--all``.
+Times depend on the machine, so what is compared with ``baseline.json`` is which rows there are and
+ratios within this one run: how many times faster the fast backend is than CasADi + Ipopt and OpenCV
+on the same pairs, how near everything is to the floor, one pass of numpy over the same bytes, and
+whether the fast backend ends no higher than Ipopt. A crash, a row that the baseline has and the run
+has not, or a ratio below a third of the baseline's is a failure (exit code 1). ``--update`` writes
+a new baseline, of a run without ``--full`` and ``--all``.
 
-The 443 and 2,338 pairs are reference B5 of the two KITTI drives of Valimaki et al. 2023 where the published data is found in
-``$HAND_EYE_CALIB_DATA`` or ``../shared/data``, otherwise of simulated drives of these lengths.
+The 443 and 2,338 pairs are reference B5 of the two KITTI drives of Valimaki et al. 2023 where the
+published data is found in ``$HAND_EYE_CALIB_DATA`` or ``../shared/data``, otherwise of simulated
+drives of these lengths.
 """
 
 import argparse
@@ -60,13 +65,30 @@ def versions():
 
 def main(arguments=None):
     """Run everything; exit code."""
-    parser = argparse.ArgumentParser(description="Benchmarks of hand_eye_calib against the checked-in baseline.")
-    parser.add_argument("--full", action="store_true", help="10^6 pairs, and the slow methods on 10^5 as well")
-    parser.add_argument("--all", action="store_true", help="all methods of OpenCV on the long drive, not only its fastest")
+    parser = argparse.ArgumentParser(
+        description="Benchmarks of hand_eye_calib against the checked-in baseline."
+    )
+    parser.add_argument(
+        "--full", action="store_true", help="10^6 pairs, and the slow methods on 10^5 as well"
+    )
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="all methods of OpenCV on the long drive, not only its fastest",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to this file")
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw the growth curves into this file")
-    parser.add_argument("--page", type=Path, metavar="FILE", help="put the tables into this page of the documentation")
-    parser.add_argument("--update", action="store_true", help="write a new baseline instead of comparing")
+    parser.add_argument(
+        "--figure", type=Path, metavar="FILE", help="draw the growth curves into this file"
+    )
+    parser.add_argument(
+        "--page",
+        type=Path,
+        metavar="FILE",
+        help="put the tables into this page of the documentation",
+    )
+    parser.add_argument(
+        "--update", action="store_true", help="write a new baseline instead of comparing"
+    )
     options = parser.parse_args(arguments)
     if options.update and (options.full or options.all):
         parser.error("the baseline is of a run without --full and --all")
@@ -75,14 +97,21 @@ def main(arguments=None):
     tables = table.tables(source, measured, memory)
     table.show(tables)
     if options.json:
-        document = {"source": source, "versions": versions(), "rows": list(map(asdict, measured)), "memory": memory}
+        document = {
+            "source": source,
+            "versions": versions(),
+            "rows": list(map(asdict, measured)),
+            "memory": memory,
+        }
         document["ratios"] = baseline.ratios(measured, memory)
         options.json.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     if options.figure:
         figure.draw(measured, options.figure)
     if options.page:
         used = ", ".join(f"{name} {number}" for name, number in versions().items() if number)
-        typed = " ".join(["python benchmarks/run.py", *(sys.argv[1:] if arguments is None else arguments)])
+        typed = " ".join(
+            ["python benchmarks/run.py", *(sys.argv[1:] if arguments is None else arguments)]
+        )
         table.write(tables, options.page, f"Measured by `OMP_NUM_THREADS=1 {typed}` with {used}.\n")
     known = json.loads(BASELINE.read_text(encoding="utf-8")) if BASELINE.exists() else {}
     if options.update:
@@ -90,11 +119,15 @@ def main(arguments=None):
         BASELINE.write_text(json.dumps(known, indent=2) + "\n", encoding="utf-8")
         return 0
     if source not in known:
-        print(f"no baseline for {source} drives in {BASELINE.name}; run with --update", file=sys.stderr)
+        print(
+            f"no baseline for {source} drives in {BASELINE.name}; run with --update",
+            file=sys.stderr,
+        )
         return 1
     found = baseline.failures(measured, memory, known[source], is_more=options.full or options.all)
     print(
-        "\n".join(found) if found else f"all {len(measured)} rows within the baseline", file=sys.stderr if found else sys.stdout
+        "\n".join(found) if found else f"all {len(measured)} rows within the baseline",
+        file=sys.stderr if found else sys.stdout,
     )
     return 1 if found else 0
 

@@ -4,7 +4,8 @@
 >>> parent, child = hec.read_trajectory("lidar.txt"), hec.read_trajectory("camera.txt")
 >>> hec.calibrate(parent, child, method="dnlo", reference="B5").T_parent_child
 
-Names are imported when first used, so that importing the package costs nothing and needs nothing but Python.
+Names are imported when first used, so that importing the package costs nothing and needs nothing
+but Python.
 """
 
 import importlib
@@ -12,11 +13,11 @@ import importlib
 _HOMES = {
     "Calibration": "calibration",
     "SolveStatus": "calibration",
-    "Calibrator": "calibrator",
+    "Calibrator": "engine.calibrator",
     "CalibratorConfig": "config",
     "HandEyeCalibError": "errors",
     "Trajectory": "geometry.trajectory",
-    "calibrate": "calibrator",
+    "calibrate": "engine.calibrator",
     "load": "io.results",
     "read_trajectory": "io.trajectory_files",
     "save": "io.results",

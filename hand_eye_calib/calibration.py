@@ -32,7 +32,8 @@ class DofVerdict(str, Enum):
 
 @dataclass(frozen=True)
 class DofObservability:
-    """Verdict on one degree of freedom of the child sensor's pose, along or about an axis of the parent sensor's frame.
+    """Verdict on one degree of freedom of the child sensor's pose, along or about an axis of the
+    parent sensor's frame.
 
     Attributes
     ----------
@@ -55,9 +56,11 @@ class Calibration:
     Attributes
     ----------
     T_parent_child : (4, 4) array
-        Pose of the child sensor in the parent sensor's frame: maps child coordinates into the parent frame, metres.
+        Pose of the child sensor in the parent sensor's frame: maps child coordinates into the
+        parent frame, metres.
     covariance : (6, 6) array
-        Covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho, phi), in the child sensor's frame, m and rad.
+        Covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho, phi), in the child
+        sensor's frame, m and rad.
     status : SolveStatus
     observability : tuple of DofObservability
         x, y, z, roll, pitch, yaw in the parent sensor's frame.
@@ -68,16 +71,19 @@ class Calibration:
     n_poses, n_pairs, n_inliers : int
         Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
     time_offset_s, time_offset_sigma_s : float
-        Seconds added to the child's stamps, and one standard deviation: 0 where the offset was given.
+        Seconds added to the child's stamps, and one standard deviation: 0 where the offset was
+        given.
     scale, scale_sigma : float
-        Factor applied to the child's translations, and one standard deviation: 0 where the scale was given.
+        Factor applied to the child's translations, and one standard deviation: 0 where the scale
+        was given.
     reference_reason : str
         Why ``auto`` chose the reference; empty where it was given.
     noise : dict or None
-        What the adaptive estimator found out about the trajectories' noise; None with other methods.
+        What the adaptive estimator found out about the trajectories' noise; None with other
+        methods.
     consistency : dict or None
         Per axis, how far other methods and references and the drive's halves lie from this answer
-        (:class:`~hand_eye_calib.assessment.consistency.Consistency`); None where they were not asked.
+        (:class:`~hand_eye_calib.engine.cross_check.Consistency`); None where they were not asked.
     stamp_ns : int
         Stamp of the newest pose used, parent clock.
     parent_frame, child_frame : str
@@ -115,7 +121,9 @@ class Calibration:
 
     @property
     def sigmas(self):
-        """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's frame; infinite where unobservable."""
+        """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's
+        frame; infinite where unobservable.
+        """
         return np.array([dof.sigma for dof in self.observability])
 
     def unobservable(self):
@@ -123,14 +131,20 @@ class Calibration:
         return [dof.name for dof in self.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
 
     def to_dict(self):
-        """Everything as plain numbers, strings, lists and mappings, ready for JSON or YAML (infinite sigmas as None)."""
+        """Everything as plain numbers, strings, lists and mappings, ready for JSON or YAML
+        (infinite sigmas as None).
+        """
         return {
             "format": _FORMAT,
             "version": _VERSION,
             "parent_frame": self.parent_frame,
             "child_frame": self.child_frame,
-            "T_parent_child": _transform_dict(self.T_parent_child, self.parent_frame, self.child_frame),
-            "T_child_parent": _transform_dict(self.T_child_parent, self.child_frame, self.parent_frame),
+            "T_parent_child": _transform_dict(
+                self.T_parent_child, self.parent_frame, self.child_frame
+            ),
+            "T_child_parent": _transform_dict(
+                self.T_child_parent, self.child_frame, self.parent_frame
+            ),
             "status": self.status.value,
             "covariance": {
                 "of": "error xi in T_parent_child @ exp(xi)",
@@ -140,7 +154,12 @@ class Calibration:
                 "matrix": [[_finite(value) for value in row] for row in self.covariance.tolist()],
             },
             "observability": [
-                {"name": dof.name, "frame": self.parent_frame, "verdict": dof.verdict.value, "sigma": _finite(dof.sigma)}
+                {
+                    "name": dof.name,
+                    "frame": self.parent_frame,
+                    "verdict": dof.verdict.value,
+                    "sigma": _finite(dof.sigma),
+                }
                 for dof in self.observability
             ],
             "objective": float(self.objective),
@@ -168,20 +187,31 @@ class Calibration:
         Raises
         ------
         InputError
-            Where ``data`` is no calibration, is of another version, or lacks something; the message says what.
+            Where ``data`` is no calibration, is of another version, or lacks something; the message
+            says what.
         """
-        found = (data.get("format"), data.get("version")) if isinstance(data, dict) else (None, None)
+        found = (
+            (data.get("format"), data.get("version")) if isinstance(data, dict) else (None, None)
+        )
         if found != (_FORMAT, _VERSION):
-            raise InputError(f"expected format {_FORMAT}, version {_VERSION}; found format {found[0]}, version {found[1]}")
+            raise InputError(
+                f"expected format {_FORMAT}, version {_VERSION}; found format {found[0]}, version {found[1]}"
+            )
         plain = ("objective", "method", "reference", "backend", "n_poses", "n_pairs", "n_inliers", "time_offset_s", "scale",
                  "stamp_ns", "parent_frame", "child_frame")  # fmt: skip
         try:
             return cls(
-                T_parent_child=np.array(data["T_parent_child"]["matrix"], dtype=float).reshape(4, 4),
-                covariance=np.array([_infinite(row) for row in data["covariance"]["matrix"]], dtype=float).reshape(6, 6),
+                T_parent_child=np.array(data["T_parent_child"]["matrix"], dtype=float).reshape(
+                    4, 4
+                ),
+                covariance=np.array(
+                    [_infinite(row) for row in data["covariance"]["matrix"]], dtype=float
+                ).reshape(6, 6),
                 status=SolveStatus(data["status"]),
                 observability=tuple(
-                    DofObservability(dof["name"], DofVerdict(dof["verdict"]), *_infinite([dof["sigma"]]))
+                    DofObservability(
+                        dof["name"], DofVerdict(dof["verdict"]), *_infinite([dof["sigma"]])
+                    )
                     for dof in data["observability"]
                 ),
                 warnings=tuple(data["warnings"]),
@@ -193,15 +223,11 @@ class Calibration:
                 consistency=data.get("consistency"),
             )
         except KeyError as error:
-            raise InputError(f"the calibration lacks {error}; it is not as it was written") from None
+            raise InputError(
+                f"the calibration lacks {error}; it is not as it was written"
+            ) from None
         except (TypeError, ValueError) as error:
             raise InputError(f"the calibration is not as it was written: {error}") from None
-
-    def save(self, directory):
-        """Write ``extrinsic.yaml`` into a directory, which is made where it is missing; returns the file's path."""
-        from hand_eye_calib.io.results import save_result
-
-        return save_result(self, directory)
 
 
 def _infinite(values):

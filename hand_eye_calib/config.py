@@ -1,7 +1,7 @@
 """Every option of the package, once: name, unit, range, default and meaning.
 
-The node's parameters, the command line's options, ``config/calibrator.yaml`` and the README's tables are made from these
-dataclasses or tested against them.
+The node's parameters, the command line's options, ``config/calibrator.yaml`` and the README's
+tables are made from these dataclasses or tested against them.
 """
 
 import dataclasses
@@ -62,7 +62,8 @@ def option(
     read_only : bool
         The node cannot change it while it runs.
     parse : callable, optional
-        Of a text option: ``parse(name, value)`` raises ConfigError where the value does not say what it has to.
+        Of a text option: ``parse(name, value)`` raises ConfigError where the value does not say
+        what it has to.
     """
     metadata = dict(
         doc=doc, unit=unit, minimum=minimum, maximum=maximum, choices=choices, pattern=pattern, words=words, name=name,
@@ -82,7 +83,8 @@ def check_value(field, value):
     Raises
     ------
     ConfigError
-        Where the value is of the wrong type, out of range or not among the choices; one line that says what is allowed.
+        Where the value is of the wrong type, out of range or not among the choices; one line that
+        says what is allowed.
     """
     meta, name, kind = field.metadata, option_name(field), type(field.default)
     if isinstance(value, str) and value in meta["words"]:
@@ -115,11 +117,15 @@ def _number(name, value, meta):
     try:
         return float(value)
     except (TypeError, ValueError):
-        raise ConfigError(f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}") from None
+        raise ConfigError(
+            f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}"
+        ) from None
 
 
 class OptionSet:
-    """Base of dataclasses made of options: checks every value, and knows the options by their public names."""
+    """Base of dataclasses made of options: checks every value, and knows the options by their
+    public names.
+    """
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
@@ -127,11 +133,15 @@ class OptionSet:
 
     @classmethod
     def from_options(cls, options):
-        """Build from a mapping of public names; unknown names are an error that lists the known ones."""
+        """Build from a mapping of public names; unknown names are an error that lists the known
+        ones.
+        """
         known = {option_name(field): field.name for field in dataclasses.fields(cls)}
         unknown = [name for name in options if name not in known]
         if unknown:
-            raise ConfigError(f"unknown option {unknown[0]!r}; known are {', '.join(sorted(known))}")
+            raise ConfigError(
+                f"unknown option {unknown[0]!r}; known are {', '.join(sorted(known))}"
+            )
         return cls(**{known[name]: value for name, value in options.items()})
 
     def to_options(self):
@@ -152,8 +162,9 @@ def parse_prior(name, text):
     name : str
         prior.x ... prior.yaw or prior.transform.
     text : str
-        ``VALUE+/-SIGMA`` for an axis; ``X Y Z ROLL PITCH YAW +/- SIGMA_TRANSLATION SIGMA_ROTATION`` for the transform. Metres and radians,
-        or with units (m, cm, mm, rad, deg). Empty for nothing.
+        ``VALUE+/-SIGMA`` for an axis; ``X Y Z ROLL PITCH YAW +/- SIGMA_TRANSLATION SIGMA_ROTATION``
+        for the transform. Metres and radians, or with units (m, cm, mm, rad, deg). Empty for
+        nothing.
 
     Returns
     -------
@@ -168,7 +179,11 @@ def parse_prior(name, text):
         return {}
     axis = name.removeprefix("prior.")
     axes = tuple(AXIS_UNITS) if axis == "transform" else (axis,)
-    expected = "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION" if axis == "transform" else "VALUE+/-SIGMA"
+    expected = (
+        "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
+        if axis == "transform"
+        else "VALUE+/-SIGMA"
+    )
     values, plus_minus, sigmas = text.replace("±", "+/-").partition("+/-")
     values, sigmas = values.split(), sigmas.split()
     if axis == "transform" and len(sigmas) == 2:
@@ -182,7 +197,9 @@ def parse_prior(name, text):
         if not prior[axis][1] > 0:
             raise ConfigError(f"{name} needs a standard deviation above 0; got {text!r}")
         if unit == "rad" and abs(prior[axis][0]) > 2 * math.pi:
-            raise ConfigError(f"{name} is in radians unless it says deg; got {value!r}: write {value}deg")
+            raise ConfigError(
+                f"{name} is in radians unless it says deg; got {value!r}: write {value}deg"
+            )
     return prior
 
 
@@ -220,16 +237,29 @@ class CalibratorConfig(OptionSet):
         pattern=REFERENCE_PATTERN,
     )
     backend: str = option(
-        "fast", "fast is the quadratic-form solver; ipopt the paper's CasADi + Ipopt formulation.", choices=BACKENDS
+        "fast",
+        "fast is the quadratic-form solver; ipopt the paper's CasADi + Ipopt formulation.",
+        choices=BACKENDS,
     )
     threshold: float = option(
-        0.01, "DNLO: pairs whose cost exceeds this are outliers (c of eq. 5).", unit="m^2", minimum=1e-12, maximum=1e6
+        0.01,
+        "DNLO: pairs whose cost exceeds this are outliers (c of eq. 5).",
+        unit="m^2",
+        minimum=1e-12,
+        maximum=1e6,
     )
     min_inlier_fraction: float = option(
-        0.5, "DNLO: share of the pairs that always counts as inliers (d of eq. 5 over the pairs).", minimum=0.0, maximum=1.0
+        0.5,
+        "DNLO: share of the pairs that always counts as inliers (d of eq. 5 over the pairs).",
+        minimum=0.0,
+        maximum=1.0,
     )
-    min_pairs: int = option(10, "Fewest synchronised pose pairs to solve with.", minimum=3, maximum=1_000_000)
-    max_pairs: int = option(5000, "Most synchronised pose pairs kept.", minimum=10, maximum=100_000_000)
+    min_pairs: int = option(
+        10, "Fewest synchronised pose pairs to solve with.", minimum=3, maximum=1_000_000
+    )
+    max_pairs: int = option(
+        5000, "Most synchronised pose pairs kept.", minimum=10, maximum=100_000_000
+    )
     keyframe_min_translation: float = option(
         0.0, "Keep a pose pair when the parent sensor has moved this far since the last one kept, or turned min_rotation.",
         unit="m", minimum=0.0, maximum=100.0, name="keyframe.min_translation",
@@ -239,10 +269,19 @@ class CalibratorConfig(OptionSet):
         unit="rad", minimum=0.0, maximum=math.pi, name="keyframe.min_rotation",
     )  # fmt: skip
     keyframe_min_interval: float = option(
-        0.0, "Time between pose pairs that are kept.", unit="s", minimum=0.0, maximum=60.0, name="keyframe.min_interval"
+        0.0,
+        "Time between pose pairs that are kept.",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+        name="keyframe.min_interval",
     )
     max_gap: float = option(
-        0.5, "Longest time between two poses of a stream that interpolation may bridge.", unit="s", minimum=1e-3, maximum=60.0
+        0.5,
+        "Longest time between two poses of a stream that interpolation may bridge.",
+        unit="s",
+        minimum=1e-3,
+        maximum=60.0,
     )
     time_offset: float | str = option(
         0.0,
@@ -272,11 +311,17 @@ class CalibratorConfig(OptionSet):
         name="prior.transform",
         parse=parse_prior,
     )
-    parent_frame: str = option("", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True)
-    child_frame: str = option("", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True)
+    parent_frame: str = option(
+        "", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True
+    )
+    child_frame: str = option(
+        "", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True
+    )
 
     def prior(self):
-        """What is known beforehand: axis name to (value, sigma), in m and rad; a single axis goes before the transform."""
+        """What is known beforehand: axis name to (value, sigma), in m and rad; a single axis goes
+        before the transform.
+        """
         known = {}
         for name in ("transform", *AXIS_UNITS):
             known |= parse_prior(f"prior.{name}", getattr(self, f"prior_{name}"))
@@ -287,15 +332,24 @@ class CalibratorConfig(OptionSet):
 class NodeConfig(OptionSet):
     """Options that only the node has."""
 
-    solve_period: float = option(2.0, "Time between solves.", unit="s", minimum=0.05, maximum=3600.0)
+    solve_period: float = option(
+        2.0, "Time between solves.", unit="s", minimum=0.05, maximum=3600.0
+    )
     parent_type: str = option(
-        "auto", "Message type of parent_odom; auto looks at the publisher.", choices=POSE_TYPES, read_only=True
+        "auto",
+        "Message type of parent_odom; auto looks at the publisher.",
+        choices=POSE_TYPES,
+        read_only=True,
     )
     child_type: str = option(
-        "auto", "Message type of child_odom; auto looks at the publisher.", choices=POSE_TYPES, read_only=True
+        "auto",
+        "Message type of child_odom; auto looks at the publisher.",
+        choices=POSE_TYPES,
+        read_only=True,
     )
     output_directory: str = option(
-        "", "Where ~/save and the end of the node write the result files, and the journal is; empty for nowhere."
+        "",
+        "Where ~/save and the end of the node write the result files, and the journal is; empty for nowhere.",
     )
     journal: str = option(
         "new",

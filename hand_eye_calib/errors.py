@@ -1,7 +1,8 @@
 """The exceptions this package raises on purpose.
 
-Every message says what was expected, what was found and what to do about it, in one line: command line and node print
-it as it is. Anything else that escapes is a defect of the package and keeps its traceback.
+Every message says what was expected, what was found and what to do about it, in one line: command
+line and node print it as it is. Anything else that escapes is a defect of the package and keeps its
+traceback.
 """
 
 

@@ -23,9 +23,15 @@ PARAMETERS = {
 
 
 def calibrator(context):
-    # An argument that was not given must not override the parameter file, hence not simply a dictionary of substitutions.
-    given = {name: text for name in PARAMETERS if (text := LaunchConfiguration(name).perform(context))}
-    overrides = {name: ParameterValue(text, value_type=bool if name == "publish_tf" else str) for name, text in given.items()}
+    # An argument that was not given must not override the parameter file, hence not simply a
+    # dictionary of substitutions.
+    given = {
+        name: text for name in PARAMETERS if (text := LaunchConfiguration(name).perform(context))
+    }
+    overrides = {
+        name: ParameterValue(text, value_type=bool if name == "publish_tf" else str)
+        for name, text in given.items()
+    }
     overrides["use_sim_time"] = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     return [
         Node(
@@ -45,14 +51,19 @@ def calibrator(context):
 
 
 def generate_launch_description():
-    default_config = PathJoinSubstitution([FindPackageShare("hand_eye_calib"), "config", "calibrator.yaml"])
+    default_config = PathJoinSubstitution(
+        [FindPackageShare("hand_eye_calib"), "config", "calibrator.yaml"]
+    )
     arguments = {
         "parent_topic": ("parent_odom", "Topic with the poses of the parent sensor."),
         "child_topic": ("child_odom", "Topic with the poses of the child sensor."),
         **{name: ("", description) for name, description in PARAMETERS.items()},
         "config_file": (default_config, "File with the node's parameters."),
         "namespace": ("", "Namespace of the node; relative topics are looked for in it."),
-        "use_sim_time": ("false", "Whether the node's clock follows /clock, as with a bag played with --clock."),
+        "use_sim_time": (
+            "false",
+            "Whether the node's clock follows /clock, as with a bag played with --clock.",
+        ),
         "log_level": ("info", "debug, info, warn, error or fatal."),
     }
     return LaunchDescription(

@@ -6,8 +6,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from hand_eye_calib.geometry import se3
 
 JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
-NOETIC.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-NOETIC.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf/msg/tfMessage"))
+NOETIC.register(
+    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+)
+NOETIC.register(
+    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf/msg/tfMessage")
+)
 TF, PATH = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Path"
 
 
@@ -19,9 +23,17 @@ def header(typestore, stamp_ns, frame):
 
 def pose(typestore, matrix, kind="Pose"):
     """A Pose or Transform of a (4, 4) matrix."""
-    types, translation, quat_xyzw = typestore.types, matrix[:3, 3].tolist(), se3.to_quat_xyzw(matrix).tolist()
-    vector = types["geometry_msgs/msg/Point" if kind == "Pose" else "geometry_msgs/msg/Vector3"](*translation)
-    return types[f"geometry_msgs/msg/{kind}"](vector, types["geometry_msgs/msg/Quaternion"](*quat_xyzw))
+    types, translation, quat_xyzw = (
+        typestore.types,
+        matrix[:3, 3].tolist(),
+        se3.to_quat_xyzw(matrix).tolist(),
+    )
+    vector = types["geometry_msgs/msg/Point" if kind == "Pose" else "geometry_msgs/msg/Vector3"](
+        *translation
+    )
+    return types[f"geometry_msgs/msg/{kind}"](
+        vector, types["geometry_msgs/msg/Quaternion"](*quat_xyzw)
+    )
 
 
 def tf_message(edges, message_type=TF):
@@ -44,21 +56,29 @@ def path_message(stamps_ns, poses, frame="map"):
 
     def make(typestore):
         steps = [
-            typestore.types["geometry_msgs/msg/PoseStamped"](header(typestore, stamp_ns, frame), pose(typestore, matrix))
+            typestore.types["geometry_msgs/msg/PoseStamped"](
+                header(typestore, stamp_ns, frame), pose(typestore, matrix)
+            )
             for stamp_ns, matrix in zip(stamps_ns, poses, strict=True)
         ]
-        return typestore.types[PATH](header(typestore, stamps_ns[-1] if len(stamps_ns) else 0, frame), steps)
+        return typestore.types[PATH](
+            header(typestore, stamps_ns[-1] if len(stamps_ns) else 0, frame), steps
+        )
 
     return make
 
 
 def write_messages(path, messages, storage="mcap", mode=None):
-    """Write (bag time, topic, type, make) messages, in the order of bag time; ``mode`` is rosbag2's compression mode."""
+    """Write (bag time, topic, type, make) messages, in the order of bag time; ``mode`` is rosbag2's
+    compression mode.
+    """
     typestore = NOETIC if storage == "rosbag1" else JAZZY
     if storage == "rosbag1":
         writer, serialize = rosbag1.Writer(path), NOETIC.serialize_ros1
     else:
-        writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+        writer = rosbag2.Writer(
+            path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()]
+        )
         serialize = JAZZY.serialize_cdr
         if mode:
             writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)

@@ -9,13 +9,16 @@ from hypothesis import settings
 settings.register_profile("hand_eye_calib", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("hand_eye_calib")
 
-# A shell starts what runs in the background with Ctrl-C ignored, and children inherit that: tests that send it would wait for ever.
+# A shell starts what runs in the background with Ctrl-C ignored, and children inherit that: tests
+# that send it would wait for ever.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _ros_stays_here(tmp_path_factory):
-    """ROS talks on this machine only and logs into pytest's temporary folder; subprocesses inherit it."""
+    """ROS talks on this machine only and logs into pytest's temporary folder; subprocesses inherit
+    it.
+    """
     patch = pytest.MonkeyPatch()
     patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))

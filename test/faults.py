@@ -43,13 +43,17 @@ def mirrored(stream):
     return dataclasses.replace(stream, poses=poses)
 
 
-# Fault: what is done to (parent, child, some other drive's child), and the code of the finding that names it.
+# Fault: what is done to (parent, child, some other drive's child), and the code of the finding that
+# names it.
 FAULTS = {
     "offset 0.2 s": (lambda parent, child, other: (parent, child.shifted(-0.2)), "time_offset"),
     "offset 500 s": (lambda parent, child, other: (parent, child.shifted(-500.0)), "time_offset"),
     "wxyz": (lambda parent, child, other: (parent, reordered(child)), "quaternion_order"),
     "inverse child": (lambda parent, child, other: (parent, inverted(child)), "inverse"),
-    "inverse both": (lambda parent, child, other: (inverted(parent), inverted(child)), "inverse_both"),
+    "inverse both": (
+        lambda parent, child, other: (inverted(parent), inverted(child)),
+        "inverse_both",
+    ),
     "millimetres": (lambda parent, child, other: (parent, child.scaled(1000.0)), "units"),
     "scale 1.05": (lambda parent, child, other: (parent, child.scaled(1.05)), "scale"),
     "frozen child": (lambda parent, child, other: (parent, frozen(child)), "frozen"),

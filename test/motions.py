@@ -12,7 +12,9 @@ def wandering_poses(n_poses, seed=0, step_m=0.1, step_rad=0.08):
     """(N, 4, 4) poses of a random walk in all six degrees of freedom, smooth over about ten poses."""
     random = np.random.default_rng(seed)
     kernel = np.ones(10) / np.sqrt(10)
-    steps = np.apply_along_axis(np.convolve, 0, random.normal(size=(n_poses + 9, 6)), kernel, mode="valid")
+    steps = np.apply_along_axis(
+        np.convolve, 0, random.normal(size=(n_poses + 9, 6)), kernel, mode="valid"
+    )
     steps *= np.r_[np.full(3, step_m), np.full(3, step_rad)]
     poses = [np.eye(4)]
     for step in se3.exp(steps[1:]):
@@ -25,7 +27,9 @@ def planar_poses(n_poses, seed=0):
     random = np.random.default_rng(seed)
     yaw = np.cumsum(random.normal(0, 0.08, n_poses))
     position = np.cumsum(0.1 * np.c_[np.cos(yaw), np.sin(yaw), np.zeros(n_poses)], axis=0)
-    return se3.from_rotation_translation(se3.rotation_exp(np.c_[np.zeros((n_poses, 2)), yaw]), position)
+    return se3.from_rotation_translation(
+        se3.rotation_exp(np.c_[np.zeros((n_poses, 2)), yaw]), position
+    )
 
 
 def child_of(Ts_pw_p, T_parent_child=T_PARENT_CHILD, T_cw_pw=None):
@@ -36,18 +40,26 @@ def child_of(Ts_pw_p, T_parent_child=T_PARENT_CHILD, T_cw_pw=None):
 
 def disturbed(poses, seed, sigma_m, sigma_rad):
     """Poses with white noise in their own frames."""
-    noise = np.random.default_rng(seed).normal(size=(len(poses), 6)) * np.r_[np.full(3, sigma_m), np.full(3, sigma_rad)]
+    noise = (
+        np.random.default_rng(seed).normal(size=(len(poses), 6))
+        * np.r_[np.full(3, sigma_m), np.full(3, sigma_rad)]
+    )
     return poses @ se3.exp(noise)
 
 
 def as_trajectory(poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **frames):
     """Poses at a steady rate."""
-    return Trajectory(start_ns + np.round(np.arange(len(poses)) * 1e9 / rate_hz).astype(np.int64), poses, **frames)
+    return Trajectory(
+        start_ns + np.round(np.arange(len(poses)) * 1e9 / rate_hz).astype(np.int64), poses, **frames
+    )
 
 
 def feed(calibrator, stream, trajectory):
     """Give all poses of a trajectory to a calibrator."""
     for stamp_ns, pose, quat_xyzw in zip(
-        trajectory.stamps_ns.tolist(), trajectory.poses, se3.to_quat_xyzw(trajectory.poses), strict=True
+        trajectory.stamps_ns.tolist(),
+        trajectory.poses,
+        se3.to_quat_xyzw(trajectory.poses),
+        strict=True,
     ):
         calibrator.add_pose(stream, stamp_ns, pose[:3, 3].tolist(), quat_xyzw.tolist())

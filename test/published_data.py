@@ -1,7 +1,8 @@
-"""The published trajectories and results that regression tests compare with. They are not part of this package.
+"""The published trajectories and results that regression tests compare with. They are not part of
+this package.
 
-They are looked for in ``$HAND_EYE_CALIB_DATA``, else in ``../shared/data`` beside the project; a test that needs them is
-skipped, and says so, where they are absent.
+They are looked for in ``$HAND_EYE_CALIB_DATA``, else in ``../shared/data`` beside the project; a
+test that needs them is skipped, and says so, where they are absent.
 """
 
 import os
@@ -10,26 +11,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hand_eye_calib.experiments import published
 from hand_eye_calib.geometry import se3
+from reproduction import published
 
 
 def data_folder():
-    """Folder that holds ``valimaki2023`` and the other data sets; skips the running test where it is absent."""
+    """Folder that holds ``valimaki2023`` and the other data sets; skips the running test where it
+    is absent.
+    """
     beside_the_project = Path(__file__).resolve().parents[2] / "shared" / "data"
     folder = Path(os.environ.get("HAND_EYE_CALIB_DATA", beside_the_project))
     if not (folder / "valimaki2023").is_dir():
-        pytest.skip(f"no published data in {folder}; set HAND_EYE_CALIB_DATA to the folder that holds valimaki2023")
+        pytest.skip(
+            f"no published data in {folder}; set HAND_EYE_CALIB_DATA to the folder that holds valimaki2023"
+        )
     return folder
 
 
 def kitti_short():
-    """KITTI 2011_09_30_drive_0027: parent lidar, child grey camera (Välimäki et al. 2023, section 5)."""
+    """KITTI 2011_09_30_drive_0027: parent lidar, child grey camera (Välimäki et al. 2023, section
+    5).
+    """
     return published.load_kitti_short(data_folder() / "valimaki2023")
 
 
 def kitti_long():
-    """KITTI 2011_10_03_drive_0027: parent grey camera, child colour camera (Välimäki et al. 2023, section 5)."""
+    """KITTI 2011_10_03_drive_0027: parent grey camera, child colour camera (Välimäki et al. 2023,
+    section 5).
+    """
     return published.load_kitti_long(data_folder() / "valimaki2023")
 
 

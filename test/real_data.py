@@ -1,6 +1,7 @@
 """Real recordings with known answers, read for tests. They are not part of this package.
 
-They are looked for where :mod:`published_data` looks; a test that needs them is skipped, and says so, where they are absent.
+They are looked for where :mod:`published_data` looks; a test that needs them is skipped, and says
+so, where they are absent.
 """
 
 import csv
@@ -25,8 +26,9 @@ _EQUATORIAL_RADIUS, _ECCENTRICITY_SQUARED = 6378137.0, 6.69437999014e-3
 _GPS_EPOCH_S, _LEAP_SECONDS = 315_964_800, 18
 
 
-# Differences that are really there and that the data's documentation does not give: found by this package, and taken out where streams
-# without any fault are wanted. The devices' scales close round the cycle to 0.5 %, the drive's is the published 2.2 %.
+# Differences that are really there and that the data's documentation does not give: found by this
+# package, and taken out where streams without any fault are wanted. The devices' scales close round
+# the cycle to 0.5 %, the drive's is the published 2.2 %.
 _TANGO_SCALES = (0.971, 1.024, 1.010)
 _ZXL19_OFFSETS_S = {"LO": (-0.052, -0.044, -0.075), "VO": (0.031, 0.034, 0.025)}
 _KITTI_LONG_SCALE = 0.9774
@@ -61,7 +63,11 @@ class Recording:
 def tango_pairs():
     """Three handheld devices on one rig, clocks not shared: (parent, child) in a cycle."""
     devices = {name: _asl_csv("asl_tango_easy", file) for name, file in TANGO.items()}
-    known = {("caligula", "mars"): -126.834, ("mars", "nero"): -107.736, ("nero", "caligula"): 234.570}
+    known = {
+        ("caligula", "mars"): -126.834,
+        ("mars", "nero"): -107.736,
+        ("nero", "caligula"): 234.570,
+    }
     return [
         Recording(f"tango {parent}<-{child}", devices[parent], devices[child], offset, scale)
         for ((parent, child), offset), scale in zip(known.items(), _TANGO_SCALES, strict=True)
@@ -71,36 +77,54 @@ def tango_pairs():
 def primesense():
     """Motion capture against a camera that sees a target, with gross jumps."""
     stem = "2017-04-09-18-13-10_"
-    parent, child = (_asl_csv("asl_primesense", stem + name) for name in ("vicon_prime_sense", "W_camera_rgb_image_raw"))
+    parent, child = (
+        _asl_csv("asl_primesense", stem + name)
+        for name in ("vicon_prime_sense", "W_camera_rgb_image_raw")
+    )
     return Recording("primesense", parent, child, 0.02)
 
 
 def robot_arm(which):
-    """An arm's hand against a camera: "complete" is real, with gross jumps; "sim" turns about nearly one axis."""
+    """An arm's hand against a camera: "complete" is real, with gross jumps; "sim" turns about
+    nearly one axis.
+    """
     names = {
-        "complete": ("complete_bag_color_and_ir_base_link_sr300_hinge", "complete_bag_color_and_ir_target_ir"),
+        "complete": (
+            "complete_bag_color_and_ir_base_link_sr300_hinge",
+            "complete_bag_color_and_ir_target_ir",
+        ),
         "sim": ("sim_hand", "sim_camera"),
     }[which]
-    return Recording(f"arm {which}", *(_asl_csv("asl_robot_arm", f"robot_arm_{name}") for name in names))
+    return Recording(
+        f"arm {which}", *(_asl_csv("asl_robot_arm", f"robot_arm_{name}") for name in names)
+    )
 
 
 def zxl19(bag, child):
-    """INS against lidar odometry ("LO") or a monocular camera of unknown scale ("VO") on a road vehicle, bags 1 to 3."""
+    """INS against lidar odometry ("LO") or a monocular camera of unknown scale ("VO") on a road
+    vehicle, bags 1 to 3.
+    """
     folder = data_folder() / "zxl19" / f"bag{bag}"
     scale = {1: 3.34, 2: 3.76, 3: 2.66}[bag] if child == "VO" else 1.0
     parent, child_poses = _mat(folder / "INS_FCPE.mat"), _mat(folder / f"{child}_FCPE.mat")
-    return Recording(f"zxl19 {bag} {child}", parent, child_poses, _ZXL19_OFFSETS_S[child][bag - 1], scale)
+    return Recording(
+        f"zxl19 {bag} {child}", parent, child_poses, _ZXL19_OFFSETS_S[child][bag - 1], scale
+    )
 
 
 def zxl19_raw():
     """Bag 1's INS and lidar odometry from its CSV exports."""
     folder = data_folder() / "zxl19" / "raw_bag1"
-    return Recording("zxl19 1 LO raw", _inspvax(folder), _odometry_csv(folder / "bag1-aft_mapped_to_init.csv"))
+    return Recording(
+        "zxl19 1 LO raw", _inspvax(folder), _odometry_csv(folder / "bag1-aft_mapped_to_init.csv")
+    )
 
 
 def boreas():
     """Lidar (stamps in microseconds) and radar (nanoseconds) of a car, both from one INS."""
-    return Recording("boreas", _boreas_csv("lidar_poses.csv", 1_000), _boreas_csv("radar_poses.csv", 1))
+    return Recording(
+        "boreas", _boreas_csv("lidar_poses.csv", 1_000), _boreas_csv("radar_poses.csv", 1)
+    )
 
 
 BOREAS_TRUTH = se3.from_rotation_translation(
@@ -109,11 +133,16 @@ BOREAS_TRUTH = se3.from_rotation_translation(
 
 
 def kitti(which):
-    """The KITTI drives of Välimäki et al. 2023 as their SLAM recorded them, stamps not shared: "short" or "long"."""
+    """The KITTI drives of Välimäki et al. 2023 as their SLAM recorded them, stamps not shared:
+    "short" or "long".
+    """
     folder = data_folder() / "valimaki2023" / "kitti_tests"
     if which == "short":
         drive = folder / "2011_09_30_drive_0027"
-        files = drive / "LIDAR_HDL64E" / "traj_HDL_aft_opt.csv", drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt"
+        files = (
+            drive / "LIDAR_HDL64E" / "traj_HDL_aft_opt.csv",
+            drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt",
+        )
         return Recording("kitti short", *map(read_trajectory, files))
     drive = folder / "2011_10_03_drive_0027"
     files = (drive / camera / "KeyFrameTrajectory_TUM_Format.txt" for camera in ("cam01", "cam23"))
@@ -159,15 +188,21 @@ def _boreas_csv(name, unit_ns):
     with open(path, encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     stamps_ns = np.array([int(row["GPSTime"]) * unit_ns for row in rows])
-    roll, pitch, yaw = (np.array([float(row[key]) for row in rows]) for key in ("roll", "pitch", "heading"))
+    roll, pitch, yaw = (
+        np.array([float(row[key]) for row in rows]) for key in ("roll", "pitch", "heading")
+    )
     rotation = Rotation.from_euler("XYZ", -np.c_[roll, pitch, yaw])
-    position = np.array([[float(row[key]) for key in ("easting", "northing", "altitude")] for row in rows])
+    position = np.array(
+        [[float(row[key]) for key in ("easting", "northing", "altitude")] for row in rows]
+    )
     return Trajectory(stamps_ns, se3.from_rotation_translation(rotation.as_matrix(), position))
 
 
 def _odometry_csv(path):
     rows = _spaced_csv(path)
-    stamps_ns = np.array([int(row[".header.stamp.secs"]) * 10**9 + int(row[".header.stamp.nsecs"]) for row in rows])
+    stamps_ns = np.array(
+        [int(row[".header.stamp.secs"]) * 10**9 + int(row[".header.stamp.nsecs"]) for row in rows]
+    )
     position, orientation = (
         np.array([[float(row[f".pose.pose.{part}.{axis}"]) for axis in axes] for row in rows])
         for part, axes in (("position", "xyz"), ("orientation", "xyzw"))
@@ -176,9 +211,13 @@ def _odometry_csv(path):
 
 
 def _inspvax(folder):
-    """NovAtel INS: latitude, longitude and height to a tangent plane; sensor y forward, azimuth clockwise from north."""
+    """NovAtel INS: latitude, longitude and height to a tangent plane; sensor y forward, azimuth
+    clockwise from north.
+    """
     rows = _spaced_csv(folder / "bag1-novatel_data-inspvax.csv")
-    week, milliseconds = ([int(row[f".header.gps_week{key}"]) for row in rows] for key in ("", "_seconds"))
+    week, milliseconds = (
+        [int(row[f".header.gps_week{key}"]) for row in rows] for key in ("", "_seconds")
+    )
     seconds = _GPS_EPOCH_S - _LEAP_SECONDS + 604_800 * np.array(week)
     stamps_ns = seconds * 10**9 + np.array(milliseconds) * 10**6
     latitude, longitude, height, roll, pitch, azimuth = (
@@ -190,7 +229,9 @@ def _inspvax(folder):
     prime_vertical = _EQUATORIAL_RADIUS / np.sqrt(shrink)
     meridional = prime_vertical * (1 - _ECCENTRICITY_SQUARED) / shrink
     position = np.c_[
-        east * (prime_vertical + height[0]) * np.cos(np.radians(latitude[0])), north * (meridional + height[0]), height
+        east * (prime_vertical + height[0]) * np.cos(np.radians(latitude[0])),
+        north * (meridional + height[0]),
+        height,
     ]
     rotation = Rotation.from_euler("ZXY", np.c_[-azimuth, pitch, roll], degrees=True)
     return _tidy(stamps_ns, position, rotation.as_quat())

@@ -24,15 +24,21 @@ import hand_eye_calib
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros import conversions
 
-# Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is busy with other things.
+# Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is
+# busy with other things.
 PATIENCE_S = 30.0
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 POSE_KINDS = (Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped)
 START_NS = 1_700_000_000_000_000_000
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-RELIABLE_INPUTS = [f"-p qos_overrides./{stream}_odom.subscription.reliability:=reliable" for stream in ("parent", "child")]
+LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+RELIABLE_INPUTS = [
+    f"-p qos_overrides./{stream}_odom.subscription.reliability:=reliable"
+    for stream in ("parent", "child")
+]
 
 _domains = itertools.count(os.getpid())
 
@@ -40,7 +46,9 @@ _domains = itertools.count(os.getpid())
 def free_domain():
     """A domain id whose first participant's port nobody listens on."""
     for candidate in itertools.islice(_domains, 100):
-        domain = 1 + candidate % 100  # above 101, the ports run into those that Linux gives to clients
+        domain = (
+            1 + candidate % 100
+        )  # above 101, the ports run into those that Linux gives to clients
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 probe.bind(("", 7410 + 250 * domain))
@@ -53,7 +61,9 @@ def free_domain():
 def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS):
     """Stamps and noise-free poses of both sensors on a rig that turns about all axes."""
     s = np.arange(n_poses) * period_ns * 1e-9
-    turns = np.stack([0.5 * np.sin(0.7 * s), 0.4 * np.sin(0.9 * s + 1.0), 0.8 * np.sin(0.4 * s)], axis=1)
+    turns = np.stack(
+        [0.5 * np.sin(0.7 * s), 0.4 * np.sin(0.9 * s + 1.0), 0.8 * np.sin(0.4 * s)], axis=1
+    )
     places = np.stack([s, 2.0 * np.sin(0.5 * s), 0.5 * np.cos(0.8 * s)], axis=1)
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     T_cw_pw = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, 0.1, 2.0]))
@@ -105,7 +115,9 @@ class NodeProcess:
         end = time.monotonic() + PATIENCE_S
         while not all(text in self.log for text in texts):
             assert time.monotonic() < end, f"no {texts} in the node's log:\n{self.log}"
-            assert self.process.poll() is None, f"the node ended with {self.process.returncode}:\n{self.log}"
+            assert self.process.poll() is None, (
+                f"the node ended with {self.process.returncode}:\n{self.log}"
+            )
             time.sleep(0.02)
         return self.log
 
@@ -152,18 +164,26 @@ class Peer:
 
     def publisher(self, kind, topic):
         """Publisher that keeps all it is given until a reliable subscription has it."""
-        return self.node.create_publisher(kind, topic, QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE))
+        return self.node.create_publisher(
+            kind, topic, QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+        )
 
     def publishers(self, kind=Odometry, child_kind=None):
         """Publishers on both inputs of the node."""
         return self.publisher(kind, "parent_odom"), self.publisher(child_kind or kind, "child_odom")
 
     def wait_matched(self, *publishers):
-        self.spin_until(lambda: all(each.get_subscription_count() for each in publishers), "the node to subscribe")
+        self.spin_until(
+            lambda: all(each.get_subscription_count() for each in publishers),
+            "the node to subscribe",
+        )
 
     def wait_left(self, *publishers):
         """Wait until a node that has ended is forgotten: what is published before that is lost."""
-        self.spin_until(lambda: not any(each.get_subscription_count() for each in publishers), "the node to leave")
+        self.spin_until(
+            lambda: not any(each.get_subscription_count() for each in publishers),
+            "the node to leave",
+        )
 
     def feed(self, publishers, stamps_ns, Ts_pw_p, Ts_cw_c, frames=("lidar", "camera")):
         """Publish both trajectories, interleaved."""
@@ -191,7 +211,8 @@ class Peer:
         asked = []
 
         def answered():
-            # An answer is lost where the server has not discovered the client yet: then ask once more.
+            # An answer is lost where the server has not discovered the client yet: then ask once
+            # more.
             if not asked or time.monotonic() > asked[-1][0] + 3.0:
                 asked.append((time.monotonic(), self.ask(kind, name, request)))
             return any(future.done() for _, future in asked)
@@ -205,7 +226,8 @@ class Peer:
     def solve(self, publishers, stamps_ns, Ts_pw_p, Ts_cw_c, **options):
         """Feed, then have the node solve with everything; answer of the last ~/solve.
 
-        Best-effort delivery and services share no order, so it asks until the last stamp is in the result.
+        Best-effort delivery and services share no order, so it asks until the last stamp is in the
+        result.
         """
         self.feed(publishers, stamps_ns, Ts_pw_p, Ts_cw_c, **options)
         extrinsics = self.listen(TransformStamped, "extrinsic")
@@ -225,14 +247,18 @@ class Peer:
     def set_parameter(self, name, value):
         parameter = Parameter(name, value=value).to_parameter_msg()
         assert isinstance(parameter, ParameterMessage)
-        (result,) = self.call(SetParameters, "set_parameters", SetParameters.Request(parameters=[parameter])).results
+        (result,) = self.call(
+            SetParameters, "set_parameters", SetParameters.Request(parameters=[parameter])
+        ).results
         return result
 
     def parameter_names(self):
         return set(self.call(ListParameters, "list_parameters").result.names)
 
     def parameter(self, name):
-        (value,) = self.call(GetParameters, "get_parameters", GetParameters.Request(names=[name])).values
+        (value,) = self.call(
+            GetParameters, "get_parameters", GetParameters.Request(names=[name])
+        ).values
         return rclpy.parameter.parameter_value_to_python(value)
 
     def describe(self, name):

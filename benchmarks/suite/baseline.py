@@ -1,4 +1,6 @@
-"""What a run is compared with: which rows there are, and ratios within the run. Absolute times depend on the machine."""
+"""What a run is compared with: which rows there are, and ratios within the run. Absolute times
+depend on the machine.
+"""
 
 from suite.data import ENGINE_MESSAGES, LONG, SHORT
 
@@ -25,7 +27,8 @@ _PROCESSES = (
 
 
 def ratios(rows, memory):
-    """How many times faster each row is than what it is measured against, a dict by "slow / fast, size"; more is better.
+    """How many times faster each row is than what it is measured against, a dict by "slow / fast,
+    size"; more is better.
 
     Parameters
     ----------
@@ -58,12 +61,16 @@ def summary(rows, memory):
 
 
 def _is_compared(key):
-    """Not OpenCV's single methods: which of them runs on the long drive depends on which is the fastest."""
+    """Not OpenCV's single methods: which of them runs on the long drive depends on which is the
+    fastest.
+    """
     return not key.startswith("opencv ")
 
 
 def failures(rows, memory, baseline, is_more=False):
-    """One line per way in which a run falls short of the baseline; ``is_more``: it may have rows that the baseline has not."""
+    """One line per way in which a run falls short of the baseline; ``is_more``: it may have rows
+    that the baseline has not.
+    """
     by_key = {row.key: row for row in rows}
     has_opencv = any(key.startswith("opencv") for key in by_key)
     measured = ratios(rows, memory)
@@ -71,7 +78,9 @@ def failures(rows, memory, baseline, is_more=False):
     def is_due(name):
         return has_opencv or not name.startswith("opencv")
 
-    found = [f"{key}: row is missing" for key in filter(is_due, baseline["rows"]) if key not in by_key]
+    found = [
+        f"{key}: row is missing" for key in filter(is_due, baseline["rows"]) if key not in by_key
+    ]
     if not is_more:
         found += [
             f"{key}: not in the baseline; run with --update"
@@ -80,26 +89,40 @@ def failures(rows, memory, baseline, is_more=False):
         ]
     for name, ratio in baseline["ratios"].items():
         if name in measured and measured[name] < ratio * TOLERATED_RATIO:
-            found.append(f"{name}: {measured[name]:.3g}, below a third of the baseline's {ratio:.3g}")
+            found.append(
+                f"{name}: {measured[name]:.3g}, below a third of the baseline's {ratio:.3g}"
+            )
         elif name not in measured and is_due(name):
             found.append(f"{name}: ratio is missing")
     for key, row in by_key.items():
         slow = by_key.get(key.replace(" fast", " ipopt"))
         if " fast" in key and slow and row.objective > slow.objective * (1 + TOLERATED_EXCESS):
-            found.append(f"{key}: objective {row.objective:.9g} is above ipopt's {slow.objective:.9g}")
+            found.append(
+                f"{key}: objective {row.objective:.9g} is above ipopt's {slow.objective:.9g}"
+            )
     return found
 
 
 def aims(rows, memory):
-    """What the package aims at: (what, aim, measured, whether it is met); rows that were not measured are left out."""
+    """What the package aims at: (what, aim, measured, whether it is met); rows that were not
+    measured are left out.
+    """
     seconds = {row.key: row.seconds for row in rows}
     measured = ratios(rows, memory)
 
     def at_least(name, aim):
-        return (name, f"at least {aim:g}", f"{measured[name]:.3g}", measured[name] >= aim) if name in measured else None
+        return (
+            (name, f"at least {aim:g}", f"{measured[name]:.3g}", measured[name] >= aim)
+            if name in measured
+            else None
+        )
 
     def below(name, key, aim):
-        return (name, f"below {aim:g} s", f"{seconds[key]:.3g} s", seconds[key] < aim) if key in seconds else None
+        return (
+            (name, f"below {aim:g} s", f"{seconds[key]:.3g} s", seconds[key] < aim)
+            if key in seconds
+            else None
+        )
 
     stated = [
         at_least(f"dnlo ipopt / dnlo fast, {SHORT}", 300),
@@ -108,7 +131,11 @@ def aims(rows, memory):
         at_least("floor / dnlo fast, 100000", 1 / 20),
         below("dnlo, 10^6 pairs", "dnlo fast, 1000000", 5),
         below("a message, 99th percentile", f"add_pose, 99th percentile, {ENGINE_MESSAGES}", 50e-6),
-        below("from two files to the result with covariance, wall", f"files to result, wall, {LONG + 5}", 1),
+        below(
+            "from two files to the result with covariance, wall",
+            f"files to result, wall, {LONG + 5}",
+            1,
+        ),
         below("calibrate --help, wall", "hand_eye_calib calibrate --help, wall, 0", 0.3),
         below("replay --help, wall", "hand_eye_calib replay --help, wall, 0", 0.3),
     ]

@@ -1,4 +1,6 @@
-"""Drives to measure with: the two KITTI drives of Valimaki et al. 2023 where they are there, and simulated ones of any length."""
+"""Drives to measure with: the two KITTI drives of Valimaki et al. 2023 where they are there, and
+simulated ones of any length.
+"""
 
 import os
 from dataclasses import dataclass
@@ -7,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.experiments.published import load_kitti_long, load_kitti_short
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
+from reproduction.published import load_kitti_long, load_kitti_short
 
 REFERENCE = "B5"
 # Pairs with B5; the KITTI drives have 448 and 2,343 poses in common.
@@ -47,23 +49,37 @@ def drives(sizes):
     """Where the two drives of published lengths come from, and a Drive for every number of pairs."""
     found = {n_pairs: simulated_drive(n_pairs + 5) for n_pairs in sizes}
     published = _published()
-    return "published" if published else "simulated", {size: published.get(size, drive) for size, drive in found.items()}
+    return "published" if published else "simulated", {
+        size: published.get(size, drive) for size, drive in found.items()
+    }
 
 
 def _published():
-    folder = Path(os.environ.get("HAND_EYE_CALIB_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+    folder = Path(
+        os.environ.get(
+            "HAND_EYE_CALIB_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"
+        )
+    )
     try:
-        cases = {SHORT: load_kitti_short(folder / "valimaki2023"), LONG: load_kitti_long(folder / "valimaki2023")}
+        cases = {
+            SHORT: load_kitti_short(folder / "valimaki2023"),
+            LONG: load_kitti_long(folder / "valimaki2023"),
+        }
     except InputError:
         return {}
     return {
-        size: Drive(PosePairs(case.parent.stamps_ns, case.parent.poses, case.child.poses), case.T_parent_child)
+        size: Drive(
+            PosePairs(case.parent.stamps_ns, case.parent.poses, case.child.poses),
+            case.T_parent_child,
+        )
         for size, case in cases.items()
     }
 
 
 def simulated_drive(n_poses, seed=0):
-    """A road vehicle's smooth motion with noise on both sensors, and a jump of the child every fifty poses or so."""
+    """A road vehicle's smooth motion with noise on both sensors, and a jump of the child every
+    fifty poses or so.
+    """
     stamps_ns = _PERIOD_NS * np.arange(n_poses)
     Ts_pw_p, Ts_cw_c = np.empty((2, n_poses, 4, 4))
     random = np.random.default_rng(seed)
@@ -73,7 +89,9 @@ def simulated_drive(n_poses, seed=0):
         s = stamps_ns[part] * 1e-9
         yaw, roll, pitch = 1.5 * np.sin(0.11 * s), 0.05 * np.sin(0.7 * s), 0.06 * np.sin(1.1 * s)
         about_z = np.stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=1)
-        rotations = se3.rotation_exp(about_z) @ se3.rotation_exp(np.stack([roll, pitch, np.zeros_like(yaw)], axis=1))
+        rotations = se3.rotation_exp(about_z) @ se3.rotation_exp(
+            np.stack([roll, pitch, np.zeros_like(yaw)], axis=1)
+        )
         places = place + np.cumsum(rotations[:, :, 0], axis=0)
         jumps = random.normal(size=places.shape) * 0.5 * (random.random((len(places), 1)) < 0.02)
         shifts = shift + np.cumsum(jumps, axis=0)

@@ -46,7 +46,9 @@ class Row:
 
 
 def measure(name, size, work, budget_s=_BUDGET_S, clock=time.process_time):
-    """Row for ``work()``, and what the last call returned. The first call does not count unless it alone takes up the budget."""
+    """Row for ``work()``, and what the last call returned. The first call does not count unless it
+    alone takes up the budget.
+    """
     start = clock()
     result = work()
     first = clock() - start
@@ -64,8 +66,8 @@ def measure(name, size, work, budget_s=_BUDGET_S, clock=time.process_time):
 def measure_in_turn(size, slow, fast, clock=time.process_time):
     """Rows for two named pieces of work, (name, work) each, and what they returned.
 
-    A processor's speed changes within seconds: for the ratio to hold, every call of the slow one is followed by as many of the fast
-    one as take a tenth of its time.
+    A processor's speed changes within seconds: for the ratio to hold, every call of the slow one is
+    followed by as many of the fast one as take a tenth of its time.
     """
 
     def timed(work):

@@ -1,7 +1,8 @@
 """What a user would run instead: OpenCV's ``calibrateHandEye``.
 
-Its "gripper to base" is our pose of the parent in its world, its "target to camera" the inverse of our pose of the child in its: then its
-"camera to gripper" is T_parent_child. It makes a pair of every two poses.
+Its "gripper to base" is our pose of the parent in its world, its "target to camera" the inverse of
+our pose of the child in its: then its "camera to gripper" is T_parent_child. It makes a pair of
+every two poses.
 """
 
 import numpy as np

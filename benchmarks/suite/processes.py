@@ -1,4 +1,6 @@
-"""Rows measured as whole processes: from files to the result, start of the command line, memory; and bags."""
+"""Rows measured as whole processes: from files to the result, start of the command line, memory;
+and bags.
+"""
 
 import os
 import subprocess
@@ -18,7 +20,8 @@ PROJECT = Path(__file__).resolve().parents[2]
 _REPEATS = 5
 _COMMAND = [sys.executable, "-m", "hand_eye_calib"]
 
-# Peak memory in bytes after importing everything, and after solving this many pairs; they are made bit by bit, so that only they count.
+# Peak memory in bytes after importing everything, and after solving this many pairs; they are made
+# bit by bit, so that only they count.
 _MEMORY = """
 import sys
 import numpy as np
@@ -40,7 +43,9 @@ print(before, peak(), A.nbytes + B.nbytes)
 
 
 def process_rows(drives):
-    """From two TUM files to the result with covariance, and the time until the command line shows its help."""
+    """From two TUM files to the result with covariance, and the time until the command line shows
+    its help.
+    """
     with tempfile.TemporaryDirectory() as folder:
         files = [str(Path(folder, name)) for name in ("parent.txt", "child.txt")]
         for file, trajectory in zip(files, drives[LONG].trajectories(), strict=True):
@@ -65,18 +70,24 @@ def _run(command):
     """Wall and processor time of a process, in seconds."""
     with tempfile.TemporaryFile("w+") as said:
         start = time.perf_counter()
-        with subprocess.Popen(command, cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=said) as process:
+        with subprocess.Popen(
+            command, cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=said
+        ) as process:
             _, status, usage = os.wait4(process.pid, 0)
             process.returncode = os.waitstatus_to_exitcode(status)
         wall = time.perf_counter() - start
         if process.returncode:
             said.seek(0)
-            raise RuntimeError(f"{' '.join(command)} ended with exit code {process.returncode}: {said.read()}")
+            raise RuntimeError(
+                f"{' '.join(command)} ended with exit code {process.returncode}: {said.read()}"
+            )
     return wall, usage.ru_utime + usage.ru_stime
 
 
 def bag_rows(n_messages):
-    """An mcap bag of two Odometry topics, read and solved by us, and iterated over with every message deserialised by rosbags."""
+    """An mcap bag of two Odometry topics, read and solved by us, and iterated over with every
+    message deserialised by rosbags.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "bag")
         write_bag(path, bags.streams(n_messages))
@@ -88,12 +99,21 @@ def bag_rows(n_messages):
 
 
 def memory(sizes):
-    """For each number of pairs: peak memory of a process that solves them by DNLO, before and after, and what the pairs take, in bytes."""
+    """For each number of pairs: peak memory of a process that solves them by DNLO, before and
+    after, and what the pairs take, in bytes.
+    """
     found = {}
     for size in sizes:
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PROJECT / "benchmarks"), str(PROJECT)])}
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(PROJECT / "benchmarks"), str(PROJECT)]),
+        }
         done = subprocess.run(
-            [sys.executable, "-c", _MEMORY, str(size)], capture_output=True, text=True, check=True, env=environment
+            [sys.executable, "-c", _MEMORY, str(size)],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=environment,
         )
         found[size] = tuple(map(int, done.stdout.split()))
     return found

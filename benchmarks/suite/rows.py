@@ -10,7 +10,7 @@ from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.assessment.covariance import assess
 from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.reference_selection import select_reference
-from hand_eye_calib.calibrator import Calibrator
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers import quadratic_form
@@ -34,7 +34,11 @@ def solver_rows(drive, is_full):
 
     def row(name, work, answer=None):
         measured, result = measure(name, size, work)
-        return measured if answer is None else judged(measured, answer(result), getattr(result, "objective", None))
+        return (
+            measured
+            if answer is None
+            else judged(measured, answer(result), getattr(result, "objective", None))
+        )
 
     def judged(measured, T_parent_child, objective):
         metres, radians = absolute_errors(T_parent_child, drive.T_parent_child)
@@ -64,10 +68,16 @@ def solver_rows(drive, is_full):
         method, solution = Method("dnlo"), solved("dnlo")()
         yield row(
             "jackknife and covariance",
-            lambda: assess(pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)),
+            lambda: assess(
+                pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)
+            ),
         )
     if size <= most["adaptive"]:
-        yield row("adaptive", lambda: estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c), extrinsic)
+        yield row(
+            "adaptive",
+            lambda: estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c),
+            extrinsic,
+        )
         yield row("reference auto", lambda: select_reference(poses, Method("dnlo")))
 
 
@@ -75,7 +85,10 @@ def opencv_rows(drives, all_methods):
     """OpenCV on the short drive, and on the long one with what was fastest there, or with all."""
     cv2 = opencv.load()
     if cv2 is None:
-        print("opencv: not installed, its rows are left out; pip install 'opencv-python-headless<5'", file=sys.stderr)
+        print(
+            "opencv: not installed, its rows are left out; pip install 'opencv-python-headless<5'",
+            file=sys.stderr,
+        )
         return
     methods, fastest = opencv.METHODS, []
     for size in (SHORT, LONG):
@@ -85,7 +98,9 @@ def opencv_rows(drives, all_methods):
             row, T_parent_child = measure(
                 f"opencv {method.lower()}",
                 size,
-                lambda drive=drive, method=method: opencv.calibrate(cv2, method, drive.poses.Ts_pw_p, drive.poses.Ts_cw_c),
+                lambda drive=drive, method=method: opencv.calibrate(
+                    cv2, method, drive.poses.Ts_pw_p, drive.poses.Ts_cw_c
+                ),
             )
             metres, radians = absolute_errors(T_parent_child, drive.T_parent_child)
             found.append(replace(row, error_m=metres, error_rad=radians))
@@ -98,16 +113,27 @@ def opencv_rows(drives, all_methods):
 
 
 def engine_rows(n_messages):
-    """Time per message of the engine: at the median, at the 99th percentile, and of many at once; and of storing one in a list."""
+    """Time per message of the engine: at the median, at the 99th percentile, and of many at once;
+    and of storing one in a list.
+    """
     messages = _messages(n_messages)
     names, stamps_ns, positions, quats_xyzw = messages
-    one_by_one = list(zip(names.tolist(), stamps_ns.tolist(), positions.tolist(), quats_xyzw.tolist(), strict=True))
+    one_by_one = list(
+        zip(
+            names.tolist(), stamps_ns.tolist(), positions.tolist(), quats_xyzw.tolist(), strict=True
+        )
+    )
     stored = []
-    for name, take in (("store in a list", lambda *message: stored.append(message)), ("add_pose", Calibrator().add_pose)):
+    for name, take in (
+        ("store in a list", lambda *message: stored.append(message)),
+        ("add_pose", Calibrator().add_pose),
+    ):
         times = np.array(list(_stopwatch(take, one_by_one)))
         halves = np.array_split(times, 5)
         yield row_of(f"{name}, median", n_messages, [np.median(half) for half in halves])
-        yield row_of(f"{name}, 99th percentile", n_messages, [np.percentile(half, 99) for half in halves])
+        yield row_of(
+            f"{name}, 99th percentile", n_messages, [np.percentile(half, 99) for half in halves]
+        )
 
     def at_once():
         calibrator = Calibrator()
@@ -129,8 +155,17 @@ def _stopwatch(take, messages):
 def _messages(count):
     """Streams, stamps, positions and quaternions of two sensors at 100 Hz, in turn."""
     s = np.arange(count // 2) / 100.0
-    turns = np.stack([0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)], axis=1)
-    Ts = se3.from_rotation_translation(se3.rotation_exp(turns), np.stack([20 * np.sin(0.05 * s), s, np.cos(0.8 * s)], axis=1))
+    turns = np.stack(
+        [0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)], axis=1
+    )
+    Ts = se3.from_rotation_translation(
+        se3.rotation_exp(turns), np.stack([20 * np.sin(0.05 * s), s, np.cos(0.8 * s)], axis=1)
+    )
     stamps_ns = np.add.outer((s * 1e9).astype(np.int64), [0, 3_000_000]).ravel()
     names = np.tile(["parent", "child"], len(s))
-    return names, stamps_ns, np.repeat(Ts[:, :3, 3], 2, axis=0), np.repeat(se3.to_quat_xyzw(Ts), 2, axis=0)
+    return (
+        names,
+        stamps_ns,
+        np.repeat(Ts[:, :3, 3], 2, axis=0),
+        np.repeat(se3.to_quat_xyzw(Ts), 2, axis=0),
+    )

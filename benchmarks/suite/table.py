@@ -11,7 +11,10 @@ from suite.baseline import FLOOR, aims, ratios
 from suite.data import LONG, REFERENCE, SHORT
 
 _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"))
-_BEGIN, _END = "<!-- tables of benchmarks/run.py: begin -->\n", "<!-- tables of benchmarks/run.py: end -->\n"
+_BEGIN, _END = (
+    "<!-- tables of benchmarks/run.py: begin -->\n",
+    "<!-- tables of benchmarks/run.py: end -->\n",
+)
 
 
 class Table(NamedTuple):
@@ -29,14 +32,24 @@ def tables(source, rows, memory):
     found = [_growth(source, [row for row in of_pairs if not row.name.startswith("opencv")])]
     for size, name in ((SHORT, "short"), (LONG, "long")):
         found.append(
-            _side_by_side(f"Side by side: {source} {name} drive, {size:,} pairs", [row for row in of_pairs if row.size == size])
+            _side_by_side(
+                f"Side by side: {source} {name} drive, {size:,} pairs",
+                [row for row in of_pairs if row.size == size],
+            )
         )
     found.append(_others([row for row in rows if row.size not in sizes], memory))
     compared = ratios(rows, memory).items()
     found.append(
-        Table("Times faster", ["ratio"], [[name, f"{ratio:.3g}"] for name, ratio in compared if not name.startswith(FLOOR)])
+        Table(
+            "Times faster",
+            ["ratio"],
+            [[name, f"{ratio:.3g}"] for name, ratio in compared if not name.startswith(FLOOR)],
+        )
     )
-    aimed_at = [[what, aim, measured, "yes" if is_met else "no"] for what, aim, measured, is_met in aims(rows, memory)]
+    aimed_at = [
+        [what, aim, measured, "yes" if is_met else "no"]
+        for what, aim, measured, is_met in aims(rows, memory)
+    ]
     return [*found, Table("What is aimed at", ["aim", "measured", "met"], aimed_at)]
 
 
@@ -59,7 +72,9 @@ def write(found, page, note):
     parts = [_BEGIN, note]
     for each in found:
         lines = [["", *each.headings], ["---", *["---:"] * len(each.headings)], *each.rows]
-        parts.append(f"### {each.title}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines))
+        parts.append(
+            f"### {each.title}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+        )
     page.write_text(before + "\n".join([*parts, _END]) + after, encoding="utf-8")
 
 

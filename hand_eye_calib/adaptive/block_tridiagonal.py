@@ -1,6 +1,8 @@
-"""Symmetric matrices of 6 x 6 blocks on the diagonal and beside it, in LAPACK's band storage: everything linear in their size.
+"""Symmetric matrices of 6 x 6 blocks on the diagonal and beside it, in LAPACK's band storage:
+everything linear in their size.
 
-``bands[k, c, d]`` is what stands d rows below the diagonal in column c of block k: an (n, 6, 12) array.
+``bands[k, c, d]`` is what stands d rows below the diagonal in column c of block k: an (n, 6, 12)
+array.
 """
 
 import numpy as np
@@ -11,7 +13,9 @@ BLOCK = 6
 
 
 def to_bands(diagonal, below):
-    """Bands (n, 6, 12) of a matrix with blocks ``diagonal`` (n, 6, 6) and, left of each but the first, ``below`` (n - 1, 6, 6)."""
+    """Bands (n, 6, 12) of a matrix with blocks ``diagonal`` (n, 6, 6) and, left of each but the
+    first, ``below`` (n - 1, 6, 6).
+    """
     bands = np.zeros((len(diagonal), BLOCK, 2 * BLOCK))
     for column in range(BLOCK):
         bands[:, column, : BLOCK - column] = diagonal[:, column:, column]
@@ -29,7 +33,9 @@ def diagonal_blocks(bands):
 
 def blocks_below(bands):
     """The blocks (n - 1, 6, 6) below those on the diagonal."""
-    return np.stack([bands[:-1, column, BLOCK - column : 2 * BLOCK - column] for column in range(BLOCK)], axis=2)
+    return np.stack(
+        [bands[:-1, column, BLOCK - column : 2 * BLOCK - column] for column in range(BLOCK)], axis=2
+    )
 
 
 def cut_below(bands, at):
@@ -39,7 +45,8 @@ def cut_below(bands, at):
 
 
 class Factor:
-    """Cholesky factor L of a positive definite block tridiagonal matrix V, whose bands it overwrites.
+    """Cholesky factor L of a positive definite block tridiagonal matrix V, whose bands it
+    overwrites.
 
     Raises
     ------
@@ -57,7 +64,9 @@ class Factor:
         return 2.0 * float(np.log(self._bands[0]).sum())
 
     def whiten(self, right):
-        """``L^-1 right`` for (6 n, k): what is left of each row once the rows before it are known, in units of its sigma."""
+        """``L^-1 right`` for (6 n, k): what is left of each row once the rows before it are known,
+        in units of its sigma.
+        """
         whitened, info = lapack.dtbtrs(self._bands, right, uplo="L")
         if info != 0:
             raise np.linalg.LinAlgError(f"singular factor at row {info}")

@@ -1,6 +1,8 @@
-"""LAPACK's routines for bands and tridiagonals as SciPy wraps them, without importing the package ``scipy.linalg``.
+"""LAPACK's routines for bands and tridiagonals as SciPy wraps them, without importing the package
+``scipy.linalg``.
 
-That package imports much else, and takes twice as long as numpy to import; the wrapper itself takes a millisecond or two.
+That package imports much else, and takes twice as long as numpy to import; the wrapper itself takes
+a millisecond or two.
 """
 
 import importlib
@@ -13,7 +15,9 @@ _USED = ("dpbtrf", "dtbtrs", "dpttrf", "dpttrs")
 
 
 def _load_wrapper():
-    """The wrapper alone where it is where SciPy has always had it, otherwise SciPy's public module of the same functions."""
+    """The wrapper alone where it is where SciPy has always had it, otherwise SciPy's public module
+    of the same functions.
+    """
     if _WRAPPER not in sys.modules:
         scipy = importlib.util.find_spec("scipy")
         folders = scipy.submodule_search_locations if scipy else []
@@ -22,10 +26,15 @@ def _load_wrapper():
             return importlib.import_module("scipy.linalg.lapack")
         wrapper = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(wrapper)
-        # Under its own name, so that scipy.linalg, imported later, finds it there and does not load it a second time.
+        # Under its own name, so that scipy.linalg, imported later, finds it there and does not load
+        # it a second time.
         sys.modules[_WRAPPER] = wrapper
     wrapper = sys.modules[_WRAPPER]
-    return wrapper if all(hasattr(wrapper, name) for name in _USED) else importlib.import_module("scipy.linalg.lapack")
+    return (
+        wrapper
+        if all(hasattr(wrapper, name) for name in _USED)
+        else importlib.import_module("scipy.linalg.lapack")
+    )
 
 
 _wrapper = _load_wrapper()

@@ -22,12 +22,14 @@ class AdaptiveSolution:
     ----------
     T_parent_child : (4, 4) array
     cov_parent_child_in_child : (6, 6) array
-        Covariance of xi = (rho, phi) in ``X exp(xi)`` under the model, nuisance parameters and misfit accounted for.
+        Covariance of xi = (rho, phi) in ``X exp(xi)`` under the model, nuisance parameters and
+        misfit accounted for.
     unseen : (6, U) array
         Directions of xi that no increment says anything about.
     noise : NoiseLevels
     centre : {"sensors", "child", "parent"}
-        What white rotation noise turns the trajectories about: the sensors, or the origin of the child's or the parent's world.
+        What white rotation noise turns the trajectories about: the sensors, or the origin of the
+        child's or the parent's world.
     nuisance : str
         Which systematic errors the data asks for, one of ``increments.NUISANCES``.
     parameters : (k,) array
@@ -37,10 +39,11 @@ class AdaptiveSolution:
     spikes : (n + 1,) bool array
         Poses that are wrong by themselves, and left out.
     used : (n + 1,) bool array
-        Poses that the answer rests on: without spikes, and where noise drowns the motion from pose to pose, only every so many.
+        Poses that the answer rests on: without spikes, and where noise drowns the motion from pose
+        to pose, only every so many.
     misfit : float
-        How many times larger the errors' variance over longer times is than the noise levels have it, 1 if the difference may be chance.
-        The covariance has this factor in it.
+        How many times larger the errors' variance over longer times is than the noise levels have
+        it, 1 if the difference may be chance. The covariance has this factor in it.
     metres_per_pose : float
         Path of the parent from pose to pose.
     objective : float
@@ -73,7 +76,9 @@ class AdaptiveSolution:
 
     @property
     def biases(self):
-        """(2, 3) array: error of the child's and of the parent's path per metre travelled, each along the axes of its sensor."""
+        """(2, 3) array: error of the child's and of the parent's path per metre travelled, each
+        along the axes of its sensor.
+        """
         return nuisance_values(self.nuisance, self.parameters)[1]
 
     @property
@@ -88,11 +93,15 @@ class AdaptiveSolution:
 
     @property
     def _after_a_metre(self):
-        """How many times larger a random walk is after a metre than after the path between two poses."""
+        """How many times larger a random walk is after a metre than after the path between two
+        poses.
+        """
         return (1.0 / max(self.metres_per_pose, 1e-9)) ** 0.5
 
     def describe(self, stamps_ns):
-        """The noise in plain numbers and strings: levels per axis, systematic errors, when trajectories went wrong (ns), all of it in words."""
+        """The noise in plain numbers and strings: levels per axis, systematic errors, when
+        trajectories went wrong (ns), all of it in words.
+        """
         return {
             "rotation_white_rad": self.noise.rotation_white,
             "translation_white_m": self.noise.translation_white,
@@ -121,17 +130,33 @@ class AdaptiveSolution:
         systematic = self.nuisance.split("+")
         if "scale" in systematic:
             off = 100 * (self.scale - 1)
-            said.append(f"the child's lengths are {abs(off):.2f} % {'shorter' if off > 0 else 'longer'} than the parent's")
-        for name, sensor, bias in zip(("bias", "parent bias"), ("child", "parent"), self.biases, strict=True):
+            said.append(
+                f"the child's lengths are {abs(off):.2f} % {'shorter' if off > 0 else 'longer'} than the parent's"
+            )
+        for name, sensor, bias in zip(
+            ("bias", "parent bias"), ("child", "parent"), self.biases, strict=True
+        ):
             if name in systematic:
-                along = ", ".join(f"{axis} {1000 * value:.2g}" for axis, value in zip("xyz", bias, strict=True))
-                said.append(f"the {sensor}'s path is off by {along} mm per metre travelled, along its own axes")
+                along = ", ".join(
+                    f"{axis} {1000 * value:.2g}" for axis, value in zip("xyz", bias, strict=True)
+                )
+                said.append(
+                    f"the {sensor}'s path is off by {along} mm per metre travelled, along its own axes"
+                )
         if "time" in systematic:
             offset_ms = 1000 * self.time_offset_s
-            said.append(f"the child's stamps are {abs(offset_ms):.1f} ms {'early' if offset_ms > 0 else 'late'}")
-        said += _when("jump of a trajectory, just before", "jumps of a trajectory, just before", stamps_ns[1:][self.jumps])
+            said.append(
+                f"the child's stamps are {abs(offset_ms):.1f} ms {'early' if offset_ms > 0 else 'late'}"
+            )
         said += _when(
-            "pose wrong by itself and left out, at", "poses wrong by themselves and left out, at", stamps_ns[self.spikes]
+            "jump of a trajectory, just before",
+            "jumps of a trajectory, just before",
+            stamps_ns[1:][self.jumps],
+        )
+        said += _when(
+            "pose wrong by itself and left out, at",
+            "poses wrong by themselves and left out, at",
+            stamps_ns[self.spikes],
         )
         if np.mean(self.used | self.spikes) < 1.0:
             every = round(1.0 / np.mean(self.used | self.spikes))
@@ -156,4 +181,6 @@ def _when(one, several, stamps_ns):
     if not len(stamps_ns):
         return []
     shown = ", ".join(f"{stamp_ns * 1e-9:.3f}" for stamp_ns in stamps_ns[:5].tolist())
-    return [f"{len(stamps_ns)} {one if len(stamps_ns) == 1 else several} {shown}{' ...' if len(stamps_ns) > 5 else ''} s"]
+    return [
+        f"{len(stamps_ns)} {one if len(stamps_ns) == 1 else several} {shown}{' ...' if len(stamps_ns) > 5 else ''} s"
+    ]

@@ -1,4 +1,6 @@
-"""What a drive has shown so far, and in plain words what it has not: for a person who is still driving."""
+"""What a drive has shown so far, and in plain words what it has not: for a person who is still
+driving.
+"""
 
 from dataclasses import dataclass
 
@@ -8,7 +10,8 @@ from hand_eye_calib.assessment.covariance import AXES, WEAK_ROTATION, WEAK_TRANS
 from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.geometry import se3
 
-# Poses looked at, spread evenly over the session: enough to see turns, few enough to cost a few milliseconds.
+# Poses looked at, spread evenly over the session: enough to see turns, few enough to cost a few
+# milliseconds.
 _MOST_POSES = 500
 
 # A turn counts when so large a share of the motions has less of it: one outlier is not a turn.
@@ -17,7 +20,8 @@ _QUANTILE = 95
 # Less turning than this reveals nothing of a lever (rad).
 ENOUGH_TURNING = np.radians(5.0)
 
-# Two turning axes must differ: turning about all but one is less than this share of the turning about that one.
+# Two turning axes must differ: turning about all but one is less than this share of the turning
+# about that one.
 _ONE_AXIS_SHARE = 0.04
 
 # An axis is hidden when this share of it lies in the direction that shows least.
@@ -35,9 +39,11 @@ class Excitation:
     n_poses : int
         Synchronised pose pairs of the session.
     turned : (3,) array
-        How far it has turned about x, y and z, rad: the largest over all spans of time of the 95th percentile over the session.
+        How far it has turned about x, y and z, rad: the largest over all spans of time of the 95th
+        percentile over the session.
     gain : (3,) array
-        Root mean square of the displacement that an offset of 1 m along x, y and z causes, m: how well that offset shows. 0 to 2.
+        Root mean square of the displacement that an offset of 1 m along x, y and z causes, m: how
+        well that offset shows. 0 to 2.
     worst : (3,) array
         Unit vector of the offset that shows least.
     worst_gain : float
@@ -68,12 +74,16 @@ def excitation(pose_pairs):
     n_poses = len(pose_pairs)
     if n_poses < 2:
         return Excitation(n_poses, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
-    poses = pose_pairs.Ts_pw_p[np.unique(np.linspace(0, n_poses - 1, min(n_poses, _MOST_POSES)).astype(int))]
+    poses = pose_pairs.Ts_pw_p[
+        np.unique(np.linspace(0, n_poses - 1, min(n_poses, _MOST_POSES)).astype(int))
+    ]
     turned, information = np.zeros(3), np.zeros((3, 3))
     lag = 1
     while lag < len(poses):
         rotations = np.swapaxes(poses[:-lag, :3, :3], 1, 2) @ poses[lag:, :3, :3]
-        turned = np.maximum(turned, np.percentile(np.abs(se3.rotation_log(rotations)), _QUANTILE, axis=0))
+        turned = np.maximum(
+            turned, np.percentile(np.abs(se3.rotation_log(rotations)), _QUANTILE, axis=0)
+        )
         moved = rotations - np.eye(3)
         at_lag = np.einsum("kai,kaj->ij", moved, moved) / len(moved)
         if np.trace(at_lag) > np.trace(information):
@@ -82,7 +92,9 @@ def excitation(pose_pairs):
     powers, directions = np.linalg.eigh(information)
     gain = np.sqrt(np.maximum(np.diag(information), 0.0))
     distance = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    return Excitation(n_poses, turned, gain, directions[:, 0], float(np.sqrt(max(powers[0], 0.0))), distance)
+    return Excitation(
+        n_poses, turned, gain, directions[:, 0], float(np.sqrt(max(powers[0], 0.0))), distance
+    )
 
 
 def what_is_missing(seen, calibration=None):
@@ -108,7 +120,9 @@ def what_is_missing(seen, calibration=None):
             f"hardly any turning so far (at most {_degrees(seen.turned.max())}): {_list(hidden)} not observable, "
             "drive curves in both directions"
         )
-    fine = [axis for axis, turned in zip("xyz", seen.turned, strict=True) if turned >= ENOUGH_TURNING]
+    fine = [
+        axis for axis, turned in zip("xyz", seen.turned, strict=True) if turned >= ENOUGH_TURNING
+    ]
     small = [axis for axis in "xyz" if axis not in fine]
     said = f"turning about {_list(fine)} is fine ({_list([_degrees(seen.turned['xyz'.index(axis)]) for axis in fine])})"
     if small:

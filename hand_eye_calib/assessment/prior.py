@@ -1,8 +1,9 @@
 """What a person knows beforehand, brought together with what the motion says.
 
-An answer with its covariance is a measurement; a tape measure is another. Both are weighed by their covariances, whatever method the answer comes
-from. Along a direction that the motion does not reveal only the prior counts; where there is none, the child sensor is put level with the
-parent along it (zero, not the value that noise would give), and the direction stays unknown.
+An answer with its covariance is a measurement; a tape measure is another. Both are weighed by their
+covariances, whatever method the answer comes from. Along a direction that the motion does not
+reveal only the prior counts; where there is none, the child sensor is put level with the parent
+along it (zero, not the value that noise would give), and the direction stays unknown.
 """
 
 import dataclasses
@@ -23,8 +24,8 @@ from hand_eye_calib.geometry import se3
 
 TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
 
-# A direction is unknown where its variance is this share of that of what is unknown, and an axis known again below this share of
-# the standard deviation.
+# A direction is unknown where its variance is this share of that of what is unknown, and an axis
+# known again below this share of the standard deviation.
 _UNKNOWN_SHARE, _KNOWN_SHARE = 0.25, 0.1
 
 # A prior says most of it where it at least halves the variance.
@@ -50,7 +51,8 @@ class Fused:
     assessment : Assessment
         Covariance and verdicts of both together.
     contradictions : dict
-        Axis names to the number of standard deviations between prior and motion, where there are too many.
+        Axis names to the number of standard deviations between prior and motion, where there are
+        too many.
     """
 
     T_parent_child: np.ndarray
@@ -68,8 +70,8 @@ def fuse(T_parent_child, assessment, prior):
     assessment : Assessment
         Of that answer.
     prior : dict
-        Axis name (x, y, z, roll, pitch, yaw; of the child sensor's pose in the parent sensor's frame, angles about fixed axes) to (value, sigma), in
-        m and rad. May be empty.
+        Axis name (x, y, z, roll, pitch, yaw; of the child sensor's pose in the parent sensor's
+        frame, angles about fixed axes) to (value, sigma), in m and rad. May be empty.
 
     Returns
     -------
@@ -87,13 +89,17 @@ def fuse(T_parent_child, assessment, prior):
         normal = np.eye(6) + jacobian.T @ jacobian
         deviations = inverse_root @ _difference(T_parent_child, T) - targets
         step = -root @ np.linalg.solve(normal, deviations + jacobian.T @ residuals)
-        T = se3.from_rotation_translation(T[:3, :3] @ se3.rotation_exp(step[3:]), T[:3, 3] + T[:3, :3] @ step[:3])
+        T = se3.from_rotation_translation(
+            T[:3, :3] @ se3.rotation_exp(step[3:]), T[:3, 3] + T[:3, :3] @ step[:3]
+        )
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     if not prior:
         return Fused(T, assessment, {})
     fused = Assessment(root @ np.linalg.inv(normal) @ root.T, ())
-    fused = dataclasses.replace(fused, observability=_verdicts(T[:3, :3], fused, T_parent_child[:3, :3], assessment, prior))
+    fused = dataclasses.replace(
+        fused, observability=_verdicts(T[:3, :3], fused, T_parent_child[:3, :3], assessment, prior)
+    )
     return Fused(T, fused, _contradictions(T_parent_child, covariance, prior))
 
 
@@ -117,7 +123,9 @@ def widened(assessment, rotation, spread):
     wider = Assessment(assessment.cov_parent_child_in_child + spread, ())
     added = _sigmas_in_parent(rotation, Assessment(spread, ()))
     observability = [
-        dof if dof.verdict is DofVerdict.UNOBSERVABLE else _known(dof.name, float(np.hypot(dof.sigma, more)))
+        dof
+        if dof.verdict is DofVerdict.UNOBSERVABLE
+        else _known(dof.name, float(np.hypot(dof.sigma, more)))
         for dof, more in zip(assessment.observability, added, strict=True)
     ]
     return dataclasses.replace(wider, observability=tuple(observability))
@@ -136,14 +144,16 @@ def _unknown_directions(covariance):
 
 
 def _whitened(T_parent_child, covariance, unknown):
-    """What makes deviations from the answer numbers of unit variance: known and unknown directions differ by many powers of ten.
+    """What makes deviations from the answer numbers of unit variance: known and unknown directions
+    differ by many powers of ten.
 
     Returns
     -------
     root, inverse_root : (6, 6) arrays
         Deviation from unit numbers, and back.
     targets : (6,) array
-        Unit numbers of where the answer is put if nothing else is known: at the parent sensor's origin along unknown translations.
+        Unit numbers of where the answer is put if nothing else is known: at the parent sensor's
+        origin along unknown translations.
     """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
     known = vectors[:, values < 0.5]
@@ -154,12 +164,18 @@ def _whitened(T_parent_child, covariance, unknown):
     sigmas = np.concatenate([np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE)), unknown_sigmas])
     in_child = T_parent_child[:3, :3].T @ T_parent_child[:3, 3]
     targets = np.where(is_translation, -(unknown[:3].T @ in_child), 0.0) / unknown_sigmas
-    return directions * sigmas, (directions / sigmas).T, np.concatenate([np.zeros(len(variances)), targets])
+    return (
+        directions * sigmas,
+        (directions / sigmas).T,
+        np.concatenate([np.zeros(len(variances)), targets]),
+    )
 
 
 def _difference(T_from, T_to):
     rotation = T_from[:3, :3].T
-    return np.r_[rotation @ (T_to[:3, 3] - T_from[:3, 3]), se3.rotation_log(rotation @ T_to[:3, :3])]
+    return np.r_[
+        rotation @ (T_to[:3, 3] - T_from[:3, 3]), se3.rotation_log(rotation @ T_to[:3, :3])
+    ]
 
 
 def _prior_residuals(T, prior):
@@ -168,7 +184,8 @@ def _prior_residuals(T, prior):
     for column, step in enumerate(_DIFFERENCE * np.eye(6)):
         for sign in (-1, 1):
             moved = se3.from_rotation_translation(
-                T[:3, :3] @ se3.rotation_exp(sign * step[3:]), T[:3, 3] + sign * T[:3, :3] @ step[:3]
+                T[:3, :3] @ se3.rotation_exp(sign * step[3:]),
+                T[:3, 3] + sign * T[:3, :3] @ step[:3],
             )
             jacobian[:, column] += sign * _weighted(moved, prior) / (2 * _DIFFERENCE)
     return residuals, jacobian
@@ -181,14 +198,20 @@ def _weighted(T, prior):
 
 def _errors(T, prior):
     """Axis name to the pose's value less the prior's."""
-    errors = {axis: value - prior[axis][0] for axis, value in zip(TRANSLATIONS, T[:3, 3], strict=True) if axis in prior}
+    errors = {
+        axis: value - prior[axis][0]
+        for axis, value in zip(TRANSLATIONS, T[:3, 3], strict=True)
+        if axis in prior
+    }
     angles = {axis: prior[axis][0] for axis in ROTATIONS if axis in prior}
     if len(angles) == 3:  # a whole rotation: no angle is singular
         nominal = se3.rotation_from_rpy(list(angles.values()))
         return errors | dict(zip(ROTATIONS, se3.rotation_log(T[:3, :3] @ nominal.T), strict=True))
     if angles:
         found = dict(zip(ROTATIONS, se3.rotation_to_rpy(T[:3, :3]), strict=True))
-        errors |= {axis: np.angle(np.exp(1j * (found[axis] - value))) for axis, value in angles.items()}
+        errors |= {
+            axis: np.angle(np.exp(1j * (found[axis] - value))) for axis, value in angles.items()
+        }
     return errors
 
 
@@ -204,7 +227,10 @@ def _contradictions(T_parent_child, covariance, prior):
 
 def _verdicts(rotation, fused, rotation_before, before, prior):
     """Verdicts for the axes of the parent sensor's frame, with the prior counted in."""
-    sigmas, sigmas_before = _sigmas_in_parent(rotation, fused), _sigmas_in_parent(rotation_before, before)
+    sigmas, sigmas_before = (
+        _sigmas_in_parent(rotation, fused),
+        _sigmas_in_parent(rotation_before, before),
+    )
     verdicts = []
     for dof, sigma, sigma_before in zip(before.observability, sigmas, sigmas_before, strict=True):
         turns = dof.name in ROTATIONS

@@ -1,4 +1,6 @@
-"""``reference: auto``: of the references with nearly the smallest predicted error, the one nearest to the adaptive estimator's answer."""
+"""``reference: auto``: of the references with nearly the smallest predicted error, the one nearest
+to the adaptive estimator's answer.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -12,7 +14,8 @@ from hand_eye_calib.pairing.motion_pairs import motion_pairs
 
 CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 
-# References whose predicted error is within this factor of the smallest are told apart by their answers.
+# References whose predicted error is within this factor of the smallest are told apart by their
+# answers.
 _NEARLY_AS_GOOD = 1.3
 
 # Fewer poses say too little about the noise to choose by it.
@@ -40,7 +43,9 @@ class ReferenceChoice:
         """One sentence for a person."""
         worst = max(self.predicted_m, key=self.predicted_m.get)
         decided = (
-            f"; of {', '.join(self.alike)} its answer is nearest to the adaptive estimator's" if len(self.alike) > 1 else ""
+            f"; of {', '.join(self.alike)} its answer is nearest to the adaptive estimator's"
+            if len(self.alike) > 1
+            else ""
         )
         return (
             f"{self.reference} of {', '.join(self.predicted_m)}: from the noise of these trajectories a translation error of "
@@ -51,10 +56,12 @@ class ReferenceChoice:
 def select_reference(pose_pairs, method, candidates=CANDIDATES):
     """Choose the reference for a method.
 
-    The residual cannot tell which reference is best (Välimäki et al. 2023, section 4.2). The noise can: once the adaptive estimator
-    has found how strong it is and how it wanders, the error of every reference follows from it. Where several are expected to do about
-    equally well, chance decides which of them does best on these poses; the one whose answer is nearest to the adaptive estimator's is the
-    best guess: that estimator's own error is the smaller one and, being that of the best linear estimator, independent of how far the others lie from it.
+    The residual cannot tell which reference is best (Välimäki et al. 2023, section 4.2). The noise
+    can: once the adaptive estimator has found how strong it is and how it wanders, the error of
+    every reference follows from it. Where several are expected to do about equally well, chance
+    decides which of them does best on these poses; the one whose answer is nearest to the adaptive
+    estimator's is the best guess: that estimator's own error is the smaller one and, being that of
+    the best linear estimator, independent of how far the others lie from it.
 
     Parameters
     ----------
@@ -91,7 +98,9 @@ def select_reference(pose_pairs, method, candidates=CANDIDATES):
         return ReferenceChoice("B1", {"B1": float("inf")})
     limit = _NEARLY_AS_GOOD * min(predicted_m.values())
     alike = tuple(reference for reference, expected in predicted_m.items() if expected <= limit)
-    return ReferenceChoice(_nearest(pose_pairs, method, alike, solution.T_parent_child), predicted_m, alike)
+    return ReferenceChoice(
+        _nearest(pose_pairs, method, alike, solution.T_parent_child), predicted_m, alike
+    )
 
 
 def _nearest(pose_pairs, method, references, T_parent_child):
@@ -101,7 +110,9 @@ def _nearest(pose_pairs, method, references, T_parent_child):
     fast = dataclasses.replace(method, backend="fast")
 
     def distance(reference):
-        T = fast.solve(motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)).T_parent_child
+        T = fast.solve(
+            motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
+        ).T_parent_child
         return float(np.linalg.norm(T[:3, 3] - T_parent_child[:3, 3]))
 
     return min(references, key=distance)

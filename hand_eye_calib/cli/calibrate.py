@@ -27,14 +27,18 @@ def add_arguments(parser):
 
 def add_file_arguments(parser):
     """Add the options that say how trajectory files are to be read: for both, and for each."""
-    group = parser.add_argument_group("trajectory files", "each also as --parent-... and --child-... for one of the two")
+    group = parser.add_argument_group(
+        "trajectory files", "each also as --parent-... and --child-... for one of the two"
+    )
     for name, settings in _FILE_OPTIONS.items():
         group.add_argument(f"--{name.replace('_', '-')}", dest=name, **settings)
         for stream in STREAMS:
             kind = {key: value for key, value in settings.items() if key != "help"} | {
                 "help": f"the same for {stream.upper()} alone"
             }
-            group.add_argument(f"--{stream}-{name.replace('_', '-')}", dest=f"{stream}_{name}", **kind)
+            group.add_argument(
+                f"--{stream}-{name.replace('_', '-')}", dest=f"{stream}_{name}", **kind
+            )
     group.add_argument(
         "--repair-stamps",
         action="store_true",
@@ -43,7 +47,8 @@ def add_file_arguments(parser):
 
 
 def read_files(arguments):
-    """The trajectories of both files, by stream, as :func:`add_file_arguments` says they are to be read.
+    """The trajectories of both files, by stream, as :func:`add_file_arguments` says they are to be
+    read.
 
     Returns
     -------
@@ -61,7 +66,10 @@ def read_files(arguments):
 
     trajectories, notes = {}, []
     for stream in STREAMS:
-        given = {name: getattr(arguments, f"{stream}_{name}") or getattr(arguments, name) for name in _FILE_OPTIONS}
+        given = {
+            name: getattr(arguments, f"{stream}_{name}") or getattr(arguments, name)
+            for name in _FILE_OPTIONS
+        }
         file_format = given.pop("format") or "tum"
         # A setting for both files is for those of them that are of its format.
         for name, belongs_to in (("columns", "csv"), ("times", "kitti")):
@@ -86,9 +94,9 @@ def _is_of_other(arguments, stream, file_format):
 
 def run(arguments):
     """Calibrate from files; returns the exit code."""
-    from hand_eye_calib.calibrator import offline_config, whole_snapshot
     from hand_eye_calib.cli.findings import with_findings
     from hand_eye_calib.cli.present import deliver
+    from hand_eye_calib.engine.calibrator import offline_config, whole_snapshot
 
     options = options_from(arguments)
     trajectories, notes = read_files(arguments)
@@ -107,7 +115,11 @@ def run(arguments):
         from hand_eye_calib.cli.replaying import fingerprints
 
         files = [getattr(arguments, stream) for stream in STREAMS]
-        files += [times for times in (arguments.times, arguments.parent_times, arguments.child_times) if times]
+        files += [
+            times
+            for times in (arguments.times, arguments.parent_times, arguments.child_times)
+            if times
+        ]
         inputs["files"] = fingerprints(files)
     return deliver(calibration, arguments, inputs, snapshot, findings=findings)
 

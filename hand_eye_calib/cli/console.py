@@ -34,7 +34,8 @@ def waiting_for(what):
 
 
 def with_progress(items, total, doing, size=lambda item: 1):
-    """Pass on ``items``; on a terminal, once that has taken two seconds, show how far, how fast and how long still.
+    """Pass on ``items``; on a terminal, once that has taken two seconds, show how far, how fast and
+    how long still.
 
     Parameters
     ----------
@@ -58,7 +59,9 @@ def with_progress(items, total, doing, size=lambda item: 1):
                     progress = _progress_bar()
                     progress.start()
                     task = progress.add_task(doing, total=total, rate="")
-                progress.update(task, completed=done, rate=f"{done / max(now - started, 1e-9):,.0f}/s")
+                progress.update(
+                    task, completed=done, rate=f"{done / max(now - started, 1e-9):,.0f}/s"
+                )
                 redraw_at = now + _REDRAW_S
             yield item
             done += size(item)
@@ -69,7 +72,13 @@ def with_progress(items, total, doing, size=lambda item: 1):
 
 def _progress_bar():
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),

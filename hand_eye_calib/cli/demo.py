@@ -1,4 +1,6 @@
-"""``demo``: one simulated drive, calibrated from its bag and by the live node, compared with the truth."""
+"""``demo``: one simulated drive, calibrated from its bag and by the live node, compared with the
+truth.
+"""
 
 import dataclasses
 import json
@@ -18,7 +20,8 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 
-# A minute of driving with good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, a handful of SLAM corrections of decimetres.
+# A minute of driving with good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, a
+# handful of SLAM corrections of decimetres.
 DRIVE = dataclasses.replace(HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera")
 NOISE = NoiseConfig(gaussian=0.002, rotation_per_metre=0.5, outliers=0.005, drift=0.002)
 
@@ -38,7 +41,9 @@ def add_arguments(parser):
         default=Path("demo_output"),
         help="directory for the bag, the node's log and report.html; those of an earlier demo are replaced. Default: demo_output",
     )
-    parser.add_argument("--seed", type=int, default=0, help="another seed, another drive. Default: 0")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="another seed, another drive. Default: 0"
+    )
     add_json_argument(parser)
 
 
@@ -92,7 +97,9 @@ def _write_bag(out, drive):
         if path.is_dir():
             shutil.rmtree(path)
     except OSError as error:
-        raise InputError(f"cannot replace {path}: {error.strerror}; remove it or choose another directory with --out") from None
+        raise InputError(
+            f"cannot replace {path}: {error.strerror}; remove it or choose another directory with --out"
+        ) from None
     streams = {
         TOPICS["parent"]: (drive.parent, "nav_msgs/msg/Odometry"),
         TOPICS["child"]: (drive.child, "nav_msgs/msg/Odometry"),
@@ -108,8 +115,8 @@ def _opened(bag_path):
 
 
 def _replay(bag_path):
-    from hand_eye_calib.calibrator import Calibrator
     from hand_eye_calib.cli.replaying import feed
+    from hand_eye_calib.engine.calibrator import Calibrator
 
     calibrator = Calibrator()
     with _opened(bag_path) as bag:
@@ -125,7 +132,9 @@ def _play(Player, bag_path, log_path, stamp_ns):
 
 
 def _keep_to_ourselves():
-    """No robot on the network shall receive simulated odometry; an explicit ROS_DOMAIN_ID is respected."""
+    """No robot on the network shall receive simulated odometry; an explicit ROS_DOMAIN_ID is
+    respected.
+    """
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     # Above 101 the ports run into those that Linux gives to clients.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
@@ -134,17 +143,28 @@ def _keep_to_ourselves():
 @contextmanager
 def _node(log_path):
     """The node in a process of its own; yields a function that raises where it has ended."""
-    command = [sys.executable, "-m", "hand_eye_calib", "calibrator", "--ros-args", "-p", "solve_period:=0.5"]
+    command = [
+        sys.executable,
+        "-m",
+        "hand_eye_calib",
+        "calibrator",
+        "--ros-args",
+        "-p",
+        "solve_period:=0.5",
+    ]
     for stream, topic in TOPICS.items():
         command += ["-r", f"{stream}_odom:={topic}"]
-        # Played this fast, best effort might lose messages, and this demo compares results of the same ones.
+        # Played this fast, best effort might lose messages, and this demo compares results of the
+        # same ones.
         command += ["-p", f"qos_overrides.{topic}.subscription.reliability:=reliable"]
     with log_path.open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
     def check():
         if process.poll() is not None:
-            raise HandEyeCalibError(f"the node ended with exit code {process.returncode}; see {log_path}")
+            raise HandEyeCalibError(
+                f"the node ended with exit code {process.returncode}; see {log_path}"
+            )
 
     try:
         yield check
@@ -160,7 +180,9 @@ def _node(log_path):
 def _document(drive, bag_path, offline, live):
     frames = {"parent_frame": offline.parent_frame, "child_frame": offline.child_frame}
     if (live.parent_frame, live.child_frame) != (offline.parent_frame, offline.child_frame):
-        raise HandEyeCalibError(f"the node's result is of {live.child_frame} in {live.parent_frame}, the replay's of {frames}")
+        raise HandEyeCalibError(
+            f"the node's result is of {live.child_frame} in {live.parent_frame}, the replay's of {frames}"
+        )
     difference_m, difference_rad = _errors(live.T_parent_child, offline.T_parent_child)
     return {
         **frames,
@@ -170,34 +192,49 @@ def _document(drive, bag_path, offline, live):
         "truth": _both_directions(drive.T_parent_child),
         "offline": _estimate(offline.T_parent_child, drive.T_parent_child)
         | {"stamp_ns": offline.stamp_ns, "reference": offline.reference},
-        "online": _estimate(live.T_parent_child, drive.T_parent_child) | {"stamp_ns": live.stamp_ns},
+        "online": _estimate(live.T_parent_child, drive.T_parent_child)
+        | {"stamp_ns": live.stamp_ns},
         "agreement": {"translation_m": difference_m, "rotation_rad": difference_rad},
     }
 
 
 def _estimate(T_parent_child, truth):
     error_m, error_rad = _errors(T_parent_child, truth)
-    return _both_directions(T_parent_child) | {"error": {"translation_m": error_m, "rotation_rad": error_rad}}
+    return _both_directions(T_parent_child) | {
+        "error": {"translation_m": error_m, "rotation_rad": error_rad}
+    }
 
 
 def _both_directions(T_parent_child):
     from hand_eye_calib.geometry import se3
 
-    return {"T_parent_child": T_parent_child.tolist(), "T_child_parent": se3.inverse(T_parent_child).tolist()}
+    return {
+        "T_parent_child": T_parent_child.tolist(),
+        "T_child_parent": se3.inverse(T_parent_child).tolist(),
+    }
 
 
 def _errors(T_parent_child, truth):
     """Distance between the translations (m) and angle between the rotations (rad)."""
     from hand_eye_calib.geometry import se3
 
-    return math.dist(T_parent_child[:3, 3], truth[:3, 3]), float(se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3]))
+    return math.dist(T_parent_child[:3, 3], truth[:3, 3]), float(
+        se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3])
+    )
 
 
 def _text(document):
-    parent, child, agreement = document["parent_frame"], document["child_frame"], document["agreement"]
+    parent, child, agreement = (
+        document["parent_frame"],
+        document["child_frame"],
+        document["agreement"],
+    )
     rows = {"truth": "truth", "offline": "replay of the bag", "online": "live node"}
     lines = []
-    for direction, source, target in (("T_parent_child", child, parent), ("T_child_parent", parent, child)):
+    for direction, source, target in (
+        ("T_parent_child", child, parent),
+        ("T_child_parent", parent, child),
+    ):
         lines.append(
             f"{f'Pose of {source} in {target}':<26}         x         y         z  m      roll     pitch       yaw  deg"
         )
@@ -218,4 +255,8 @@ def _row(matrix):
     from hand_eye_calib.geometry import se3
 
     angles = se3.rotation_to_rpy([row[:3] for row in matrix[:3]])
-    return "".join(f"{row[3]:10.4f}" for row in matrix[:3]) + "   " + "".join(f"{math.degrees(a):10.3f}" for a in angles)
+    return (
+        "".join(f"{row[3]:10.4f}" for row in matrix[:3])
+        + "   "
+        + "".join(f"{math.degrees(a):10.3f}" for a in angles)
+    )

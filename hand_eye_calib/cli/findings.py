@@ -3,15 +3,16 @@
 import dataclasses
 import textwrap
 
+from hand_eye_calib.checks.findings import Severity
 from hand_eye_calib.cli.options import flag
-from hand_eye_calib.pairing.stream_checks import Severity
 
 _MARKS = {Severity.ERROR: "ERROR", Severity.WARNING: "WARNING", Severity.NOTE: "note"}
 _WIDTH = 100
 
 
 def with_findings(calibration, snapshot):
-    """A calibration whose warnings hold what is wrong with its streams, and all findings as plain values.
+    """A calibration whose warnings hold what is wrong with its streams, and all findings as plain
+    values.
 
     Parameters
     ----------
@@ -32,7 +33,9 @@ def table(findings):
     lines = []
     for finding in findings:
         head = f"{_MARKS[finding.severity]:<8} {finding.code:<17} {finding.stream:<7} {finding.confidence.value:<9} "
-        body = textwrap.wrap(finding.what, _WIDTH - 4) + textwrap.wrap(f"-> {finding.advice}{_typed(finding)}", _WIDTH - 4)
+        body = textwrap.wrap(finding.what, _WIDTH - 4) + textwrap.wrap(
+            f"-> {finding.advice}{_typed(finding)}", _WIDTH - 4
+        )
         lines += [head.rstrip(), *(f"    {line}" for line in body)]
     return "\n".join(lines)
 

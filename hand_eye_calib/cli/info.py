@@ -5,7 +5,9 @@ from hand_eye_calib.cli.options import add_json_argument
 
 def add_arguments(parser):
     """Declare the command's arguments."""
-    parser.add_argument("result", metavar="RESULT", help="extrinsic.yaml, or the directory that holds it")
+    parser.add_argument(
+        "result", metavar="RESULT", help="extrinsic.yaml, or the directory that holds it"
+    )
     add_json_argument(parser)
 
 

@@ -52,7 +52,10 @@ def _print_table(document, topics):
         print(f"{document['bag']} has no topics")
         return
     table = Table(
-        title=f"{document['bag']}, {document['duration_s']:.1f} s", box=box.SIMPLE, title_justify="left", pad_edge=False
+        title=f"{document['bag']}, {document['duration_s']:.1f} s",
+        box=box.SIMPLE,
+        title_justify="left",
+        pad_edge=False,
     )
     for heading, justify in (("topic", "left"), ("type", "left"), ("count", "right"), ("rate", "right"), ("duration", "right"),
                              ("frames", "left")):  # fmt: skip
@@ -60,7 +63,14 @@ def _print_table(document, topics):
     for topic in topics:
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
         duration = "" if topic.duration_s is None else f"{topic.duration_s:.1f} s"
-        cells = [topic.name, topic.type or "several types", str(topic.count), rate, duration, "\n".join(topic.frames)]
+        cells = [
+            topic.name,
+            topic.type or "several types",
+            str(topic.count),
+            rate,
+            duration,
+            "\n".join(topic.frames),
+        ]
         table.add_row(*cells, style="bold" if topic.is_usable else None)
     # Whoever reads through a pipe wants whole lines, not those of a terminal of eighty columns.
     console = Console(highlight=False, markup=False)

@@ -1,7 +1,8 @@
-"""``hand_eye_calib COMMAND``: finds the command, runs it, turns what went wrong into one line and an exit code.
+"""``hand_eye_calib COMMAND``: finds the command, runs it, turns what went wrong into one line and
+an exit code.
 
-A command is a module with ``add_arguments(parser)`` and ``run(arguments) -> int``. It is imported when it is asked for, so
-that an optional package which is missing breaks no other command.
+A command is a module with ``add_arguments(parser)`` and ``run(arguments) -> int``. It is imported
+when it is asked for, so that an optional package which is missing breaks no other command.
 """
 
 import argparse
@@ -24,7 +25,6 @@ COMMANDS = {
     "calibrator": "run the ROS 2 node",
     "info": "show a saved result",
     "simulate": "make trajectories or a bag with known truth",
-    "experiment": "reproduce a figure or table of the article",
     "demo": "simulate a drive and calibrate it, offline and live",
 }
 
@@ -40,17 +40,26 @@ def main(argv=None):
     Returns
     -------
     int
-        0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is unobservable; 130 interrupted.
+        0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is unobservable; 130
+        interrupted.
 
     Raises
     ------
     SystemExit
         From argparse: code 2 for wrong usage, 0 after ``--help``.
     """
-    # The matrices are small: several threads only wait for each other, and three times as long where other programs run.
+    return exit_code_of(lambda: _run(sys.argv[1:] if argv is None else argv))
+
+
+def exit_code_of(run):
+    """What ``run()`` returns; an error that a person can act on becomes one line on stderr and an
+    exit code.
+    """
+    # The matrices are small: several threads only wait for each other, and three times as long
+    # where other programs run.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
-        code = _run(sys.argv[1:] if argv is None else argv)
+        code = run()
         sys.stdout.flush()
         return code
     except ConfigError as error:
@@ -61,7 +70,8 @@ def main(argv=None):
         if error.name is None or error.name.partition(".")[0] == "hand_eye_calib":
             raise
         return fail(
-            f"this needs the Python package {error.name!r}, which is not installed; install it and try again", EXIT_FAILED
+            f"this needs the Python package {error.name!r}, which is not installed; install it and try again",
+            EXIT_FAILED,
         )
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
@@ -91,7 +101,9 @@ def _run(argv):
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, summary in COMMANDS.items():
-        command_parser = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        command_parser = commands.add_parser(
+            name, help=summary, description=summary, allow_abbrev=False
+        )
         if name == chosen:
             command = importlib.import_module(f"hand_eye_calib.cli.{name}")
             command.add_arguments(command_parser)

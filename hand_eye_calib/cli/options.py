@@ -1,4 +1,6 @@
-"""Command-line options made from the option dataclasses, and the configuration file that may stand for them."""
+"""Command-line options made from the option dataclasses, and the configuration file that may stand
+for them.
+"""
 
 import argparse
 import dataclasses
@@ -23,7 +25,10 @@ def add_config_arguments(parser):
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
     group.add_argument(
-        "--config", metavar="FILE", type=Path, help="YAML file with these options by name, or a ROS parameter file"
+        "--config",
+        metavar="FILE",
+        type=Path,
+        help="YAML file with these options by name, or a ROS parameter file",
     )
     for name, field in _FIELDS.items():
         meta = field.metadata
@@ -62,7 +67,9 @@ def add_output_arguments(parser):
 
 def add_json_argument(parser):
     """Add ``--json``."""
-    parser.add_argument("--json", action="store_true", help="print one JSON document on stdout instead of text")
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON document on stdout instead of text"
+    )
 
 
 def flag(name):
@@ -82,7 +89,11 @@ def options_from(arguments):
     """
     options = _read_config(arguments.config) if arguments.config else {}
     options |= dict(getattr(arguments, "prior", ()))
-    return options | {name.removeprefix(_PREFIX): value for name, value in vars(arguments).items() if name.startswith(_PREFIX)}
+    return options | {
+        name.removeprefix(_PREFIX): value
+        for name, value in vars(arguments).items()
+        if name.startswith(_PREFIX)
+    }
 
 
 def config_from(arguments):
@@ -94,7 +105,9 @@ def _prior_argument(text):
     axis, equals, value = text.partition("=")
     if not equals or _PRIOR + axis not in _FIELDS:
         axes = ", ".join(name.removeprefix(_PRIOR) for name in _FIELDS if name.startswith(_PRIOR))
-        raise argparse.ArgumentTypeError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {axes}; got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected AXIS=VALUE+/-SIGMA with AXIS one of {axes}; got {text!r}"
+        )
     try:
         return _PRIOR + axis, check_value(_FIELDS[_PRIOR + axis], value)
     except ConfigError as error:
@@ -149,7 +162,9 @@ def _read_config(path):
     if document is None:
         return {}
     if not isinstance(document, dict):
-        raise ConfigError(f"{path}: expected a mapping of options to values; found {type(document).__name__}")
+        raise ConfigError(
+            f"{path}: expected a mapping of options to values; found {type(document).__name__}"
+        )
     options, ignored = {}, []
     for name, value in _flatten(_parameters(path, document)).items():
         if name in _FIELDS:
@@ -157,7 +172,9 @@ def _read_config(path):
         elif name in _NODE_OPTIONS or name.partition(".")[0] in _ROS_OPTIONS:
             ignored.append(name)
         else:
-            raise ConfigError(f"{path}: unknown option {name!r}; known are {', '.join(sorted(_FIELDS))}")
+            raise ConfigError(
+                f"{path}: unknown option {name!r}; known are {', '.join(sorted(_FIELDS))}"
+            )
     if ignored:
         note(f"{path}: only the node uses {', '.join(ignored)}; ignored here")
     return options
@@ -175,9 +192,15 @@ def _parameters(path, document):
     sections = dict(_ros_sections(document))
     if not sections:
         return document
-    ours = [parameters for node, parameters in sections.items() if node.rpartition("/")[2] in _NODE_NAMES]
+    ours = [
+        parameters
+        for node, parameters in sections.items()
+        if node.rpartition("/")[2] in _NODE_NAMES
+    ]
     if not ours:
-        raise ConfigError(f"{path}: no parameters for a node named calibrator; found some for {', '.join(sections)}")
+        raise ConfigError(
+            f"{path}: no parameters for a node named calibrator; found some for {', '.join(sections)}"
+        )
     return {name: value for parameters in ours for name, value in _flatten(parameters).items()}
 
 
@@ -193,5 +216,9 @@ def _flatten(mapping, prefix=""):
     """Nested mappings to dotted names."""
     flat = {}
     for name, value in mapping.items():
-        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        flat |= (
+            _flatten(value, f"{prefix}{name}.")
+            if isinstance(value, dict)
+            else {f"{prefix}{name}": value}
+        )
     return flat

@@ -23,9 +23,11 @@ def deliver(calibration, arguments, inputs, snapshot=None, **more):
     arguments : argparse.Namespace
         With ``json`` and ``out``.
     inputs : dict
-        Where the data came from, in plain values: part of the JSON document and of the saved file's provenance.
+        Where the data came from, in plain values: part of the JSON document and of the saved file's
+        provenance.
     snapshot : Snapshot, optional
-        The poses and options that gave it: with them, ``--out`` also asks other methods and writes the report.
+        The poses and options that gave it: with them, ``--out`` also asks other methods and writes
+        the report.
     **more
         What else the JSON document holds.
     """
@@ -39,7 +41,9 @@ def deliver(calibration, arguments, inputs, snapshot=None, **more):
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
     print(as_json(calibration, inputs=inputs, **more) if arguments.json else as_text(calibration))
     if evidence is not None:
-        write_report(arguments.out, calibration, evidence, snapshot.config, inputs, more.get("findings", ()))
+        write_report(
+            arguments.out, calibration, evidence, snapshot.config, inputs, more.get("findings", ())
+        )
     if calibration.status is SolveStatus.NOT_CONVERGED:
         fail("the solver did not converge; do not use this result, record more varied motion", 1)
     return EXIT_CODES[calibration.status]
@@ -83,8 +87,12 @@ def convergence_line(entry):
     if calibration is None:
         return f"{at} no estimate yet, {entry['reason']}"
     transform = calibration["T_parent_child"]
-    values = [f"{name} {value:.3f}" for name, value in zip("xyz", transform["translation"], strict=True)]
-    values += [f"{name} {value:.2f}" for name, value in zip(_ROTATIONS, transform["rpy_deg"], strict=True)]
+    values = [
+        f"{name} {value:.3f}" for name, value in zip("xyz", transform["translation"], strict=True)
+    ]
+    values += [
+        f"{name} {value:.2f}" for name, value in zip(_ROTATIONS, transform["rpy_deg"], strict=True)
+    ]
     return f"{at} {' '.join(values[:3])} m, {' '.join(values[3:])} deg, {calibration['n_poses']} poses, {calibration['status']}"
 
 
@@ -93,12 +101,16 @@ def _transform_lines(transform):
         f"  {transform['maps']}",
         "  translation " + _row(("x", "y", "z"), transform["translation"]) + "  m",
         "  quaternion  " + _row(("x", "y", "z", "w"), transform["quat_xyzw"]),
-        "  rotation    " + _row(_ROTATIONS, transform["rpy_deg"], digits=4) + "  deg, about fixed axes",
+        "  rotation    "
+        + _row(_ROTATIONS, transform["rpy_deg"], digits=4)
+        + "  deg, about fixed axes",
     ]
 
 
 def _row(names, values, digits=6):
-    return "  ".join(f"{name} {value:{digits + 6}.{digits}f}" for name, value in zip(names, values, strict=True))
+    return "  ".join(
+        f"{name} {value:{digits + 6}.{digits}f}" for name, value in zip(names, values, strict=True)
+    )
 
 
 def _with_sigma(value, sigma, digits):
@@ -116,10 +128,15 @@ def _observability_line(dof):
 
 def _consistency_lines(consistency):
     """The same as other methods and references, and the drive's halves, suggest it."""
-    titles = {"of_methods": "Other methods and references suggest", "of_halves": "The two halves of the drive suggest"}
+    titles = {
+        "of_methods": "Other methods and references suggest",
+        "of_halves": "The two halves of the drive suggest",
+    }
     for kind, title in titles.items() if consistency else ():
         told = [
-            f"{axis} {np.degrees(row[kind]):.3f} deg" if axis in _ROTATIONS else f"{axis} {row[kind]:.4f} m"
+            f"{axis} {np.degrees(row[kind]):.3f} deg"
+            if axis in _ROTATIONS
+            else f"{axis} {row[kind]:.4f} m"
             for axis, row in consistency.items()
             if row[kind] is not None
         ]

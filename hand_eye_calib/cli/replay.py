@@ -34,7 +34,9 @@ def add_arguments(parser):
             help=f"poses of the {stream} sensor from /tf and /tf_static: its frame, and the fixed one, such as odom:lidar",
         )
     parser.add_argument(
-        "--list", action="store_true", help="show what is in the bag - topics, types, counts, rates, frames - and end"
+        "--list",
+        action="store_true",
+        help="show what is in the bag - topics, types, counts, rates, frames - and end",
     )
     parser.add_argument(
         "--every",
@@ -43,10 +45,22 @@ def add_arguments(parser):
         help="estimate every so much bag time as well, such as 5s, and show how the estimate converges",
     )
     batch = parser.add_argument_group("many bags")
-    batch.add_argument("--batch", metavar="FILE", type=Path, help="YAML file with a list of bags, each with options of its own")
-    batch.add_argument("--jobs", metavar="N", type=_positive, help="processes that work on it. Default: one for each core")
     batch.add_argument(
-        "--dask", metavar="ADDRESS", help="work on it on a Dask cluster instead: address of its scheduler, tcp://..."
+        "--batch",
+        metavar="FILE",
+        type=Path,
+        help="YAML file with a list of bags, each with options of its own",
+    )
+    batch.add_argument(
+        "--jobs",
+        metavar="N",
+        type=_positive,
+        help="processes that work on it. Default: one for each core",
+    )
+    batch.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="work on it on a Dask cluster instead: address of its scheduler, tcp://...",
     )
     add_config_arguments(parser)
     add_output_arguments(parser)
@@ -86,7 +100,9 @@ def run(arguments):
 
 def _check_usage(arguments):
     if arguments.batch and (arguments.bags or arguments.list or arguments.every):
-        raise ConfigError("--batch names its bags in its file: no BAG, --list or --every goes with it")
+        raise ConfigError(
+            "--batch names its bags in its file: no BAG, --list or --every goes with it"
+        )
     if not arguments.batch and (arguments.jobs or arguments.dask):
         raise ConfigError("--jobs and --dask are for --batch")
     if not arguments.batch and not arguments.bags:
@@ -105,7 +121,9 @@ def _tf_source(text):
 def _duration_s(text):
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(s|ms|min|)", text)
     if not match or not float(match[1]):
-        raise argparse.ArgumentTypeError(f"expected a duration such as 5s, 500ms or 1min; got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected a duration such as 5s, 500ms or 1min; got {text!r}"
+        )
     return float(match[1]) * _UNITS_S[match[2]]
 
 

@@ -8,9 +8,9 @@ from itertools import chain, islice, pairwise
 import numpy as np
 
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.calibrator import Calibrator
 from hand_eye_calib.cli.console import note, waiting_for, with_progress
 from hand_eye_calib.cli.present import convergence_line
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 
 _NS_PER_S = 1_000_000_000
@@ -52,7 +52,8 @@ def replay(paths, parent, child, config, every_s=None, quiet=False):
     every_s : float, optional
         Bag time between estimates on the way.
     quiet : bool
-        Say nothing on stderr; what there is to say of the data is among the calibration's warnings anyway.
+        Say nothing on stderr; what there is to say of the data is among the calibration's warnings
+        anyway.
 
     Returns
     -------
@@ -70,26 +71,37 @@ def replay(paths, parent, child, config, every_s=None, quiet=False):
     with PoseBag(*paths) as bag:
         sources = dict(zip(("parent", "child"), bag.select_topics(parent, child), strict=True))
         if not (parent and child):
-            say(f"parent is {sources['parent']}, child is {sources['child']}; --parent-topic and --child-topic say otherwise")
+            say(
+                f"parent is {sources['parent']}, child is {sources['child']}; --parent-topic and --child-topic say otherwise"
+            )
         blocks = bag.blocks(*sources.values(), config.max_gap)
         with waited_for(f"opening {bag}"):
             blocks = _started(blocks)
         expected = bag.expected(*sources.values())
         convergence = Convergence(calibrator, every_s) if every_s else None
-        found = feed(calibrator, shown(blocks, expected, f"reading {bag}", len), sources, convergence)
+        found = feed(
+            calibrator, shown(blocks, expected, f"reading {bag}", len), sources, convergence
+        )
         found += bag.n_left_out
         warnings = bag.warnings
         files = bag.files()
     if expected is not None and found != expected:
-        warnings.append(f"{bag} says it has {expected} messages on these topics, but {found} could be read; it may be damaged")
+        warnings.append(
+            f"{bag} says it has {expected} messages on these topics, but {found} could be read; it may be damaged"
+        )
     for text in warnings:
         say(text)
     with waited_for("solving"):
         calibration = calibrator.estimate()
     calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *warnings))
     inputs = {"bag": str(bag), "options": calibrator.config.to_options()}
-    inputs |= {stream: {"topic": str(source), **_counts(calibrator.statistics(stream))} for stream, source in sources.items()}
-    return Replayed(calibration, inputs, files, convergence.history if convergence else [], calibrator)
+    inputs |= {
+        stream: {"topic": str(source), **_counts(calibrator.statistics(stream))}
+        for stream, source in sources.items()
+    }
+    return Replayed(
+        calibration, inputs, files, convergence.history if convergence else [], calibrator
+    )
 
 
 def feed(calibrator, blocks, topics, convergence=None):
@@ -118,10 +130,17 @@ def feed(calibrator, blocks, topics, convergence=None):
     for block in blocks:
         count += len(block)
         new_frames = {}
-        for row, pair in enumerate(zip(block.streams.tolist(), block.sensor_frames.tolist(), strict=True)):
+        for row, pair in enumerate(
+            zip(block.streams.tolist(), block.sensor_frames.tolist(), strict=True)
+        ):
             if pair not in frames:
                 new_frames.setdefault(pair, row)
-        cuts = {0, len(block), *new_frames.values(), *(convergence.cuts(block.bag_ns) if convergence else ())}
+        cuts = {
+            0,
+            len(block),
+            *new_frames.values(),
+            *(convergence.cuts(block.bag_ns) if convergence else ()),
+        }
         for first, last in pairwise(sorted(cuts)):
             part = block[first:last]
             if convergence is not None:
@@ -130,7 +149,9 @@ def feed(calibrator, blocks, topics, convergence=None):
                 if (pair := (part.streams[0], part.sensor_frames[0])) not in frames:
                     calibrator.set_frame(*pair)
                     frames.add(pair)
-                calibrator.add_poses(part.streams, part.stamps_ns, part.poses[:, :3], part.poses[:, 3:])
+                calibrator.add_poses(
+                    part.streams, part.stamps_ns, part.poses[:, :3], part.poses[:, 3:]
+                )
             except InputError as error:
                 row = getattr(error, "index", 0)
                 seconds, nanoseconds = divmod(int(part.stamps_ns[row]), _NS_PER_S)
@@ -151,7 +172,8 @@ class Convergence:
     Attributes
     ----------
     history : list of dict
-        Bag time in seconds since the first message, and the calibration in plain values, or why there was none.
+        Bag time in seconds since the first message, and the calibration in plain values, or why
+        there was none.
     """
 
     def __init__(self, calibrator, every_s):
@@ -165,7 +187,9 @@ class Convergence:
         return (np.flatnonzero(np.diff((bag_ns - first_ns) // self._every_ns)) + 1).tolist()
 
     def reached(self, bag_ns):
-        """Estimate where another period has passed; call it before the message of that time is added."""
+        """Estimate where another period has passed; call it before the message of that time is
+        added.
+        """
         if self._first_ns is None:
             self._first_ns, self._next_ns = bag_ns, bag_ns + self._every_ns
         if bag_ns < self._next_ns:
@@ -186,7 +210,10 @@ def fingerprints(files, quiet=False):
     """Name, size and SHA-256 of the files that were read."""
     from hand_eye_calib.io.results import fingerprint
 
-    return [fingerprint(file) for file in (files if quiet else with_progress(files, len(files), "hashing"))]
+    return [
+        fingerprint(file)
+        for file in (files if quiet else with_progress(files, len(files), "hashing"))
+    ]
 
 
 def _started(blocks):

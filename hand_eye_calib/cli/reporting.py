@@ -1,13 +1,15 @@
-"""What ``--out`` adds to a calibration: other answers to the same question, ``report.html``; and ``check.html`` of the command ``check``."""
+"""What ``--out`` adds to a calibration: other answers to the same question, ``report.html``; and
+``check.html`` of the command ``check``.
+"""
 
 import dataclasses
 from pathlib import Path
 
-from hand_eye_calib.assessment.consistency import consistency
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
+from hand_eye_calib.engine.cross_check import consistency
+from hand_eye_calib.engine.estimation import estimate_extrinsic
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.estimation import estimate_extrinsic
 
 REPORT, CHECK = "report.html", "check.html"
 _REJECT_OUTLIERS = ("dnlo", "adaptive")
@@ -15,7 +17,8 @@ _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 
 
 def with_consistency(calibration, snapshot):
-    """A calibration with how far other methods, other references and the drive's halves lie from it; and the Evidence for a report.
+    """A calibration with how far other methods, other references and the drive's halves lie from
+    it; and the Evidence for a report.
 
     Parameters
     ----------
@@ -23,19 +26,24 @@ def with_consistency(calibration, snapshot):
     snapshot : Snapshot
         The poses and options that gave it.
     """
-    from hand_eye_calib.report.evidence import gather
+    from hand_eye_calib.engine.evidence import gather
 
     # The clock is settled; estimating it again would cost time.
     config = dataclasses.replace(snapshot.config, time_offset=calibration.time_offset_s)
     pose_pairs = dataclasses.replace(snapshot, config=config).pose_pairs()
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True))
     evidence = gather(calibration, snapshot.config, pose_pairs, estimate_extrinsic, streams)
-    others, halves = ([one.calibration for one in answers] for answers in (evidence.comparison, evidence.halves))
-    # Where there are jumps, methods that use every pair disagree for a reason that says nothing about the result.
+    others, halves = (
+        [one.calibration for one in answers] for answers in (evidence.comparison, evidence.halves)
+    )
+    # Where there are jumps, methods that use every pair disagree for a reason that says nothing
+    # about the result.
     robust = [other for other in others if other.method in _REJECT_OUTLIERS]
     found = consistency(calibration, robust, halves)
     warnings = (*calibration.warnings, *found.warnings())
-    return dataclasses.replace(calibration, consistency=found.to_dict(), warnings=warnings), evidence
+    return dataclasses.replace(
+        calibration, consistency=found.to_dict(), warnings=warnings
+    ), evidence
 
 
 def write_report(directory, *arguments):
@@ -60,7 +68,8 @@ def write_report(directory, *arguments):
 
 
 def write_check(directory, *arguments):
-    """Write the page of the stream checks into a directory, which is made; without the libraries, say so and go on.
+    """Write the page of the stream checks into a directory, which is made; without the libraries,
+    say so and go on.
 
     Parameters
     ----------
@@ -129,5 +138,7 @@ def save_page(path, text):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"cannot write {error.filename or path}: {error.strerror}; choose another directory") from None
+        raise InputError(
+            f"cannot write {error.filename or path}: {error.strerror}; choose another directory"
+        ) from None
     return path

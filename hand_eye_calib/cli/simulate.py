@@ -28,10 +28,21 @@ def add_arguments(parser):
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _FILES
     parser.add_argument(
-        "--out", metavar="DIR", type=Path, required=True, help="directory to make; it must be empty or not exist"
+        "--out",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="directory to make; it must be empty or not exist",
     )
-    parser.add_argument("--runs", type=_positive, default=1, metavar="N", help="number of drives. Default: 1")
-    parser.add_argument("--seed", type=_not_negative, default=0, help="the same seed gives the same drives. Default: 0")
+    parser.add_argument(
+        "--runs", type=_positive, default=1, metavar="N", help="number of drives. Default: 1"
+    )
+    parser.add_argument(
+        "--seed",
+        type=_not_negative,
+        default=0,
+        help="the same seed gives the same drives. Default: 0",
+    )
     parser.add_argument(
         "--drive",
         choices=tuple(_DRIVES),
@@ -40,19 +51,29 @@ def add_arguments(parser):
         "10 and 20 Hz, no common stamps. Default: published",
     )
     parser.add_argument(
-        "--poses", type=int, metavar="N", help="poses of the parent sensor. Default: 100 (published), 1200 (hilly)"
+        "--poses",
+        type=int,
+        metavar="N",
+        help="poses of the parent sensor. Default: 100 (published), 1200 (hilly)",
     )
     fields = {field.name: field for field in dataclasses.fields(NoiseConfig)}
     for option, name in _NOISE_OPTIONS.items():
         meta = fields[name].metadata
         unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
-        parser.add_argument(f"--{option}", type=float, metavar=option.upper(), help=f"{meta['doc']}{unit} Default: 0.")
+        parser.add_argument(
+            f"--{option}",
+            type=float,
+            metavar=option.upper(),
+            help=f"{meta['doc']}{unit} Default: 0.",
+        )
     parser.add_argument(
         "--mixture",
         action="store_true",
         help=f"the article's mixture: --noise {MIXTURE.gaussian} --outliers {MIXTURE.outliers} --drift {MIXTURE.drift}, where not given",
     )
-    parser.add_argument("--bag", choices=("mcap", "sqlite3", "rosbag1"), help="write a bag of every drive too")
+    parser.add_argument(
+        "--bag", choices=("mcap", "sqlite3", "rosbag1"), help="write a bag of every drive too"
+    )
     add_json_argument(parser)
 
 
@@ -67,7 +88,11 @@ def run(arguments):
     for number, folder in enumerate(folders):
         write_drive(folder, simulate_drive((arguments.seed, number), config, noise), arguments.bag)
     if arguments.json:
-        settings = {"seed": arguments.seed, "drive": config.to_options(), "noise": noise.to_options()}
+        settings = {
+            "seed": arguments.seed,
+            "drive": config.to_options(),
+            "noise": noise.to_options(),
+        }
         print(json.dumps({"runs": [str(folder) for folder in folders], **settings}, indent=2))
     else:
         print(f"{len(folders)} drive{'s' * (len(folders) != 1)} written to {arguments.out}")
@@ -95,7 +120,9 @@ def write_drive(folder, drive, bag=None):
     _make_empty(folder)
     write_trajectory(folder / PARENT_FILE, drive.parent)
     write_trajectory(folder / CHILD_FILE, drive.child)
-    write_trajectory(folder / TRUTH_FILE, Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None]))
+    write_trajectory(
+        folder / TRUTH_FILE, Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None])
+    )
     if bag:
         from hand_eye_calib.io.bags import write_bag
 
@@ -111,7 +138,9 @@ def _configs(arguments):
     if arguments.poses is not None:
         config = dataclasses.replace(config, poses=arguments.poses)
     given = {
-        name: getattr(arguments, option) for option, name in _NOISE_OPTIONS.items() if getattr(arguments, option) is not None
+        name: getattr(arguments, option)
+        for option, name in _NOISE_OPTIONS.items()
+        if getattr(arguments, option) is not None
     }
     return config, dataclasses.replace(MIXTURE if arguments.mixture else NoiseConfig(), **given)
 
@@ -121,9 +150,13 @@ def _make_empty(folder):
         folder.mkdir(parents=True, exist_ok=True)
         occupied = any(folder.iterdir())
     except OSError as error:
-        raise InputError(f"cannot make directory {folder}: {error.strerror}; choose another with --out") from None
+        raise InputError(
+            f"cannot make directory {folder}: {error.strerror}; choose another with --out"
+        ) from None
     if occupied:
-        raise InputError(f"{folder} is not empty, and nothing in it is overwritten; remove it or choose another with --out")
+        raise InputError(
+            f"{folder} is not empty, and nothing in it is overwritten; remove it or choose another with --out"
+        )
 
 
 def _positive(text):
@@ -136,5 +169,7 @@ def _not_negative(text):
 
 def _at_least(minimum, text):
     if not text.isdecimal() or int(text) < minimum:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least {minimum}, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected a whole number of at least {minimum}, got {text!r}"
+        )
     return int(text)

@@ -1,14 +1,16 @@
 """Batched rigid transforms.
 
-Transforms are ``(..., 4, 4)`` arrays named ``T_target_source``: they map coordinates of ``source`` into ``target``. Tangent
-vectors are ``(..., 6)`` arrays ``(rho, phi)``, translation (m) before rotation (rad), acting on the right:
-``T_target_source @ exp(xi_in_source)``. Rotation conversions are written out: SciPy's, as good, take a tenth of a second to import.
+Transforms are ``(..., 4, 4)`` arrays named ``T_target_source``: they map coordinates of ``source``
+into ``target``. Tangent vectors are ``(..., 6)`` arrays ``(rho, phi)``, translation (m) before
+rotation (rad), acting on the right: ``T_target_source @ exp(xi_in_source)``. Rotation conversions
+are written out: SciPy's, as good, take a tenth of a second to import.
 """
 
 import numpy as np
 
-# Below this angle the coefficients of exp and log come from their Taylor series. At 1e-2 rad the first term left out is
-# of order angle^6, about 1e-16 relative, whereas the closed forms lose digits to cancellation.
+# Below this angle the coefficients of exp and log come from their Taylor series. At 1e-2 rad the
+# first term left out is of order angle^6, about 1e-16 relative, whereas the closed forms lose
+# digits to cancellation.
 _SERIES_ANGLE = 1e-2
 
 # Cosine of the pitch below which roll and yaw turn about the same axis, but for rounding.
@@ -35,7 +37,9 @@ def skew(vectors):
 
 
 def cross(left, right):
-    """Cross products (..., 3) of vectors, two arrays of the same shape (..., 3): numpy.cross takes several times as long for a few hundred."""
+    """Cross products (..., 3) of vectors, two arrays of the same shape (..., 3): numpy.cross takes
+    several times as long for a few hundred.
+    """
     (x, y, z), (u, v, w) = (vectors.T for vectors in (left, right))
     products = np.empty(left.shape)
     products.T[0], products.T[1], products.T[2] = y * w - z * v, z * u - x * w, x * v - y * u
@@ -43,7 +47,9 @@ def cross(left, right):
 
 
 def from_rotation_translation(rotation, translation):
-    """Transforms from rotation matrices (..., 3, 3) and translations (..., 3) in metres; returns (..., 4, 4)."""
+    """Transforms from rotation matrices (..., 3, 3) and translations (..., 3) in metres; returns
+    (..., 4, 4).
+    """
     rotation, translation = np.asarray(rotation, dtype=float), np.asarray(translation, dtype=float)
     shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     transforms = np.zeros(shape + (4, 4))
@@ -54,9 +60,11 @@ def from_rotation_translation(rotation, translation):
 
 
 def from_quat_xyzw(translation, quat_xyzw):
-    """Transforms from translations (..., 3) in metres and quaternions (..., 4), scalar last; returns (..., 4, 4).
+    """Transforms from translations (..., 3) in metres and quaternions (..., 4), scalar last;
+    returns (..., 4, 4).
 
-    Quaternions are normalised; whether they were close enough to unit length is for the caller to judge.
+    Quaternions are normalised; whether they were close enough to unit length is for the caller to
+    judge.
 
     Raises
     ------
@@ -71,7 +79,9 @@ def from_quat_xyzw(translation, quat_xyzw):
 
 
 def to_quat_xyzw(transforms):
-    """Quaternions (..., 4), scalar last and not negative, of the rotations of transforms (..., 4, 4), or of rotations (..., 3, 3)."""
+    """Quaternions (..., 4), scalar last and not negative, of the rotations of transforms (..., 4,
+    4), or of rotations (..., 3, 3).
+    """
     rotations = np.asarray(transforms, dtype=float)[..., :3, :3]
     quats = _scaled_quats(rotations.reshape(-1, 3, 3))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -79,21 +89,27 @@ def to_quat_xyzw(transforms):
 
 
 def rotation_from_rpy(rpy):
-    """Rotation matrices (..., 3, 3) of roll, pitch and yaw (..., 3), rad, about the fixed axes x, y and z in this order (REP 103, URDF)."""
+    """Rotation matrices (..., 3, 3) of roll, pitch and yaw (..., 3), rad, about the fixed axes x, y
+    and z in this order (REP 103, URDF).
+    """
     rpy = np.asarray(rpy, dtype=float)
     roll, pitch, yaw = (rotation_exp(rpy[..., axis, None] * np.eye(3)[axis]) for axis in range(3))
     return yaw @ pitch @ roll
 
 
 def rotation_to_rpy(rotation):
-    """Roll, pitch and yaw (..., 3), rad, of rotation matrices (..., 3, 3): the inverse of :func:`rotation_from_rpy`.
+    """Roll, pitch and yaw (..., 3), rad, of rotation matrices (..., 3, 3): the inverse of
+    :func:`rotation_from_rpy`.
 
-    The pitch is from -pi/2 to pi/2. Where it is one of these, only the sum or difference of the others is defined, and the yaw is 0.
+    The pitch is from -pi/2 to pi/2. Where it is one of these, only the sum or difference of the
+    others is defined, and the yaw is 0.
     """
     R = np.asarray(rotation, dtype=float)
     cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
     singular = cosine < _SINGULAR_COSINE
-    roll = np.where(singular, np.arctan2(-R[..., 1, 2], R[..., 1, 1]), np.arctan2(R[..., 2, 1], R[..., 2, 2]))
+    roll = np.where(
+        singular, np.arctan2(-R[..., 1, 2], R[..., 1, 1]), np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    )
     yaw = np.where(singular, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
     return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
 
@@ -116,7 +132,8 @@ def quat_log(quat_xyzw):
 def _scaled_quats(rotations):
     """Quaternions (N, 4), scalar last and not negative, of rotations (N, 3, 3), but of any length.
 
-    From the largest of their numbers, so that no digits are lost: S. W. Shepperd, *Quaternion from rotation matrix*, 1978.
+    From the largest of their numbers, so that no digits are lost: S. W. Shepperd, *Quaternion from
+    rotation matrix*, 1978.
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotations.reshape(-1, 9).T
     trace = r00 + r11 + r22
@@ -147,7 +164,11 @@ def _matrices(x, y, z, w):
     matrices = np.empty((*np.shape(w), 3, 3))
     twice_x, twice_y, twice_z = 2.0 * x, 2.0 * y, 2.0 * z
     xx, yy, zz = twice_x * x, twice_y * y, twice_z * z
-    matrices[..., 0, 0], matrices[..., 1, 1], matrices[..., 2, 2] = 1.0 - (yy + zz), 1.0 - (xx + zz), 1.0 - (xx + yy)
+    matrices[..., 0, 0], matrices[..., 1, 1], matrices[..., 2, 2] = (
+        1.0 - (yy + zz),
+        1.0 - (xx + zz),
+        1.0 - (xx + yy),
+    )
     for row, column, product, other in (
         (1, 0, twice_x * y, twice_z * w),
         (0, 2, twice_x * z, twice_y * w),
@@ -161,7 +182,9 @@ def inverse(transforms):
     """Inverses of transforms (..., 4, 4): ``T_source_target`` of ``T_target_source``."""
     transforms = np.asarray(transforms, dtype=float)
     rotation_inverse = np.swapaxes(transforms[..., :3, :3], -1, -2)
-    return from_rotation_translation(rotation_inverse, -(rotation_inverse @ transforms[..., :3, 3:])[..., 0])
+    return from_rotation_translation(
+        rotation_inverse, -(rotation_inverse @ transforms[..., :3, 3:])[..., 0]
+    )
 
 
 def exp(xi):
@@ -178,8 +201,9 @@ def exp(xi):
 
     Notes
     -----
-    ``t = V rho`` with ``V = I + (1 - cos a)/a^2 [phi] + (a - sin a)/a^3 [phi]^2`` and ``a = |phi|``; Sola, Deray,
-    Atchuthan, *A micro Lie theory for state estimation in robotics*, 2018, eqs 172-174.
+    ``t = V rho`` with ``V = I + (1 - cos a)/a^2 [phi] + (a - sin a)/a^3 [phi]^2`` and ``a =
+    |phi|``; Sola, Deray, Atchuthan, *A micro Lie theory for state estimation in robotics*, 2018,
+    eqs 172-174.
     """
     xi = np.asarray(xi, dtype=float)
     rho, phi = xi[..., :3], xi[..., 3:]
@@ -187,9 +211,7 @@ def exp(xi):
     safe = np.where(angle < _SERIES_ANGLE, 1.0, angle)
     squared = angle**2
     first = np.where(
-        angle < _SERIES_ANGLE,
-        0.5 - squared / 24 + squared**2 / 720,
-        (1 - np.cos(safe)) / safe**2,
+        angle < _SERIES_ANGLE, 0.5 - squared / 24 + squared**2 / 720, (1 - np.cos(safe)) / safe**2
     )
     second = np.where(
         angle < _SERIES_ANGLE,
@@ -215,8 +237,9 @@ def log(transforms):
 
     Notes
     -----
-    ``rho = V^-1 t`` with ``V^-1 = I - [phi]/2 + (1/a^2 - (1 + cos a) / (2 a sin a)) [phi]^2``; written with the half angle the
-    last coefficient is ``(1 - (a/2) cot(a/2)) / a^2``, finite up to a = pi.
+    ``rho = V^-1 t`` with ``V^-1 = I - [phi]/2 + (1/a^2 - (1 + cos a) / (2 a sin a)) [phi]^2``;
+    written with the half angle the last coefficient is ``(1 - (a/2) cot(a/2)) / a^2``, finite up to
+    a = pi.
     """
     transforms = np.asarray(transforms, dtype=float)
     phi = rotation_log(transforms[..., :3, :3])
@@ -237,7 +260,8 @@ def log(transforms):
 def adjoint(transforms):
     """Adjoint matrices (..., 6, 6) of transforms (..., 4, 4).
 
-    ``T @ exp(xi) == exp(adjoint(T) @ xi) @ T``: moves a tangent vector (rho, phi) from the source frame to the target frame.
+    ``T @ exp(xi) == exp(adjoint(T) @ xi) @ T``: moves a tangent vector (rho, phi) from the source
+    frame to the target frame.
     """
     transforms = np.asarray(transforms, dtype=float)
     rotation = transforms[..., :3, :3]
@@ -251,7 +275,8 @@ def adjoint(transforms):
 def rotation_angle(rotation):
     """Angles (...) in rad, from 0 to pi, of rotation matrices (..., 3, 3).
 
-    Taken from sine and cosine together, so that neither small angles nor angles near pi lose digits.
+    Taken from sine and cosine together, so that neither small angles nor angles near pi lose
+    digits.
     """
     rotation = np.asarray(rotation, dtype=float)
     twice_sine = np.sqrt(

@@ -8,10 +8,12 @@ import numpy as np
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 
-# Farther from unit length than this a quaternion is not a rounded rotation but a wrong one (tf2 uses the same bound).
+# Farther from unit length than this a quaternion is not a rounded rotation but a wrong one (tf2
+# uses the same bound).
 QUATERNION_NORM_TOLERANCE = 1e-2
 
-# Poses given as matrices must be rotations to this tolerance; a file with six digits passes, a scaled matrix does not.
+# Poses given as matrices must be rotations to this tolerance; a file with six digits passes, a
+# scaled matrix does not.
 ROTATION_TOLERANCE = 1e-3
 
 
@@ -49,7 +51,9 @@ class Trajectory:
                 f"stamps_ns must be one-dimensional integers (nanoseconds); found shape {stamps_ns.shape} of {stamps_ns.dtype}"
             )
         if poses.shape != (len(stamps_ns), 4, 4):
-            raise InputError(f"poses must have shape ({len(stamps_ns)}, 4, 4), one per stamp; found {poses.shape}")
+            raise InputError(
+                f"poses must have shape ({len(stamps_ns)}, 4, 4), one per stamp; found {poses.shape}"
+            )
         stamps_ns = stamps_ns.astype(np.int64, copy=False)
         backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
         if backwards.size:
@@ -64,7 +68,8 @@ class Trajectory:
 
     @classmethod
     def from_quat_xyzw(cls, stamps_ns, translations, quats_xyzw, **frames):
-        """Build from translations (N, 3) in metres and quaternions (N, 4), scalar last, of nearly unit length.
+        """Build from translations (N, 3) in metres and quaternions (N, 4), scalar last, of nearly
+        unit length.
 
         Raises
         ------
@@ -75,7 +80,9 @@ class Trajectory:
         quats_xyzw = np.asarray(quats_xyzw, dtype=float).reshape(-1, 4)
         finite = np.isfinite(translations).all(axis=1) & np.isfinite(quats_xyzw).all(axis=1)
         if not finite.all():
-            raise InputError(f"pose {int(np.argmin(finite))} has a value that is not finite; remove it or repair its source")
+            raise InputError(
+                f"pose {int(np.argmin(finite))} has a value that is not finite; remove it or repair its source"
+            )
         norms = np.linalg.norm(quats_xyzw, axis=1)
         wrong = np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE
         if wrong.any():
@@ -92,8 +99,12 @@ class Trajectory:
     def __getitem__(self, index):
         """A part of the trajectory: any slice, mask or increasing index array."""
         if isinstance(index, (int, np.integer)):
-            raise TypeError("index a Trajectory with a slice, mask or index array; single poses are trajectory.poses[i]")
-        return Trajectory(self.stamps_ns[index], self.poses[index], self.sensor_frame, self.world_frame)
+            raise TypeError(
+                "index a Trajectory with a slice, mask or index array; single poses are trajectory.poses[i]"
+            )
+        return Trajectory(
+            self.stamps_ns[index], self.poses[index], self.sensor_frame, self.world_frame
+        )
 
     @property
     def duration_s(self):
@@ -119,8 +130,8 @@ class Trajectory:
         ----------
         stamps_ns : (M,) int64 array
         extrapolate : bool
-            Extend the first and last segment's twist beyond the ends (as the paper's KITTI experiments do); otherwise a stamp
-            outside the trajectory is an error.
+            Extend the first and last segment's twist beyond the ends (as the paper's KITTI
+            experiments do); otherwise a stamp outside the trajectory is an error.
 
         Returns
         -------
@@ -130,7 +141,8 @@ class Trajectory:
         Raises
         ------
         InputError
-            With fewer than two poses, or outside the trajectory's time range without ``extrapolate``.
+            With fewer than two poses, or outside the trajectory's time range without
+            ``extrapolate``.
         """
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         if len(self) < 2:
@@ -148,16 +160,22 @@ class Trajectory:
         poses = self.poses[np.where(fraction == 1.0, after, before)]
         between = (fraction != 0.0) & (fraction != 1.0)
         if between.any():
-            poses[between] = se3.interpolate(self.poses[before[between]], self.poses[after[between]], fraction[between])
+            poses[between] = se3.interpolate(
+                self.poses[before[between]], self.poses[after[between]], fraction[between]
+            )
         return poses
 
 
 def _check_poses(poses):
     finite = np.isfinite(poses).all(axis=(1, 2))
     if not finite.all():
-        raise InputError(f"pose {int(np.argmin(finite))} has a value that is not finite; remove it or repair its source")
+        raise InputError(
+            f"pose {int(np.argmin(finite))} has a value that is not finite; remove it or repair its source"
+        )
     rotation = poses[:, :3, :3]
-    deviation = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    deviation = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(
+        axis=(1, 2), initial=0.0
+    )
     wrong = (deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotation) < 0)
     if wrong.any():
         raise InputError(

@@ -1,7 +1,10 @@
-"""Poses in bags: rosbag2 (sqlite3, mcap) and rosbag1, read and written without ROS. The only module that imports rosbags.
+"""Poses in bags: rosbag2 (sqlite3, mcap) and rosbag1, read and written without ROS. The only module
+that imports rosbags.
 
-Only the messages of the chosen topics are read, and of these only stamp, frames and pose (:mod:`~hand_eye_calib.io.messages`). mcap files have a
-reader of their own (:mod:`~hand_eye_calib.io.mcap`), which copes with those that end in the middle and leaves camera images where they are.
+Only the messages of the chosen topics are read, and of these only stamp, frames and pose
+(:mod:`~hand_eye_calib.io.messages`). mcap files have a reader of their own
+(:mod:`~hand_eye_calib.io.mcap`), which copes with those that end in the middle and leaves camera
+images where they are.
 """
 
 import heapq
@@ -50,12 +53,15 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 # Messages that are unpacked at once.
 _BLOCK = 2048
-# A topic that carries fewer poses is none that two sensors could be meant by: goals and initial poses are published once.
+# A topic that carries fewer poses is none that two sensors could be meant by: goals and initial
+# poses are published once.
 _FEWEST_POSES = 3
 
 
 class TopicInfo(NamedTuple):
-    """A topic of a bag: its name, its message type ("" where publishers disagree) and its number of messages."""
+    """A topic of a bag: its name, its message type ("" where publishers disagree) and its number of
+    messages.
+    """
 
     name: str
     type: str
@@ -73,7 +79,8 @@ class TopicDescription(NamedTuple):
     name, type, count
         As in TopicInfo.
     rate_hz, duration_s : float or None
-        Of the stamps where the topic has poses, otherwise of the bag; None where there are too few messages.
+        Of the stamps where the topic has poses, otherwise of the bag; None where there are too few
+        messages.
     frames : list of str
         ``world:sensor`` of poses, as far as they say; ``parent:child`` of transforms.
     is_usable : bool
@@ -151,24 +158,34 @@ class PoseBlock:
     @classmethod
     def concatenate(cls, blocks):
         """One after the other."""
-        return cls(*map(np.concatenate, zip(*(vars(block).values() for block in blocks), strict=True)))
+        return cls(
+            *map(np.concatenate, zip(*(vars(block).values() for block in blocks), strict=True))
+        )
 
     @classmethod
     def of_columns(cls, stream, numbers, columns, bag_ns):
         """Of PoseColumns."""
         streams = np.full(len(numbers), stream, dtype=object)
-        frames = (np.array(names, dtype=object) for names in (columns.world_frames, columns.sensor_frames))
+        frames = (
+            np.array(names, dtype=object) for names in (columns.world_frames, columns.sensor_frames)
+        )
         return cls(streams, numbers, columns.stamps_ns, *frames, columns.numbers, bag_ns)
 
     @classmethod
     def of_rows(cls, rows):
         """Of a list of StampedPose."""
-        streams, numbers, stamps_ns, world_frames, sensor_frames, positions, quats_xyzw, bag_ns = zip(*rows, strict=True)
-        names = (np.array(column, dtype=object) for column in (streams, world_frames, sensor_frames))
+        streams, numbers, stamps_ns, world_frames, sensor_frames, positions, quats_xyzw, bag_ns = (
+            zip(*rows, strict=True)
+        )
+        names = (
+            np.array(column, dtype=object) for column in (streams, world_frames, sensor_frames)
+        )
         streams, world_frames, sensor_frames = names
         stamps_ns, bag_ns = np.array(stamps_ns, dtype=np.int64), np.array(bag_ns, dtype=np.int64)
         poses = np.concatenate([positions, quats_xyzw], axis=1)
-        return cls(streams, np.array(numbers), stamps_ns, world_frames, sensor_frames, poses, bag_ns)
+        return cls(
+            streams, np.array(numbers), stamps_ns, world_frames, sensor_frames, poses, bag_ns
+        )
 
     def rows(self):
         """An iterator of StampedPose."""
@@ -185,13 +202,15 @@ class PoseBag:
     Parameters
     ----------
     *paths : str or path-like
-        Each a rosbag2 directory, a single ``.mcap`` or ``.db3`` file of one, or a rosbag1 ``.bag`` file. They are read in the order of
-        their times, those that were recorded at the same time side by side.
+        Each a rosbag2 directory, a single ``.mcap`` or ``.db3`` file of one, or a rosbag1 ``.bag``
+        file. They are read in the order of their times, those that were recorded at the same time
+        side by side.
 
     Raises
     ------
     InputError
-        Where there is no bag or it cannot be read: one line that names the path and says what to do.
+        Where there is no bag or it cannot be read: one line that names the path and says what to
+        do.
     """
 
     def __init__(self, *paths):
@@ -225,9 +244,15 @@ class PoseBag:
 
     @property
     def warnings(self):
-        """What a person should know of what could not be read, and of poses that cannot be right; complete after reading."""
+        """What a person should know of what could not be read, and of poses that cannot be right;
+        complete after reading.
+        """
         losses = [f"{part.path}: {loss}" for part in self._parts for loss in part.losses]
-        return self._notes + losses + [text for name, watch in self._watches.items() for text in watch.warnings(name)]
+        return (
+            self._notes
+            + losses
+            + [text for name, watch in self._watches.items() for text in watch.warnings(name)]
+        )
 
     @property
     def n_left_out(self):
@@ -237,7 +262,9 @@ class PoseBag:
     @property
     def start_ns(self):
         """Bag time of the first message, None where there is none."""
-        return min((part.start_ns for part in self._parts if part.start_ns is not None), default=None)
+        return min(
+            (part.start_ns for part in self._parts if part.start_ns is not None), default=None
+        )
 
     @property
     def end_ns(self):
@@ -260,7 +287,8 @@ class PoseBag:
         return [TopicInfo(name, *found[name]) for name in sorted(found)]
 
     def describe(self):
-        """All topics with rates and frames, a list of TopicDescription; reads all poses and transforms.
+        """All topics with rates and frames, a list of TopicDescription; reads all poses and
+        transforms.
 
         Raises
         ------
@@ -268,7 +296,9 @@ class PoseBag:
             Where a message cannot be read.
         """
         infos = self.topics()
-        looks = {info.name: _Look() for info in infos if info.type in (*POSE_TYPES, PATH_TYPE, *TF_TYPES)}
+        looks = {
+            info.name: _Look() for info in infos if info.type in (*POSE_TYPES, PATH_TYPE, *TF_TYPES)
+        }
         counts = dict.fromkeys(looks, 0)
         for block in self._messages(looks):
             for kind in {message[0] for message in block}:
@@ -281,8 +311,9 @@ class PoseBag:
     def select_topics(self, parent=None, child=None):
         """Where the parent's and the child's poses come from.
 
-        What is not named is chosen where the bag leaves only one way to do it: with neither named, it has exactly two
-        topics of poses, and the first in alphabetical order becomes the parent. Topics of paths count where there are not enough others.
+        What is not named is chosen where the bag leaves only one way to do it: with neither named,
+        it has exactly two topics of poses, and the first in alphabetical order becomes the parent.
+        Topics of paths count where there are not enough others.
 
         Parameters
         ----------
@@ -292,19 +323,25 @@ class PoseBag:
         Raises
         ------
         InputError
-            Where a named topic is not in the bag or holds no poses, where both are the same, or where there is a choice to make.
-            The message lists the topics that are there.
+            Where a named topic is not in the bag or holds no poses, where both are the same, or
+            where there is a choice to make. The message lists the topics that are there.
         """
         topics = {topic.name: topic for topic in self.topics()}
         named = [source for source in (parent, child) if source]
         for source in named:
             self.check(source)
         if len(named) == 2 and named[0] == named[1]:
-            raise InputError(f"parent and child topic are both {parent}; name two topics. {self._listing(topics)}")
+            raise InputError(
+                f"parent and child topic are both {parent}; name two topics. {self._listing(topics)}"
+            )
         wanted = 2 - len(named)
-        free = [name for name, topic in topics.items() if topic.type in POSE_TYPES and name not in named]
+        free = [
+            name for name, topic in topics.items() if topic.type in POSE_TYPES and name not in named
+        ]
         moving = [name for name in free if topics[name].count >= _FEWEST_POSES]
-        paths = [name for name, topic in topics.items() if topic.type == PATH_TYPE and name not in named]
+        paths = [
+            name for name, topic in topics.items() if topic.type == PATH_TYPE and name not in named
+        ]
         choices = [names for names in (free, moving, moving + paths) if len(names) == wanted]
         if wanted and not choices:
             raise InputError(
@@ -330,7 +367,9 @@ class PoseBag:
             self._check_topic(source, topics)
 
     def expected(self, *sources):
-        """How many poses the sources will give, as far as the bag says; None for paths and transforms, where that is found by reading."""
+        """How many poses the sources will give, as far as the bag says; None for paths and
+        transforms, where that is found by reading.
+        """
         topics = {topic.name: topic for topic in self.topics()}
         if any(source not in topics or topics[source].type not in POSE_TYPES for source in sources):
             return None
@@ -340,27 +379,38 @@ class PoseBag:
         if name not in topics:
             raise InputError(f"no topic {name} in {self}. {self._listing(topics)}")
         if topics[name].type not in (*POSE_TYPES, PATH_TYPE):
-            frames = "; name two of its frames with --parent-tf and --child-tf" if topics[name].type in TF_TYPES else ""
+            frames = (
+                "; name two of its frames with --parent-tf and --child-tf"
+                if topics[name].type in TF_TYPES
+                else ""
+            )
             raise InputError(
                 f"topic {name} of {self} is of type {topics[name].type or 'several types'}; accepted are "
                 f"{', '.join([*POSE_TYPES, PATH_TYPE])}{frames}. {self._listing(topics)}"
             )
 
     def _listing(self, topics):
-        return f"The bag has {', '.join(map(str, topics.values()))}" if topics else f"There are no topics in {self}"
+        return (
+            f"The bag has {', '.join(map(str, topics.values()))}"
+            if topics
+            else f"There are no topics in {self}"
+        )
 
     # ---- poses
 
     def poses(self, parent, child, max_gap_s=0.5):
-        """Iterate over the poses of both streams, StampedPose by StampedPose; as :meth:`blocks` otherwise."""
+        """Iterate over the poses of both streams, StampedPose by StampedPose; as :meth:`blocks`
+        otherwise.
+        """
         for block in self.blocks(parent, child, max_gap_s):
             yield from block.rows()
 
     def blocks(self, parent, child, max_gap_s=0.5):
         """Iterate over the poses of both streams in the order of the bag's time, many at once.
 
-        A path's poses are those of its newest message, and before its first stamp those of older ones; they count as recorded when they first
-        appeared. Transforms are composed at the stamps of the slowest moving one of the chain.
+        A path's poses are those of its newest message, and before its first stamp those of older
+        ones; they count as recorded when they first appeared. Transforms are composed at the stamps
+        of the slowest moving one of the chain.
 
         Parameters
         ----------
@@ -376,17 +426,26 @@ class PoseBag:
         Raises
         ------
         InputError
-            Where the bag turns out to be damaged, or the transforms do not lead from one frame to the other.
+            Where the bag turns out to be damaged, or the transforms do not lead from one frame to
+            the other.
         """
         sources = {"parent": parent, "child": child}
         types = {topic.name: topic.type for topic in self.topics()}
         self._watches = {str(source): PoseWatch() for source in sources.values()}
-        direct = {source: stream for stream, source in sources.items() if types.get(source) in POSE_TYPES}
+        direct = {
+            source: stream for stream, source in sources.items() if types.get(source) in POSE_TYPES
+        }
         streams = [self._direct_blocks(direct)] if direct else []
-        transforms = {stream: source for stream, source in sources.items() if isinstance(source, TfSource)}
+        transforms = {
+            stream: source for stream, source in sources.items() if isinstance(source, TfSource)
+        }
         if transforms:
             streams += [[block] for block in self._transformed_poses(transforms, max_gap_s)]
-        streams += [[self._path_poses(stream, source)] for stream, source in sources.items() if types.get(source) == PATH_TYPE]
+        streams += [
+            [self._path_poses(stream, source)]
+            for stream, source in sources.items()
+            if types.get(source) == PATH_TYPE
+        ]
         if len(streams) == 1:
             yield from filter(len, streams[0])
         else:
@@ -403,7 +462,10 @@ class PoseBag:
             parts, rows_kept = [], []
             for kind, rows in rows_of.items():
                 part, keep = self._unpacked_poses(
-                    kind, streams[kind.topic], counts[kind.topic] + 1, [messages[row] for row in rows]
+                    kind,
+                    streams[kind.topic],
+                    counts[kind.topic] + 1,
+                    [messages[row] for row in rows],
                 )
                 counts[kind.topic] += len(rows)
                 parts.append(part[keep])
@@ -431,10 +493,14 @@ class PoseBag:
         return PoseBlock.of_columns(stream, numbers, columns, bag_ns)
 
     def _path_poses(self, stream, topic):
-        """Poses of a path that is published again and again as it grows, perhaps with all poses corrected."""
+        """Poses of a path that is published again and again as it grows, perhaps with all poses
+        corrected.
+        """
         stamps_ns, numbers = np.empty(0, dtype=np.int64), np.empty((0, 7))
         first_seen, world_frame = {}, ""
-        for number, (kind, bag_ns, data) in enumerate(chain.from_iterable(self._messages([topic])), start=1):
+        for number, (kind, bag_ns, data) in enumerate(
+            chain.from_iterable(self._messages([topic])), start=1
+        ):
             try:
                 world_frame, new_stamps_ns, new_numbers = unpack_path(data, kind.is_ros1)
             except MALFORMED as error:
@@ -451,14 +517,18 @@ class PoseBag:
             raise InputError(
                 f"the poses of path {topic} have no stamps: all are zero; use the odometry that the path was made from"
             )
-        columns = PoseColumns(stamps_ns, [world_frame] * len(stamps_ns), [None] * len(stamps_ns), numbers)
+        columns = PoseColumns(
+            stamps_ns, [world_frame] * len(stamps_ns), [None] * len(stamps_ns), numbers
+        )
         bag_ns = np.array([first_seen[stamp_ns] for stamp_ns in stamps_ns.tolist()], dtype=np.int64)
         return self._watched(topic, stream, columns, bag_ns)[np.argsort(bag_ns, kind="stable")]
 
     def _transformed_poses(self, sources, max_gap_s):
         """A PoseBlock for each stream whose poses come from the transform tree."""
         tree = self.transforms()
-        needed = {frame for source in sources.values() for side in tree.chain(source) for frame in side}
+        needed = {
+            frame for source in sources.values() for side in tree.chain(source) for frame in side
+        }
         for transform, is_static, bag_ns in self._transforms(needed):
             tree.keep(transform, is_static, bag_ns)
         found = []
@@ -470,9 +540,15 @@ class PoseBag:
                     f"was not known within {max_gap_s:g} s"
                 )
             frames = [[frame] * len(trajectory) for frame in source]
-            numbers = np.concatenate([trajectory.poses[:, :3, 3], se3.to_quat_xyzw(trajectory.poses)], axis=1)
+            numbers = np.concatenate(
+                [trajectory.poses[:, :3, 3], se3.to_quat_xyzw(trajectory.poses)], axis=1
+            )
             columns = PoseColumns(trajectory.stamps_ns, *frames, numbers)
-            found.append(self._watched(str(source), stream, columns, bag_ns)[np.argsort(bag_ns, kind="stable")])
+            found.append(
+                self._watched(str(source), stream, columns, bag_ns)[
+                    np.argsort(bag_ns, kind="stable")
+                ]
+            )
         return found
 
     def transforms(self):
@@ -492,7 +568,9 @@ class PoseBag:
         """Transforms, whether each is static, and its bag time; of some frames, or of all."""
         names = [topic.name for topic in self.topics() if topic.type in TF_TYPES]
         needles = None if frames is None else [frame.encode() for frame in frames]
-        for number, (kind, bag_ns, data) in enumerate(chain.from_iterable(self._messages(names)), start=1):
+        for number, (kind, bag_ns, data) in enumerate(
+            chain.from_iterable(self._messages(names)), start=1
+        ):
             data = bytes(data)
             if needles is not None and not any(needle in data for needle in needles):
                 continue
@@ -513,7 +591,10 @@ class PoseBag:
             if len(streams) == 1:
                 yield from streams[0]
             else:
-                yield from _blocks(heapq.merge(*map(chain.from_iterable, streams), key=lambda message: message[1]), _BLOCK)
+                yield from _blocks(
+                    heapq.merge(*map(chain.from_iterable, streams), key=lambda message: message[1]),
+                    _BLOCK,
+                )
 
     def _part_messages(self, part, topics):
         with _reading(part.path):
@@ -521,7 +602,11 @@ class PoseBag:
                 # Compressed message by message; plain CDR never begins like this.
                 if any(message[2][:4] == _ZSTD_MAGIC for message in block):
                     block = [
-                        (kind, bag_ns, zstd.decompress(bytes(data)) if data[:4] == _ZSTD_MAGIC else data)
+                        (
+                            kind,
+                            bag_ns,
+                            zstd.decompress(bytes(data)) if data[:4] == _ZSTD_MAGIC else data,
+                        )
                         for kind, bag_ns, data in block
                     ]
                 yield block
@@ -546,12 +631,16 @@ class PoseBag:
         return part
 
     def _storage_files(self, path):
-        """The files that hold a bag's messages, in order; those compressed as a whole are unpacked into a temporary folder."""
+        """The files that hold a bag's messages, in order; those compressed as a whole are unpacked
+        into a temporary folder.
+        """
         if path.is_file():
             return [self._unpacked(path)]
         files = self._listed_files(path) if (path / "metadata.yaml").exists() else None
         if files is None:
-            files = sorted((file for file in path.iterdir() if _storage_suffix(file)), key=_natural_order)
+            files = sorted(
+                (file for file in path.iterdir() if _storage_suffix(file)), key=_natural_order
+            )
         if not files:
             raise InputError(
                 f"no bag in {path}: expected metadata.yaml or files that end in {', '.join(_STORAGE_SUFFIXES)}; check the path"
@@ -562,7 +651,10 @@ class PoseBag:
         """The files that metadata.yaml names; None where it cannot be used."""
         try:
             document = yaml.safe_load((path / "metadata.yaml").read_text(encoding="utf-8"))
-            names = [PurePath(name).name for name in document["rosbag2_bagfile_information"]["relative_file_paths"]]
+            names = [
+                PurePath(name).name
+                for name in document["rosbag2_bagfile_information"]["relative_file_paths"]
+            ]
         except (OSError, UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError) as error:
             self._notes.append(
                 f"{path / 'metadata.yaml'} is damaged ({type(error).__name__}); the files beside it were read instead"
@@ -573,14 +665,23 @@ class PoseBag:
             self._notes.append(
                 f"{path}: {', '.join(missing)} of {len(names)} files in metadata.yaml is missing; its messages are left out"
             )
-        return [path / name for name in names if name not in missing and _storage_suffix(path / name)]
+        return [
+            path / name for name in names if name not in missing and _storage_suffix(path / name)
+        ]
 
     def _unpacked(self, file):
         if file.suffix != ".zstd":
             return file
         self._temporary = self._temporary or tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
-        target = Path(self._temporary.name, f"{len(list(Path(self._temporary.name).iterdir()))}_{file.stem}")
-        with _reading(file), file.open("rb") as raw, zstd.open(raw, "rb") as source, target.open("wb") as unpacked:
+        target = Path(
+            self._temporary.name, f"{len(list(Path(self._temporary.name).iterdir()))}_{file.stem}"
+        )
+        with (
+            _reading(file),
+            file.open("rb") as raw,
+            zstd.open(raw, "rb") as source,
+            target.open("wb") as unpacked,
+        ):
             shutil.copyfileobj(source, unpacked, 1 << 20)
         return target
 
@@ -603,16 +704,23 @@ class _McapPart:
         self.topics = {}
         for key, channel in self._mcap.channels.items():
             known, before = self.topics.get(channel.topic, (channel.type, 0))
-            self.topics[channel.topic] = (known if known == channel.type else "", before + self._mcap.counts.get(key, 0))
+            self.topics[channel.topic] = (
+                known if known == channel.type else "",
+                before + self._mcap.counts.get(key, 0),
+            )
 
     def messages(self, topics):
         channels = [channel for channel in self._mcap.channels.values() if channel.topic in topics]
         for channel in channels:
             if channel.encoding != "cdr":
-                raise ValueError(f"messages of {channel.topic} are encoded as {channel.encoding!r}, expected 'cdr'")
+                raise ValueError(
+                    f"messages of {channel.topic} are encoded as {channel.encoding!r}, expected 'cdr'"
+                )
         kinds = {channel: MessageKind(channel.topic, channel.type, False) for channel in channels}
         waiting = []
-        for block in self._mcap.messages(topics):  # between images, a chunk may hold only a few poses
+        for block in self._mcap.messages(
+            topics
+        ):  # between images, a chunk may hold only a few poses
             waiting += [(kinds[channel], bag_ns, data) for channel, bag_ns, data in block]
             if len(waiting) >= _BLOCK:
                 yield waiting
@@ -628,19 +736,30 @@ class _RosbagsPart:
         reader.open()
         self._reader, self._is_ros1 = reader, is_ros1
         self.close, self.losses = reader.close, []
-        self.topics = {name: (info.msgtype or "", info.msgcount) for name, info in reader.topics.items()}
+        self.topics = {
+            name: (info.msgtype or "", info.msgcount) for name, info in reader.topics.items()
+        }
         has_messages = any(number for _, number in self.topics.values())
-        self.start_ns, self.end_ns = (reader.start_time, reader.end_time - 1) if has_messages else (None, None)
+        self.start_ns, self.end_ns = (
+            (reader.start_time, reader.end_time - 1) if has_messages else (None, None)
+        )
 
     def messages(self, topics):
-        connections = [connection for connection in self._reader.connections if connection.topic in topics]
+        connections = [
+            connection for connection in self._reader.connections if connection.topic in topics
+        ]
         for connection in connections:
             encoding = getattr(connection.ext, "serialization_format", "cdr")
             if encoding != "cdr":
-                raise ValueError(f"messages of {connection.topic} are encoded as {encoding!r}, expected 'cdr'")
+                raise ValueError(
+                    f"messages of {connection.topic} are encoded as {encoding!r}, expected 'cdr'"
+                )
         if not connections:
             return
-        kinds = {connection.id: MessageKind(connection.topic, connection.msgtype, self._is_ros1) for connection in connections}
+        kinds = {
+            connection.id: MessageKind(connection.topic, connection.msgtype, self._is_ros1)
+            for connection in connections
+        }
         for block in _blocks(self._reader.messages(connections), _BLOCK):
             yield [(kinds[connection.id], bag_ns, data) for connection, bag_ns, data in block]
 
@@ -649,8 +768,8 @@ class _RosbagsPart:
 def _reading(path):
     """Whatever a reader stumbles over becomes one line.
 
-    A damaged file makes rosbags, sqlite, lz4 or zstd raise nearly anything, assertions and key errors included. Nothing but
-    readers' code runs inside, so no defect of the rest is hidden.
+    A damaged file makes rosbags, sqlite, lz4 or zstd raise nearly anything, assertions and key
+    errors included. Nothing but readers' code runs inside, so no defect of the rest is hidden.
     """
     try:
         yield
@@ -658,7 +777,9 @@ def _reading(path):
         raise
     except Exception as error:
         reason = " ".join([f"{type(error).__name__}:", *str(error).split()]).rstrip(".:")
-        repair = {".bag": "'rosbag reindex'", ".db3": "sqlite3's '.recover'"}.get(path.suffix, "'mcap recover'")
+        repair = {".bag": "'rosbag reindex'", ".db3": "sqlite3's '.recover'"}.get(
+            path.suffix, "'mcap recover'"
+        )
         raise InputError(
             f"cannot read bag {path}: it is cut off, damaged or of an unsupported kind ({reason}); "
             f"repair it with {repair}, or record it again"
@@ -725,7 +846,9 @@ class _Look:
                 columns = unpack_poses(messages, kind.type, kind.is_ros1)
             except MalformedMessage as error:
                 raise _unreadable(kind, first_number + error.index, error) from error
-            self._note(columns.stamps_ns, zip(columns.world_frames, columns.sensor_frames, strict=True))
+            self._note(
+                columns.stamps_ns, zip(columns.world_frames, columns.sensor_frames, strict=True)
+            )
             return
         for number, data in enumerate(messages, start=first_number):
             try:
@@ -734,8 +857,13 @@ class _Look:
                     self._note(stamps_ns, [(world_frame, None)])
                 else:
                     transforms = unpack_transforms(data, kind.is_ros1)
-                    frames = [(transform.world_frame, transform.sensor_frame) for transform in transforms]
-                    self._note(np.array([transform.stamp_ns for transform in transforms], dtype=np.int64), frames)
+                    frames = [
+                        (transform.world_frame, transform.sensor_frame) for transform in transforms
+                    ]
+                    self._note(
+                        np.array([transform.stamp_ns for transform in transforms], dtype=np.int64),
+                        frames,
+                    )
             except MALFORMED as error:
                 raise _unreadable(kind, number, error) from error
 
@@ -748,11 +876,19 @@ class _Look:
 
     def describe(self, info, bag_duration_s):
         is_usable = info.type in POSE_TYPES or info.type == PATH_TYPE
-        duration_s = (self._last_ns - self._first_ns) * 1e-9 if is_usable and self._first_ns is not None else bag_duration_s
+        duration_s = (
+            (self._last_ns - self._first_ns) * 1e-9
+            if is_usable and self._first_ns is not None
+            else bag_duration_s
+        )
         is_sampled = info.count > 1 and duration_s > 0
         frames = [":".join(filter(None, pair)) for pair in sorted(self._frames, key=str)]
         return TopicDescription(
-            *info, (info.count - 1) / duration_s if is_sampled else None, duration_s if is_sampled else None, frames, is_usable
+            *info,
+            (info.count - 1) / duration_s if is_sampled else None,
+            duration_s if is_sampled else None,
+            frames,
+            is_usable,
         )
 
 
@@ -767,7 +903,9 @@ _make_stamped_pose = partial(tuple.__new__, StampedPose)
 
 
 def _tuples(rows):
-    """Rows of a float array as tuples: quicker than lists, and nothing for the garbage collector to look through."""
+    """Rows of a float array as tuples: quicker than lists, and nothing for the garbage collector to
+    look through.
+    """
     return struct.iter_unpack(f"{rows.shape[1]}d", rows.tobytes())
 
 
@@ -818,15 +956,16 @@ def _check_path(path):
 
 
 def write_bag(path, streams, storage="mcap"):
-    """Write trajectories into a new bag, the poses of all topics interleaved in the order of their stamps.
+    """Write trajectories into a new bag, the poses of all topics interleaved in the order of their
+    stamps.
 
     Parameters
     ----------
     path : str or path-like
         Directory to make, or for rosbag1 the ``.bag`` file. It must not exist.
     streams : mapping of str to (Trajectory, str)
-        Topic to trajectory and message type, one of POSE_TYPES. Where the type has a place for the sensor's frame, the
-        trajectory's is put there. Stamps are written to both header and bag.
+        Topic to trajectory and message type, one of POSE_TYPES. Where the type has a place for the
+        sensor's frame, the trajectory's is put there. Stamps are written to both header and bag.
     storage : str
         "mcap", "sqlite3" or "rosbag1".
 
@@ -840,11 +979,17 @@ def write_bag(path, streams, storage="mcap"):
     path = Path(path)
     if storage not in STORAGES:
         raise ConfigError(f"unknown bag storage {storage!r}; known are {', '.join(STORAGES)}")
-    unknown = [message_type for _, message_type in streams.values() if message_type not in POSE_TYPES]
+    unknown = [
+        message_type for _, message_type in streams.values() if message_type not in POSE_TYPES
+    ]
     if unknown:
-        raise ConfigError(f"cannot write messages of type {unknown[0]!r}; known are {', '.join(POSE_TYPES)}")
+        raise ConfigError(
+            f"cannot write messages of type {unknown[0]!r}; known are {', '.join(POSE_TYPES)}"
+        )
     if (path.suffix == ".bag") != (storage == "rosbag1"):
-        raise InputError(f"cannot write {path} as {storage}: a rosbag1 file, and nothing else, must be named .bag")
+        raise InputError(
+            f"cannot write {path} as {storage}: a rosbag1 file, and nothing else, must be named .bag"
+        )
     if path.exists():
         raise InputError(f"{path} exists already; remove it or choose another name")
     try:
@@ -868,7 +1013,9 @@ def _write_streams(writer, streams, storage):
     sequences = []
     for topic, (trajectory, message_type) in streams.items():
         connection = writer.add_connection(topic, message_type, typestore=typestore)
-        sequences.append(_stamped_messages(typestore, trajectory, message_type, is_rosbag1, connection))
+        sequences.append(
+            _stamped_messages(typestore, trajectory, message_type, is_rosbag1, connection)
+        )
     for stamp_ns, connection, message in heapq.merge(*sequences, key=lambda item: item[0]):
         writer.write(connection, stamp_ns, serialize(message, connection.msgtype))
 
@@ -876,8 +1023,13 @@ def _write_streams(writer, streams, storage):
 def _stamped_messages(typestore, trajectory, message_type, is_rosbag1, connection):
     types = typestore.types
     zero, no_covariance = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(36)
-    twist = types["geometry_msgs/msg/TwistWithCovariance"](types["geometry_msgs/msg/Twist"](zero, zero), no_covariance)
-    positions, quats_xyzw = trajectory.poses[:, :3, 3].tolist(), se3.to_quat_xyzw(trajectory.poses).tolist()
+    twist = types["geometry_msgs/msg/TwistWithCovariance"](
+        types["geometry_msgs/msg/Twist"](zero, zero), no_covariance
+    )
+    positions, quats_xyzw = (
+        trajectory.poses[:, :3, 3].tolist(),
+        se3.to_quat_xyzw(trajectory.poses).tolist(),
+    )
     for number, stamp_ns in enumerate(trajectory.stamps_ns.tolist()):
         header = types["std_msgs/msg/Header"](
             stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _NS_PER_S)),
@@ -885,7 +1037,8 @@ def _stamped_messages(typestore, trajectory, message_type, is_rosbag1, connectio
             **({"seq": number} if is_rosbag1 else {}),
         )
         pose = types["geometry_msgs/msg/Pose"](
-            types["geometry_msgs/msg/Point"](*positions[number]), types["geometry_msgs/msg/Quaternion"](*quats_xyzw[number])
+            types["geometry_msgs/msg/Point"](*positions[number]),
+            types["geometry_msgs/msg/Quaternion"](*quats_xyzw[number]),
         )
         with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](pose, no_covariance)
         if message_type == "nav_msgs/msg/Odometry":

@@ -1,9 +1,11 @@
-"""The session journal: what the calibrator was told, on disk as it comes in, so that a crash loses next to nothing.
+"""The session journal: what the calibrator was told, on disk as it comes in, so that a crash loses
+next to nothing.
 
-A journal is a directory of segments ``session-<number>.journal``. A segment opens with a checkpoint of the whole engine and goes on
-with every pose and frame name since; when it has grown enough, the next segment starts from a new checkpoint and older ones are
-removed. Records carry their length and a checksum: a reader takes what is whole and stops at the first record that is not, so
-that a process killed in the middle of a write costs at most the record it was writing.
+A journal is a directory of segments ``session-<number>.journal``. A segment opens with a checkpoint
+of the whole engine and goes on with every pose and frame name since; when it has grown enough, the
+next segment starts from a new checkpoint and older ones are removed. Records carry their length and
+a checksum: a reader takes what is whole and stops at the first record that is not, so that a
+process killed in the middle of a write costs at most the record it was writing.
 """
 
 import io
@@ -23,7 +25,8 @@ _POSE = struct.Struct("<Bq7d")
 _CHECKPOINT, _POSE_KIND, _FRAME = b"C", b"P", b"F"
 _STREAMS = ("parent", "child")
 
-# No payload is longer than this; a damaged length is recognised before anything is allocated for it.
+# No payload is longer than this; a damaged length is recognised before anything is allocated for
+# it.
 _LONGEST_PAYLOAD = 1 << 30
 
 
@@ -35,7 +38,8 @@ class JournalWriter:
     directory : path
         Made if it does not exist. Segments that are there already are replaced by this session's.
     checkpoint : dict of str to arrays
-        The engine's state to start from (:meth:`hand_eye_calib.calibrator.Calibrator.state`).
+        The engine's state to start from
+        (:meth:`hand_eye_calib.engine.calibrator.Calibrator.state`).
     segment_bytes : int
         Bytes since the checkpoint at which :attr:`is_full` asks for a new one.
 
@@ -67,9 +71,12 @@ class JournalWriter:
         self._add(_FRAME, bytes([_STREAMS.index(stream)]) + sensor_frame.encode())
 
     def flush(self):
-        """Hand all that was noted to the operating system: from then on it survives the end of this process."""
+        """Hand all that was noted to the operating system: from then on it survives the end of this
+        process.
+        """
         if self._pending:
-            # Unbuffered: a short write leaves a torn record at the end, which the next flush would bury.
+            # Unbuffered: a short write leaves a torn record at the end, which the next flush would
+            # bury.
             taken = self._file.write(self._pending)
             if taken != len(self._pending):
                 raise OSError(f"only {taken} of {len(self._pending)} bytes were written")
@@ -139,7 +146,9 @@ def count_poses(directory):
         checkpoint, events, _ = read_journal(directory)
     except InputError:
         return None
-    return sum(int(checkpoint[f"{stream}.statistics"][0]) for stream in _STREAMS) + sum(event[0] == "pose" for event in events)
+    return sum(int(checkpoint[f"{stream}.statistics"][0]) for stream in _STREAMS) + sum(
+        event[0] == "pose" for event in events
+    )
 
 
 def read_journal(directory):
@@ -153,7 +162,8 @@ def read_journal(directory):
     -------
     checkpoint : dict of str to arrays
     events : list of tuple
-        ("pose", stream, stamp_ns, position, quat_xyzw) and ("frame", stream, name), in the order they came in.
+        ("pose", stream, stamp_ns, position, quat_xyzw) and ("frame", stream, name), in the order
+        they came in.
     lost_bytes : int
         Bytes at the end that were not whole; 0 after a clean end.
 
@@ -170,15 +180,25 @@ def read_journal(directory):
         try:
             data = segment.read_bytes()
         except OSError as error:
-            raise InputError(f"cannot read the session journal {segment}: {error.strerror}") from None
+            raise InputError(
+                f"cannot read the session journal {segment}: {error.strerror}"
+            ) from None
         records, end = _whole_records(data)
         if records and records[0][0] == _CHECKPOINT:
-            return _unpack_checkpoint(records[0][1]), [_event(*record) for record in records[1:]], len(data) - end
-    raise InputError(f"the session journal {segments[-1]} is damaged from its first byte; move it away to start anew")
+            return (
+                _unpack_checkpoint(records[0][1]),
+                [_event(*record) for record in records[1:]],
+                len(data) - end,
+            )
+    raise InputError(
+        f"the session journal {segments[-1]} is damaged from its first byte; move it away to start anew"
+    )
 
 
 def _segments(directory):
-    return sorted(directory.glob("session-*.journal"), key=lambda path: int(path.stem.rpartition("-")[2]))
+    return sorted(
+        directory.glob("session-*.journal"), key=lambda path: int(path.stem.rpartition("-")[2])
+    )
 
 
 def _record(kind, payload):
@@ -194,7 +214,11 @@ def _whole_records(data):
         kind, length, checksum = _HEADER.unpack_from(data, position)
         start = position + _HEADER.size
         payload = data[start : start + length]
-        if length > _LONGEST_PAYLOAD or len(payload) < length or zlib.crc32(payload, zlib.crc32(kind)) != checksum:
+        if (
+            length > _LONGEST_PAYLOAD
+            or len(payload) < length
+            or zlib.crc32(payload, zlib.crc32(kind)) != checksum
+        ):
             break
         records.append((kind, payload))
         position = start + length
@@ -207,7 +231,9 @@ def _event(kind, payload):
         return "pose", _STREAMS[stream], stamp_ns, tuple(pose[:3]), tuple(pose[3:])
     if kind == _FRAME:
         return "frame", _STREAMS[payload[0]], payload[1:].decode()
-    raise InputError(f"the session journal has a record of unknown kind {kind!r}; it is of a newer version of this program")
+    raise InputError(
+        f"the session journal has a record of unknown kind {kind!r}; it is of a newer version of this program"
+    )
 
 
 def _pack_checkpoint(checkpoint):

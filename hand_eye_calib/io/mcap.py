@@ -1,8 +1,10 @@
-"""Reading mcap files: those that are whole, those that end in the middle, and those with damaged chunks.
+"""Reading mcap files: those that are whole, those that end in the middle, and those with damaged
+chunks.
 
-Only records of the topics that are asked for are looked at. Where a file has an index, the bytes of other topics - camera images -
-are not even read; where it has none, because the recorder never came to write it, everything up to the last whole record is found by walking
-through the file. The format: https://mcap.dev/spec
+Only records of the topics that are asked for are looked at. Where a file has an index, the bytes of
+other topics - camera images - are not even read; where it has none, because the recorder never came
+to write it, everything up to the last whole record is found by walking through the file. The
+format: https://mcap.dev/spec
 """
 
 import struct
@@ -11,7 +13,17 @@ from collections import Counter
 from typing import NamedTuple
 
 _MAGIC = b"\x89MCAP0\r\n"
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 3, 4, 5, 6, 7, 8, 11, 15
+(
+    _FOOTER,
+    _SCHEMA,
+    _CHANNEL,
+    _MESSAGE,
+    _CHUNK,
+    _MESSAGE_INDEX,
+    _CHUNK_INDEX,
+    _STATISTICS,
+    _DATA_END,
+) = 2, 3, 4, 5, 6, 7, 8, 11, 15
 _FOOTER_SIZE = 9 + 20 + len(_MAGIC)
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
@@ -20,7 +32,8 @@ _CHUNK_HEADER = struct.Struct("<QQQI")  # start, end, uncompressed size, checksu
 _UINT16, _UINT32, _UINT64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _ENTRY = struct.Struct("<QQ")
 
-# No chunk of a recorder is larger; a size beyond it is damage, and must not be believed and allocated.
+# No chunk of a recorder is larger; a size beyond it is damage, and must not be believed and
+# allocated.
 _LARGEST_CHUNK = 1 << 31
 
 # What parsing bytes that are not what they should be may raise.
@@ -36,7 +49,9 @@ class Channel(NamedTuple):
 
 
 class _Chunk(NamedTuple):
-    """Where a chunk's record begins, the time it covers, and for an indexed one where each channel's message index is."""
+    """Where a chunk's record begins, the time it covers, and for an indexed one where each
+    channel's message index is.
+    """
 
     offset: int
     start_ns: int
@@ -126,7 +141,9 @@ class McapFile:
         if not len(_MAGIC) <= start <= self._size - _FOOTER_SIZE:
             raise ValueError("the index is not where the file says")
         schemas, statistics = {}, None
-        for opcode, body in _records(memoryview(self._read(start, self._size - _FOOTER_SIZE - start))):
+        for opcode, body in _records(
+            memoryview(self._read(start, self._size - _FOOTER_SIZE - start))
+        ):
             if opcode == _CHUNK_INDEX:
                 self._chunks.append(_chunk_index(body))
             elif opcode == _STATISTICS:
@@ -138,7 +155,9 @@ class McapFile:
         self.start_ns, self.end_ns = _ENTRY.unpack_from(statistics, 26)
         (size,) = _UINT32.unpack_from(statistics, 42)
         for position in range(46, 46 + size, 10):
-            self.counts[_UINT16.unpack_from(statistics, position)[0]] = _UINT64.unpack_from(statistics, position + 2)[0]
+            self.counts[_UINT16.unpack_from(statistics, position)[0]] = _UINT64.unpack_from(
+                statistics, position + 2
+            )[0]
         return True
 
     def _note_channel(self, opcode, body, schemas):
@@ -165,13 +184,17 @@ class McapFile:
                 if opcode == _CHUNK:
                     self._walk_chunk(offset, size, schemas, times)
                 elif opcode == _MESSAGE:
-                    channel, _, log_ns, _ = _MESSAGE_HEADER.unpack(self._read(offset + _RECORD.size, _MESSAGE_HEADER.size))
+                    channel, _, log_ns, _ = _MESSAGE_HEADER.unpack(
+                        self._read(offset + _RECORD.size, _MESSAGE_HEADER.size)
+                    )
                     self._read(offset + _RECORD.size + size - 1, 1)
                     self._loose = True
                     self.counts[channel] += 1
                     times.append(log_ns)
                 elif opcode in (_SCHEMA, _CHANNEL):
-                    self._note_channel(opcode, memoryview(self._read(offset + _RECORD.size, size)), schemas)
+                    self._note_channel(
+                        opcode, memoryview(self._read(offset + _RECORD.size, size)), schemas
+                    )
             except _MALFORMED as error:
                 first_lost, lost_because = offset, str(error)
                 break
@@ -203,7 +226,9 @@ class McapFile:
         except ValueError as error:
             if end > self._size:
                 raise
-            self.losses.append(f"the chunk at byte {offset} is damaged ({error}); what follows the damage in it was left out")
+            self.losses.append(
+                f"the chunk at byte {offset} is damaged ({error}); what follows the damage in it was left out"
+            )
         inside = times[before:]
         if inside:
             self._chunks.append(chunk._replace(start_ns=min(inside), end_ns=max(inside)))
@@ -213,12 +238,19 @@ class McapFile:
     # ---- messages
 
     def messages(self, topics):
-        """Iterate over lists of (channel, bag time in ns, message) of some topics; all in the order of bag time."""
+        """Iterate over lists of (channel, bag time in ns, message) of some topics; all in the order
+        of bag time.
+        """
         wanted = {key: channel for key, channel in self.channels.items() if channel.topic in topics}
-        chunks = [chunk for chunk in self._chunks if not chunk.index_offsets or chunk.index_offsets.keys() & wanted.keys()]
+        chunks = [
+            chunk
+            for chunk in self._chunks
+            if not chunk.index_offsets or chunk.index_offsets.keys() & wanted.keys()
+        ]
         chunks.sort(key=lambda chunk: chunk.start_ns)
         waiting = self._loose_messages(wanted) if self._loose else []
-        # Chunks may overlap in time: of what has been read, only that which no later chunk can precede is passed on.
+        # Chunks may overlap in time: of what has been read, only that which no later chunk can
+        # precede is passed on.
         for chunk in chunks:
             split = bisect_left(waiting, chunk.start_ns, key=_log_time)
             if split:
@@ -237,7 +269,9 @@ class McapFile:
                 break
             if opcode == _MESSAGE:
                 body = offset + _RECORD.size
-                channel, _, log_ns, _ = _MESSAGE_HEADER.unpack(self._read(body, _MESSAGE_HEADER.size))
+                channel, _, log_ns, _ = _MESSAGE_HEADER.unpack(
+                    self._read(body, _MESSAGE_HEADER.size)
+                )
                 if channel in wanted:
                     data = self._read(body + _MESSAGE_HEADER.size, size - _MESSAGE_HEADER.size)
                     found.append((wanted[channel], log_ns, data))
@@ -260,7 +294,9 @@ class McapFile:
             return found
         except _MALFORMED as error:
             seconds = (chunk.end_ns - chunk.start_ns) * 1e-9
-            self.losses.append(f"a chunk of {seconds:.1f} s at byte {chunk.offset} is damaged ({error}) and was left out")
+            self.losses.append(
+                f"a chunk of {seconds:.1f} s at byte {chunk.offset} is damaged ({error}) and was left out"
+            )
             return []
 
     def _is_plain(self, chunk):
@@ -274,17 +310,28 @@ class McapFile:
             position = chunk.index_offsets[key]
             opcode, size = _RECORD.unpack(self._read(position, _RECORD.size))
             index = self._read(position + _RECORD.size, size) if size < _LARGEST_CHUNK else b""
-            if opcode != _MESSAGE_INDEX or size < 6 or (size - 6) % _ENTRY.size or _UINT16.unpack_from(index)[0] != key:
+            if (
+                opcode != _MESSAGE_INDEX
+                or size < 6
+                or (size - 6) % _ENTRY.size
+                or _UINT16.unpack_from(index)[0] != key
+            ):
                 raise ValueError("its index is not readable")
             for log_ns, offset in _ENTRY.iter_unpack(index[6:]):
                 opcode, size = _RECORD.unpack(self._read(start + offset, _RECORD.size))
                 header = self._read(start + offset + _RECORD.size, _MESSAGE_HEADER.size)
-                if opcode != _MESSAGE or _MESSAGE_HEADER.unpack(header)[0] != key or size > _LARGEST_CHUNK:
+                if (
+                    opcode != _MESSAGE
+                    or _MESSAGE_HEADER.unpack(header)[0] != key
+                    or size > _LARGEST_CHUNK
+                ):
                     raise ValueError("its index does not lead to messages")
                 yield wanted[key], log_ns, self._file.read(size - _MESSAGE_HEADER.size)
 
     def _chunk_records(self, chunk):
-        """Opcode and body of each record in a chunk. One that the file cuts off gives what is whole, if it is not compressed."""
+        """Opcode and body of each record in a chunk. One that the file cuts off gives what is
+        whole, if it is not compressed.
+        """
         opcode, size = _RECORD.unpack(self._read(chunk.offset, _RECORD.size))
         if opcode != _CHUNK or size > _LARGEST_CHUNK:
             raise ValueError("there is no chunk where one should be")
@@ -297,11 +344,15 @@ class McapFile:
         if len(content) == compressed_size:
             if uncompressed_size > _LARGEST_CHUNK:
                 raise ValueError(f"a chunk of {uncompressed_size} bytes is not believable")
-            yield from _records(memoryview(self._decompressed(bytes(content), compression, uncompressed_size, crc)))
+            yield from _records(
+                memoryview(self._decompressed(bytes(content), compression, uncompressed_size, crc))
+            )
         elif compression == "":
             yield from _records(content, may_end_early=True)
         else:
-            raise EOFError(f"the file ends at byte {self._size}, in the middle of a compressed chunk")
+            raise EOFError(
+                f"the file ends at byte {self._size}, in the middle of a compressed chunk"
+            )
 
     def _decompressed(self, content, compression, size, crc):
         # The libraries raise errors of their own kinds; nothing but their code runs here.

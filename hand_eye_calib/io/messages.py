@@ -1,8 +1,9 @@
 """What is read of ROS messages, straight from their bytes: stamps, frames and poses.
 
-All types of stamped poses begin with the same bytes: a ``std_msgs/Header``, for some the sensor's frame, then seven doubles. Only those are
-unpacked, which takes a small part of the time of a whole message and needs no type definitions; and many messages that differ in nothing but
-their numbers are unpacked at once.
+All types of stamped poses begin with the same bytes: a ``std_msgs/Header``, for some the sensor's
+frame, then seven doubles. Only those are unpacked, which takes a small part of the time of a whole
+message and needs no type definitions; and many messages that differ in nothing but their numbers
+are unpacked at once.
 """
 
 import struct
@@ -28,7 +29,9 @@ _POSE_SIZE = 7 * 8
 
 
 class PoseFields(NamedTuple):
-    """What is unpacked of one message; the frame of the sensor is None where the type has no place for it."""
+    """What is unpacked of one message; the frame of the sensor is None where the type has no place
+    for it.
+    """
 
     stamp_ns: int
     world_frame: str
@@ -38,7 +41,9 @@ class PoseFields(NamedTuple):
 
 
 class _Packing(NamedTuple):
-    """How the parts of a message are packed: formats, whether they are aligned, and where the stamp is."""
+    """How the parts of a message are packed: formats, whether they are aligned, and where the stamp
+    is.
+    """
 
     order: str
     is_aligned: bool
@@ -54,7 +59,8 @@ def _packing(order, is_aligned, time):
 _CDR = {b"\x00\x00": _packing(">", True, "iI"), b"\x00\x01": _packing("<", True, "iI")}
 _ROS1 = _packing("<", False, "II")
 
-# CDR begins with 4 bytes that say how it is encoded, and alignment counts from there; a ROS 1 header with 4 bytes of sequence number.
+# CDR begins with 4 bytes that say how it is encoded, and alignment counts from there; a ROS 1
+# header with 4 bytes of sequence number.
 _START = 4
 
 
@@ -136,7 +142,9 @@ def _unpack_pose(cursor, message_type):
 
 
 class PoseColumns(NamedTuple):
-    """What is unpacked of many messages: N stamps and frames, and x y z qx qy qz qw as an (N, 7) array."""
+    """What is unpacked of many messages: N stamps and frames, and x y z qx qy qz qw as an (N, 7)
+    array.
+    """
 
     stamps_ns: np.ndarray
     world_frames: list
@@ -173,7 +181,8 @@ def unpack_poses(messages, message_type, is_ros1):
     if any(len(data) != size for data in messages):
         return _one_by_one(messages, message_type, is_ros1)
     block = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(count, size)
-    # Frames and the padding after them, and how CDR is encoded; the sequence number of ROS 1 may be any.
+    # Frames and the padding after them, and how CDR is encoded; the sequence number of ROS 1 may be
+    # any.
     is_alike = (block[:, 12 : end - _POSE_SIZE] == block[0, 12 : end - _POSE_SIZE]).all()
     is_alike = is_alike and (is_ros1 or (block[:, :2] == block[0, :2]).all())
     order, time = first.packing.order, "u4" if is_ros1 else "i4"
@@ -181,8 +190,17 @@ def unpack_poses(messages, message_type, is_ros1):
     if not is_alike or (nanoseconds >= _NS_PER_S).any():
         return _one_by_one(messages, message_type, is_ros1)
     seconds = np.ascontiguousarray(block[:, 4:8]).view(order + time)[:, 0].astype(np.int64)
-    numbers = np.ascontiguousarray(block[:, end - _POSE_SIZE : end]).view(order + "f8").astype(float, copy=False)
-    return PoseColumns(seconds * _NS_PER_S + nanoseconds, [fields.world_frame] * count, [fields.sensor_frame] * count, numbers)
+    numbers = (
+        np.ascontiguousarray(block[:, end - _POSE_SIZE : end])
+        .view(order + "f8")
+        .astype(float, copy=False)
+    )
+    return PoseColumns(
+        seconds * _NS_PER_S + nanoseconds,
+        [fields.world_frame] * count,
+        [fields.sensor_frame] * count,
+        numbers,
+    )
 
 
 class MalformedMessage(ValueError):
@@ -202,7 +220,9 @@ def _one_by_one(messages, message_type, is_ros1):
             raise MalformedMessage(index, error) from error
     numbers = np.array([[*row.position, *row.quat_xyzw] for row in rows], dtype=float)
     stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
-    return PoseColumns(stamps_ns, [row.world_frame for row in rows], [row.sensor_frame for row in rows], numbers)
+    return PoseColumns(
+        stamps_ns, [row.world_frame for row in rows], [row.sensor_frame for row in rows], numbers
+    )
 
 
 def unpack_path(data, is_ros1):
@@ -230,18 +250,23 @@ def unpack_path(data, is_ros1):
         start = cursor.position
         stamps_ns[index], _ = cursor.header()
         numbers[index, :3], numbers[index, 3:] = cursor.pose()
-        # The first pose may be aligned otherwise than the rest; the second tells what the others are like.
+        # The first pose may be aligned otherwise than the rest; the second tells what the others
+        # are like.
         if index == 1 and _unpack_alike(cursor, start, stamps_ns, numbers):
             break
     return world_frame, stamps_ns, numbers
 
 
 def _unpack_alike(cursor, start, stamps_ns, numbers):
-    """All but the first two poses of a path at once; False where their frames differ, so that they are not of one length."""
+    """All but the first two poses of a path at once; False where their frames differ, so that they
+    are not of one length.
+    """
     size, rest = cursor.position - start, len(stamps_ns) - 2
     if len(cursor.data) - cursor.position < rest * size:
         return False
-    block = np.frombuffer(cursor.data, dtype=np.uint8, offset=start, count=(rest + 1) * size).reshape(-1, size)
+    block = np.frombuffer(
+        cursor.data, dtype=np.uint8, offset=start, count=(rest + 1) * size
+    ).reshape(-1, size)
     stamp = 0 if cursor.packing.is_aligned else 4
     if (block[:, stamp + 8 : size - _POSE_SIZE] != block[0, stamp + 8 : size - _POSE_SIZE]).any():
         return False
@@ -270,5 +295,7 @@ def unpack_transforms(data, is_ros1):
     for _ in range(count):
         stamp_ns, world_frame = cursor.header()
         sensor_frame = cursor.text()
-        transforms.append(PoseFields(stamp_ns, world_frame.lstrip("/"), sensor_frame.lstrip("/"), *cursor.pose()))
+        transforms.append(
+            PoseFields(stamp_ns, world_frame.lstrip("/"), sensor_frame.lstrip("/"), *cursor.pose())
+        )
     return transforms

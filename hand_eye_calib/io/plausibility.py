@@ -1,19 +1,22 @@
 """What single poses cannot tell: a pose or a stamp that does not go with those before and after it.
 
-Most bags have no checksums, so a flipped bit reads as a number like any other. One in a frame's name, a quaternion or a length is noticed where it is
-read; one that moves a single pose or stamp is noticed here, if it moves it farther than noise. What stays within the noise cannot be told from it.
+Most bags have no checksums, so a flipped bit reads as a number like any other. One in a frame's
+name, a quaternion or a length is noticed where it is read; one that moves a single pose or stamp is
+noticed here, if it moves it farther than noise. What stays within the noise cannot be told from it.
 """
 
 import numpy as np
 
 from hand_eye_calib.errors import InputError
 
-# An isolated pose is one that lies this many times farther from both neighbours than these from each other (and than the usual step).
+# An isolated pose is one that lies this many times farther from both neighbours than these from
+# each other (and than the usual step).
 _FACTOR = 10.0
 _SMALLEST_JUMP_M, _SMALLEST_JUMP_RAD, _SMALLEST_JUMP_S = 0.2, 0.1, 0.5
 _BLOCK = 4096
 
-# Nothing that moves on its own is farther from its world's origin; coordinates from the earth's centre are of 6.4e6 m.
+# Nothing that moves on its own is farther from its world's origin; coordinates from the earth's
+# centre are of 6.4e6 m.
 _FARTHEST_M = 1e8
 
 
@@ -23,7 +26,8 @@ class PoseWatch:
     Attributes
     ----------
     n_poses, n_jumps, n_stamps : int
-        Poses looked at, poses that jump away and back, and poses left out because their stamps do so against the bag's own time.
+        Poses looked at, poses that jump away and back, and poses left out because their stamps do
+        so against the bag's own time.
     first_jump, first_stamp : str
         The first of each, for a person.
     """
@@ -37,7 +41,8 @@ class PoseWatch:
     def believable(self, first_number, stamps_ns, bag_ns):
         """Whose stamps to believe among messages in the order in which they were recorded.
 
-        A stamp that alone jumps away from the bag's own time and back is none: with it, a recording of minutes would last for years.
+        A stamp that alone jumps away from the bag's own time and back is none: with it, a recording
+        of minutes would last for years.
 
         Parameters
         ----------
@@ -54,7 +59,9 @@ class PoseWatch:
         delays_s = (bag_ns - stamps_ns)[:, None] * 1e-9
         jumps_s = _isolated(delays_s, _distance, _SMALLEST_JUMP_S, is_first=True, is_last=True)
         if jumps_s.any():
-            self.first_stamp = self.first_stamp or _first(jumps_s, "s", first_number + np.arange(len(stamps_ns)), stamps_ns)
+            self.first_stamp = self.first_stamp or _first(
+                jumps_s, "s", first_number + np.arange(len(stamps_ns)), stamps_ns
+            )
             self.n_stamps += int((jumps_s > 0).sum())
         return jumps_s == 0
 
@@ -136,7 +143,8 @@ def _seconds(stamp_ns):
 def _isolated(values, distance, smallest, is_first, is_last):
     """(N,) how far each lies off its neighbours; 0 where that is nothing unusual.
 
-    The first and last value, neighbours of those in other blocks, are judged only where the stream begins or ends with them.
+    The first and last value, neighbours of those in other blocks, are judged only where the stream
+    begins or ends with them.
     """
     steps = distance(values[:-1], values[1:])
     off, usual = np.zeros(len(values)), np.zeros(len(values))

@@ -1,4 +1,6 @@
-"""Calibrations in files: ``extrinsic.yaml`` with everything, and what a robot needs of it as xacro and as launch file."""
+"""Calibrations in files: ``extrinsic.yaml`` with everything, and what a robot needs of it as xacro
+and as launch file.
+"""
 
 import hashlib
 import os
@@ -23,7 +25,8 @@ LAUNCH_NAME = "static_transform.launch.py"
 def save_result(calibration, directory, inputs=None):
     """Write ``extrinsic.yaml``, ``extrinsic.urdf.xacro`` and ``static_transform.launch.py``.
 
-    Each in one step: a reader sees the old file or the new one, never half of it. Where one cannot be written, none changes.
+    Each in one step: a reader sees the old file or the new one, never half of it. Where one cannot
+    be written, none changes.
 
     Parameters
     ----------
@@ -31,7 +34,8 @@ def save_result(calibration, directory, inputs=None):
     directory : str or path-like
         Made where it is missing.
     inputs : mapping, optional
-        Where the data came from, in plain values; it goes into the file's provenance. Its ``options`` are the parameters there.
+        Where the data came from, in plain values; it goes into the file's provenance. Its
+        ``options`` are the parameters there.
 
     Returns
     -------
@@ -56,19 +60,24 @@ def save_result(calibration, directory, inputs=None):
     texts = {
         XACRO_NAME: _xacro_text(calibration),
         LAUNCH_NAME: _launch_text(calibration),
-        FILE_NAME: yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True),
+        FILE_NAME: yaml.safe_dump(
+            document, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
+        ),
     }
     directory = Path(directory)
     try:
         directory.mkdir(parents=True, exist_ok=True)
         replace_files({directory / name: text for name, text in texts.items()})
     except OSError as error:
-        raise InputError(f"cannot write {error.filename or directory}: {error.strerror}; choose another directory") from None
+        raise InputError(
+            f"cannot write {error.filename or directory}: {error.strerror}; choose another directory"
+        ) from None
     return directory / FILE_NAME
 
 
 def keep_earlier_results(directory):
-    """Copy the result files in a directory into its folder ``previous``, before they are replaced by those of another session.
+    """Copy the result files in a directory into its folder ``previous``, before they are replaced
+    by those of another session.
 
     Raises
     ------
@@ -83,7 +92,9 @@ def keep_earlier_results(directory):
                 previous.mkdir(exist_ok=True)
                 replace_file(previous / name, (directory / name).read_text(encoding="utf-8"))
         except OSError as error:
-            raise InputError(f"cannot keep {directory / name} in {previous}: {error.strerror}") from None
+            raise InputError(
+                f"cannot keep {directory / name} in {previous}: {error.strerror}"
+            ) from None
 
 
 def fingerprint(path):
@@ -125,7 +136,9 @@ def load_result(path):
     try:
         return Calibration.from_dict(yaml.safe_load(path.read_text(encoding="utf-8")))
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}; expected a result or the directory of one") from None
+        raise InputError(
+            f"cannot read {path}: {error.strerror}; expected a result or the directory of one"
+        ) from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
     except InputError as error:
@@ -149,7 +162,10 @@ def replace_files(texts):
     OSError
         Where one cannot be written, by its name; what was there stays.
     """
-    temporaries = {path: path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}") for path in texts}
+    temporaries = {
+        path: path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
+        for path in texts
+    }
     try:
         for path, temporary in temporaries.items():
             with open(temporary, "w", encoding="utf-8") as file:
@@ -166,11 +182,17 @@ def replace_files(texts):
 
 
 def _xacro_text(calibration):
-    """A fixed joint from the parent's to the child's link, for a robot description that has both links."""
+    """A fixed joint from the parent's to the child's link, for a robot description that has both
+    links.
+    """
     transform = calibration.to_dict()["T_parent_child"]
-    parent, child = (_xacro_attribute(frame) for frame in (calibration.parent_frame, calibration.child_frame))
+    parent, child = (
+        _xacro_attribute(frame) for frame in (calibration.parent_frame, calibration.child_frame)
+    )
     joint = _xacro_attribute(f"{calibration.parent_frame}_to_{calibration.child_frame}")
-    xyz, rpy = (" ".join(map(repr, values)) for values in (transform["translation"], _rpy_rad(calibration)))
+    xyz, rpy = (
+        " ".join(map(repr, values)) for values in (transform["translation"], _rpy_rad(calibration))
+    )
     comment = "\n".join(f"     {line}" for line in _remarks(calibration)).replace("--", "- -")
     return f"""\
 <?xml version="1.0" encoding="UTF-8"?>
@@ -189,9 +211,16 @@ def _xacro_text(calibration):
 def _launch_text(calibration):
     """A launch file that publishes the extrinsic as a static transform."""
     transform = calibration.to_dict()["T_parent_child"]
-    values = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), transform["translation"] + transform["quat_xyzw"], strict=True)
+    values = zip(
+        ("x", "y", "z", "qx", "qy", "qz", "qw"),
+        transform["translation"] + transform["quat_xyzw"],
+        strict=True,
+    )
     arguments = [(f"--{name}", f"{round(value, 12) + 0.0:.12f}") for name, value in values]
-    arguments += [("--frame-id", calibration.parent_frame), ("--child-frame-id", calibration.child_frame)]
+    arguments += [
+        ("--frame-id", calibration.parent_frame),
+        ("--child-frame-id", calibration.child_frame),
+    ]
     lines = "\n".join(f"                    {option!r}, {value!r}," for option, value in arguments)
     comment = "\n".join(f"# {line}" for line in _remarks(calibration))
     return f"""\
@@ -241,7 +270,9 @@ def _xacro_attribute(text):
 
 
 def _versions():
-    return {"python": platform.python_version()} | {name: metadata.version(name) for name in ("numpy", "scipy")}
+    return {"python": platform.python_version()} | {
+        name: metadata.version(name) for name in ("numpy", "scipy")
+    }
 
 
 def _package_version():

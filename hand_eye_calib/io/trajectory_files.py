@@ -1,14 +1,17 @@
 """Trajectories in text files.
 
-========  ====================================================================================================================
-tum       ``timestamp tx ty tz qx qy qz qw``, separated by white space
-kitti     the first three rows of the pose's matrix, 12 numbers; stamps, one a line, in a file of their own
-euroc     ``timestamp, px, py, pz, qw, qx, qy, qz, ...``, nanoseconds; what follows (velocities, biases) is ignored
-csv       columns found by the names in the header, or named by ``columns``; separated by commas, semicolons or white space
-========  ====================================================================================================================
+========
+====================================================================================================================
+tum       ``timestamp tx ty tz qx qy qz qw``, separated by white space kitti     the first three
+rows of the pose's matrix, 12 numbers; stamps, one a line, in a file of their own euroc
+``timestamp, px, py, pz, qw, qx, qy, qz, ...``, nanoseconds; what follows (velocities, biases) is
+ignored csv       columns found by the names in the header, or named by ``columns``; separated by
+commas, semicolons or white space ========
+====================================================================================================================
 
-Lines that start with ``#`` and empty lines are skipped, but a csv file's header may start with ``#``. Lengths are in metres. The unit of the
-stamps is recognised from their size. The order of a quaternion's numbers is the format's or is named, never guessed.
+Lines that start with ``#`` and empty lines are skipped, but a csv file's header may start with
+``#``. Lengths are in metres. The unit of the stamps is recognised from their size. The order of a
+quaternion's numbers is the format's or is named, never guessed.
 """
 
 import csv
@@ -23,7 +26,11 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, ROTATION_TOLERANCE, Trajectory
+from hand_eye_calib.geometry.trajectory import (
+    QUATERNION_NORM_TOLERANCE,
+    ROTATION_TOLERANCE,
+    Trajectory,
+)
 
 _TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _EUROC_COLUMNS = "timestamp, px, py, pz, qw, qx, qy, qz"
@@ -31,12 +38,19 @@ _POSE_NAMES = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _NS_PER_S = 1_000_000_000
 _LARGEST_NS = int(np.iinfo(np.int64).max)
 
-# The largest stamp of a file decides: seconds since 1970 have ten digits, and each smaller unit three more.
-_SMALLEST_OF_UNIT = {"ns": Decimal(10) ** 17, "us": Decimal(10) ** 14, "ms": Decimal(10) ** 11, "s": Decimal(0)}
+# The largest stamp of a file decides: seconds since 1970 have ten digits, and each smaller unit
+# three more.
+_SMALLEST_OF_UNIT = {
+    "ns": Decimal(10) ** 17,
+    "us": Decimal(10) ** 14,
+    "ms": Decimal(10) ** 11,
+    "s": Decimal(0),
+}
 # Poses farther apart than this are of no use to a calibration: rather the unit has been mistaken.
 _LONGEST_INTERVAL_S = 10
 
-# Last parts of column names, lower case, words joined by underscores; exports of bags have whole paths such as .pose.pose.position.x.
+# Last parts of column names, lower case, words joined by underscores; exports of bags have whole
+# paths such as .pose.pose.position.x.
 _ALIASES = {
     "t": ("t", "time", "timestamp", "timestamps", "stamp", "gpstime", "header_stamp"),
     "x": ("x", "tx", "px", "p_x", "pos_x", "position_x", "translation_x", "p_rs_r_x", "easting"),
@@ -49,7 +63,17 @@ _ALIASES = {
 }  # fmt: skip
 
 
-def read_trajectory(path, format="tum", *, topic=None, tf=None, columns=None, times=None, stamp_unit=None, repair=False):
+def read_trajectory(
+    path,
+    format="tum",
+    *,
+    topic=None,
+    tf=None,
+    columns=None,
+    times=None,
+    stamp_unit=None,
+    repair=False,
+):
     """Read a trajectory from a text file, or from a bag where ``topic`` or ``tf`` is given.
 
     Parameters
@@ -60,32 +84,41 @@ def read_trajectory(path, format="tum", *, topic=None, tf=None, columns=None, ti
     topic : str, optional
         Of a bag: the topic of the poses. No other option goes with it.
     tf : str, optional
-        Of a bag: the two frames, ``world:sensor``, whose transform is the trajectory, from ``/tf`` and ``/tf_static``.
+        Of a bag: the two frames, ``world:sensor``, whose transform is the trajectory, from ``/tf``
+        and ``/tf_static``.
     columns : str, optional
-        For csv without a header: the columns' names, such as ``"t,x,y,z,qw,qx,qy,qz"``. Other names are columns to skip.
+        For csv without a header: the columns' names, such as ``"t,x,y,z,qw,qx,qy,qz"``. Other names
+        are columns to skip.
     times : str or path-like, optional
         For kitti: the file of the stamps.
     stamp_unit : str, optional
-        "s", "ms", "us" or "ns"; recognised from the stamps' size or taken from the header (``timestamp [ns]``) where left out.
+        "s", "ms", "us" or "ns"; recognised from the stamps' size or taken from the header
+        (``timestamp [ns]``) where left out.
     repair : bool
-        Sort poses that are out of order and drop those with a stamp that is there already, with a ``UserWarning`` that says how
-        many; otherwise they are an error.
+        Sort poses that are out of order and drop those with a stamp that is there already, with a
+        ``UserWarning`` that says how many; otherwise they are an error.
 
     Returns
     -------
     Trajectory
-        Stamps are exactly the decimal numbers of the file, in nanoseconds; frame names are empty, from a bag those of the messages.
+        Stamps are exactly the decimal numbers of the file, in nanoseconds; frame names are empty,
+        from a bag those of the messages.
 
     Raises
     ------
     InputError
-        Where the file cannot be read or a line cannot be used; the message names file, line and what was found.
+        Where the file cannot be read or a line cannot be used; the message names file, line and
+        what was found.
     ConfigError
         For a format or unit that is not known, and options that do not go together.
     """
     if topic or tf:
-        if (format, columns, times, stamp_unit, repair) != ("tum", None, None, None, False) or (topic and tf):
-            raise ConfigError("topic and tf are for bags: give one of them and none of the options of text files")
+        if (format, columns, times, stamp_unit, repair) != ("tum", None, None, None, False) or (
+            topic and tf
+        ):
+            raise ConfigError(
+                "topic and tf are for bags: give one of them and none of the options of text files"
+            )
         from hand_eye_calib.io.bags import read_bag_trajectory
 
         trajectory, notes = read_bag_trajectory(path, topic, tf)
@@ -96,17 +129,25 @@ def read_trajectory(path, format="tum", *, topic=None, tf=None, columns=None, ti
     return trajectory
 
 
-def read_trajectory_file(path, format="tum", columns=None, times=None, stamp_unit=None, repair=False):
-    """As :func:`read_trajectory` for text files, but what a person should know is returned: (Trajectory, list of str)."""
+def read_trajectory_file(
+    path, format="tum", columns=None, times=None, stamp_unit=None, repair=False
+):
+    """As :func:`read_trajectory` for text files, but what a person should know is returned:
+    (Trajectory, list of str).
+    """
     if stamp_unit is not None and stamp_unit not in STAMP_UNITS:
-        raise ConfigError(f"unknown unit of stamps {stamp_unit!r}; known are {', '.join(STAMP_UNITS)}")
+        raise ConfigError(
+            f"unknown unit of stamps {stamp_unit!r}; known are {', '.join(STAMP_UNITS)}"
+        )
     if format not in FORMATS:
         raise ConfigError(f"unknown trajectory format {format!r}; known are {', '.join(FORMATS)}")
     if columns is not None and format != "csv":
         raise ConfigError(f"columns are named for format csv only; the format is {format}")
     if times is not None and format != "kitti":
         raise ConfigError(f"a file of times belongs to format kitti only; the format is {format}")
-    table = _READERS[format](path, *((columns,) if format == "csv" else (times,) if format == "kitti" else ()))
+    table = _READERS[format](
+        path, *((columns,) if format == "csv" else (times,) if format == "kitti" else ())
+    )
     if not table.stamps:
         raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
     stamps_ns = _to_ns(path, table, stamp_unit)
@@ -116,7 +157,8 @@ def read_trajectory_file(path, format="tum", columns=None, times=None, stamp_uni
 
 
 def write_trajectory(path, trajectory, format="tum"):
-    """Write a trajectory to a file, replacing it where it exists; reading it back gives the same stamps and poses.
+    """Write a trajectory to a file, replacing it where it exists; reading it back gives the same
+    stamps and poses.
 
     Parameters
     ----------
@@ -144,7 +186,8 @@ def write_trajectory(path, trajectory, format="tum"):
 
 @dataclass
 class _Table:
-    """What the lines of a file say; stamps and values row by row, the values in the format's own order.
+    """What the lines of a file say; stamps and values row by row, the values in the format's own
+    order.
 
     ``stamps`` are Decimal in ``unit``, or in a unit to be recognised where that is empty.
     """
@@ -175,7 +218,9 @@ def _read_euroc(path):
     for number, line in _data_lines(path, table.expected):
         fields = [cell.strip() for cell in line.split(",")]
         if len(fields) < 8:
-            raise _unexpected(path, number, f"8 numbers or more, {table.expected}", line, len(fields))
+            raise _unexpected(
+                path, number, f"8 numbers or more, {table.expected}", line, len(fields)
+            )
         qw, qx, qy, qz = fields[4:8]
         _add(path, table, number, fields[0], [*fields[1:4], qx, qy, qz, qw])
     return table
@@ -184,7 +229,9 @@ def _read_euroc(path):
 def _read_kitti(path, times):
     table = _Table("12 numbers, the first three rows of a pose", matrices=True)
     if times is None:
-        raise ConfigError(f"{path}: the poses of format kitti have no stamps; name their file with times (--times)")
+        raise ConfigError(
+            f"{path}: the poses of format kitti have no stamps; name their file with times (--times)"
+        )
     stamps = list(_data_lines(times, "stamps"))
     for index, (number, line) in enumerate(_data_lines(path, table.expected)):
         fields = line.split()
@@ -199,7 +246,11 @@ def _read_kitti(path, times):
 
 
 def _read_csv(path, columns):
-    lines = [(number, line) for number, line in enumerate(_lines(path, "a table"), start=1) if line.strip()]
+    lines = [
+        (number, line)
+        for number, line in enumerate(_lines(path, "a table"), start=1)
+        if line.strip()
+    ]
     if columns is None:
         names, lines = _header(path, lines)
     else:
@@ -242,7 +293,9 @@ def _choose(path, names):
         found = [index for index, name in enumerate(plain) if name in aliases]
         # Of paths, the longest end that is known: position_x rather than x.
         found = found or [
-            index for index, name in enumerate(plain) if any(name.endswith("_" + end) for end in aliases if "_" in end)
+            index
+            for index, name in enumerate(plain)
+            if any(name.endswith("_" + end) for end in aliases if "_" in end)
         ]
         if len(found) > 1:
             raise InputError(
@@ -251,7 +304,9 @@ def _choose(path, names):
         if found:
             chosen[wanted] = found[0]
     if {"secs", "nsecs"} <= chosen.keys():
-        chosen.pop("t", None)  # the stamp of the message's header rather than the time of its arrival
+        chosen.pop(
+            "t", None
+        )  # the stamp of the message's header rather than the time of its arrival
     needed = set(_POSE_NAMES) - ({"t"} if {"secs", "nsecs"} <= chosen.keys() else set())
     missing = [name for name in _POSE_NAMES if name in needed - chosen.keys()]
     if missing:
@@ -259,7 +314,9 @@ def _choose(path, names):
             f"{path}: no column for {', '.join(missing)} among {', '.join(names)}; name all columns with columns (--columns), such as "
             "t,x,y,z,qw,qx,qy,qz"
         )
-    return {name: index for name, index in chosen.items() if name in needed or name in ("secs", "nsecs")}
+    return {
+        name: index for name, index in chosen.items() if name in needed or name in ("secs", "nsecs")
+    }
 
 
 def _plain(name):
@@ -271,7 +328,10 @@ def _plain(name):
 
 def _unit_in(name):
     """Unit of the stamps in a column's name, empty where it has none."""
-    found = re.search(r"[\[(]\s*(s|ms|us|ns)\s*[\])]\s*$|^\W*(?:t|time|timestamp|stamp)_(s|ms|us|ns)$", name.strip().lower())
+    found = re.search(
+        r"[\[(]\s*(s|ms|us|ns)\s*[\])]\s*$|^\W*(?:t|time|timestamp|stamp)_(s|ms|us|ns)$",
+        name.strip().lower(),
+    )
     return (found[1] or found[2]) if found else ""
 
 
@@ -285,7 +345,9 @@ def _cells(line):
 def _joined(path, number, secs, nsecs):
     """Nanoseconds of a stamp in two columns."""
     if not (re.fullmatch(r"-?\d+", secs) and re.fullmatch(r"\d{1,9}", nsecs)):
-        raise InputError(f"{path}, line {number}: expected whole seconds and nanoseconds; found {secs!r} and {nsecs!r}")
+        raise InputError(
+            f"{path}, line {number}: expected whole seconds and nanoseconds; found {secs!r} and {nsecs!r}"
+        )
     return str(int(secs) * _NS_PER_S + int(nsecs))
 
 
@@ -344,19 +406,28 @@ def _decimal(text):
 
 
 def _to_ns(path, table, stamp_unit):
-    """Stamps in nanoseconds, in the unit that is given, that the format has, or that their size tells."""
+    """Stamps in nanoseconds, in the unit that is given, that the format has, or that their size
+    tells.
+    """
     unit = stamp_unit or table.unit
     largest = max(map(abs, table.stamps))
-    recognised = unit or next(unit for unit, smallest in _SMALLEST_OF_UNIT.items() if largest >= smallest)
+    recognised = unit or next(
+        unit for unit, smallest in _SMALLEST_OF_UNIT.items() if largest >= smallest
+    )
     if largest > Decimal(_LARGEST_NS) / STAMP_UNITS[recognised]:
         index = max(range(len(table.stamps)), key=lambda index: abs(table.stamps[index]))
         raise InputError(
             f"{path}, line {table.line_numbers[index]}: the timestamp {table.stamps[index]:.6g} is too large for {recognised}; "
             "name its unit with stamp_unit (--stamp-unit)"
         )
-    stamps_ns = np.array([int((stamp * STAMP_UNITS[recognised]).to_integral_value()) for stamp in table.stamps], dtype=np.int64)
+    stamps_ns = np.array(
+        [int((stamp * STAMP_UNITS[recognised]).to_integral_value()) for stamp in table.stamps],
+        dtype=np.int64,
+    )
     interval_s = float(np.median(np.abs(np.diff(stamps_ns)))) * 1e-9 if len(stamps_ns) > 1 else 0.0
-    is_whole = all(stamp == stamp.to_integral_value() for stamp in table.stamps)  # with a fraction, they are in seconds
+    is_whole = all(
+        stamp == stamp.to_integral_value() for stamp in table.stamps
+    )  # with a fraction, they are in seconds
     if not unit and is_whole and interval_s > _LONGEST_INTERVAL_S:
         raise InputError(
             f"{path}: the unit of the timestamps is unclear; read as {recognised}, the poses are {interval_s:.4g} s apart; "
@@ -366,7 +437,9 @@ def _to_ns(path, table, stamp_unit):
 
 
 def _poses(path, table):
-    """Positions (N, 3) and quaternions (N, 4), scalar last; what Trajectory would refuse too, but here the line can be named."""
+    """Positions (N, 3) and quaternions (N, 4), scalar last; what Trajectory would refuse too, but
+    here the line can be named.
+    """
     values = np.array(table.values)
 
     def refuse(wrong, message):
@@ -375,7 +448,8 @@ def _poses(path, table):
             raise InputError(f"{path}, line {table.line_numbers[index]}: {message(index)}")
 
     refuse(
-        ~np.isfinite(values).all(axis=1), lambda index: "found a value that is not finite; remove the line or repair its source"
+        ~np.isfinite(values).all(axis=1),
+        lambda index: "found a value that is not finite; remove the line or repair its source",
     )
     if table.matrices:
         matrices = values.reshape(-1, 3, 4)
@@ -383,9 +457,13 @@ def _poses(path, table):
         deviation = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
         refuse(
             (deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotations) < 0),
-            lambda index: f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check what the numbers are",
+            lambda index: (
+                f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check what the numbers are"
+            ),
         )
-        left, _, right = np.linalg.svd(rotations)  # their product is the nearest rotation: files have few digits
+        left, _, right = np.linalg.svd(
+            rotations
+        )  # their product is the nearest rotation: files have few digits
         return matrices[:, :, 3], se3.to_quat_xyzw(left @ right)
     norms = np.linalg.norm(values[:, 3:], axis=1)
     refuse(
@@ -413,7 +491,11 @@ def _ordered(path, table, stamps_ns, repair):
     order = np.argsort(stamps_ns, kind="stable")
     repeated = np.diff(stamps_ns[order], prepend=stamps_ns[order[0]] - 1) == 0
     backward, n_repeated = int((np.diff(stamps_ns) < 0).sum()), int(repeated.sum())
-    repairs = [f"stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted"] if backward else []
+    repairs = (
+        [f"stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted"]
+        if backward
+        else []
+    )
     repairs += [f"dropped {n_repeated} whose stamp was there already"] if n_repeated else []
     return order[~repeated], [f"{path}: {'; '.join(repairs)}"]
 

@@ -1,4 +1,6 @@
-"""Trajectories out of the transform tree: from the edges on ``/tf`` and ``/tf_static`` to the pose of one frame in another."""
+"""Trajectories out of the transform tree: from the edges on ``/tf`` and ``/tf_static`` to the pose
+of one frame in another.
+"""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -30,7 +32,9 @@ class TfSource(NamedTuple):
         """
         frames = [frame.strip().lstrip("/") for frame in text.split(":")]
         if len(frames) != 2 or not all(frames) or frames[0] == frames[1]:
-            raise ConfigError(f"expected two frames as WORLD:SENSOR, such as odom:lidar; got {text!r}")
+            raise ConfigError(
+                f"expected two frames as WORLD:SENSOR, such as odom:lidar; got {text!r}"
+            )
         return cls(*frames)
 
 
@@ -48,8 +52,8 @@ class Edge:
 class TransformTree:
     """The frames of a bag and how they hang together.
 
-    Transforms are noted with :meth:`note` in a first pass over the messages, and their numbers kept with :meth:`keep` in a second one, when it
-    is known which of them are needed.
+    Transforms are noted with :meth:`note` in a first pass over the messages, and their numbers kept
+    with :meth:`keep` in a second one, when it is known which of them are needed.
     """
 
     def __init__(self):
@@ -72,7 +76,9 @@ class TransformTree:
         edge.is_static &= is_static
 
     def keep(self, transform, is_static, log_ns):
-        """Keep the numbers of a transform that is needed. An edge that moves is not bothered by what is said to be static."""
+        """Keep the numbers of a transform that is needed. An edge that moves is not bothered by
+        what is said to be static.
+        """
         edge = self.edges[transform.sensor_frame]
         if edge.is_static or not is_static:
             edge.log_ns.append(log_ns)
@@ -80,7 +86,8 @@ class TransformTree:
             edge.numbers.append((*transform.position, *transform.quat_xyzw))
 
     def chain(self, source):
-        """The frames whose edges lead from the world frame to the sensor's: those to go up from the world, those to come down by.
+        """The frames whose edges lead from the world frame to the sensor's: those to go up from the
+        world, those to come down by.
 
         Raises
         ------
@@ -88,22 +95,34 @@ class TransformTree:
             Where a frame is not there, or nothing moves between the two.
         """
         for frame in source:
-            if frame not in self.edges and frame not in {edge.parent for edge in self.edges.values()}:
+            if frame not in self.edges and frame not in {
+                edge.parent for edge in self.edges.values()
+            }:
                 raise InputError(f"no frame {frame!r} in the bag's transforms; {self.listing()}")
         up, down = self._to_root(source.world_frame), self._to_root(source.sensor_frame)
         if self._root(source.world_frame) != self._root(source.sensor_frame):
-            raise InputError(f"frames {source.world_frame!r} and {source.sensor_frame!r} are not connected; {self.listing()}")
+            raise InputError(
+                f"frames {source.world_frame!r} and {source.sensor_frame!r} are not connected; {self.listing()}"
+            )
         shared = set(up) & set(down)
-        up, down = [frame for frame in up if frame not in shared], [frame for frame in down if frame not in shared]
+        up, down = (
+            [frame for frame in up if frame not in shared],
+            [frame for frame in down if frame not in shared],
+        )
         if all(self.edges[frame].is_static for frame in up + down):
-            raise InputError(f"{source} does not move: all of its transforms are static; {self.listing()}")
+            raise InputError(
+                f"{source} does not move: all of its transforms are static; {self.listing()}"
+            )
         return up, down[::-1]
 
     def listing(self):
         """All edges in one line."""
         if not self.edges:
             return "it has none"
-        edges = sorted(f"{edge.parent}:{frame}{' (static)' * edge.is_static}" for frame, edge in self.edges.items())
+        edges = sorted(
+            f"{edge.parent}:{frame}{' (static)' * edge.is_static}"
+            for frame, edge in self.edges.items()
+        )
         return f"it has {', '.join(edges)}"
 
     def _to_root(self, frame):
@@ -120,9 +139,11 @@ class TransformTree:
         return self.edges[frames[-1]].parent if frames else frame
 
     def trajectory(self, source, max_gap_s):
-        """Poses of the sensor's frame in the world frame, at the stamps of the chain's slowest moving edge.
+        """Poses of the sensor's frame in the world frame, at the stamps of the chain's slowest
+        moving edge.
 
-        The other moving edges are interpolated there, never extrapolated and never across more than ``max_gap_s``.
+        The other moving edges are interpolated there, never extrapolated and never across more than
+        ``max_gap_s``.
 
         Returns
         -------
@@ -155,7 +176,11 @@ class TransformTree:
             if frame == slowest:
                 return base.poses[known]
             edge = moving[frame][0]
-            return edge.at(stamps_ns) if len(edge) > 1 else np.repeat(edge.poses, len(stamps_ns), axis=0)
+            return (
+                edge.at(stamps_ns)
+                if len(edge) > 1
+                else np.repeat(edge.poses, len(stamps_ns), axis=0)
+            )
 
         Ts_world_sensor = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
         for frame in up:
@@ -170,15 +195,21 @@ class TransformTree:
         return self._checked(frame, [0], self.edges[frame].numbers[-1:]).poses[0]
 
     def _moving(self, frame):
-        """Trajectory and bag times of an edge; transforms are often repeated, the first with a stamp counts."""
+        """Trajectory and bag times of an edge; transforms are often repeated, the first with a
+        stamp counts.
+        """
         edge = self.edges[frame]
         stamps_ns, first = np.unique(np.array(edge.stamps_ns, dtype=np.int64), return_index=True)
-        return self._checked(frame, stamps_ns, np.array(edge.numbers)[first]), np.array(edge.log_ns, dtype=np.int64)[first]
+        return self._checked(frame, stamps_ns, np.array(edge.numbers)[first]), np.array(
+            edge.log_ns, dtype=np.int64
+        )[first]
 
     def _checked(self, frame, stamps_ns, numbers):
         numbers = np.array(numbers, dtype=float).reshape(-1, 7)
         try:
-            return Trajectory.from_quat_xyzw(np.array(stamps_ns, dtype=np.int64), numbers[:, :3], numbers[:, 3:])
+            return Trajectory.from_quat_xyzw(
+                np.array(stamps_ns, dtype=np.int64), numbers[:, :3], numbers[:, 3:]
+            )
         except InputError as error:
             raise InputError(f"transform {self.edges[frame].parent}:{frame}: {error}") from None
 
@@ -188,10 +219,14 @@ def _interval(trajectory):
 
 
 def _is_known(available_ns, wanted_ns, max_gap_s):
-    """Mask of the stamps at which an edge has a transform or lies between two that are not too far apart."""
+    """Mask of the stamps at which an edge has a transform or lies between two that are not too far
+    apart.
+    """
     after = np.searchsorted(available_ns, wanted_ns)
     inside = after < len(available_ns)
     after = np.minimum(after, len(available_ns) - 1)
     before = np.maximum(after - 1, 0)
     gap_ns = available_ns[after] - available_ns[before]
-    return inside & ((available_ns[after] == wanted_ns) | ((after > 0) & (gap_ns <= max_gap_s * 1e9)))
+    return inside & (
+        (available_ns[after] == wanted_ns) | ((after > 0) & (gap_ns <= max_gap_s * 1e9))
+    )

@@ -11,8 +11,9 @@ _WINDOW = 64
 def select_keyframes(pose_pairs, min_translation, min_rotation, min_interval_s, previous=None):
     """Indices of the pose pairs to keep, in order.
 
-    A pose pair is kept when ``min_interval_s`` has passed since the last one kept and the parent sensor has since moved
-    ``min_translation`` or turned ``min_rotation``. A threshold of zero switches that criterion off.
+    A pose pair is kept when ``min_interval_s`` has passed since the last one kept and the parent
+    sensor has since moved ``min_translation`` or turned ``min_rotation``. A threshold of zero
+    switches that criterion off.
 
     Parameters
     ----------

@@ -31,7 +31,12 @@ class MotionPairs:
         return len(self.i)
 
     def __getitem__(self, index):
-        return MotionPairs(self.Ts_parenti_parentj[index], self.Ts_childi_childj[index], self.i[index], self.j[index])
+        return MotionPairs(
+            self.Ts_parenti_parentj[index],
+            self.Ts_childi_childj[index],
+            self.i[index],
+            self.j[index],
+        )
 
 
 def motion_pairs(Ts_pw_p, Ts_cw_c, reference="B1"):
@@ -50,7 +55,9 @@ def motion_pairs(Ts_pw_p, Ts_cw_c, reference="B1"):
         Where the two stacks differ in length.
     """
     if len(Ts_pw_p) != len(Ts_cw_c):
-        raise InputError(f"parent and child need the same number of poses; found {len(Ts_pw_p)} and {len(Ts_cw_c)}")
+        raise InputError(
+            f"parent and child need the same number of poses; found {len(Ts_pw_p)} and {len(Ts_cw_c)}"
+        )
     return pairs_between(Ts_pw_p, Ts_cw_c, *reference_indices(reference, len(Ts_pw_p)))
 
 
@@ -61,7 +68,8 @@ def pairs_between(Ts_pw_p, Ts_cw_c, i, j):
 
 def _relative(Ts_world_sensor, i, j):
     start, end = Ts_world_sensor.take(i, axis=0), Ts_world_sensor.take(j, axis=0)
-    # The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting first costs ten digits.
+    # The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting
+    # first costs ten digits.
     end[:, :3, 3] -= start[:, :3, 3]
     relative = np.empty_like(end)
     np.matmul(np.swapaxes(start[:, :3, :3], 1, 2), end[:, :3], out=relative[:, :3])

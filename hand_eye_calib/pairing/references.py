@@ -1,4 +1,6 @@
-"""Reference selection: which index pairs (i, j) become motion pairs (Välimäki et al. 2023, section 3.4)."""
+"""Reference selection: which index pairs (i, j) become motion pairs (Välimäki et al. 2023, section
+3.4).
+"""
 
 import re
 
@@ -22,7 +24,9 @@ def parse_reference(reference):
         return "A", 1
     if match and (match[1] == "B" or int(match[2]) >= 2):
         return match[1], int(match[2])
-    raise ConfigError(f"reference {reference!r} is not one of A, B<n> (n >= 1) or C<n> (n >= 2), for example B5")
+    raise ConfigError(
+        f"reference {reference!r} is not one of A, B<n> (n >= 1) or C<n> (n >= 2), for example B5"
+    )
 
 
 def reference_indices(reference, n_poses):
@@ -31,8 +35,9 @@ def reference_indices(reference, n_poses):
     Parameters
     ----------
     reference : str
-        ``"A"``: every pose against the first. ``"B<n>"``: against the n-th before it. ``"C<n>"``: against the keyframe that opens its
-        segment of n poses; a last segment whose keyframe is N - n or later is left out, as in the published results.
+        ``"A"``: every pose against the first. ``"B<n>"``: against the n-th before it. ``"C<n>"``:
+        against the keyframe that opens its segment of n poses; a last segment whose keyframe is N -
+        n or later is left out, as in the published results.
     n_poses : int
         Number of poses N.
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from hand_eye_calib.geometry.trajectory import Trajectory
 
-# Streams whose intervals differ by less than this factor count as equally fast: the child's stamps are then used.
+# Streams whose intervals differ by less than this factor count as equally fast: the child's stamps
+# are then used.
 _EQUALLY_FAST = 1.2
 
 
@@ -38,7 +39,12 @@ class PosePairs:
 
     @classmethod
     def concatenate(cls, *parts):
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("stamps_ns", "Ts_pw_p", "Ts_cw_c")))
+        return cls(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in ("stamps_ns", "Ts_pw_p", "Ts_cw_c")
+            )
+        )
 
 
 def slower_stream(parent: Trajectory, child: Trajectory):
@@ -48,15 +54,19 @@ def slower_stream(parent: Trajectory, child: Trajectory):
     """
     if len(parent) < 2 or len(child) < 2:
         return "child"
-    interval_parent, interval_child = np.median(np.diff(parent.stamps_ns)), np.median(np.diff(child.stamps_ns))
+    interval_parent, interval_child = (
+        np.median(np.diff(parent.stamps_ns)),
+        np.median(np.diff(child.stamps_ns)),
+    )
     return "parent" if interval_parent > _EQUALLY_FAST * interval_child else "child"
 
 
 def synchronise(parent: Trajectory, child: Trajectory, max_gap_s, at=None) -> PosePairs:
     """Poses of both sensors at the slower stream's stamps.
 
-    The faster stream is interpolated along the geodesic of SE(3). An instant outside it, or between two of its poses that lie
-    more than ``max_gap_s`` apart, is left out; an instant at which it has a pose of its own is always kept.
+    The faster stream is interpolated along the geodesic of SE(3). An instant outside it, or between
+    two of its poses that lie more than ``max_gap_s`` apart, is left out; an instant at which it has
+    a pose of its own is always kept.
 
     Parameters
     ----------
@@ -73,14 +83,18 @@ def synchronise(parent: Trajectory, child: Trajectory, max_gap_s, at=None) -> Po
     slow, fast = (parent, child) if at == "parent" else (child, parent)
     keep = _interpolable(fast.stamps_ns, slow.stamps_ns, max_gap_s)
     stamps_ns = slow.stamps_ns[keep]
-    fast_poses = np.repeat(fast.poses, len(stamps_ns), axis=0) if len(fast) == 1 else fast.at(stamps_ns)
+    fast_poses = (
+        np.repeat(fast.poses, len(stamps_ns), axis=0) if len(fast) == 1 else fast.at(stamps_ns)
+    )
     if at == "parent":
         return PosePairs(stamps_ns, slow.poses[keep], fast_poses)
     return PosePairs(stamps_ns, fast_poses, slow.poses[keep])
 
 
 def _interpolable(available_ns, wanted_ns, max_gap_s):
-    """Mask of the wanted stamps at which a stream with the available stamps has a pose or may be interpolated."""
+    """Mask of the wanted stamps at which a stream with the available stamps has a pose or may be
+    interpolated.
+    """
     after = np.searchsorted(available_ns, wanted_ns)
     inside = after < len(available_ns)
     after = np.minimum(after, len(available_ns) - 1)

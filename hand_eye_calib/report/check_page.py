@@ -1,7 +1,7 @@
 """``check.html``: what the stream checks found, and what they saw."""
 
-from hand_eye_calib.pairing.stream_checks import Severity
-from hand_eye_calib.report.evidence import see_streams
+from hand_eye_calib.checks.findings import Severity
+from hand_eye_calib.engine.evidence import see_streams
 from hand_eye_calib.report.report import environment, said_of_streams
 from hand_eye_calib.report.report_figures import draw_streams
 
@@ -25,7 +25,8 @@ def render_check(parent, child, agreement, findings, inputs, max_gap_s=0.5):
     str
     """
     svg = said = aligned = ""
-    # Without any correlation the streams were not looked at: too short, or their stamps are in doubt.
+    # Without any correlation the streams were not looked at: too short, or their stamps are in
+    # doubt.
     if agreement.correlation.overlap_s:
         offset_s = agreement.correlation.offset_s if agreement.correlation.is_clear else 0.0
         if offset_s:
@@ -38,7 +39,9 @@ def render_check(parent, child, agreement, findings, inputs, max_gap_s=0.5):
         .render(
             inputs=inputs,
             findings=findings,
-            tone="good" if all(finding.severity is Severity.NOTE for finding in findings) else "bad",
+            tone="good"
+            if all(finding.severity is Severity.NOTE for finding in findings)
+            else "bad",
             svg=svg,
             said=said,
             aligned=aligned,

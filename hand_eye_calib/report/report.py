@@ -1,4 +1,6 @@
-"""``report.html``: one self-contained page that says how the sensors are mounted, how sure that is, and why."""
+"""``report.html``: one self-contained page that says how the sensors are mounted, how sure that is,
+and why.
+"""
 
 import math
 import platform
@@ -13,7 +15,7 @@ from hand_eye_calib.assessment.covariance import AXES, WEAK_ROTATION, WEAK_TRANS
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.pairing.stream_checks import summarise
+from hand_eye_calib.checks.stream_checks import summarise
 from hand_eye_calib.report.report_figures import draw_all, time_axis
 
 _TITLES = {
@@ -32,13 +34,15 @@ _WORDS = {
     DofVerdict.PRIOR: "mostly what was given beforehand",
 }
 
-# A bar reaches from a thousandth of the limit beyond which an axis is weak to ten times that, by its logarithm.
+# A bar reaches from a thousandth of the limit beyond which an axis is weak to ten times that, by
+# its logarithm.
 _BAR_DECADES, _BAR_ABOVE = 4.0, 1.0
 
 # Two answers disagree when they are this many standard deviations apart.
 _DISAGREE = 3.0
 
-# A drive is long enough when from its first part on the answer stays within this many standard deviations of the result.
+# A drive is long enough when from its first part on the answer stays within this many standard
+# deviations of the result.
 _SETTLED = 3.0
 
 
@@ -51,7 +55,7 @@ def render(calibration, config, evidence, *, inputs=None, findings=(), command="
     config : CalibratorConfig
         The options that gave it.
     evidence : Evidence
-        See :func:`~hand_eye_calib.report.evidence.gather`.
+        See :func:`~hand_eye_calib.engine.evidence.gather`.
     inputs : mapping, optional
         Where the data came from, in plain values.
     findings : sequence of dict
@@ -79,7 +83,8 @@ def render(calibration, config, evidence, *, inputs=None, findings=(), command="
             advice=what_is_missing(evidence.excitation, calibration),
             command=command,
             figures=[
-                {"name": name, "title": title, "said": said[name], "svg": svgs.get(name)} for name, title in _TITLES.items()
+                {"name": name, "title": title, "said": said[name], "svg": svgs.get(name)}
+                for name, title in _TITLES.items()
             ],
             findings=list(findings),
             summary=_summary(calibration, evidence),
@@ -140,7 +145,10 @@ def _verdict(calibration):
     worst = [max((dof for dof in known if (dof.name in "xyz") is is_length), key=lambda dof: dof.sigma, default=None)
              for is_length in (True, False)]  # fmt: skip
     limits = " and ".join(f"{_size(dof.sigma, dof.name)} ({dof.name})" for dof in worst if dof)
-    hidden, weak = calibration.unobservable(), [dof.name for dof in known if dof.verdict is DofVerdict.WEAK]
+    hidden, weak = (
+        calibration.unobservable(),
+        [dof.name for dof in known if dof.verdict is DofVerdict.WEAK],
+    )
     if len(hidden) == 6:
         return "This drive reveals nothing of how the sensors are mounted."
     if hidden:
@@ -217,7 +225,9 @@ def _said_of_convergence(calibration, evidence):
     if len(estimates) < 3:
         return "The drive is too short to be looked at in parts."
     known = np.isfinite(calibration.sigmas)
-    moved = np.array([deviation(one.calibration.T_parent_child, calibration.T_parent_child) for one in estimates])[:, known]
+    moved = np.array(
+        [deviation(one.calibration.T_parent_child, calibration.T_parent_child) for one in estimates]
+    )[:, known]
     spread = np.array([one.calibration.sigmas for one in estimates])[:, known]
     if not known.any():
         return "No axis is revealed, however much of the drive is used."
@@ -262,7 +272,9 @@ def _said_of_methods(calibration, evidence):
     # What a method itself calls unobservable is not held against it.
     moved = {
         one.label: np.where(
-            np.isfinite(one.calibration.sigmas), deviation(one.calibration.T_parent_child, calibration.T_parent_child), 0.0
+            np.isfinite(one.calibration.sigmas),
+            deviation(one.calibration.T_parent_child, calibration.T_parent_child),
+            0.0,
         )
         for one in evidence.comparison
     }
@@ -276,7 +288,9 @@ def _said_of_methods(calibration, evidence):
         )
     if others:
         label = max(others, key=lambda name: _distance(others[name], known))
-        texts.append(f"those that use every pair (dnl, park) by {_worst(others[label], known)} ({label})")
+        texts.append(
+            f"those that use every pair (dnl, park) by {_worst(others[label], known)} ({label})"
+        )
     return (
         "; ".join(texts)
         + ". B<n> compares with the n-th pose before. Bars: one standard deviation; triangles lie beyond the axis; shaded: the result's own."
@@ -299,7 +313,11 @@ def _said_of_halves(calibration, evidence):
         if ratio[worst] > _DISAGREE
         else f"no more than chance: the farthest, {name}, lies {ratio[worst]:.1f} of their standard deviations apart"
     )
-    less = [name for name, is_known in zip(AXES, known | ~np.isfinite(calibration.sigmas), strict=True) if not is_known]
+    less = [
+        name
+        for name, is_known in zip(AXES, known | ~np.isfinite(calibration.sigmas), strict=True)
+        if not is_known
+    ]
     missing = f" {_list(less)} is not revealed by half of the drive." if less else ""
     return f"From each half alone, without priors: they differ by {_worst(apart, known)}, {judged}.{missing}{_thinned(evidence.halves)}"
 
@@ -368,7 +386,9 @@ def _summary(calibration, evidence):
         "Poses": f"{calibration.n_poses:,} synchronised pose pairs over {_duration(evidence.tracks.times_s[-1])}",
         "Motion pairs": f"{calibration.n_inliers:,} of {calibration.n_pairs:,} are inliers",
         "Objective": f"{calibration.objective:.6g}",
-        "Time offset": _given_or_estimated(calibration.time_offset_s, calibration.time_offset_sigma_s, "s"),
+        "Time offset": _given_or_estimated(
+            calibration.time_offset_s, calibration.time_offset_sigma_s, "s"
+        ),
         "Scale": _given_or_estimated(calibration.scale, calibration.scale_sigma, ""),
     }
     if noise := calibration.noise:
@@ -382,7 +402,9 @@ def _summary(calibration, evidence):
 
 
 def _streams(inputs, streams):
-    """A row for each stream: where it came from, how many poses, how fast, the longest gap, the way."""
+    """A row for each stream: where it came from, how many poses, how fast, the longest gap, the
+    way.
+    """
     rows = []
     for name in ("parent", "child"):
         known = dict(inputs.get(name, {}))
@@ -398,10 +420,14 @@ def _streams(inputs, streams):
             "duration": "-" if first_ns is None else _duration((last_ns - first_ns) * 1e-9),
             "gap": "-",
             "way": "-",
-            "refused": "; ".join(f"{known[key]:,} {word}" for key, word in _REFUSED.items() if known.get(key)) or "none",
+            "refused": "; ".join(
+                f"{known[key]:,} {word}" for key, word in _REFUSED.items() if known.get(key)
+            )
+            or "none",
         }
         stream = streams.get(name)
-        # In a very long drive only the newest poses are at hand: of the stream as a whole they say nothing.
+        # In a very long drive only the newest poses are at hand: of the stream as a whole they say
+        # nothing.
         if stream is not None and len(stream) >= max(2, count or 0):
             whole = summarise(stream)
             row |= {
@@ -419,15 +445,22 @@ _REFUSED = {"refused_duplicate": "with a stamp that was there already", "refused
 
 def _provenance(inputs):
     """Versions, files and the rest of the inputs, as names and values."""
-    versions = {name: _version(name) for name in ("hand_eye_calib", "numpy", "scipy")} | {"python": platform.python_version()}
-    rows = {"Written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"), "Versions": _plain(versions)}
+    versions = {name: _version(name) for name in ("hand_eye_calib", "numpy", "scipy")} | {
+        "python": platform.python_version()
+    }
+    rows = {
+        "Written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
+        "Versions": _plain(versions),
+    }
     rows |= {
         name.capitalize(): _plain(value)
         for name, value in inputs.items()
         if name not in ("parent", "child", "options", "files")
     }
     for file in inputs.get("files", ()):
-        rows[f"File {Path(file['file']).name}"] = f"{file['file']}, {file['bytes']:,} bytes, SHA-256 {file['sha256']}"
+        rows[f"File {Path(file['file']).name}"] = (
+            f"{file['file']}, {file['bytes']:,} bytes, SHA-256 {file['sha256']}"
+        )
     return rows
 
 
@@ -453,7 +486,11 @@ def _size(value, axis):
 
 
 def _length(value_m):
-    return f"{_two_digits(100 * value_m)} cm" if value_m < 1 else f"{value_m:,.{1 if value_m < 100 else 0}f} m"
+    return (
+        f"{_two_digits(100 * value_m)} cm"
+        if value_m < 1
+        else f"{value_m:,.{1 if value_m < 100 else 0}f} m"
+    )
 
 
 def _two_digits(value):

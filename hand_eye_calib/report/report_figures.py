@@ -1,4 +1,6 @@
-"""The figures of the report: SVG that takes its colours from the page, so that one drawing is right in light, in dark and on paper."""
+"""The figures of the report: SVG that takes its colours from the page, so that one drawing is right
+in light, in dark and on paper.
+"""
 
 import io
 import re
@@ -47,7 +49,9 @@ def draw_all(calibration, evidence):
     }  # fmt: skip
     with _page_style():
         drawn = {name: make(calibration, evidence) for name, make in makers.items()}
-        drawn["streams"] = _streams(evidence.streams, (calibration.parent_frame, calibration.child_frame))
+        drawn["streams"] = _streams(
+            evidence.streams, (calibration.parent_frame, calibration.child_frame)
+        )
         return {name: _svg(figure, name) for name, figure in drawn.items() if figure}
 
 
@@ -67,19 +71,27 @@ def draw_streams(seen, names):
 @contextmanager
 def _page_style():
     with house_style(), matplotlib.rc_context(_STYLE), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")  # text is drawn by the browser, with its own fonts
+        warnings.filterwarnings(
+            "ignore", message="Glyph .* missing"
+        )  # text is drawn by the browser, with its own fonts
         yield
 
 
 def _svg(figure, name):
-    """The figure as an element that can stand in a page: no prologue, names of its own, the page's colours."""
+    """The figure as an element that can stand in a page: no prologue, names of its own, the page's
+    colours.
+    """
     written = io.StringIO()
-    figure.savefig(written, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    figure.savefig(
+        written, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    )
     svg = written.getvalue()
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg)
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
-    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r'\1 aria-hidden="true" focusable="false"', svg, count=1)
+    svg = re.sub(
+        r'(<svg[^>]*?) height="[^"]*"', r'\1 aria-hidden="true" focusable="false"', svg, count=1
+    )
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
     svg = re.sub(r'href="#', f'href="#{name}-', svg).replace("url(#", f"url(#{name}-")
     svg = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px var(--sans)", svg)
@@ -90,13 +102,22 @@ def _svg(figure, name):
 
 
 def _figure(height, rows, columns, left, bottom, gap=0.2, between=0.25, top=0.3, **options):
-    """A figure with panels; room is given in inches, for finding out what the text takes costs more time than all else."""
+    """A figure with panels; room is given in inches, for finding out what the text takes costs more
+    time than all else.
+    """
     figure = Figure(figsize=(WIDTH, height))
     right = 0.12
     width = (WIDTH - left - right - gap * (columns - 1)) / columns
     tall = (height - top - bottom - between * (rows - 1)) / rows
-    edges = dict(left=left / WIDTH, right=1 - right / WIDTH, bottom=bottom / height, top=1 - top / height)
-    panels = figure.subplots(rows, columns, gridspec_kw=edges | dict(wspace=gap / width, hspace=between / tall), **options)
+    edges = dict(
+        left=left / WIDTH, right=1 - right / WIDTH, bottom=bottom / height, top=1 - top / height
+    )
+    panels = figure.subplots(
+        rows,
+        columns,
+        gridspec_kw=edges | dict(wspace=gap / width, hspace=between / tall),
+        **options,
+    )
     return figure, panels
 
 
@@ -118,7 +139,9 @@ def _trajectories(calibration, evidence):
         above.plot(*points[shown, :2].T, label=_plain(label), **drawn)
         height.plot(tracks.times_s[shown] * factor, points[shown, 2], **drawn)
     above.plot(*tracks.parent[0, :2], "o", color=INK, ms=6, label="start")
-    above.set(title="From above", xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
+    above.set(
+        title="From above", xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim"
+    )
     height.set(title="Height", xlabel=f"time ({unit})", ylabel="z (m)")
     low, high = height.get_ylim()
     if high - low < 0.5:  # rounding is no relief
@@ -140,14 +163,26 @@ def _residuals(calibration, evidence):
     ):
         values = np.maximum(values, smallest)
         times = residuals.times_s * factor
-        panel.plot(times[dots], values[dots], "o", color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
-        panel.plot(times[crosses], values[crosses], "x", color=BAD, ms=5.5, mew=1.5, label="left out as outlier")
+        panel.plot(
+            times[dots], values[dots], "o", color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used"
+        )
+        panel.plot(
+            times[crosses],
+            values[crosses],
+            "x",
+            color=BAD,
+            ms=5.5,
+            mew=1.5,
+            label="left out as outlier",
+        )
         panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
         panel.set_ylabel(name)
         panel.yaxis.set_label_coords(-0.06, 0.5)
         _magnitude_axis(panel, values)
     panels[1].set_xlabel(f"time ({unit})")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=3, borderaxespad=0)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="lower center", ncols=3, borderaxespad=0
+    )
     return figure
 
 
@@ -157,14 +192,21 @@ def _convergence(calibration, evidence):
         return None
     factor, unit = time_axis(estimates[-1].until_s)
     times = np.array([estimate.until_s for estimate in estimates]) * factor
-    moved = np.array([deviation(estimate.calibration.T_parent_child, calibration.T_parent_child) for estimate in estimates])
+    moved = np.array(
+        [
+            deviation(estimate.calibration.T_parent_child, calibration.T_parent_child)
+            for estimate in estimates
+        ]
+    )
     spread = np.array([estimate.calibration.sigmas for estimate in estimates])
     figure, panels = _figure(4.4, 2, 3, left=0.7, bottom=0.5, gap=0.15, between=0.4, sharex=True)
     for kind, row in enumerate(panels):
         columns = slice(3 * kind, 3 * kind + 3)
         unit_factor = (100, 180 / np.pi)[kind]
         limit = _limit(
-            moved[:, columns] * unit_factor, spread[:, columns] * unit_factor, calibration.sigmas[columns] * unit_factor
+            moved[:, columns] * unit_factor,
+            spread[:, columns] * unit_factor,
+            calibration.sigmas[columns] * unit_factor,
         )
         for axis, panel in enumerate(row):
             index = 3 * kind + axis
@@ -173,7 +215,12 @@ def _convergence(calibration, evidence):
             panel.axhline(0, color=MUTED, lw=0.8)
             if known.any():
                 panel.fill_between(
-                    times[known], _within(values - sigma, limit), _within(values + sigma, limit), color=BAND, alpha=0.2, lw=0
+                    times[known],
+                    _within(values - sigma, limit),
+                    _within(values + sigma, limit),
+                    color=BAND,
+                    alpha=0.2,
+                    lw=0,
                 )
                 _dots(panel, times[known], values, limit)
             else:
@@ -209,27 +256,49 @@ def _excitation(calibration, evidence):
 
 
 def _methods(calibration, evidence):
-    rows = [("this result", calibration)] + [(one.label, one.calibration) for one in evidence.comparison]
+    rows = [("this result", calibration)] + [
+        (one.label, one.calibration) for one in evidence.comparison
+    ]
     return _rows(calibration, rows) if len(rows) > 1 else None
 
 
 def _halves(calibration, evidence):
     if len(evidence.halves) < 2:
         return None
-    return _rows(calibration, [("whole drive", calibration)] + [(half.label, half.calibration) for half in evidence.halves])
+    return _rows(
+        calibration,
+        [("whole drive", calibration)]
+        + [(half.label, half.calibration) for half in evidence.halves],
+    )
 
 
 def _rows(calibration, rows):
-    """A dot with its error bar for every answer (down) and axis (across), as distances from the result."""
+    """A dot with its error bar for every answer (down) and axis (across), as distances from the
+    result.
+    """
     longest = max(len(label) for label, _ in rows)
-    figure, panels = _figure(0.85 + 0.235 * len(rows), 1, 6, left=0.25 + 0.068 * longest, bottom=0.5, gap=0.1, sharey=True)
+    figure, panels = _figure(
+        0.85 + 0.235 * len(rows),
+        1,
+        6,
+        left=0.25 + 0.068 * longest,
+        bottom=0.5,
+        gap=0.1,
+        sharey=True,
+    )
     places = np.arange(len(rows))
-    moved = np.array([deviation(answer.T_parent_child, calibration.T_parent_child) for _, answer in rows])
+    moved = np.array(
+        [deviation(answer.T_parent_child, calibration.T_parent_child) for _, answer in rows]
+    )
     spread = np.array([answer.sigmas for _, answer in rows])
     for index, panel in enumerate(panels):
         unit_factor = 100 if index < 3 else 180 / np.pi
         columns = slice(0, 3) if index < 3 else slice(3, 6)
-        limit = _limit(moved[:, columns] * unit_factor, spread[:, columns] * unit_factor, spread[0, columns] * unit_factor)
+        limit = _limit(
+            moved[:, columns] * unit_factor,
+            spread[:, columns] * unit_factor,
+            spread[0, columns] * unit_factor,
+        )
         values, sigma = moved[:, index] * unit_factor, spread[:, index] * unit_factor
         known = np.isfinite(sigma)
         if known[0]:
@@ -237,12 +306,19 @@ def _rows(calibration, rows):
         panel.axvline(0, color=MUTED, lw=0.8)
         for place in places[known]:
             colour = INK if place == 0 else PARENT
-            ends = _within(np.array([values[place] - sigma[place], values[place] + sigma[place]]), limit)
+            ends = _within(
+                np.array([values[place] - sigma[place], values[place] + sigma[place]]), limit
+            )
             panel.plot(ends, [place, place], color=colour, lw=1.4)
             _dots(panel, values[place : place + 1], None, limit, at=place, colour=colour)
         if not known.any():
             _say(panel, "not\nrevealed")
-        panel.set(xlim=(-limit, limit), ylim=(len(rows) - 0.5, -0.5), title=AXES[index], xlabel="cm" if index < 3 else "deg")
+        panel.set(
+            xlim=(-limit, limit),
+            ylim=(len(rows) - 0.5, -0.5),
+            title=AXES[index],
+            xlabel="cm" if index < 3 else "deg",
+        )
         panel.set_yticks(places, [_plain(label) for label, _ in rows])
         panel.tick_params(axis="y", length=0)
         tick = float(f"{0.75 * limit:.0e}")
@@ -266,9 +342,14 @@ def _streams(seen, names):
     for row, ((times, rates), spans, name, (colour, dashes, width)) in enumerate(
         zip(seen.rates, seen.spans_s, names, looks, strict=True)
     ):
-        speed.plot(times * factor, np.degrees(rates), color=colour, ls=dashes, lw=width, label=_plain(name))
+        speed.plot(
+            times * factor, np.degrees(rates), color=colour, ls=dashes, lw=width, label=_plain(name)
+        )
         strip.broken_barh(
-            [(start * factor, (end - start) * factor) for start, end in spans], (0.6 - row, 0.8), color=colour, lw=0
+            [(start * factor, (end - start) * factor) for start, end in spans],
+            (0.6 - row, 0.8),
+            color=colour,
+            lw=0,
         )
     speed.set(ylabel="turning (deg/s)", ylim=(0, None))
     speed.tick_params(labelbottom=False)
@@ -279,7 +360,9 @@ def _streams(seen, names):
     strip.grid(visible=False)
     wide = (across - 0.75) / 2
     below = [panel(0.8 + column * (wide + 0.75), 0.55, wide, 2.9) for column in range(2)]
-    below[0].set(title=f"Angle of motions over {seen.lag_s:g} s", xlabel="parent (deg)", ylabel="child (deg)")
+    below[0].set(
+        title=f"Angle of motions over {seen.lag_s:g} s", xlabel="parent (deg)", ylabel="child (deg)"
+    )
     below[1].set(title="How far they go along their axis", xlabel="parent (m)", ylabel="child (m)")
     _identity(below[0], np.degrees(seen.angles))
     # On flat ground nothing moves along the axis, and noise should not look like motion.
@@ -288,7 +371,9 @@ def _streams(seen, names):
 
 
 def _identity(panel, values, least=0.0):
-    """Dots of the child's values over the parent's, and the line they should be on; the axes reach to ``least`` at least."""
+    """Dots of the child's values over the parent's, and the line they should be on; the axes reach
+    to ``least`` at least.
+    """
     if not len(values):
         return _say(panel, "nothing to compare")
     reach = max(1.15 * float(np.percentile(np.abs(values), 99)), least, 1e-6)
@@ -296,7 +381,9 @@ def _identity(panel, values, least=0.0):
     panel.plot([low, reach], [low, reach], color=MUTED, lw=1.0, ls="--", zorder=1)
     beyond = (np.abs(values) > reach).any(axis=1)
     panel.plot(*values[~beyond].T, "o", color=PARENT, ms=3.2, mew=0, alpha=0.5)
-    panel.plot(*np.clip(values[beyond], low, reach).T, "x", color=BAD, ms=5.5, mew=1.5, clip_on=False)
+    panel.plot(
+        *np.clip(values[beyond], low, reach).T, "x", color=BAD, ms=5.5, mew=1.5, clip_on=False
+    )
     panel.set(xlim=(low, reach), ylim=(low, reach))
 
 
@@ -318,7 +405,9 @@ def _dots(panel, first, second, limit, at=None, colour=PARENT):
 
 
 def _limit(values, spread, result):
-    """How far an axis reaches: all that is reasonably near, and what is far off is shown at the edge."""
+    """How far an axis reaches: all that is reasonably near, and what is far off is shown at the
+    edge.
+    """
     known = np.isfinite(spread)
     if not known.any():
         return 1.0
@@ -345,7 +434,9 @@ def _say(panel, text):
 
 
 def _plain(label):
-    """A name that matplotlib takes as it is: no formulas, and no leading underscore, which would hide it from the legend."""
+    """A name that matplotlib takes as it is: no formulas, and no leading underscore, which would
+    hide it from the legend.
+    """
     text = label.replace("$", r"\$")
     return f"\u200b{text}" if text.startswith("_") else text
 

@@ -1,4 +1,5 @@
-"""How every figure looks: light, readable at the width of a printed page, and told apart by the colour-blind too.
+"""How every figure looks: light, readable at the width of a printed page, and told apart by the
+colour-blind too.
 
 Figures are made without pyplot: no display, no global state.
 """
@@ -12,7 +13,14 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 # Okabe, Ito 2008, without the yellow that vanishes on white.
-BLACK, SKY, GREEN, BLUE, VERMILION, PURPLE = "#000000", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7"
+BLACK, SKY, GREEN, BLUE, VERMILION, PURPLE = (
+    "#000000",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+    "#CC79A7",
+)
 GREY, LIGHT_GREY = "#666666", "#DDDDDD"
 
 PAGE_WIDTH = 7.2  # inches
@@ -52,7 +60,9 @@ def new_page(height, title, note):
 
 
 def plain_decades(axis, marks=(1,)):
-    """Ticks at powers of ten, times ``marks``, written as 0.01 and not as a power; no minor ones. Zero is kept where the axis has it."""
+    """Ticks at powers of ten, times ``marks``, written as 0.01 and not as a power; no minor ones.
+    Zero is kept where the axis has it.
+    """
     if axis.get_scale() == "log":
         axis.set_major_locator(LogLocator(subs=marks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -73,7 +83,8 @@ def save(figure, stem):
 
 
 def spread(positions, gap):
-    """Positions moved apart as little as needed to be ``gap`` from each other, in their order: where labels can be read.
+    """Positions moved apart as little as needed to be ``gap`` from each other, in their order:
+    where labels can be read.
 
     Parameters
     ----------
@@ -89,7 +100,9 @@ def spread(positions, gap):
     groups = []  # [sum of wanted positions less offsets, members]
     for index in order:
         groups.append(([positions[index]], [index]))
-        while len(groups) > 1 and _start(groups[-2], gap) + gap * len(groups[-2][1]) > _start(groups[-1], gap):
+        while len(groups) > 1 and _start(groups[-2], gap) + gap * len(groups[-2][1]) > _start(
+            groups[-1], gap
+        ):
             wanted, members = groups.pop()
             groups[-1] = (groups[-1][0] + wanted, groups[-1][1] + members)
     placed = [0.0] * len(positions)

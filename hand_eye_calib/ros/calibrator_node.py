@@ -1,7 +1,8 @@
 """The node: thin callbacks around the engine.
 
-Messages are converted and handed to the engine, solves run in a worker thread, results are published. All of it but the
-solve happens in the executor's one thread, so nothing here needs a lock.
+Messages are converted and handed to the engine, solves run in a worker thread, results are
+published. All of it but the solve happens in the executor's one thread, so nothing here needs a
+lock.
 """
 
 import dataclasses
@@ -25,23 +26,34 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from hand_eye_calib.calibration import SolveStatus
-from hand_eye_calib.calibrator import Calibrator
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import has_session
-from hand_eye_calib.io.results import keep_earlier_results
+from hand_eye_calib.io.results import keep_earlier_results, save_result
 from hand_eye_calib.ros import diagnostics
-from hand_eye_calib.ros.conversions import POSE_TYPES, to_ns, to_pose_with_covariance, to_time, to_transform
+from hand_eye_calib.ros.conversions import (
+    POSE_TYPES,
+    to_ns,
+    to_pose_with_covariance,
+    to_time,
+    to_transform,
+)
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S, DirectoryLock, SessionJournal, resume
 from hand_eye_calib.ros.stamp_guard import StampGuard, Verdict
 from hand_eye_calib.ros.tf import StaticBroadcaster, check_available
 from hand_eye_calib.ros.worker import Checked, SolveWorker
 
-# Best effort hears reliable publishers too; the queue holds seconds of a fast stream while a callback is busy.
-INPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+# Best effort hears reliable publishers too; the queue holds seconds of a fast stream while a
+# callback is busy.
+INPUT_QOS = QoSProfile(
+    depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
+)
 INPUT_QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
-RESULT_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RESULT_QOS = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 
 DISCOVERY_PERIOD_S = 0.2
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -71,7 +83,8 @@ class _Stream:
 
 
 class CalibratorNode(Node):
-    """Estimates the pose of the child sensor in the parent sensor's frame from two live streams of poses.
+    """Estimates the pose of the child sensor in the parent sensor's frame from two live streams of
+    poses.
 
     Raises
     ------
@@ -83,11 +96,17 @@ class CalibratorNode(Node):
         try:
             super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)
         except ValueError as error:
-            raise ConfigError(f"a parameter that was given has no usable value, such as []: {error}") from None
+            raise ConfigError(
+                f"a parameter that was given has no usable value, such as []: {error}"
+            ) from None
         self._last_logged = {}
         self._lock = None
-        self._streams = [_Stream(name, self.resolve_topic_name(f"{name}_odom")) for name in ("parent", "child")]
-        self._options = Parameters(self, set(self._qos_names()), self._on_parameters, self._check_node_options)
+        self._streams = [
+            _Stream(name, self.resolve_topic_name(f"{name}_odom")) for name in ("parent", "child")
+        ]
+        self._options = Parameters(
+            self, set(self._qos_names()), self._on_parameters, self._check_node_options
+        )
         for line in self._options.unknown:
             self.get_logger().warning(line)
         self._calibrator = Calibrator(self._options.calibrator)
@@ -117,22 +136,29 @@ class CalibratorNode(Node):
         )
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._broadcaster = StaticBroadcaster(self) if self._options.node.publish_tf else None
-        # In a group of its own: while it awaits the solve, it would hold up every other callback of its group.
-        self.create_service(Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup())
+        # In a group of its own: while it awaits the solve, it would hold up every other callback of
+        # its group.
+        self.create_service(
+            Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup()
+        )
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
         self.create_service(SetBool, "~/set_enabled", self._on_set_enabled)
 
         # Steady time: these go on while a bag, and with it simulated time, is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._solve_timer = self.create_timer(self._options.node.solve_period, self._on_solve_timer, clock=steady)
+        self._solve_timer = self.create_timer(
+            self._options.node.solve_period, self._on_solve_timer, clock=steady
+        )
         self._discovery_timer = self.create_timer(DISCOVERY_PERIOD_S, self._discover, clock=steady)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._publish_diagnostics, clock=steady)
         self.create_timer(FLUSH_PERIOD_S, self._flush_journal, clock=steady)
         self._discover()
 
     def stop(self, timeout_s):
-        """End the threads and save the newest result; False where a solve is still running after ``timeout_s`` seconds."""
+        """End the threads and save the newest result; False where a solve is still running after
+        ``timeout_s`` seconds.
+        """
         ended = self._worker.stop(timeout_s)
         for outcome in self._worker.ready():
             if not isinstance(outcome, Checked):
@@ -157,11 +183,15 @@ class CalibratorNode(Node):
             self._discovery_timer.cancel()
 
     def _type_of(self, stream):
-        """Message type of an input by parameter or by the first publisher seen; None while neither tells."""
+        """Message type of an input by parameter or by the first publisher seen; None while neither
+        tells.
+        """
         wanted = getattr(self._options.node, f"{stream.name}_type")
         if wanted != "auto":
             return wanted
-        offered = sorted({info.topic_type for info in self.get_publishers_info_by_topic(stream.relative_topic)})
+        offered = sorted(
+            {info.topic_type for info in self.get_publishers_info_by_topic(stream.relative_topic)}
+        )
         usable = [name for name in offered if name in POSE_TYPES]
         if offered and not usable and self._is_due(("type", stream.name)):
             self.get_logger().warning(
@@ -180,9 +210,19 @@ class CalibratorNode(Node):
                 INPUT_QOS,
                 qos_overriding_options=QoSOverridingOptions(INPUT_QOS_OVERRIDES),
             )
-        except (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError) as error:
-            raise ConfigError(f"cannot subscribe to {stream.topic} with the QoS overrides given: {error}") from error
-        self.get_logger().info(f"subscribed to {stream.topic} ({type_name}) for the {stream.name} sensor")
+        except (
+            ParameterException,
+            InvalidQosOverridesError,
+            RuntimeError,
+            AssertionError,
+            ValueError,
+        ) as error:
+            raise ConfigError(
+                f"cannot subscribe to {stream.topic} with the QoS overrides given: {error}"
+            ) from error
+        self.get_logger().info(
+            f"subscribed to {stream.topic} ({type_name}) for the {stream.name} sensor"
+        )
 
     def _on_pose(self, stream, pose_type, message):
         if not self._enabled:
@@ -250,7 +290,11 @@ class CalibratorNode(Node):
         if silent and self._enabled and self._is_due("silent", 2 * LOG_PERIOD_S):
             self.get_logger().info("; ".join(self._say_silent(stream) for stream in silent))
         now_s = time.monotonic()
-        if (self._new_poses or self._checks.is_due(now_s)) and not self._solving and now_s >= self._rest_until_s:
+        if (
+            (self._new_poses or self._checks.is_due(now_s))
+            and not self._solving
+            and now_s >= self._rest_until_s
+        ):
             self._start_solve()
 
     def _say_silent(self, stream):
@@ -281,7 +325,9 @@ class CalibratorNode(Node):
         self._rest_until_s = max(self._rest_until_s, now_s + checked.seconds)
         if checked.error is not None:
             if self._is_due("unchecked"):
-                self.get_logger().warning(f"the streams cannot be checked: {type(checked.error).__name__}: {checked.error}")
+                self.get_logger().warning(
+                    f"the streams cannot be checked: {type(checked.error).__name__}: {checked.error}"
+                )
             return
         new, gone = self._checks.take(checked.agreement, now_s)
         for line in new:
@@ -340,11 +386,15 @@ class CalibratorNode(Node):
                 self.get_logger().warning(f"cannot solve: {error}")
             return str(error)
         if self._is_due("unexpected"):
-            self.get_logger().error("the solver failed unexpectedly:\n" + "".join(traceback.format_exception(error)))
+            self.get_logger().error(
+                "the solver failed unexpectedly:\n" + "".join(traceback.format_exception(error))
+            )
         return f"the solver failed unexpectedly, see the log: {type(error).__name__}: {error}"
 
     def _reset(self, because_of=None):
-        """Begin a new session; ``because_of`` a stream whose stamps jumped back, which has begun its own already."""
+        """Begin a new session; ``because_of`` a stream whose stamps jumped back, which has begun
+        its own already.
+        """
         self._calibrator.reset()
         self._session += 1
         self._new_poses = False
@@ -365,7 +415,9 @@ class CalibratorNode(Node):
         directory = _journal_directory(self._options.node)
         self._lock = DirectoryLock(directory.parent) if directory else None
         resumed = resuming and self._resume(directory)
-        self._journal = SessionJournal(directory, self._calibrator.state(), resumed) if directory else None
+        self._journal = (
+            SessionJournal(directory, self._calibrator.state(), resumed) if directory else None
+        )
 
     def _resume(self, directory):
         """Whether the session in a directory goes on."""
@@ -434,16 +486,22 @@ class CalibratorNode(Node):
             stale_after_s=max(STALE_S, STALE_PERIODS * self._options.node.solve_period),
             faults=self._checks.grave(),
         )
-        return diagnostics.status("extrinsic", *diagnostics.calibration_report(state, steady_s, clock_ns))
+        return diagnostics.status(
+            "extrinsic", *diagnostics.calibration_report(state, steady_s, clock_ns)
+        )
 
     def _input_statuses(self, steady_s):
         reports = {
-            stream.name: stream.monitor.report(stream.topic, steady_s, self._calibrator.statistics(stream.name))
+            stream.name: stream.monitor.report(
+                stream.topic, steady_s, self._calibrator.statistics(stream.name)
+            )
             for stream in self._streams
         }
         seen_s = diagnostics.offset_between(*(stream.monitor for stream in self._streams))
         has_result = self._result is not None and self._result.status is SolveStatus.OK
-        used_s = self._result.time_offset_s if self._result else self._options.calibrator.time_offset
+        used_s = (
+            self._result.time_offset_s if self._result else self._options.calibrator.time_offset
+        )
         for name, report in reports.items():
             level, text, values = diagnostics.with_clock_offset(*report, seen_s, used_s)
             if level == diagnostics.OK and not has_result:
@@ -456,12 +514,22 @@ class CalibratorNode(Node):
         has_result = self._result is not None and self._result.status is SolveStatus.OK
         if journal is None:
             node = self._options.node
-            text = "off" if node.journal == "off" else "off: output_directory is not set, a crash would lose the session"
+            text = (
+                "off"
+                if node.journal == "off"
+                else "off: output_directory is not set, a crash would lose the session"
+            )
             level = diagnostics.WARN if node.journal != "off" or not has_result else diagnostics.OK
         elif journal.error:
-            level, text = diagnostics.ERROR, f"cannot write: {journal.error}; a crash would lose the session"
+            level, text = (
+                diagnostics.ERROR,
+                f"cannot write: {journal.error}; a crash would lose the session",
+            )
         else:
-            level, text = diagnostics.OK if has_result else diagnostics.WARN, "the session is being written"
+            level, text = (
+                diagnostics.OK if has_result else diagnostics.WARN,
+                "the session is being written",
+            )
         return diagnostics.status("journal", level, text, values)
 
     # -------------------------------------------------- services, parameters
@@ -502,7 +570,9 @@ class CalibratorNode(Node):
                 keep_earlier_results(Path(directory).expanduser())
             self._earlier_results_kept = True
             warnings = (*self._result.warnings, *self._checks.grave())
-            dataclasses.replace(self._result, warnings=warnings).save(Path(directory).expanduser())
+            save_result(
+                dataclasses.replace(self._result, warnings=warnings), Path(directory).expanduser()
+            )
         except (OSError, HandEyeCalibError) as error:
             return False, f"cannot save to {directory}: {error}"
         return True, f"result saved to {directory}"
@@ -533,7 +603,9 @@ class CalibratorNode(Node):
         if options.publish_tf:
             check_available()
         if options.journal == "resume" and not options.output_directory:
-            raise ConfigError("journal resume needs output_directory: that is where the session to resume is")
+            raise ConfigError(
+                "journal resume needs output_directory: that is where the session to resume is"
+            )
         directory = _journal_directory(options)
         if directory and (self._lock is None or directory.parent != self._lock.directory):
             DirectoryLock(directory.parent).release()
@@ -556,7 +628,9 @@ class CalibratorNode(Node):
             self._broadcaster.send(to_transform(self._result))
 
     def _is_due(self, key, period_s=LOG_PERIOD_S):
-        """Whether a message of this kind may be logged again: rclpy's own throttle cannot tell two topics apart."""
+        """Whether a message of this kind may be logged again: rclpy's own throttle cannot tell two
+        topics apart.
+        """
         now = time.monotonic()
         if now - self._last_logged.get(key, -float("inf")) < period_s:
             return False

@@ -73,7 +73,9 @@ def to_time(stamp_ns):
 
 
 def to_transform(calibration):
-    """The extrinsic as geometry_msgs/TransformStamped: header.frame_id is the parent sensor, child_frame_id the child sensor."""
+    """The extrinsic as geometry_msgs/TransformStamped: header.frame_id is the parent sensor,
+    child_frame_id the child sensor.
+    """
     message = TransformStamped()
     message.header.stamp = to_time(calibration.stamp_ns)
     message.header.frame_id = calibration.parent_frame
@@ -84,7 +86,9 @@ def to_transform(calibration):
 
 
 def to_pose_with_covariance(calibration):
-    """The child sensor's pose in the parent sensor's frame as geometry_msgs/PoseWithCovarianceStamped (REP-103 covariance)."""
+    """The child sensor's pose in the parent sensor's frame as
+    geometry_msgs/PoseWithCovarianceStamped (REP-103 covariance).
+    """
     message = PoseWithCovarianceStamped()
     message.header.stamp = to_time(calibration.stamp_ns)
     message.header.frame_id = calibration.parent_frame
@@ -98,9 +102,10 @@ def to_pose_with_covariance(calibration):
 def covariance_about_parent_axes(T_parent_child, cov_parent_child_in_child):
     """Covariance of a pose as ROS messages carry it (REP-103).
 
-    The engine's error is ``xi = (rho, phi)`` in ``T_parent_child @ exp(xi)``, in the child's axes. To first order it moves the
-    child's origin by ``R rho`` and turns it by ``R phi`` about the parent's fixed axes through that origin, so both blocks
-    are rotated and nothing else: there is no lever arm.
+    The engine's error is ``xi = (rho, phi)`` in ``T_parent_child @ exp(xi)``, in the child's axes.
+    To first order it moves the child's origin by ``R rho`` and turns it by ``R phi`` about the
+    parent's fixed axes through that origin, so both blocks are rotated and nothing else: there is
+    no lever arm.
 
     Parameters
     ----------

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from hand_eye_calib.assessment.agreement import ENOUGH_S, ENOUGH_TURNED_RAD
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
-from hand_eye_calib.pairing.stream_checks import Confidence, Severity
+from hand_eye_calib.checks.agreement import ENOUGH_S, ENOUGH_TURNED_RAD
+from hand_eye_calib.checks.findings import Confidence, Severity
 
 HARDWARE_ID = "hand_eye_calib"
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -19,7 +19,8 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 STALE_AFTER_S = 2.0
 BAD_INPUT_FOR_S = 10.0
 
-# Streams whose stamps differ by more than this (s) from what time_offset says are suspected of different clocks.
+# Streams whose stamps differ by more than this (s) from what time_offset says are suspected of
+# different clocks.
 SUSPICIOUS_OFFSET_S = 2.0
 
 # The streams are checked at most this often (s), which costs a second or two each time.
@@ -91,8 +92,12 @@ class InputMonitor:
             "longest gap (s)": f"{self._longest_gap_ns * 1e-9:.3f}",
             "gaps above max_gap": self._long_gaps,
             "silent for (s)": "never heard" if silent_s is None else f"{silent_s:.1f}",
-            "node clock minus stamps, median (s)": "-" if self.delay_s is None else f"{self.delay_s:.4f}",
-            "node clock minus stamps, 99 % (s)": f"{np.percentile(delays_s, 99):.4f}" if delays_s.size else "-",
+            "node clock minus stamps, median (s)": "-"
+            if self.delay_s is None
+            else f"{self.delay_s:.4f}",
+            "node clock minus stamps, 99 % (s)": f"{np.percentile(delays_s, 99):.4f}"
+            if delays_s.size
+            else "-",
         }
         level, text = OK, f"{rate:.1f} Hz"
         if silent_s is None:
@@ -107,8 +112,8 @@ class InputMonitor:
 class StreamChecks:
     """When to check the streams, and what the last check found.
 
-    Errors count at once; warnings, and what is merely possible, where two checks in a row have them: over a short drive, odometry may
-    well be off by some per cent.
+    Errors count at once; warnings, and what is merely possible, where two checks in a row have
+    them: over a short drive, odometry may well be off by some per cent.
 
     Attributes
     ----------
@@ -140,16 +145,24 @@ class StreamChecks:
         self.has_new_poses, self._due_at_s = False, steady_s + CHECK_PERIOD_S
 
     def take(self, agreement, steady_s):
-        """What a check found, None where the poses did not suffice; lines for the log: new findings, and those that are gone."""
+        """What a check found, None where the poses did not suffice; lines for the log: new
+        findings, and those that are gone.
+        """
         if agreement is None:
             self._due_at_s = -np.inf
             return [], []
         before, self._agreement, self._checked_at_s = self._faults, agreement, steady_s
-        found = {(f.code, f.stream): f for f in agreement.findings if f.severity is not Severity.NOTE}
+        found = {
+            (f.code, f.stream): f for f in agreement.findings if f.severity is not Severity.NOTE
+        }
         self._faults = {key: f for key, f in found.items() if _is_sure(f) or key in self._suspected}
         self._suspected = set(found)
         new = [in_parameters(finding) for key, finding in self._faults.items() if key not in before]
-        return new, [f"no longer so: {finding.what}" for key, finding in before.items() if key not in self._faults]
+        return new, [
+            f"no longer so: {finding.what}"
+            for key, finding in before.items()
+            if key not in self._faults
+        ]
 
     def grave(self):
         """What speaks against calibrating with these streams, the gravest first, each in one line."""
@@ -159,17 +172,27 @@ class StreamChecks:
         """Level, message and values."""
         if self._agreement is None:
             turned = f"{np.degrees(ENOUGH_TURNED_RAD):.0f} deg"
-            return WARN, f"not checked yet: that takes {ENOUGH_S:g} s of driving with turns of {turned}", {"checked": "not yet"}
+            return (
+                WARN,
+                f"not checked yet: that takes {ENOUGH_S:g} s of driving with turns of {turned}",
+                {"checked": "not yet"},
+            )
         correlation, grave = self._agreement.correlation, self.grave()
         values = {
             "checked": f"{steady_s - self._checked_at_s:.0f} s ago, again after {CHECK_PERIOD_S:g} s at the earliest",
             "turning of both streams correlates by": f"{correlation.correlation:.3f}",
             **{
-                f"{finding.severity.value} {finding.code} ({finding.stream})": in_parameters(finding)
+                f"{finding.severity.value} {finding.code} ({finding.stream})": in_parameters(
+                    finding
+                )
                 for finding in self._agreement.findings
             },
         }
-        return (WARN, "; ".join(grave), values) if grave else (OK, "both streams can be of one rigid body", values)
+        return (
+            (WARN, "; ".join(grave), values)
+            if grave
+            else (OK, "both streams can be of one rigid body", values)
+        )
 
 
 def _is_sure(finding):
@@ -182,19 +205,28 @@ def in_parameters(finding):
 
 
 def offset_between(parent, child):
-    """Clock offset seen between two inputs, in s to be added to the child's stamps; None where one is silent."""
+    """Clock offset seen between two inputs, in s to be added to the child's stamps; None where one
+    is silent.
+    """
     if parent.delay_s is None or child.delay_s is None:
         return None
     return child.delay_s - parent.delay_s
 
 
 def with_clock_offset(level, text, values, seen_s, used_s):
-    """An input's report with the clock offset seen, and a warning where it is far from the one in use."""
+    """An input's report with the clock offset seen, and a warning where it is far from the one in
+    use.
+    """
     values = values | {
         "clock offset to the other input seen (s)": "-" if seen_s is None else f"{seen_s:.4f}",
         "time offset used (s)": used_s if isinstance(used_s, str) else f"{used_s:.6f}",
     }
-    if level == OK and seen_s is not None and not isinstance(used_s, str) and abs(seen_s - used_s) > SUSPICIOUS_OFFSET_S:
+    if (
+        level == OK
+        and seen_s is not None
+        and not isinstance(used_s, str)
+        and abs(seen_s - used_s) > SUSPICIOUS_OFFSET_S
+    ):
         seen = f"the stamps of the two inputs are {seen_s:.3f} s apart where time_offset is {used_s:.3f}"
         level, text = WARN, f"{text}; {seen}: if their clocks differ, set time_offset"
     return level, text, values
@@ -235,9 +267,13 @@ def calibration_report(state, steady_s, clock_ns):
             "synchronised poses": seen.n_poses,
             "distance (m)": f"{seen.distance:.1f}",
             **{
-                f"turned about {axis} (deg)": f"{angle:.1f}" for axis, angle in zip("xyz", np.degrees(seen.turned), strict=True)
+                f"turned about {axis} (deg)": f"{angle:.1f}"
+                for axis, angle in zip("xyz", np.degrees(seen.turned), strict=True)
             },
-            **{f"an offset of 1 m in {axis} shows as (m)": f"{gain:.3f}" for axis, gain in zip("xyz", seen.gain, strict=True)},
+            **{
+                f"an offset of 1 m in {axis} shows as (m)": f"{gain:.3f}"
+                for axis, gain in zip("xyz", seen.gain, strict=True)
+            },
         }
     values["missing"] = missing or ("nothing" if calibration else "-")
     if calibration is not None:
@@ -255,7 +291,9 @@ def _result_values(calibration, age_s, clock_ns):
         "pairs": calibration.n_pairs,
         "inliers (%)": f"{100 * calibration.n_inliers / max(calibration.n_pairs, 1):.1f}",
         "age of the result (s)": f"{age_s:.1f}",
-        "age of its newest pose (s)": f"{newest_s:.1f}" if clock_ns else "the clock does not run: nothing on /clock",
+        "age of its newest pose (s)": f"{newest_s:.1f}"
+        if clock_ns
+        else "the clock does not run: nothing on /clock",
         "time offset used (s)": f"{calibration.time_offset_s:.6f} +/- {calibration.time_offset_sigma_s:.6f}",
         "scale used": f"{calibration.scale:.6f} +/- {calibration.scale_sigma:.6f}",
         **{f"sigma {dof.name} {_unit(dof)}": _sigma(dof) for dof in calibration.observability},
@@ -279,17 +317,26 @@ def _judge(state, age_s, missing):
     if calibration.status is not SolveStatus.OK:
         return WARN, missing or "; ".join(calibration.warnings) or calibration.status.value
     if age_s > state.stale_after_s:
-        return WARN, f"the result is {age_s:.0f} s old" + (f": {state.failure}" if state.failure else "")
+        return WARN, f"the result is {age_s:.0f} s old" + (
+            f": {state.failure}" if state.failure else ""
+        )
     if missing:
         return WARN, missing
-    weakest = max((dof.sigma for dof in calibration.observability if dof.name in "xyz"), default=0.0)
-    return OK, f"all is observable; translation known to {weakest * 1000:.1f} mm or better (one sigma)"
+    weakest = max(
+        (dof.sigma for dof in calibration.observability if dof.name in "xyz"), default=0.0
+    )
+    return (
+        OK,
+        f"all is observable; translation known to {weakest * 1000:.1f} mm or better (one sigma)",
+    )
 
 
 def status(name, level, text, values):
     """A DiagnosticStatus."""
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticStatus(level=level, name=f"calibrator: {name}", message=text, hardware_id=HARDWARE_ID, values=pairs)
+    return DiagnosticStatus(
+        level=level, name=f"calibrator: {name}", message=text, hardware_id=HARDWARE_ID, values=pairs
+    )
 
 
 def _unit(dof):

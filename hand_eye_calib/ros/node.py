@@ -18,14 +18,17 @@ def main(args=None):
     Returns
     -------
     int
-        Exit code: 0 stopped by a signal, 1 bad parameter or failure (reported on stderr), 2 wrong usage.
+        Exit code: 0 stopped by a signal, 1 bad parameter or failure (reported on stderr), 2 wrong
+        usage.
     """
     signals = _signal_pipe()
-    # Imported this late so that Ctrl-C while numpy, scipy and rclpy load ends the program quietly too.
+    # Imported this late so that Ctrl-C while numpy, scipy and rclpy load ends the program quietly
+    # too.
     from hand_eye_calib.ros.running import run
 
     code = run(sys.argv[1:] if args is None else args, signals)
-    # The interpreter's own clean-up would restore the defaults, and a late Ctrl-C change the exit code.
+    # The interpreter's own clean-up would restore the defaults, and a late Ctrl-C change the exit
+    # code.
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     return code
@@ -34,8 +37,8 @@ def main(args=None):
 def _signal_pipe():
     """File descriptor that becomes readable on SIGINT or SIGTERM.
 
-    The signals do nothing else: no KeyboardInterrupt in the middle of a callback, no context that rclpy shuts down while a
-    callback still publishes, and a second Ctrl-C changes nothing.
+    The signals do nothing else: no KeyboardInterrupt in the middle of a callback, no context that
+    rclpy shuts down while a callback still publishes, and a second Ctrl-C changes nothing.
     """
     readable, writable = os.pipe()
     os.set_blocking(writable, False)

@@ -3,12 +3,21 @@
 import dataclasses
 import difflib
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, check_value, option_name
 from hand_eye_calib.errors import ConfigError
 
-FIELDS = {option_name(field): field for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)}
+FIELDS = {
+    option_name(field): field
+    for config in (CalibratorConfig, NodeConfig)
+    for field in dataclasses.fields(config)
+}
 
 # Declared by rclpy itself.
 _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
@@ -17,8 +26,8 @@ _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
 class Parameters:
     """Declares the parameters on a node and keeps them as option objects.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides=True``: that is how rclpy shows what
-    a file or the command line sets, unknown names included.
+    The node must have been made with ``automatically_declare_parameters_from_overrides=True``: that
+    is how rclpy shows what a file or the command line sets, unknown names included.
 
     Parameters
     ----------
@@ -28,7 +37,8 @@ class Parameters:
     check : callable
         ``check(NodeConfig)`` raises ConfigError for options that cannot be had.
     on_change : callable
-        Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the new options by then.
+        Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the
+        new options by then.
 
     Attributes
     ----------
@@ -45,22 +55,31 @@ class Parameters:
 
     def __init__(self, node, qos_names, on_change, check=lambda options: None):
         given = _take_overrides(node)
-        self.unknown = [_unknown(name) for name in given if name not in FIELDS and name not in qos_names]
+        self.unknown = [
+            _unknown(name) for name in given if name not in FIELDS and name not in qos_names
+        ]
         self._values = {
-            name: _start_value(field, given[name]) if name in given else field.default for name, field in FIELDS.items()
+            name: _start_value(field, given[name]) if name in given else field.default
+            for name, field in FIELDS.items()
         }
         self.calibrator, self.node = _configs(self._values)
         check(self.node)
         self._check_node = check
         for name, field in FIELDS.items():
-            node.declare_parameter(name, self._values[name], _descriptor(field), ignore_override=True)  # it is in the value
+            node.declare_parameter(
+                name, self._values[name], _descriptor(field), ignore_override=True
+            )  # it is in the value
         self._on_change = on_change
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
 
     def _proposed(self, parameters):
-        ours = {parameter.name: parameter.value for parameter in parameters if parameter.name in FIELDS}
-        return self._values | {name: check_value(FIELDS[name], value) for name, value in ours.items()}
+        ours = {
+            parameter.name: parameter.value for parameter in parameters if parameter.name in FIELDS
+        }
+        return self._values | {
+            name: check_value(FIELDS[name], value) for name, value in ours.items()
+        }
 
     def _check(self, parameters):
         try:
@@ -79,13 +98,17 @@ class Parameters:
 
 def _configs(values):
     def part(config):
-        return config.from_options({option_name(field): values[option_name(field)] for field in dataclasses.fields(config)})
+        return config.from_options(
+            {option_name(field): values[option_name(field)] for field in dataclasses.fields(config)}
+        )
 
     return part(CalibratorConfig), part(NodeConfig)
 
 
 def _take_overrides(node):
-    """Mapping of the names and values that file and command line give, undeclared again so that they can get descriptors."""
+    """Mapping of the names and values that file and command line give, undeclared again so that
+    they can get descriptors.
+    """
     given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
     for name in _SYSTEM_PARAMETERS:
         given.pop(name, None)
@@ -96,13 +119,18 @@ def _take_overrides(node):
 
 def _unknown(name):
     guesses = difflib.get_close_matches(name, FIELDS, n=1)
-    return f"parameter {name} does not exist and is ignored" + (f"; did you mean {guesses[0]}?" if guesses else "")
+    return f"parameter {name} does not exist and is ignored" + (
+        f"; did you mean {guesses[0]}?" if guesses else ""
+    )
 
 
 def _start_value(field, value):
-    # ROS parameters have fixed types: rclpy refuses an integer for a double, and so does `ros2 param set`.
+    # ROS parameters have fixed types: rclpy refuses an integer for a double, and so does `ros2
+    # param set`.
     if isinstance(field.default, float) and type(value) is int and not _dynamic(field):
-        raise ConfigError(f"{option_name(field)} must be a double; got the integer {value}: write {value}.0")
+        raise ConfigError(
+            f"{option_name(field)} must be a double; got the integer {value}: write {value}.0"
+        )
     if value is False and "off" in (field.metadata["choices"] or ()):
         value = "off"  # which is what YAML makes of an off without quotes
     return check_value(field, value)
@@ -117,7 +145,9 @@ def _descriptor(field):
     meta = field.metadata
     words = meta["choices"] or (f"{' or '.join(meta['words'])}, or a number",) * _dynamic(field)
     description = (
-        meta["doc"] + (f" Unit: {meta['unit']}." if meta["unit"] else "") + (f" Values: {', '.join(words)}." if words else "")
+        meta["doc"]
+        + (f" Unit: {meta['unit']}." if meta["unit"] else "")
+        + (f" Values: {', '.join(words)}." if words else "")
     )
     descriptor = ParameterDescriptor(
         description=description,
@@ -126,7 +156,10 @@ def _descriptor(field):
         dynamic_typing=_dynamic(field),
     )
     if meta["minimum"] is not None and meta["maximum"] is not None and not _dynamic(field):
-        bounds = dict(from_value=type(field.default)(meta["minimum"]), to_value=type(field.default)(meta["maximum"]))
+        bounds = dict(
+            from_value=type(field.default)(meta["minimum"]),
+            to_value=type(field.default)(meta["maximum"]),
+        )
         if isinstance(field.default, float):
             descriptor.floating_point_range = [FloatingPointRange(**bounds)]
         else:

@@ -1,4 +1,6 @@
-"""Plays poses to a node ``calibrator`` in another process and waits for its answer: the far end of the middleware."""
+"""Plays poses to a node ``calibrator`` in another process and waits for its answer: the far end of
+the middleware.
+"""
 
 import time
 from dataclasses import dataclass
@@ -18,13 +20,17 @@ from hand_eye_calib.ros.conversions import to_ns, to_time
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 _SPIN_S = 0.02
 
 
 @dataclass(frozen=True)
 class LiveExtrinsic:
-    """What the node published on ``~/extrinsic``: the (4, 4) extrinsic, its frames, the stamp of the newest pose used."""
+    """What the node published on ``~/extrinsic``: the (4, 4) extrinsic, its frames, the stamp of
+    the newest pose used.
+    """
 
     T_parent_child: np.ndarray
     parent_frame: str
@@ -40,7 +46,8 @@ class Player:
     topics : mapping
         "parent" and "child" to the names of their topics.
     check : callable
-        Called while waiting; raises where waiting has become pointless, such as when the node has died.
+        Called while waiting; raises where waiting has become pointless, such as when the node has
+        died.
     patience_s : float
         How long to wait for the node at each step.
 
@@ -57,11 +64,16 @@ class Player:
         self._node = rclpy.create_node("hand_eye_calib_player", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._publishers = {stream: self._node.create_publisher(Odometry, topic, _LOSSLESS) for stream, topic in topics.items()}
+        self._publishers = {
+            stream: self._node.create_publisher(Odometry, topic, _LOSSLESS)
+            for stream, topic in topics.items()
+        }
         self._solve = self._node.create_client(Trigger, "calibrator/solve")
         self._answer = "no answer"
         self._extrinsic = None
-        self._node.create_subscription(TransformStamped, "calibrator/extrinsic", self._on_extrinsic, _LATCHED)
+        self._node.create_subscription(
+            TransformStamped, "calibrator/extrinsic", self._on_extrinsic, _LATCHED
+        )
 
     def __enter__(self):
         return self
@@ -72,14 +84,20 @@ class Player:
         self._context.try_shutdown()
 
     def play(self, poses, speed):
-        """Publish poses ``speed`` times as fast as they were recorded, once the node listens to both topics.
+        """Publish poses ``speed`` times as fast as they were recorded, once the node listens to
+        both topics.
 
         Parameters
         ----------
         poses : iterable of StampedPose
         speed : float
         """
-        self._wait(lambda: all(publisher.get_subscription_count() for publisher in self._publishers.values()), "to subscribe")
+        self._wait(
+            lambda: all(
+                publisher.get_subscription_count() for publisher in self._publishers.values()
+            ),
+            "to subscribe",
+        )
         start, first_stamp_ns = time.monotonic(), None
         for pose in poses:
             first_stamp_ns = pose.stamp_ns if first_stamp_ns is None else first_stamp_ns
@@ -110,7 +128,11 @@ class Player:
                 pending = self._solve.call_async(Trigger.Request())
             return False
 
-        self._wait(is_covered, "for a result with all poses", lambda: f"; its last answer was: {self._answer}")
+        self._wait(
+            is_covered,
+            "for a result with all poses",
+            lambda: f"; its last answer was: {self._answer}",
+        )
         return self._extrinsic
 
     def _wait(self, condition, purpose, details=lambda: ""):
@@ -118,7 +140,9 @@ class Player:
         while not condition():
             self._check()
             if time.monotonic() > end:
-                raise HandEyeCalibError(f"waited {self._patience_s:g} s for the node {purpose}{details()}")
+                raise HandEyeCalibError(
+                    f"waited {self._patience_s:g} s for the node {purpose}{details()}"
+                )
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
     def _on_extrinsic(self, message):

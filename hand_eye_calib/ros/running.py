@@ -20,7 +20,8 @@ from hand_eye_calib.ros.calibrator_node import CalibratorNode
 # How long a running solve may hold up the end of the program.
 SOLVE_GRACE_S = 0.5
 
-# How long the solver may keep the interpreter from a message that waits (s). Python's own 5 ms are asked for several times a message.
+# How long the solver may keep the interpreter from a message that waits (s). Python's own 5 ms are
+# asked for several times a message.
 _SWITCH_INTERVAL_S = 0.0005
 
 

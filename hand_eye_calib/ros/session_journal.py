@@ -1,4 +1,6 @@
-"""The journal of the node's session, written by a thread of its own: a slow or full disk never holds up a message."""
+"""The journal of the node's session, written by a thread of its own: a slow or full disk never
+holds up a message.
+"""
 
 import fcntl
 import os
@@ -8,7 +10,13 @@ import time
 from pathlib import Path
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, keep_aside, read_journal
+from hand_eye_calib.io.journal import (
+    JournalWriter,
+    count_poses,
+    has_session,
+    keep_aside,
+    read_journal,
+)
 
 # How often what came in is handed to the disk: what a crash can cost.
 FLUSH_PERIOD_S = 0.25
@@ -44,7 +52,8 @@ class DirectoryLock:
     Parameters
     ----------
     directory : path
-        Made if it does not exist. Where it cannot be written, nothing is locked: the journal will say so.
+        Made if it does not exist. Where it cannot be written, nothing is locked: the journal will
+        say so.
 
     Raises
     ------
@@ -114,7 +123,9 @@ class SessionJournal:
         self._events.append((stream, sensor_frame))
 
     def flush(self, make_state):
-        """Hand what was noted to the thread; to be called often. ``make_state()`` gives the engine's state where one is needed."""
+        """Hand what was noted to the thread; to be called often. ``make_state()`` gives the
+        engine's state where one is needed.
+        """
         events, self._events = self._events, []
         if self._failed_at is not None:
             if time.monotonic() - self._failed_at >= _RETRY_S:
@@ -182,7 +193,9 @@ class SessionJournal:
         self._broken = False
         if self.error:
             self.error = ""
-            self._notes.put((False, f"the session journal in {self.directory} is being written again"))
+            self._notes.put(
+                (False, f"the session journal in {self.directory} is being written again")
+            )
 
     def _begin(self, state):
         if self._writer is not None and not self._broken:
@@ -198,7 +211,9 @@ class SessionJournal:
         if poses == 0:
             return
         aside = keep_aside(self.directory)
-        size = "a damaged session" if poses is None else f"the session before this one ({poses} poses)"
+        size = (
+            "a damaged session" if poses is None else f"the session before this one ({poses} poses)"
+        )
         how = f"stop the node, rename that folder to {self.directory.name} and start with the parameter journal at resume"
         self._notes.put((False, f"{size} is kept in {aside}; to go on with it, {how}"))
 

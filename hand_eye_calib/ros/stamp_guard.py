@@ -2,14 +2,16 @@
 
 from enum import Enum, auto
 
-# A stamp this much earlier than the one before is not a late message, one this much later not the next one.
+# A stamp this much earlier than the one before is not a late message, one this much later not the
+# next one.
 BACKWARD_JUMP_NS = 1_000_000_000
 FORWARD_JUMP_NS = 60_000_000_000
 
 # So many messages must agree on a jump before it is believed.
 _WITNESSES = 3
 
-# After one stream has jumped back, the others' messages of before are left out for so long: theirs are about to jump too.
+# After one stream has jumped back, the others' messages of before are left out for so long: theirs
+# are about to jump too.
 _OTHERS_FOLLOW_S = 2.0
 
 
@@ -58,7 +60,8 @@ class StampGuard:
         -------
         verdict : Verdict
         messages : list of (stamp_ns, message)
-            TAKE: to be taken now, held ones included. JUMPED_BACK: the first of a new session. Otherwise empty.
+            TAKE: to be taken now, held ones included. JUMPED_BACK: the first of a new session.
+            Otherwise empty.
         """
         if self._outdated_until_s is not None:
             if now_s < self._outdated_until_s and _follows(stamp_ns, self.last_ns):

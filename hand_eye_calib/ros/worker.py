@@ -9,10 +9,10 @@ import time
 import traceback
 from dataclasses import dataclass
 
-from hand_eye_calib.assessment.agreement import Agreement, tell_enough
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.calibrator import Snapshot
+from hand_eye_calib.checks.agreement import Agreement, tell_enough
+from hand_eye_calib.engine.calibrator import Snapshot
 
 # Whoever else needs the processor goes before the solver's process.
 _NICENESS = 10
@@ -20,7 +20,9 @@ _NICENESS = 10
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a solve of a snapshot ended, after how many seconds: with a calibration or with an exception."""
+    """How a solve of a snapshot ended, after how many seconds: with a calibration or with an
+    exception.
+    """
 
     session: int
     snapshot: Snapshot
@@ -32,7 +34,9 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Checked:
-    """How a check of a snapshot's streams ended, after how many seconds: with neither where its poses turn too little to tell."""
+    """How a check of a snapshot's streams ended, after how many seconds: with neither where its
+    poses turn too little to tell.
+    """
 
     session: int
     seconds: float
@@ -41,12 +45,14 @@ class Checked:
 
 
 class SolveWorker:
-    """Runs ``snapshot.estimate()`` in a thread of its own, and ``snapshot.check()`` after it where that is asked for.
+    """Runs ``snapshot.estimate()`` in a thread of its own, and ``snapshot.check()`` after it where
+    that is asked for.
 
     Parameters
     ----------
     on_done : callable
-        Called in the worker's thread when an Outcome or Checked is ready; calls may come so close that one serves for two.
+        Called in the worker's thread when an Outcome or Checked is ready; calls may come so close
+        that one serves for two.
     """
 
     def __init__(self, on_done):
@@ -60,7 +66,9 @@ class SolveWorker:
         self._thread.start()
 
     def submit(self, session, snapshot, check=False):
-        """Solve a snapshot of the engine, then check its streams if asked to; ``session`` comes back with what is ready."""
+        """Solve a snapshot of the engine, then check its streams if asked to; ``session`` comes
+        back with what is ready.
+        """
         self._snapshots.put((session, snapshot, check))
 
     def ready(self):
@@ -95,7 +103,8 @@ class SolveWorker:
 class SolverProcess:
     """Estimates in a process of its own, started when it is first needed.
 
-    CasADi keeps the interpreter's lock for a tenth of a second while it builds a problem, and all messages would wait.
+    CasADi keeps the interpreter's lock for a tenth of a second while it builds a problem, and all
+    messages would wait.
     """
 
     def __init__(self):
@@ -116,7 +125,9 @@ class SolverProcess:
             answer = self._connection.recv()
         except (EOFError, OSError):
             self._process.join(1.0)
-            raise RuntimeError(f"the solver's process ended with code {self._process.exitcode}") from None
+            raise RuntimeError(
+                f"the solver's process ended with code {self._process.exitcode}"
+            ) from None
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -128,7 +139,9 @@ class SolverProcess:
             self._process.join()
 
     def _start(self):
-        spawn = multiprocessing.get_context("spawn")  # a fork would copy the middleware's threads' locks
+        spawn = multiprocessing.get_context(
+            "spawn"
+        )  # a fork would copy the middleware's threads' locks
         self._connection, theirs = spawn.Pipe()
         self._process = spawn.Process(target=_serve, args=(theirs,), name="solver", daemon=True)
         self._process.start()

@@ -1,1 +1,3 @@
-"""Drives with known truth: trajectories of two sensors on one vehicle, and the noise of the odometry that measured them."""
+"""Drives with known truth: trajectories of two sensors on one vehicle, and the noise of the
+odometry that measured them.
+"""

@@ -58,10 +58,22 @@ def simulate_drive(seed, config=PUBLISHED_DRIVE, noise=NoiseConfig()):  # noqa: 
     )
     T_parent_child = _random_extrinsic(extrinsic_rng, config.max_offset)
     T_pw_cw = _random_world(extrinsic_rng)
-    Ts_pw_p, Ts_cw_c = add_noise(Ts_pw_p, se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child, noise, noise_rng)
+    Ts_pw_p, Ts_cw_c = add_noise(
+        Ts_pw_p, se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child, noise, noise_rng
+    )
     return SimulatedDrive(
-        Trajectory(_stamps_ns(config, parent_times_s), Ts_pw_p, config.parent_frame, f"{config.parent_frame}_odom"),
-        Trajectory(_stamps_ns(config, child_times_s), Ts_cw_c, config.child_frame, f"{config.child_frame}_odom"),
+        Trajectory(
+            _stamps_ns(config, parent_times_s),
+            Ts_pw_p,
+            config.parent_frame,
+            f"{config.parent_frame}_odom",
+        ),
+        Trajectory(
+            _stamps_ns(config, child_times_s),
+            Ts_cw_c,
+            config.child_frame,
+            f"{config.child_frame}_odom",
+        ),
         T_parent_child,
         T_pw_cw,
     )
@@ -79,26 +91,39 @@ def _random_extrinsic(rng, max_offset):
 def _random_world(rng):
     """Euler angles (rad) and translation (m), each the difference of two uniforms between 0 and 1."""
     angles, translation = rng.uniform(size=(2, 3)) - rng.uniform(size=(2, 3))
-    return se3.from_rotation_translation(Rotation.from_euler("ZYX", angles).as_matrix(), translation)
+    return se3.from_rotation_translation(
+        Rotation.from_euler("ZYX", angles).as_matrix(), translation
+    )
 
 
 def _vehicle_poses(config, rng, *times_s):
-    """Poses (N, 4, 4) of the vehicle on one drive, for each of several arrays of times since its start."""
+    """Poses (N, 4, 4) of the vehicle on one drive, for each of several arrays of times since its
+    start.
+    """
     duration = max(times[-1] for times in times_s)
     holds = np.full(int(duration // config.hold_time) + 2, config.hold_time)
     holds[0] = config.first_hold_time
     yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds))
-    return [_poses_on_terrain(config, *_ground_track(config, yaw_rates, holds, times)) for times in times_s]
+    return [
+        _poses_on_terrain(config, *_ground_track(config, yaw_rates, holds, times))
+        for times in times_s
+    ]
 
 
 def _ground_track(config, yaw_rates, holds, times_s):
-    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time; each yaw rate is held for its time."""
+    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time; each yaw rate is
+    held for its time.
+    """
     starts = _sums_before(holds)
     headings = _sums_before(yaw_rates * holds)
-    corners = _START * config.terrain_scale + _sums_before(_arc(config.speed, headings, yaw_rates, holds))
+    corners = _START * config.terrain_scale + _sums_before(
+        _arc(config.speed, headings, yaw_rates, holds)
+    )
     k = np.searchsorted(starts, times_s, side="right") - 1
     elapsed = times_s - starts[k]
-    return corners[k] + _arc(config.speed, headings[k], yaw_rates[k], elapsed), headings[k] + yaw_rates[k] * elapsed
+    return corners[k] + _arc(config.speed, headings[k], yaw_rates[k], elapsed), headings[
+        k
+    ] + yaw_rates[k] * elapsed
 
 
 def _sums_before(values):
@@ -110,30 +135,42 @@ def _arc(speed, heading, yaw_rate, duration):
     """Displacement (N, 2) along an arc: its chord points half-way between the headings at its ends."""
     half_turn = 0.5 * yaw_rate * duration
     chord = speed * duration * np.sinc(half_turn / np.pi)
-    return np.stack([chord * np.cos(heading + half_turn), chord * np.sin(heading + half_turn)], axis=-1)
+    return np.stack(
+        [chord * np.cos(heading + half_turn), chord * np.sin(heading + half_turn)], axis=-1
+    )
 
 
 def _poses_on_terrain(config, positions, headings):
     z, slope_x, slope_y = surface(
-        positions[:, 0], positions[:, 1], config.terrain_height, config.terrain_scale, config.terrain_limit
+        positions[:, 0],
+        positions[:, 1],
+        config.terrain_height,
+        config.terrain_scale,
+        config.terrain_limit,
     )
     normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     attitude = _published_attitude if config.attitude == "published" else _vehicle_attitude
-    return se3.from_rotation_translation(attitude(headings, normals), np.column_stack([positions, z]))
+    return se3.from_rotation_translation(
+        attitude(headings, normals), np.column_stack([positions, z])
+    )
 
 
 def _vehicle_attitude(headings, normals):
     """z along the normal, x in the vertical plane of the heading."""
-    left = np.cross(normals, np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1))
+    left = np.cross(
+        normals, np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1)
+    )
     left /= np.linalg.norm(left, axis=-1, keepdims=True)
     return np.stack([np.cross(left, normals), left, normals], axis=-1)
 
 
 def _published_attitude(headings, normals):
-    """The published trajectories' orientation, found by fitting it to their noise-free poses (to 0.01 rad, heading exactly).
+    """The published trajectories' orientation, found by fitting it to their noise-free poses (to
+    0.01 rad, heading exactly).
 
-    Yaw is the heading, pitch and roll are the arc sines of the normal's x and y in the world, and the matrix is transposed.
+    Yaw is the heading, pitch and roll are the arc sines of the normal's x and y in the world, and
+    the matrix is transposed.
     """
     angles = np.stack([headings, np.arcsin(normals[:, 0]), np.arcsin(normals[:, 1])], axis=-1)
     return np.swapaxes(Rotation.from_euler("ZYX", angles).as_matrix(), -1, -2)

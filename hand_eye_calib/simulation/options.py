@@ -7,30 +7,63 @@ from hand_eye_calib.config import OptionSet, option
 
 @dataclass(frozen=True)
 class DriveConfig(OptionSet):
-    """Vehicle, terrain and sensors; the defaults are the published trajectories' but for the attitude."""
+    """Vehicle, terrain and sensors; the defaults are the published trajectories' but for the
+    attitude.
+    """
 
     poses: int = option(100, "Number of poses of the parent sensor.", minimum=2, maximum=10_000_000)
-    parent_rate: float = option(10.0, "Poses of the parent sensor per second.", unit="Hz", minimum=0.01, maximum=10_000.0)
-    child_rate: float = option(10.0, "Poses of the child sensor per second.", unit="Hz", minimum=0.01, maximum=10_000.0)
-    child_delay: float = option(
-        0.0, "Time from the first pose of the parent to that of the child.", unit="s", minimum=0.0, maximum=60.0
+    parent_rate: float = option(
+        10.0, "Poses of the parent sensor per second.", unit="Hz", minimum=0.01, maximum=10_000.0
     )
-    start_time: float = option(0.0, "Stamp of the first pose of the parent.", unit="s", minimum=0.0, maximum=4e9)
+    child_rate: float = option(
+        10.0, "Poses of the child sensor per second.", unit="Hz", minimum=0.01, maximum=10_000.0
+    )
+    child_delay: float = option(
+        0.0,
+        "Time from the first pose of the parent to that of the child.",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+    )
+    start_time: float = option(
+        0.0, "Stamp of the first pose of the parent.", unit="s", minimum=0.0, maximum=4e9
+    )
     speed: float = option(0.5, "Horizontal speed.", unit="m/s", minimum=0.0, maximum=100.0)
     max_yaw_rate: float = option(
-        2.0, "Yaw rates are drawn between plus and minus this.", unit="rad/s", minimum=0.0, maximum=100.0
+        2.0,
+        "Yaw rates are drawn between plus and minus this.",
+        unit="rad/s",
+        minimum=0.0,
+        maximum=100.0,
     )
-    hold_time: float = option(0.5, "Time for which a yaw rate is held.", unit="s", minimum=1e-3, maximum=1e4)
-    first_hold_time: float = option(0.4, "Time for which the first yaw rate is held.", unit="s", minimum=1e-3, maximum=1e4)
+    hold_time: float = option(
+        0.5, "Time for which a yaw rate is held.", unit="s", minimum=1e-3, maximum=1e4
+    )
+    first_hold_time: float = option(
+        0.4, "Time for which the first yaw rate is held.", unit="s", minimum=1e-3, maximum=1e4
+    )
     lead_time: float = option(
-        0.1, "Time from the start of the drive to the first pose of the parent.", unit="s", minimum=0.0, maximum=1e4
+        0.1,
+        "Time from the start of the drive to the first pose of the parent.",
+        unit="s",
+        minimum=0.0,
+        maximum=1e4,
     )
-    terrain_height: float = option(0.1, "Height of the terrain per unit of peaks.", unit="m", minimum=0.0, maximum=100.0)
+    terrain_height: float = option(
+        0.1, "Height of the terrain per unit of peaks.", unit="m", minimum=0.0, maximum=100.0
+    )
     terrain_scale: float = option(
-        1.0, "Horizontal size of the terrain per unit of peaks' arguments.", unit="m", minimum=0.01, maximum=1e4
+        1.0,
+        "Horizontal size of the terrain per unit of peaks' arguments.",
+        unit="m",
+        minimum=0.01,
+        maximum=1e4,
     )
     terrain_limit: float = option(
-        5.0, "Beyond this argument of peaks the terrain continues mirrored.", minimum=1.0, maximum=1e6
+        5.0,
+        "Beyond this argument of peaks the terrain continues mirrored.",
+        minimum=1.0,
+        maximum=1e6,
     )
     attitude: str = option(
         "vehicle",
@@ -39,7 +72,11 @@ class DriveConfig(OptionSet):
         choices=("published", "vehicle"),
     )
     max_offset: float = option(
-        0.5, "Offset of the child sensor along each axis of the parent, at most.", unit="m", minimum=0.0, maximum=100.0
+        0.5,
+        "Offset of the child sensor along each axis of the parent, at most.",
+        unit="m",
+        minimum=0.0,
+        maximum=100.0,
     )
     parent_frame: str = option("parent", "Frame of the parent sensor.")
     child_frame: str = option("child", "Frame of the child sensor.")
@@ -48,8 +85,8 @@ class DriveConfig(OptionSet):
 # The article's drives, as published.
 PUBLISHED_DRIVE = DriveConfig(attitude="published")
 
-# Two minutes of a robot or forklift outdoors: hills steep enough to reveal all six degrees of freedom, sensors at different
-# rates that never share a stamp.
+# Two minutes of a robot or forklift outdoors: hills steep enough to reveal all six degrees of
+# freedom, sensors at different rates that never share a stamp.
 HILLY_DRIVE = DriveConfig(
     poses=1200, parent_rate=10.0, child_rate=20.0, child_delay=0.0137, start_time=1.7e9, speed=1.5, max_yaw_rate=1.0, hold_time=1.5,
     terrain_height=0.15, terrain_scale=2.5, terrain_limit=3.0,
@@ -75,10 +112,17 @@ class NoiseConfig(OptionSet):
         maximum=100.0,
     )
     outliers: float = option(
-        0.0, "Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).", minimum=0.0, maximum=1.0
+        0.0,
+        "Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).",
+        minimum=0.0,
+        maximum=1.0,
     )
     drift: float = option(
-        0.0, "Drift of the child sensor along one of its axes (published: 0 to 0.05).", unit="m/m", minimum=0.0, maximum=10.0
+        0.0,
+        "Drift of the child sensor along one of its axes (published: 0 to 0.05).",
+        unit="m/m",
+        minimum=0.0,
+        maximum=10.0,
     )
 
 

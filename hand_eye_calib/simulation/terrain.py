@@ -4,7 +4,9 @@ import numpy as np
 
 
 def peaks(x, y):
-    """Three hills and three hollows around the origin, flat beyond about 3.5; arrays of one shape, no unit."""
+    """Three hills and three hollows around the origin, flat beyond about 3.5; arrays of one shape,
+    no unit.
+    """
     return (
         3.0 * (1.0 - x) ** 2 * np.exp(-(x**2) - (y + 1.0) ** 2)
         - 10.0 * (x / 5.0 - x**3 - y**5) * np.exp(-(x**2) - y**2)
@@ -36,7 +38,8 @@ def surface(x, y, height, scale, limit):
     scale : float
         m per unit of the arguments of ``peaks``.
     limit : float
-        Arguments of ``peaks`` beyond +/- limit are mirrored back, so that a long drive does not leave the hills.
+        Arguments of ``peaks`` beyond +/- limit are mirrored back, so that a long drive does not
+        leave the hills.
 
     Returns
     -------
@@ -45,7 +48,11 @@ def surface(x, y, height, scale, limit):
     """
     (u, sign_u), (v, sign_v) = _mirrored(x / scale, limit), _mirrored(y / scale, limit)
     along_u, along_v = peaks_gradient(u, v)
-    return height * peaks(u, v), height / scale * sign_u * along_u, height / scale * sign_v * along_v
+    return (
+        height * peaks(u, v),
+        height / scale * sign_u * along_u,
+        height / scale * sign_v * along_v,
+    )
 
 
 def _mirrored(values, limit):

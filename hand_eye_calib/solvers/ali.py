@@ -1,9 +1,11 @@
 """Ali: rotation and translation together, from the translation residual alone.
 
-Cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E. R. Morales, *Methods for simultaneous robot-world-hand-eye calibration: a comparative
-study*, Sensors 19(12), 2019, as its authors' program computes it: the rotation residual of a motion pair enters only as the norm of a unit
-quaternion, a constant (Välimäki et al. 2023, section 2). What is left is the translation of AX - XB, a quadratic form in the same thirteen
-numbers as dnl's cost, and minimised the same way over proper rotations.
+Cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E. R. Morales, *Methods for simultaneous
+robot-world-hand-eye calibration: a comparative study*, Sensors 19(12), 2019, as its authors'
+program computes it: the rotation residual of a motion pair enters only as the norm of a unit
+quaternion, a constant (Välimäki et al. 2023, section 2). What is left is the translation of AX -
+XB, a quadratic form in the same thirteen numbers as dnl's cost, and minimised the same way over
+proper rotations.
 """
 
 import numpy as np
@@ -31,11 +33,19 @@ def solve(pairs):
     best = int(np.argmin(minimum.value))
     T_parent_child = minimum.T_parent_child[best]
     objective = squared_translation_residual(pairs, T_parent_child)
-    return Solution(T_parent_child, objective, bool(minimum.converged[best]), minimum.iterations, np.ones(len(pairs)))
+    return Solution(
+        T_parent_child,
+        objective,
+        bool(minimum.converged[best]),
+        minimum.iterations,
+        np.ones(len(pairs)),
+    )
 
 
 def residual_rows(pairs):
-    """Matrix (3 K, 13) that turns ``x = (vec R, t, 1)``, vec row-major, into the residuals ``R_A t + t_A - R t_B - t``."""
+    """Matrix (3 K, 13) that turns ``x = (vec R, t, 1)``, vec row-major, into the residuals ``R_A t
+    + t_A - R t_B - t``.
+    """
     rows = np.zeros((len(pairs), 3, quadratic_form.DIMENSION))
     for axis in range(3):
         rows[:, axis, 3 * axis : 3 * axis + 3] = -pairs.Ts_childi_childj[:, :3, 3]

@@ -19,7 +19,9 @@ def solve(pairs):
     Solution
     """
     numbers, weights = quadratic_form.numbers(pairs), np.ones(len(pairs))
-    minimum = quadratic_form.minimise(quadratic_form.weighted_sum(numbers, weights), start_rotations(pairs))
+    minimum = quadratic_form.minimise(
+        quadratic_form.weighted_sum(numbers, weights), start_rotations(pairs)
+    )
     best = int(np.argmin(minimum.value))
     T_parent_child = minimum.T_parent_child[best]
     return Solution(
@@ -32,23 +34,30 @@ def solve(pairs):
 
 
 def solve_without(pairs, solution, left_out):
-    """Answers (B, 4, 4) near a given one when the pairs of each row of ``left_out`` (B, K) are left out, for resampling."""
+    """Answers (B, 4, 4) near a given one when the pairs of each row of ``left_out`` (B, K) are left
+    out, for resampling.
+    """
     numbers = quadratic_form.numbers(pairs)
-    forms = np.stack([quadratic_form.weighted_sum(numbers, kept) for kept in (~left_out).astype(float)])
+    forms = np.stack(
+        [quadratic_form.weighted_sum(numbers, kept) for kept in (~left_out).astype(float)]
+    )
     starts = np.repeat(solution.T_parent_child[None, :3, :3], len(left_out), axis=0)
     return quadratic_form.minimise(forms, starts).T_parent_child
 
 
 def pair_costs(pairs, T_parent_child):
-    """Costs ``|A X - X B|_F^2`` (K,) straight from the matrices: exact to the last digit where the condensed forms cancel."""
+    """Costs ``|A X - X B|_F^2`` (K,) straight from the matrices: exact to the last digit where the
+    condensed forms cancel.
+    """
     return quadratic_form.costs(quadratic_form.numbers(pairs), T_parent_child)
 
 
 def start_rotations(pairs):
     """Rotations (4, 3, 3) to start from.
 
-    The first turns the child's rotation axes onto the parent's as well as it can: close to the answer whenever the motion turns
-    at all. The others do so after half a turn about one of the child's axes, for motion that hardly turns.
+    The first turns the child's rotation axes onto the parent's as well as it can: close to the
+    answer whenever the motion turns at all. The others do so after half a turn about one of the
+    child's axes, for motion that hardly turns.
     """
     axes_parent = _axial(pairs.Ts_parenti_parentj)
     axes_child = _axial(pairs.Ts_childi_childj)
@@ -57,11 +66,15 @@ def start_rotations(pairs):
     return aligned @ _HALF_TURNS
 
 
-_HALF_TURNS = np.array([np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])], dtype=float)
+_HALF_TURNS = np.array(
+    [np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])], dtype=float
+)
 
 
 def _axial(transforms):
-    """Rotation axes times twice the sine of the angle (K, 3): as good as a rotation vector for aligning axes, and cheaper."""
+    """Rotation axes times twice the sine of the angle (K, 3): as good as a rotation vector for
+    aligning axes, and cheaper.
+    """
     rotation = transforms[:, :3, :3]
     return np.stack(
         [

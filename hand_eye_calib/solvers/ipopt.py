@@ -1,7 +1,8 @@
-"""DNL and DNLO as the paper states them: CasADi expressions minimised by Ipopt (Välimäki et al. 2023, section 3.2).
+"""DNL and DNLO as the paper states them: CasADi expressions minimised by Ipopt (Välimäki et al.
+2023, section 3.2).
 
-The reference that the fast solvers are tested against. Unknowns are the rotation vector, the translation and, for DNLO, one
-weight per pair.
+The reference that the fast solvers are tested against. Unknowns are the rotation vector, the
+translation and, for DNLO, one weight per pair.
 """
 
 import numpy as np
@@ -14,7 +15,9 @@ from hand_eye_calib.solvers.solution import Solution
 try:
     import casadi
 except ImportError as error:
-    raise MissingDependencyError("backend ipopt needs CasADi, which is not installed: pip install casadi") from error
+    raise MissingDependencyError(
+        "backend ipopt needs CasADi, which is not installed: pip install casadi"
+    ) from error
 
 _IPOPT_OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
 _IDENTITY_START = 1e-6  # rad; at exactly zero the derivative of the rotation angle does not exist
@@ -23,7 +26,12 @@ _IDENTITY_START = 1e-6  # rad; at exactly zero the derivative of the rotation an
 def solve_dnl(pairs):
     """Minimise eq. (4) from the identity; see :func:`hand_eye_calib.solvers.dnl.solve`."""
     pose = casadi.MX.sym("pose", 6)
-    solver = casadi.nlpsol("dnl", "ipopt", {"x": pose, "f": casadi.sum2(_cost_expressions(pairs, pose))}, _IPOPT_OPTIONS)
+    solver = casadi.nlpsol(
+        "dnl",
+        "ipopt",
+        {"x": pose, "f": casadi.sum2(_cost_expressions(pairs, pose))},
+        _IPOPT_OPTIONS,
+    )
     answer = solver(x0=np.r_[np.full(3, _IDENTITY_START), np.zeros(3)])
     T_parent_child = _transform(answer["x"])
     objective = float(dnl.pair_costs(pairs, T_parent_child).sum())
@@ -31,7 +39,9 @@ def solve_dnl(pairs):
 
 
 def solve_dnlo(pairs, threshold=0.01, min_inlier_fraction=0.5):
-    """Minimise eq. (5) from the identity with all weights 1; see :func:`hand_eye_calib.solvers.dnlo.solve`."""
+    """Minimise eq. (5) from the identity with all weights 1; see
+    :func:`hand_eye_calib.solvers.dnlo.solve`.
+    """
     n_pairs = len(pairs)
     pose, alpha = casadi.MX.sym("pose", 6), casadi.MX.sym("alpha", n_pairs)
     costs = _cost_expressions(pairs, pose).T
@@ -55,16 +65,22 @@ def solve_dnlo(pairs, threshold=0.01, min_inlier_fraction=0.5):
 
 
 def _cost_expressions(pairs, pose):
-    """(1, K) expression: each pair's ``|A X - X B|_F^2``, mapped over the pairs so that the expression graph stays small."""
+    """(1, K) expression: each pair's ``|A X - X B|_F^2``, mapped over the pairs so that the
+    expression graph stays small.
+    """
     motion_a, motion_b = casadi.SX.sym("A", 3, 4), casadi.SX.sym("B", 3, 4)
     x = casadi.SX.sym("x", 6)
     rotation, translation = _rodrigues(x[:3]), x[3:]
     rotation_residual = motion_a[:, :3] @ rotation - rotation @ motion_b[:, :3]
-    translation_residual = motion_a[:, :3] @ translation + motion_a[:, 3] - rotation @ motion_b[:, 3] - translation
+    translation_residual = (
+        motion_a[:, :3] @ translation + motion_a[:, 3] - rotation @ motion_b[:, 3] - translation
+    )
     cost = casadi.sumsqr(rotation_residual) + casadi.sumsqr(translation_residual)
     columns_a, columns_b = casadi.vec(motion_a), casadi.vec(motion_b)
     function = casadi.Function("cost", [x, columns_a, columns_b], [cost])
-    return function.map(len(pairs))(pose, _columns(pairs.Ts_parenti_parentj), _columns(pairs.Ts_childi_childj))
+    return function.map(len(pairs))(
+        pose, _columns(pairs.Ts_parenti_parentj), _columns(pairs.Ts_childi_childj)
+    )
 
 
 def _columns(transforms):
@@ -85,4 +101,10 @@ def _transform(x):
 
 def _solution(solver, T_parent_child, objective, weights):
     statistics = solver.stats()
-    return Solution(T_parent_child, objective, bool(statistics["success"]), int(statistics["iter_count"]), weights)
+    return Solution(
+        T_parent_child,
+        objective,
+        bool(statistics["success"]),
+        int(statistics["iter_count"]),
+        weights,
+    )

@@ -1,7 +1,8 @@
 """Park: rotation by aligning rotation vectors, then translation by linear least squares.
 
-The coarse stage of C. Park, P. Moghadam, S. Kim, S. Sridharan, C. Fookes, *Spatiotemporal camera-LiDAR calibration: a targetless
-and structureless approach*, IEEE Robotics and Automation Letters 5(2), 2020.
+The coarse stage of C. Park, P. Moghadam, S. Kim, S. Sridharan, C. Fookes, *Spatiotemporal
+camera-LiDAR calibration: a targetless and structureless approach*, IEEE Robotics and Automation
+Letters 5(2), 2020.
 """
 
 from hand_eye_calib.solvers import separable
@@ -18,6 +19,7 @@ def solve(pairs):
     Returns
     -------
     Solution
-        ``objective`` is the sum of squared translation residuals, the cost of the second stage, in m^2.
+        ``objective`` is the sum of squared translation residuals, the cost of the second stage, in
+        m^2.
     """
     return separable.solve_in_two_stages(pairs, separable.align_rotation_vectors(pairs))

@@ -1,15 +1,17 @@
 """The cost of a motion pair as a fixed quadratic form, and its minimum over SE(3).
 
-``A X - X B`` is linear in ``x = (vec R, t, 1)``, thirteen numbers (vec is row-major). The cost of pair k,
+``A X - X B`` is linear in ``x = (vec R, t, 1)``, thirteen numbers (vec is row-major). The cost of
+pair k,
 
     e_k(X) = | A X - X B |_F^2  (top three rows)  =  x^T Q_k x,
 
-is therefore a quadratic form with a constant symmetric 13 x 13 matrix, and so is every weighted sum of pairs, whose minimum takes
-a three-variable Newton iteration however many pairs went in.
+is therefore a quadratic form with a constant symmetric 13 x 13 matrix, and so is every weighted sum
+of pairs, whose minimum takes a three-variable Newton iteration however many pairs went in.
 
-Both ends of the residual are linear: it is ``(A - I) X - X (B - I)``, where a pair enters with the 24 numbers u of ``A - I`` and
-``B - I``. Residuals, forms and sums of forms are thus plain matrix products of u with a constant array. Taking the identity off
-first keeps the digits of small motions.
+Both ends of the residual are linear: it is ``(A - I) X - X (B - I)``, where a pair enters with the
+24 numbers u of ``A - I`` and ``B - I``. Residuals, forms and sums of forms are thus plain matrix
+products of u with a constant array. Taking the identity off first keeps the digits of small
+motions.
 """
 
 from dataclasses import dataclass
@@ -42,7 +44,8 @@ _RESIDUAL = np.concatenate(
 # Pairs handled at a time: keeps the intermediate arrays in the processor's cache.
 _BLOCK, _SUMMED_BLOCK = 128, 1024
 
-# Eigenvalues of the translation block below this share of the largest count as zero: rounding, not motion.
+# Eigenvalues of the translation block below this share of the largest count as zero: rounding, not
+# motion.
 _RANK_TOLERANCE = 1e-10
 
 _MAX_NEWTON_STEPS = 60
@@ -70,14 +73,22 @@ def condense(pairs):
     for start in range(0, len(pairs), _BLOCK):
         block = slice(start, min(start + _BLOCK, len(pairs)))
         part = slice(block.stop - start)
-        np.matmul(pair_numbers[block], _RESIDUAL.reshape(24, -1), out=residuals[part].reshape(-1, 12 * DIMENSION))
+        np.matmul(
+            pair_numbers[block],
+            _RESIDUAL.reshape(24, -1),
+            out=residuals[part].reshape(-1, 12 * DIMENSION),
+        )
         np.matmul(np.swapaxes(residuals[part], 1, 2), residuals[part], out=forms[part])
-        np.take(forms[part].reshape(-1, DIMENSION**2), _UPPER, axis=1, out=condensed[block], mode="clip")
+        np.take(
+            forms[part].reshape(-1, DIMENSION**2), _UPPER, axis=1, out=condensed[block], mode="clip"
+        )
     return condensed
 
 
 def numbers(pairs):
-    """What the residual is linear in, (K, 24): the top three rows of A - I, then of B - I, of every pair."""
+    """What the residual is linear in, (K, 24): the top three rows of A - I, then of B - I, of every
+    pair.
+    """
     rows = [Ts.reshape(-1, 16)[:, :12] for Ts in (pairs.Ts_parenti_parentj, pairs.Ts_childi_childj)]
     found = np.concatenate(rows, axis=1)
     for one in _ONES:  # column by column: numpy is slow at many short rows
@@ -100,16 +111,22 @@ def costs(numbers, T_parent_child):
 
 
 def weighted_sum(numbers, weights):
-    """Sum (13, 13) of the forms, each with its weight (K,), from the :func:`numbers` of the pairs: the forms are not made for it."""
+    """Sum (13, 13) of the forms, each with its weight (K,), from the :func:`numbers` of the pairs:
+    the forms are not made for it.
+    """
     moments = np.zeros((24, 24))
     for start in range(0, len(numbers), _SUMMED_BLOCK):
         block = slice(start, start + _SUMMED_BLOCK)
         moments += (numbers[block] * weights[block, None]).T @ numbers[block]
-    return _RESIDUAL.reshape(-1, DIMENSION).T @ (moments @ _RESIDUAL.reshape(24, -1)).reshape(-1, DIMENSION)
+    return _RESIDUAL.reshape(-1, DIMENSION).T @ (moments @ _RESIDUAL.reshape(24, -1)).reshape(
+        -1, DIMENSION
+    )
 
 
 def fall(Q, T_parent_child, T_parent_child_new):
-    """By how much ``x^T Q x`` of one form (13, 13) falls from one transform (4, 4) to another; keeps the digits of small steps."""
+    """By how much ``x^T Q x`` of one form (13, 13) falls from one transform (4, 4) to another;
+    keeps the digits of small steps.
+    """
     x, x_new = T_parent_child.ravel()[_X_IN_T], T_parent_child_new.ravel()[_X_IN_T]
     return (x - x_new) @ Q @ (x + x_new)
 
@@ -127,7 +144,9 @@ def monomials(T_parent_child):
         ``x_i x_j``, doubled off the diagonal.
     """
     numbers = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,))
-    return numbers.take(_X_IN_T[_ROWS], axis=-1) * (numbers.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY)
+    return numbers.take(_X_IN_T[_ROWS], axis=-1) * (
+        numbers.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY
+    )
 
 
 _MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
@@ -147,7 +166,9 @@ def _pseudo_inverse(matrices):
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where forms are smallest: B transforms (B, 4, 4), their values (B,) and whether Newton converged (B,)."""
+    """Where forms are smallest: B transforms (B, 4, 4), their values (B,) and whether Newton
+    converged (B,).
+    """
 
     T_parent_child: np.ndarray
     value: np.ndarray
@@ -158,8 +179,8 @@ class Minimum:
 def minimise(Q, rotation_start, max_steps=_MAX_NEWTON_STEPS):
     """Minimise ``x^T Q x`` over SE(3), from several rotations or for several forms at once.
 
-    The translation is eliminated exactly; what is left is a quadratic in the nine entries of R, minimised by damped Newton
-    steps ``R <- R Exp(phi)``.
+    The translation is eliminated exactly; what is left is a quadratic in the nine entries of R,
+    minimised by damped Newton steps ``R <- R Exp(phi)``.
 
     Parameters
     ----------
@@ -174,7 +195,9 @@ def minimise(Q, rotation_start, max_steps=_MAX_NEWTON_STEPS):
     rotation = np.array(rotation_start, dtype=float)
     Q = np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION))
     gain = _pseudo_inverse(Q[:, _TRANSLATION, _TRANSLATION])
-    Q_translation_rest = np.concatenate([Q[:, _TRANSLATION, _ROTATION], Q[:, _TRANSLATION, _ONE, None]], axis=2)
+    Q_translation_rest = np.concatenate(
+        [Q[:, _TRANSLATION, _ROTATION], Q[:, _TRANSLATION, _ONE, None]], axis=2
+    )
     reduced = np.empty((len(rotation), 10, 10))
     reduced[:, :9, :9] = Q[:, _ROTATION, _ROTATION]
     reduced[:, :9, 9] = reduced[:, 9, :9] = Q[:, _ROTATION, _ONE]
@@ -189,9 +212,19 @@ def minimise(Q, rotation_start, max_steps=_MAX_NEWTON_STEPS):
     while iterations < max_steps and not converged.all():
         iterations += 1
         curvature, axes = np.linalg.eigh(hessian)
-        # Follow negative curvature downhill too, and never divide by a curvature that is only rounding.
-        size = np.maximum(np.abs(curvature), 1e-14 * np.maximum(np.abs(curvature).max(axis=1, keepdims=True), 1e-300))
-        step = -(axes @ ((np.swapaxes(axes, 1, 2) @ gradient[:, :, None]) / (size + damping[:, None])[:, :, None]))[:, :, 0]
+        # Follow negative curvature downhill too, and never divide by a curvature that is only
+        # rounding.
+        size = np.maximum(
+            np.abs(curvature),
+            1e-14 * np.maximum(np.abs(curvature).max(axis=1, keepdims=True), 1e-300),
+        )
+        step = -(
+            axes
+            @ (
+                (np.swapaxes(axes, 1, 2) @ gradient[:, :, None])
+                / (size + damping[:, None])[:, :, None]
+            )
+        )[:, :, 0]
         length = np.linalg.norm(step, axis=1)
         step *= np.minimum(1.0, 1.0 / np.maximum(length, 1e-300))[:, None]
         trial = rotation @ se3.rotation_exp(step)
@@ -199,10 +232,13 @@ def minimise(Q, rotation_start, max_steps=_MAX_NEWTON_STEPS):
         small = length < _STEP_TOLERANCE
         better = (trial_value < value) & ~converged
         scale = np.abs(curvature).max(axis=1)
-        # At the rounding level the value no longer falls; a tiny step that does not raise it noticeably is the end.
+        # At the rounding level the value no longer falls; a tiny step that does not raise it
+        # noticeably is the end.
         stalled = ~better & (0.5 * scale * length**2 <= 1e-15 * (np.abs(value) + np.abs(constant)))
         converged |= small | stalled
-        damping = np.where(better, 0.25 * damping * (damping > 1e-9 * scale), np.maximum(4 * damping, 1e-3 * scale))
+        damping = np.where(
+            better, 0.25 * damping * (damping > 1e-9 * scale), np.maximum(4 * damping, 1e-3 * scale)
+        )
         pick = better[:, None, None]
         rotation = np.where(pick, trial, rotation)
         hessian = np.where(pick, trial_hessian, hessian)
@@ -210,11 +246,17 @@ def minimise(Q, rotation_start, max_steps=_MAX_NEWTON_STEPS):
         value = np.where(better, trial_value, value)
     rotation_vec = np.concatenate([rotation.reshape(-1, 9), np.ones((len(rotation), 1))], axis=1)
     translation = -(gain @ Q_translation_rest @ rotation_vec[:, :, None])[:, :, 0]
-    return Minimum(se3.from_rotation_translation(rotation, translation), value + constant, converged, iterations)
+    return Minimum(
+        se3.from_rotation_translation(rotation, translation),
+        value + constant,
+        converged,
+        iterations,
+    )
 
 
 def gauss_newton_step(Q, Ts_parent_child):
-    """One Gauss-Newton step of every form from its own transform: cheap, for searches that are polished afterwards.
+    """One Gauss-Newton step of every form from its own transform: cheap, for searches that are
+    polished afterwards.
 
     Parameters
     ----------
@@ -230,7 +272,8 @@ def gauss_newton_step(Q, Ts_parent_child):
     # The derivatives of x along the six tangents at X, and x itself, are linear in X.
     tangents = (Ts_parent_child.reshape(n_forms, 16) @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
     normal = tangents @ Q @ tangents.transpose(0, 2, 1)
-    # Enough damping to keep directions that the pairs do not see where they are, too little to slow down the others.
+    # Enough damping to keep directions that the pairs do not see where they are, too little to slow
+    # down the others.
     diagonal = normal.reshape(n_forms, 49)[:, :48:8]
     diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-300
     step = np.linalg.solve(normal[:, :6, :6], -normal[:, :6, 6:])
@@ -241,7 +284,8 @@ def gauss_newton_step(Q, Ts_parent_child):
 
 
 _IDENTITY = np.eye(4)
-# (6, 16): a tangent (rho, phi) times it gives the matrix D of ``X D``, the derivative of X along it.
+# (6, 16): a tangent (rho, phi) times it gives the matrix D of ``X D``, the derivative of X along
+# it.
 _TWISTS = np.zeros((6, 4, 4))
 _TWISTS[[0, 1, 2], [0, 1, 2], 3] = 1.0
 _TWISTS[3:, :3, :3] = _GENERATORS
@@ -252,7 +296,9 @@ _TWISTS = _TWISTS.reshape(6, 16)
 
 
 def _derivatives(S, linear, rotation):
-    """Value, gradient (B, 3) and Hessian (B, 3, 3) of ``r^T S r + 2 linear^T r`` under ``R Exp(phi)`` at phi = 0."""
+    """Value, gradient (B, 3) and Hessian (B, 3, 3) of ``r^T S r + 2 linear^T r`` under ``R
+    Exp(phi)`` at phi = 0.
+    """
     flat = rotation.reshape(-1, 9)
     S_flat = (S @ flat[:, :, None])[:, :, 0]
     value = ((S_flat + 2 * linear) * flat).sum(axis=1)

@@ -38,7 +38,9 @@ class Method:
 
     def __post_init__(self):
         if self.name not in ("dnl", "dnlo", *_PLAIN):
-            raise ConfigError(f"method {self.name!r} is unknown; known are dnlo, dnl, {', '.join(_PLAIN)}")
+            raise ConfigError(
+                f"method {self.name!r} is unknown; known are dnlo, dnl, {', '.join(_PLAIN)}"
+            )
         if self.backend == "ipopt" and self.name in _PLAIN:
             raise ConfigError(f"method {self.name} has no ipopt backend; only dnl and dnlo do")
 
@@ -59,11 +61,17 @@ class Method:
             Without any pair.
         """
         if len(pairs) == 0:
-            raise NotEnoughDataError("no motion pairs: there are too few common poses for the chosen reference")
+            raise NotEnoughDataError(
+                "no motion pairs: there are too few common poses for the chosen reference"
+            )
         if self.backend == "ipopt":
             from hand_eye_calib.solvers import ipopt
 
-            return ipopt.solve_dnl(pairs) if self.name == "dnl" else ipopt.solve_dnlo(pairs, *self._rejection)
+            return (
+                ipopt.solve_dnl(pairs)
+                if self.name == "dnl"
+                else ipopt.solve_dnlo(pairs, *self._rejection)
+            )
         if self.name == "dnlo":
             return dnlo.solve(pairs, *self._rejection)
         return dnl.solve(pairs) if self.name == "dnl" else _PLAIN[self.name].solve(pairs)

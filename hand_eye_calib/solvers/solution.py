@@ -12,11 +12,13 @@ class Solution:
     Attributes
     ----------
     T_parent_child : (4, 4) array
-        X. Directions that the motion does not excite at all are left at zero translation or at the start's rotation.
+        X. Directions that the motion does not excite at all are left at zero translation or at the
+        start's rotation.
     objective : float
         The method's own cost at X.
     converged : bool
-        False is an answer too: the iteration ended before it settled, and X is only the best point seen.
+        False is an answer too: the iteration ended before it settled, and X is only the best point
+        seen.
     iterations : int
         Iterations of the method's main loop.
     weights : (K,) array

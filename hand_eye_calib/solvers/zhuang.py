@@ -1,21 +1,23 @@
 """Zhuang: rotation and translation together, by Gauss-Newton on the identification Jacobian.
 
-H. Zhuang, Z. Qu, *A new identification Jacobian for robotic hand/eye calibration*, IEEE Transactions on Systems, Man, and
-Cybernetics 24(8), 1994, eqs 14-16.
+H. Zhuang, Z. Qu, *A new identification Jacobian for robotic hand/eye calibration*, IEEE
+Transactions on Systems, Man, and Cybernetics 24(8), 1994, eqs 14-16.
 
-With ``z = tan(w/2) k`` for the rotation by w about k, Cayley's formula ``R = (I - [z])^-1 (I + [z])`` makes both halves of AX = XB
-polynomial once they are multiplied by ``I - [z]``:
+With ``z = tan(w/2) k`` for the rotation by w about k, Cayley's formula ``R = (I - [z])^-1 (I +
+[z])`` makes both halves of AX = XB polynomial once they are multiplied by ``I - [z]``:
 
     f = [k_A + k_B] z + k_A - k_B                              (rotation axes: k_A = R k_B)
     g = (I - [z]) ((R_A - I) t + t_A) - (I + [z]) t_B          (translations)
 
-Both are linear in the sixteen products of (1, z) with (1, t), so the pairs are condensed once, by a QR decomposition, and an iteration costs
-the same however many there are.
+Both are linear in the sixteen products of (1, z) with (1, t), so the pairs are condensed once, by a
+QR decomposition, and an iteration costs the same however many there are.
 
-The axes enter with unit length however small the turn, and g grows with X's own rotation: where rotations are noisy or X turns far, the answer
-is biased. Half a turn between the sensors has no finite z. From the identity the iteration may also settle in a false minimum, the more often
-the farther X turns (from about 1.8 rad on): in the published results 33 rows of one simulated trajectory with an X of 3.13 rad, three noise-free
-ones among them. The answer stays the published one, but it is not called converged where the cost is lower next to park's answer.
+The axes enter with unit length however small the turn, and g grows with X's own rotation: where
+rotations are noisy or X turns far, the answer is biased. Half a turn between the sensors has no
+finite z. From the identity the iteration may also settle in a false minimum, the more often the
+farther X turns (from about 1.8 rad on): in the published results 33 rows of one simulated
+trajectory with an X of 3.13 rad, three noise-free ones among them. The answer stays the published
+one, but it is not called converged where the cost is lower next to park's answer.
 """
 
 import numpy as np
@@ -27,10 +29,12 @@ from hand_eye_calib.solvers.solution import Solution
 _MAX_ITERATIONS = 500
 _STEP_TOLERANCE = 1e-8
 
-# Singular values of the Jacobian below this share of the largest are directions the motion does not show: left where they are.
+# Singular values of the Jacobian below this share of the largest are directions the motion does not
+# show: left where they are.
 _RANK_TOLERANCE = 1e-12
 
-# By how much a cost must be lower to be a lower minimum: a share of the cost, and residuals as a share of the data.
+# By how much a cost must be lower to be a lower minimum: a share of the cost, and residuals as a
+# share of the data.
 _LOWER = 1e-6
 _ROUNDING = 1e-12
 
@@ -46,11 +50,14 @@ def solve(pairs):
     Returns
     -------
     Solution
-        ``objective`` is the sum of ``|f|^2 + |g|^2``. ``converged`` is false where the iteration did not settle, or settled in a false minimum.
+        ``objective`` is the sum of ``|f|^2 + |g|^2``. ``converged`` is false where the iteration
+        did not settle, or settled in a false minimum.
     """
     residual_of_products = _condense(pairs)
     parameters, objective, settled, iterations = _gauss_newton(residual_of_products, np.zeros(6))
-    _, elsewhere, _, _ = _gauss_newton(residual_of_products, _parameters(park.solve(pairs).T_parent_child))
+    _, elsewhere, _, _ = _gauss_newton(
+        residual_of_products, _parameters(park.solve(pairs).T_parent_child)
+    )
     rounding = _ROUNDING**2 * float((residual_of_products**2).sum())
     lowest = objective <= elsewhere / (1 - _LOWER) + rounding
     T_parent_child = se3.from_rotation_translation(_rotation(parameters[:3]), parameters[3:])
@@ -58,12 +65,18 @@ def solve(pairs):
 
 
 def _gauss_newton(residual_of_products, parameters):
-    """Where the iteration ends: (z, t) (6,), the cost there, whether it settled, and the number of iterations."""
+    """Where the iteration ends: (z, t) (6,), the cost there, whether it settled, and the number of
+    iterations.
+    """
     settled, iterations = False, 0
     while iterations < _MAX_ITERATIONS and not settled:
         iterations += 1
         products, derivative = _products(parameters)
-        step = np.linalg.lstsq(residual_of_products @ derivative, -residual_of_products @ products, rcond=_RANK_TOLERANCE)[0]
+        step = np.linalg.lstsq(
+            residual_of_products @ derivative,
+            -residual_of_products @ products,
+            rcond=_RANK_TOLERANCE,
+        )[0]
         parameters = parameters + step
         settled = bool((np.abs(step) < _STEP_TOLERANCE).all())
     residuals = residual_of_products @ _products(parameters)[0]
@@ -71,11 +84,18 @@ def _gauss_newton(residual_of_products, parameters):
 
 
 def _condense(pairs):
-    """Matrix (at most 20, 16) that turns the products into residuals with the same squared length as all f and g together."""
-    rotation_parent, translation_parent = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_parenti_parentj[:, :3, 3]
+    """Matrix (at most 20, 16) that turns the products into residuals with the same squared length
+    as all f and g together.
+    """
+    rotation_parent, translation_parent = (
+        pairs.Ts_parenti_parentj[:, :3, :3],
+        pairs.Ts_parenti_parentj[:, :3, 3],
+    )
     translation_child = pairs.Ts_childi_childj[:, :3, 3]
     axes_parent, axes_child = _axes(rotation_parent), _axes(pairs.Ts_childi_childj[:, :3, :3])
-    f = np.concatenate([(axes_parent - axes_child)[:, :, None], se3.skew(axes_parent + axes_child)], axis=2)
+    f = np.concatenate(
+        [(axes_parent - axes_child)[:, :, None], se3.skew(axes_parent + axes_child)], axis=2
+    )
     g = np.zeros((len(pairs), 3, 4, 4))
     g[..., 1:] = (rotation_parent - np.eye(3))[:, :, None]
     g[:, :, 0, 0] = translation_parent - translation_child
@@ -111,4 +131,6 @@ def _parameters(T_parent_child):
     """(z, t) (6,) of a transform, the inverse of ``_rotation`` for z."""
     rotvec = se3.rotation_log(T_parent_child[:3, :3])
     angle = np.linalg.norm(rotvec)
-    return np.append(rotvec * (np.tan(angle / 2) / angle if angle > 0.0 else 0.5), T_parent_child[:3, 3])
+    return np.append(
+        rotvec * (np.tan(angle / 2) / angle if angle > 0.0 else 0.5), T_parent_child[:3, 3]
+    )

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
 
-from hand_eye_calib.calibrator import Calibrator, UnusablePose
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.calibrator import Calibrator, UnusablePose
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -17,7 +17,9 @@ CONFIG = CalibratorConfig(reference="B3", max_gap=0.15)
 
 
 def messages():
-    """Both at 10 Hz, 30 ms apart; the child lies on the parent's geodesics, so that interpolating the parent is exact."""
+    """Both at 10 Hz, 30 ms apart; the child lies on the parent's geodesics, so that interpolating
+    the parent is exact.
+    """
     parent = as_trajectory(wandering_poses(60))
     between = parent.stamps_ns[:-1] + 30_000_000
     streams = {"parent": parent, "child": Trajectory(between, child_of(parent.at(between)))}
@@ -25,7 +27,10 @@ def messages():
         (stream, stamp_ns, tuple(pose[:3, 3]), tuple(quat))
         for stream, trajectory in streams.items()
         for stamp_ns, pose, quat in zip(
-            trajectory.stamps_ns.tolist(), trajectory.poses, se3.to_quat_xyzw(trajectory.poses), strict=True
+            trajectory.stamps_ns.tolist(),
+            trajectory.poses,
+            se3.to_quat_xyzw(trajectory.poses),
+            strict=True,
         )
     ]
 
@@ -54,7 +59,9 @@ def test_any_interleaving_gives_the_same_bits(random):
 
 
 @settings(max_examples=25)
-@given(st.lists(st.sampled_from(MESSAGES), min_size=1, max_size=40), st.randoms(use_true_random=False))
+@given(
+    st.lists(st.sampled_from(MESSAGES), min_size=1, max_size=40), st.randoms(use_true_random=False)
+)
 def test_repetitions_change_nothing_and_are_counted(repeated, random):
     sequence = MESSAGES + repeated
     random.shuffle(sequence)
@@ -71,7 +78,10 @@ def test_a_gap_leaves_pairs_out_but_invents_none(first, length, random):
     random.shuffle(kept)
     result, calibrator, _ = estimate(kept)
     assert result.n_poses <= IN_ORDER.n_poses
-    stamps = {stream: {message[1] for message in kept if message[0] == stream} for stream in ("parent", "child")}
+    stamps = {
+        stream: {message[1] for message in kept if message[0] == stream}
+        for stream in ("parent", "child")
+    }
     assert set(calibrator.snapshot().pose_pairs().stamps_ns.tolist()) <= stamps["child"]
     np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
@@ -93,7 +103,9 @@ def fed_at_once(names, stamps_ns, poses, cuts):
     for first, last in pairwise([0, *cuts, len(names)]):
         part = slice(first, last)
         try:
-            taken += calibrator.add_poses(names[part], stamps_ns[part], poses[part, :3], poses[part, 3:]).tolist()
+            taken += calibrator.add_poses(
+                names[part], stamps_ns[part], poses[part, :3], poses[part, 3:]
+            ).tolist()
         except UnusablePose as error:
             return calibrator, error.index + first, str(error)
     return calibrator, taken, None
@@ -108,21 +120,32 @@ def assert_same_state(first, second):
 
 NUMBERS = st.one_of(st.floats(-5, 5), st.sampled_from([np.nan, np.inf, 1.7e308]))
 QUATERNIONS = st.sampled_from([(0.0, 0.0, 0.0, 1.0), (0.6, 0.0, 0.0, 0.8), (0.0, 0.0, 0.0, 1.009)])
-BAD_QUATERNIONS = st.sampled_from([(0.0, 0.0, 0.0, 1.02), (0.0, 0.0, 0.0, 0.0), (np.nan,) * 4, (1e200,) * 4])
+BAD_QUATERNIONS = st.sampled_from(
+    [(0.0, 0.0, 0.0, 1.02), (0.0, 0.0, 0.0, 0.0), (np.nan,) * 4, (1e200,) * 4]
+)
 
 
 @settings(max_examples=60)
 @given(st.data())
 def test_many_poses_at_once_are_the_same_as_one_by_one(data):
-    """Statistics, waiting poses and pairs to the last bit; or the same error at the same pose, with all before it taken."""
-    names = data.draw(st.lists(st.sampled_from(["parent", "child"]), min_size=1, max_size=60)) * data.draw(st.integers(1, 90))
+    """Statistics, waiting poses and pairs to the last bit; or the same error at the same pose, with
+    all before it taken.
+    """
+    names = data.draw(
+        st.lists(st.sampled_from(["parent", "child"]), min_size=1, max_size=60)
+    ) * data.draw(st.integers(1, 90))
     steps = data.draw(st.lists(st.integers(-3, 12), min_size=1, max_size=20))
     stamps_ns = 10_000_000 * np.cumsum(np.resize(steps, len(names)))
     places = data.draw(st.lists(st.tuples(st.floats(-5, 5), QUATERNIONS), min_size=1, max_size=40))
     poses = np.resize([(x, 0.0, 0.0, *quat_xyzw) for x, quat_xyzw in places], (len(names), 7))
     if data.draw(st.booleans()):
         wrong = data.draw(st.integers(0, len(names) - 1))
-        poses[wrong] = [data.draw(NUMBERS), 0.0, 0.0, *data.draw(st.one_of(QUATERNIONS, BAD_QUATERNIONS))]
+        poses[wrong] = [
+            data.draw(NUMBERS),
+            0.0,
+            0.0,
+            *data.draw(st.one_of(QUATERNIONS, BAD_QUATERNIONS)),
+        ]
     one_by_one, taken, refused = fed_one_by_one(names, stamps_ns, poses)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(names)), max_size=3)))
     at_once, taken_at_once, refused_at_once = fed_at_once(names, stamps_ns, poses, cuts)
@@ -132,16 +155,27 @@ def test_many_poses_at_once_are_the_same_as_one_by_one(data):
 
 
 def test_many_poses_of_a_long_session_are_the_same_as_one_by_one():
-    """Far beyond the size of the waiting room, where poses are made into pairs and let go, at last without a partner."""
+    """Far beyond the size of the waiting room, where poses are made into pairs and let go, at last
+    without a partner.
+    """
     random = np.random.default_rng(4)
     names = np.where(random.random(60_000) < np.linspace(0.2, 1.8, 60_000), "parent", "child")
     stamps_ns = np.cumsum(random.integers(0, 20_000_000, len(names)))
-    stamps_ns[random.choice(len(names), 300, replace=False)] -= random.integers(0, 60_000_000_000, 300)
+    stamps_ns[random.choice(len(names), 300, replace=False)] -= random.integers(
+        0, 60_000_000_000, 300
+    )
     positions = np.cumsum(random.normal(size=(len(names), 3)) * 0.01, axis=0)
     poses = np.concatenate([positions, np.tile([0.6, 0.0, 0.0, 0.8], (len(names), 1))], axis=1)
     one_by_one, taken, _ = fed_one_by_one(names.tolist(), stamps_ns, poses)
     at_once, taken_at_once, _ = fed_at_once(names, stamps_ns, poses, range(7001, len(names), 7001))
     statistics = one_by_one.statistics("parent")
-    assert min(statistics.refused_late, statistics.dropped_unpaired, len(one_by_one.state()["kept.stamps_ns"])) > 10
+    assert (
+        min(
+            statistics.refused_late,
+            statistics.dropped_unpaired,
+            len(one_by_one.state()["kept.stamps_ns"]),
+        )
+        > 10
+    )
     assert taken_at_once == taken
     assert_same_state(at_once, one_by_one)

@@ -34,14 +34,18 @@ def test_exp_agrees_with_the_matrix_exponential(xi):
 
     generator = np.zeros((4, 4))
     generator[:3, :3], generator[:3, 3] = se3.skew(xi[3:]), xi[:3]
-    np.testing.assert_allclose(se3.exp(xi), expm(generator), atol=1e-11 * (1 + np.abs(xi).max()), rtol=0)
+    np.testing.assert_allclose(
+        se3.exp(xi), expm(generator), atol=1e-11 * (1 + np.abs(xi).max()), rtol=0
+    )
 
 
 @given(tangents(), tangents())
 def test_adjoint_moves_a_twist_across_a_transform(xi, pose_xi):
     T = se3.exp(pose_xi)
     small = 1e-3 * xi / (1 + np.linalg.norm(xi))
-    np.testing.assert_allclose(T @ se3.exp(small), se3.exp(se3.adjoint(T) @ small) @ T, atol=1e-9, rtol=1e-9)
+    np.testing.assert_allclose(
+        T @ se3.exp(small), se3.exp(se3.adjoint(T) @ small) @ T, atol=1e-9, rtol=1e-9
+    )
 
 
 @given(tangents())
@@ -53,7 +57,9 @@ def test_inverse_and_quaternions_go_round(xi):
 
 @given(tangents())
 def test_rotation_angle_is_the_length_of_the_rotation_vector(xi):
-    np.testing.assert_allclose(se3.rotation_angle(se3.exp(xi)[:3, :3]), np.linalg.norm(xi[3:]), rtol=1e-7, atol=1e-15)
+    np.testing.assert_allclose(
+        se3.rotation_angle(se3.exp(xi)[:3, :3]), np.linalg.norm(xi[3:]), rtol=1e-7, atol=1e-15
+    )
 
 
 @given(tangents(), tangents(), st.floats(0, 1))
@@ -62,7 +68,9 @@ def test_interpolation_runs_at_constant_twist(start_xi, step_xi, fraction):
     end = start @ se3.exp(step_xi)
     between = se3.interpolate(start, end, fraction)
     np.testing.assert_allclose(
-        se3.log(se3.inverse(start) @ between), fraction * step_xi, atol=1e-7 * (1 + np.abs(step_xi).max())
+        se3.log(se3.inverse(start) @ between),
+        fraction * step_xi,
+        atol=1e-7 * (1 + np.abs(step_xi).max()),
     )
 
 
@@ -77,9 +85,19 @@ def test_conversions_agree_with_scipy(direction, angle):
 
     quat = unit_quat(direction, angle)
     rotation = Rotation.from_quat(quat)
-    np.testing.assert_allclose(se3.from_quat_xyzw(np.zeros(3), 3.0 * quat)[:3, :3], rotation.as_matrix(), atol=1e-14, rtol=0)
-    np.testing.assert_allclose(se3.rotation_exp(rotation.as_rotvec()), rotation.as_matrix(), atol=1e-14, rtol=0)
-    found, expected = se3.to_quat_xyzw(rotation.as_matrix()), Rotation.from_matrix(rotation.as_matrix()).as_quat()
+    np.testing.assert_allclose(
+        se3.from_quat_xyzw(np.zeros(3), 3.0 * quat)[:3, :3],
+        rotation.as_matrix(),
+        atol=1e-14,
+        rtol=0,
+    )
+    np.testing.assert_allclose(
+        se3.rotation_exp(rotation.as_rotvec()), rotation.as_matrix(), atol=1e-14, rtol=0
+    )
+    found, expected = (
+        se3.to_quat_xyzw(rotation.as_matrix()),
+        Rotation.from_matrix(rotation.as_matrix()).as_quat(),
+    )
     assert found[3] >= 0.0
     np.testing.assert_allclose(found * np.sign(found @ expected), expected, atol=1e-14, rtol=0)
 
@@ -93,13 +111,18 @@ def test_roll_pitch_yaw_agree_with_scipy_up_to_gimbal_lock(roll, pitch, yaw):
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
-    np.testing.assert_allclose(se3.rotation_from_rpy([roll, pitch, yaw]), rotation, atol=1e-14, rtol=0)
+    np.testing.assert_allclose(
+        se3.rotation_from_rpy([roll, pitch, yaw]), rotation, atol=1e-14, rtol=0
+    )
     found = se3.rotation_to_rpy(rotation)
     np.testing.assert_allclose(se3.rotation_from_rpy(found), rotation, atol=1e-14, rtol=0)
     if abs(pitch) < 1.51:
         # Half a turn may come out with either sign; near gimbal lock the digits of roll and yaw go.
         np.testing.assert_allclose(
-            np.exp(1j * found), np.exp(1j * np.array([roll, pitch, yaw])), atol=1e-14 / np.cos(pitch), rtol=0
+            np.exp(1j * found),
+            np.exp(1j * np.array([roll, pitch, yaw])),
+            atol=1e-14 / np.cos(pitch),
+            rtol=0,
         )
     else:
         assert found[2] == 0.0
@@ -120,7 +143,9 @@ def test_conversions_of_a_stack_are_those_of_each_and_empty_stacks_stay_empty():
         (se3.rotation_to_rpy, rotations),
         (se3.rotation_from_rpy, vectors),
     ):
-        np.testing.assert_allclose(convert(stack), [[convert(one) for one in row] for row in stack], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(
+            convert(stack), [[convert(one) for one in row] for row in stack], rtol=0, atol=1e-15
+        )
         assert len(convert(stack[:0])) == 0
 
 
@@ -133,7 +158,9 @@ def test_rotation_log_agrees_with_scipy_up_to_exact_half_turns(direction, angle)
     rotation = half_turn if angle == np.pi else se3.rotation_exp(angle * axis)
     found, expected = se3.rotation_log(rotation), Rotation.from_matrix(rotation).as_rotvec()
     # At half a turn both signs are right.
-    np.testing.assert_allclose(min(found, -found, key=lambda v: np.abs(v - expected).max()), expected, atol=1e-14)
+    np.testing.assert_allclose(
+        min(found, -found, key=lambda v: np.abs(v - expected).max()), expected, atol=1e-14
+    )
     if angle < np.pi:
         assert found @ expected >= 0.0
 
@@ -148,7 +175,9 @@ def test_rotation_log_of_a_stack_is_that_of_each():
 def test_cross_products_are_numpys():
     left, right = np.random.default_rng(2).normal(size=(2, 4, 5, 3))
     np.testing.assert_allclose(se3.cross(left, right), np.cross(left, right), rtol=0, atol=1e-15)
-    np.testing.assert_allclose(se3.cross(left[0, 0], right[0, 0]), np.cross(left[0, 0], right[0, 0]), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        se3.cross(left[0, 0], right[0, 0]), np.cross(left[0, 0], right[0, 0]), rtol=0, atol=1e-15
+    )
 
 
 @given(DIRECTIONS, st.floats(1e-6, np.pi - 1e-6), st.sampled_from([-3.0, -1.0, 0.5]))

@@ -1,4 +1,6 @@
-"""What every solver must do whatever the data: find the truth, respect frames and order, and survive motion that shows nothing."""
+"""What every solver must do whatever the data: find the truth, respect frames and order, and
+survive motion that shows nothing.
+"""
 
 import numpy as np
 import pytest
@@ -27,21 +29,31 @@ def vectors(coordinates):
     return st.tuples(coordinates, coordinates, coordinates).map(np.array)
 
 
-# Zhuang's start, the identity, leads to the truth where the sensors are turned by no more than this (rad); beyond, it may miss it.
+# Zhuang's start, the identity, leads to the truth where the sensors are turned by no more than this
+# (rad); beyond, it may miss it.
 ZHUANG_IS_SURE_TO = 1.6
 
 transforms = st.builds(
-    lambda t, w: se3.from_rotation_translation(se3.rotation_exp(w), t), vectors(coordinate), vectors(rotation_coordinate)
+    lambda t, w: se3.from_rotation_translation(se3.rotation_exp(w), t),
+    vectors(coordinate),
+    vectors(rotation_coordinate),
 )
-rotations = st.builds(lambda w: se3.from_rotation_translation(se3.rotation_exp(w), np.zeros(3)), vectors(rotation_coordinate))
+rotations = st.builds(
+    lambda w: se3.from_rotation_translation(se3.rotation_exp(w), np.zeros(3)),
+    vectors(rotation_coordinate),
+)
 seeds = st.integers(0, 2**32 - 1)
 
 
 def drive(seed):
-    """Poses (N_POSES, 4, 4) of a body that moves up to 2 m and turns up to 0.8 rad per axis from pose to pose."""
+    """Poses (N_POSES, 4, 4) of a body that moves up to 2 m and turns up to 0.8 rad per axis from
+    pose to pose.
+    """
     random = np.random.default_rng(seed)
     poses = [np.eye(4)]
-    for step in random.uniform([-2, -2, -2, -0.8, -0.8, -0.8], [2, 2, 2, 0.8, 0.8, 0.8], (N_POSES - 1, 6)):
+    for step in random.uniform(
+        [-2, -2, -2, -0.8, -0.8, -0.8], [2, 2, 2, 0.8, 0.8, 0.8], (N_POSES - 1, 6)
+    ):
         poses.append(poses[-1] @ se3.exp(step))
     return np.array(poses)
 
@@ -49,7 +61,9 @@ def drive(seed):
 def trajectories(seed, T_parent_child, noise=0.0):
     """Poses of both sensors in their own worlds; noise in m and rad on each pose of each."""
     Ts_pw_p = drive(seed)
-    parent_noise, child_noise = se3.exp(noise * np.random.default_rng([seed, 1]).normal(size=(2, N_POSES, 6)))
+    parent_noise, child_noise = se3.exp(
+        noise * np.random.default_rng([seed, 1]).normal(size=(2, N_POSES, 6))
+    )
     return Ts_pw_p @ parent_noise, Ts_pw_p @ T_parent_child @ child_noise
 
 
@@ -87,19 +101,32 @@ def test_worlds_do_not_matter(method, seed, truth, parent_world, child_world):
 @pytest.mark.parametrize("method", PAPER_METHODS)
 @few_examples
 @given(seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=transforms)
-def test_answer_follows_the_sensor_frames_without_noise(method, seed, truth, T_parent_new, T_child_new):
+def test_answer_follows_the_sensor_frames_without_noise(
+    method, seed, truth, T_parent_new, T_child_new
+):
     expected = se3.inverse(T_parent_new) @ truth @ T_child_new
     assume(method != "zhuang" or rotation_angle(expected) < ZHUANG_IS_SURE_TO)
     Ts_pw_p, Ts_cw_c = trajectories(seed, truth)
-    np.testing.assert_allclose(answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6
+    )
 
 
 @few_examples
-@given(seed=seeds, axis=vectors(rotation_coordinate), angle=st.floats(2.4, 3.1), shift=vectors(coordinate))
+@given(
+    seed=seeds,
+    axis=vectors(rotation_coordinate),
+    angle=st.floats(2.4, 3.1),
+    shift=vectors(coordinate),
+)
 def test_zhuang_knows_a_false_minimum(seed, axis, angle, shift):
-    """Sensors that face almost opposite ways: from the identity it often misses the truth, but then says so."""
+    """Sensors that face almost opposite ways: from the identity it often misses the truth, but then
+    says so.
+    """
     assume(np.linalg.norm(axis) > 0.1)
-    truth = se3.from_rotation_translation(se3.rotation_exp(angle * axis / np.linalg.norm(axis)), shift)
+    truth = se3.from_rotation_translation(
+        se3.rotation_exp(angle * axis / np.linalg.norm(axis)), shift
+    )
     solution = Method("zhuang").solve(motion_pairs(*trajectories(seed, truth), "B1"))
     assert solution.converged == np.allclose(solution.T_parent_child, truth, atol=1e-6)
 
@@ -107,32 +134,43 @@ def test_zhuang_knows_a_false_minimum(seed, axis, angle, shift):
 @pytest.mark.parametrize("method", [name for name in SUMMING_METHODS if name != "zhuang"])
 @few_examples
 @given(seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=rotations)
-def test_answer_follows_the_sensor_frames_with_noise(method, seed, truth, T_parent_new, T_child_new):
+def test_answer_follows_the_sensor_frames_with_noise(
+    method, seed, truth, T_parent_new, T_child_new
+):
     """With M = AX - XB of the old frames, the new frames have ``inv(T_parent_new) M T_child_new``.
 
-    Its translation is turned and its rotation part keeps its size, so every cost stays what it was - as long as the child's frame only turns:
-    a shifted child's frame adds a part of the rotation residual to the translation residual, and the best compromise moves.
+    Its translation is turned and its rotation part keeps its size, so every cost stays what it was
+    - as long as the child's frame only turns: a shifted child's frame adds a part of the rotation
+    residual to the translation residual, and the best compromise moves.
     """
     Ts_pw_p, Ts_cw_c = trajectories(seed, truth, noise=0.01)
     expected = se3.inverse(T_parent_new) @ answer(method, Ts_pw_p, Ts_cw_c) @ T_child_new
-    np.testing.assert_allclose(answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6
+    )
 
 
 @few_examples
 @given(seed=seeds, truth=transforms, turn=rotations, shift=vectors(coordinate))
 def test_zhuang_follows_a_turn_of_both_sensors_with_noise(seed, truth, turn, shift):
-    """Its residuals are scaled by ``1 + |z|^2``, which only turning both frames alike leaves as it is; the parent's may also be shifted."""
+    """Its residuals are scaled by ``1 + |z|^2``, which only turning both frames alike leaves as it
+    is; the parent's may also be shifted.
+    """
     Ts_pw_p, Ts_cw_c = trajectories(seed, truth, noise=0.01)
     T_parent_new = turn.copy()
     T_parent_new[:3, 3] = shift
     expected = se3.inverse(T_parent_new) @ answer("zhuang", Ts_pw_p, Ts_cw_c) @ turn
-    np.testing.assert_allclose(answer("zhuang", Ts_pw_p @ T_parent_new, Ts_cw_c @ turn), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        answer("zhuang", Ts_pw_p @ T_parent_new, Ts_cw_c @ turn), expected, atol=1e-6
+    )
 
 
 @few_examples
 @given(seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=rotations)
 def test_dnlo_follows_the_sensor_frames_with_outliers(seed, truth, T_parent_new, T_child_new):
-    """Its costs are dnl's; with two pairs that are plainly wrong its answer is that of the others, in any frames."""
+    """Its costs are dnl's; with two pairs that are plainly wrong its answer is that of the others,
+    in any frames.
+    """
     Ts_pw_p, Ts_cw_c = trajectories(seed, truth, noise=1e-4)
     Ts_cw_c[5:, :3, 3] += [30.0, 0.0, 0.0]
     Ts_cw_c[9:, :3, 3] += [0.0, 30.0, 0.0]
@@ -140,17 +178,23 @@ def test_dnlo_follows_the_sensor_frames_with_outliers(seed, truth, T_parent_new,
     solution = Method("dnlo").solve(pairs)
     np.testing.assert_array_equal(np.flatnonzero(solution.weights == 0.0), [4, 8])
     np.testing.assert_allclose(
-        solution.T_parent_child, Method("dnl").solve(pairs[solution.weights > 0]).T_parent_child, atol=1e-6
+        solution.T_parent_child,
+        Method("dnl").solve(pairs[solution.weights > 0]).T_parent_child,
+        atol=1e-6,
     )
     expected = se3.inverse(T_parent_new) @ solution.T_parent_child @ T_child_new
-    np.testing.assert_allclose(answer("dnlo", Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        answer("dnlo", Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("method", PAPER_METHODS)
 @few_examples
 @given(seed=seeds, truth=transforms, order=st.permutations(range(N_POSES - 1)))
 def test_order_of_the_pairs_does_not_matter(method, seed, truth, order):
-    pairs = motion_pairs(*trajectories(seed, truth, noise=0.01 if method in SUMMING_METHODS else 0.0), "B1")
+    pairs = motion_pairs(
+        *trajectories(seed, truth, noise=0.01 if method in SUMMING_METHODS else 0.0), "B1"
+    )
     ours, reordered = Method(method).solve(pairs), Method(method).solve(pairs[np.array(order)])
     np.testing.assert_allclose(reordered.T_parent_child, ours.T_parent_child, atol=1e-6)
     assert reordered.objective == pytest.approx(ours.objective, rel=1e-6, abs=1e-12)
@@ -162,10 +206,12 @@ def test_each_cost_is_lowest_at_its_own_method(seed, truth):
     pairs = motion_pairs(*trajectories(seed, truth, noise=0.03), "B1")
     found = {method: Method(method).solve(pairs) for method in PAPER_METHODS}
     for solution in found.values():
-        assert found["dnl"].objective <= pair_costs(pairs, solution.T_parent_child).sum() * (1 + 1e-9)
-        assert found["dnlo"].objective <= np.minimum(pair_costs(pairs, solution.T_parent_child), 0.01).sum() * (1 + 1e-9) or (
-            found["dnlo"].weights.sum() < (len(pairs) + 1) / 2
+        assert found["dnl"].objective <= pair_costs(pairs, solution.T_parent_child).sum() * (
+            1 + 1e-9
         )
+        assert found["dnlo"].objective <= np.minimum(
+            pair_costs(pairs, solution.T_parent_child), 0.01
+        ).sum() * (1 + 1e-9) or (found["dnlo"].weights.sum() < (len(pairs) + 1) / 2)
     assert found["ali"].objective <= found["park"].objective * (1 + 1e-9)
 
 
@@ -176,7 +222,11 @@ def along(axis, amounts):
 def degenerate_motions(kind, seed):
     """Tangent vectors (K, 6) of motions that leave part of X, or all of it, unseen."""
     random = np.random.default_rng(seed)
-    shifts, turns, amounts = random.uniform(-1, 1, (12, 3)), random.uniform(-1, 1, (12, 3)), random.uniform(-1, 1, 12)
+    shifts, turns, amounts = (
+        random.uniform(-1, 1, (12, 3)),
+        random.uniform(-1, 1, (12, 3)),
+        random.uniform(-1, 1, 12),
+    )
     axis = turns[0] / np.linalg.norm(turns[0])
     none = np.zeros((12, 3))
     motions = {
@@ -204,7 +254,10 @@ def degenerate_motions(kind, seed):
     ],
 )  # fmt: skip
 @settings(max_examples=8)
-@given(seed=seeds, truth=st.one_of(transforms, st.just(np.eye(4)), st.just(np.diag([1.0, -1.0, -1.0, 1.0]))))
+@given(
+    seed=seeds,
+    truth=st.one_of(transforms, st.just(np.eye(4)), st.just(np.diag([1.0, -1.0, -1.0, 1.0]))),
+)
 def test_degenerate_motion_gives_a_rigid_transform(method, kind, seed, truth):
     Ts_parent = se3.exp(degenerate_motions(kind, seed))
     index = np.arange(len(Ts_parent))
@@ -231,7 +284,9 @@ def test_no_pairs_is_a_clear_error(method):
 @few_examples
 @given(seed=seeds, yaw=st.floats(-1.5, 1.5), shift=vectors(coordinate))
 def test_planar_motion_still_shows_what_it_can(method, seed, yaw, shift):
-    """A vehicle on flat ground: the height is left near zero instead of blowing up, and methods that use all residuals find the rest."""
+    """A vehicle on flat ground: the height is left near zero instead of blowing up, and methods
+    that use all residuals find the rest.
+    """
     truth = se3.from_rotation_translation(se3.rotation_exp(np.array([0.0, 0.0, yaw])), shift)
     Ts_parent = se3.exp(degenerate_motions("plane", seed))
     index = np.arange(len(Ts_parent))

@@ -1,4 +1,6 @@
-"""One command gives the article's tables and figures from the published trajectories, and says what differs."""
+"""One command gives the article's tables and figures from the published trajectories, and says what
+differs.
+"""
 
 import csv
 import json
@@ -6,9 +8,9 @@ import json
 import pytest
 from published_data import data_folder
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.experiments.published import METHODS
-from hand_eye_calib.experiments.tables import PRINTED
+from reproduction.command import main
+from reproduction.published import METHODS
+from reproduction.tables import PRINTED
 
 # Four methods in every simulated and every KITTI case, and Ali: as published where simulated.
 ROWS_OF_FOUR_METHODS, ROWS_OF_ONE = 17_376, 4_344
@@ -16,7 +18,7 @@ ROWS_OF_FOUR_METHODS, ROWS_OF_ONE = 17_376, 4_344
 
 def run(capsys, *arguments):
     """Document printed by an experiment on the published data."""
-    assert main(["experiment", *arguments, "--data-folder", str(data_folder()), "--json"]) == 0
+    assert main([*arguments, "--data-folder", str(data_folder()), "--json"]) == 0
     return json.loads(capsys.readouterr().out)
 
 
@@ -46,7 +48,9 @@ def test_tables_1_and_2_are_as_printed(tmp_path, capsys, name, drive):
 
 
 def test_rectified_truth_explains_the_rotation_error_of_the_long_drive(tmp_path, capsys):
-    """Against the unrectified cameras every good method seems 0.43 deg off; against what the SLAM saw it is within 0.06 deg."""
+    """Against the unrectified cameras every good method seems 0.43 deg off; against what the SLAM
+    saw it is within 0.06 deg.
+    """
     run(capsys, "table2", "--out", str(tmp_path))
     errors = {line["method"]: line for line in read(tmp_path / "table2.csv")}
     assert float(errors["DNL"]["e_aR (deg)"]) > 0.4
@@ -56,9 +60,11 @@ def test_rectified_truth_explains_the_rotation_error_of_the_long_drive(tmp_path,
 def test_variant_tables_hold_every_method_on_both_drives(tmp_path, capsys):
     document = run(capsys, "s-tables", "--out", str(tmp_path))
     assert list(document["files"]) == [f"tableS{number}" for number in range(1, 13)]
-    assert {item["method"]: item["agreeing"] for item in document["agreement"] if item["method"] != "dnlo"} == dict.fromkeys(
-        ("ali", "dnl", "park", "taylor", "zhuang"), 12
-    )
+    assert {
+        item["method"]: item["agreeing"]
+        for item in document["agreement"]
+        if item["method"] != "dnlo"
+    } == dict.fromkeys(("ali", "dnl", "park", "taylor", "zhuang"), 12)
     for number in range(1, 13):
         assert len(read(tmp_path / f"tableS{number}_comparison.csv")) == 24
 
@@ -79,7 +85,14 @@ def test_everything_from_one_command(tmp_path, capsys):
     assert sum(objective.values()) == ROWS_OF_ONE
     assert objective["higher"] == 0
     assert objective["lower"] > 500
-    for figure, exact in (("figS1", 1.0), ("figS2", 0.95), ("figS3", 1.0), ("figS4", 1.0), ("figS5", 0.99), ("fig3", 0.5)):
+    for figure, exact in (
+        ("figS1", 1.0),
+        ("figS2", 0.95),
+        ("figS3", 1.0),
+        ("figS4", 1.0),
+        ("figS5", 0.99),
+        ("fig3", 0.5),
+    ):
         points = [line["agrees"] == "True" for line in read(tmp_path / f"{figure}_comparison.csv")]
         assert len(points) == 19 * 6 * 4
         assert sum(points) >= exact * len(points), figure

@@ -1,7 +1,8 @@
 """Ten faults in fifteen real recordings: found, named right, and no false alarm.
 
-The test takes every fourth cell, all faults and recordings among them; HAND_EYE_CALIB_ALL_FAULTS=1 makes it take all 150, several minutes.
-``PYTHONPATH=.:test python test/regression/test_fault_table.py`` prints the table as Markdown, for docs/stream_checks.md.
+The test takes every fourth cell, all faults and recordings among them; HAND_EYE_CALIB_ALL_FAULTS=1
+makes it take all 150, several minutes. ``PYTHONPATH=.:test python
+test/regression/test_fault_table.py`` prints the table as Markdown, for docs/stream_checks.md.
 """
 
 import os
@@ -10,21 +11,28 @@ import pytest
 import real_data
 from faults import FAULTS
 
-from hand_eye_calib.assessment.agreement import check_streams
-from hand_eye_calib.pairing.stream_checks import Severity
+from hand_eye_calib.checks.agreement import check_streams
+from hand_eye_calib.checks.findings import Severity
 
-# What is wrong with a recording by itself: the camera's stream of this one has 3 to 11 % gross jumps.
+# What is wrong with a recording by itself: the camera's stream of this one has 3 to 11 % gross
+# jumps.
 REALLY_THERE = {"primesense": {"jumps"}}
 LEAST_SHARE = 0.95
 CLEAN = "none"
 
 
 def found_codes(parent, child):
-    return {finding.code for finding in check_streams(parent, child).findings if finding.severity is not Severity.NOTE}
+    return {
+        finding.code
+        for finding in check_streams(parent, child).findings
+        if finding.severity is not Severity.NOTE
+    }
 
 
 def fault_table(every=1):
-    """Recording to fault to (whether right, what was found), of every n-th cell; no fault is ``CLEAN``."""
+    """Recording to fault to (whether right, what was found), of every n-th cell; no fault is
+    ``CLEAN``.
+    """
     recordings = real_data.all_recordings()
     table = {}
     for index, recording in enumerate(recordings):
@@ -38,7 +46,10 @@ def fault_table(every=1):
             if (index + column) % every == 0
         }
         table[recording.name] = {
-            fault: ((codes - expected) == ({FAULTS[fault][1]} if fault in FAULTS else set()), sorted(codes - expected))
+            fault: (
+                (codes - expected) == ({FAULTS[fault][1]} if fault in FAULTS else set()),
+                sorted(codes - expected),
+            )
             for fault, codes in cells.items()
         }
     return table
@@ -49,7 +60,11 @@ def as_markdown(table):
     lines = ["| Recording | " + " | ".join(columns) + " |", "|" + " --- |" * (1 + len(columns))]
     for name, cells in table.items():
         marks = [
-            "" if column not in cells else "yes" if cells[column][0] else ", ".join(cells[column][1]) or "missed"
+            ""
+            if column not in cells
+            else "yes"
+            if cells[column][0]
+            else ", ".join(cells[column][1]) or "missed"
             for column in columns
         ]
         lines.append(f"| {name.replace('<-', ' from ')} | " + " | ".join(marks) + " |")

@@ -1,7 +1,8 @@
 """The methods give the published results of Välimäki et al. 2023, row by row.
 
-A row agrees where each of its four errors is within 1e-3 relative or 1e-6 (m, deg) absolute of the published one. dnlo, whose published
-answers depend on the optimiser's build, is held to its objective elsewhere.
+A row agrees where each of its four errors is within 1e-3 relative or 1e-6 (m, deg) absolute of the
+published one. dnlo, whose published answers depend on the optimiser's build, is held to its
+objective elsewhere.
 """
 
 from dataclasses import astuple
@@ -11,15 +12,16 @@ import pytest
 from published_data import kitti_long, kitti_short, simulated
 
 from hand_eye_calib.assessment.metrics import errors
-from hand_eye_calib.experiments import ali_as_published
-from hand_eye_calib.experiments.published import REFERENCES, SIMULATED
 from hand_eye_calib.solvers import ali, dnl, park, taylor, zhuang
+from reproduction import ali_as_published
+from reproduction.published import REFERENCES, SIMULATED
 
 KITTI_SOLVERS = {"park": park, "taylor": taylor, "zhuang": zhuang, "dnl": dnl, "ali": ali}
 SIMULATION_SOLVERS = KITTI_SOLVERS | {"ali": ali_as_published}
 N_SIMULATED_ROWS = 19 * 38 * 6
 
-# Ipopt ended in a false minimum, with a rotation 170 to 178 deg off and a cost at least ten times ours.
+# Ipopt ended in a false minimum, with a rotation 170 to 178 deg off and a cost at least ten times
+# ours.
 FALSE_MINIMA_OF_DNL = {
     ("outliers/6/run_48", "A"),
     ("outliers/8/run_48", "A"),
@@ -57,7 +59,11 @@ def test_kitti_rows_agree(method, load):
 
 @pytest.fixture(scope="module")
 def sample():
-    return [*simulated(["noise"], [0.0, 0.01]), *simulated(["outliers"], [10.0]), *simulated(["mixture"])[::2]]
+    return [
+        *simulated(["noise"], [0.0, 0.01]),
+        *simulated(["outliers"], [10.0]),
+        *simulated(["mixture"])[::2],
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -87,21 +93,28 @@ def check_disagreeing(method, n_rows, disagreeing):
         assert names <= FALSE_MINIMA_OF_DNL
         for name, reference, case, solution in disagreeing:
             published = case.results["dnl", reference].T_parent_child
-            assert solution.objective < 0.1 * dnl.pair_costs(case.pairs(reference), published).sum(), (name, reference)
+            assert (
+                solution.objective < 0.1 * dnl.pair_costs(case.pairs(reference), published).sum()
+            ), (name, reference)
     elif method == "zhuang":
-        # Where the iteration never settles, the last of 500 steps may differ with the processor's rounding.
+        # Where the iteration never settles, the last of 500 steps may differ with the processor's
+        # rounding.
         assert not any(solution.converged for *_, solution in disagreeing), names
     else:
         assert names == set()
 
 
 def test_order_of_the_rows_holds_for_every_reference_and_method(sample):
-    """The order is found from park's B1 answers alone; every other park row must then be the same trajectory's."""
+    """The order is found from park's B1 answers alone; every other park row must then be the same
+    trajectory's.
+    """
     for case in sample:
         for method in ("park", "taylor"):
             for reference in REFERENCES:
                 answer = park.solve(case.pairs(reference)).T_parent_child
-                np.testing.assert_allclose(answer, case.results[method, reference].T_parent_child, rtol=1e-5, atol=1e-6)
+                np.testing.assert_allclose(
+                    answer, case.results[method, reference].T_parent_child, rtol=1e-5, atol=1e-6
+                )
 
 
 @pytest.mark.parametrize(
@@ -109,8 +122,12 @@ def test_order_of_the_rows_holds_for_every_reference_and_method(sample):
     [("outliers", 2.0, "A", 500), ("noise", 0.0, "B5", 12)],
     ids=["endless", "false minimum"],
 )
-def test_zhuang_knows_that_the_published_answer_is_no_minimum(dataset, level, reference, iterations):
-    """Trajectory run_27, whose sensors face almost opposite ways (3.13 rad); even without noise the published answer is 164 deg off."""
+def test_zhuang_knows_that_the_published_answer_is_no_minimum(
+    dataset, level, reference, iterations
+):
+    """Trajectory run_27, whose sensors face almost opposite ways (3.13 rad); even without noise the
+    published answer is 164 deg off.
+    """
     (case,) = [case for case in simulated([dataset], [level]) if case.run == "run_27"]
     solution = zhuang.solve(case.pairs(reference))
     published = case.results["zhuang", reference].T_parent_child
@@ -123,6 +140,11 @@ def test_zhuang_knows_that_the_published_answer_is_no_minimum(dataset, level, re
 def test_proper_ali_is_far_nearer_to_the_truth_than_the_published_one():
     """Noise 0.01, B1: what the article reports for Ali is the unnormalised quaternion's error."""
     cases = simulated(["noise"], [0.01])
-    ours = [errors(case.pairs("B1"), ali.solve(case.pairs("B1")).T_parent_child, case.T_parent_child).e_aR for case in cases]
+    ours = [
+        errors(
+            case.pairs("B1"), ali.solve(case.pairs("B1")).T_parent_child, case.T_parent_child
+        ).e_aR
+        for case in cases
+    ]
     published = [case.results["ali", "B1"].errors.e_aR for case in cases]
     assert np.median(ours) < 0.5 * np.median(published)

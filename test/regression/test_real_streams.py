@@ -5,13 +5,13 @@ import pytest
 import real_data
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.assessment.agreement import check_streams
+from hand_eye_calib.alignment.alignment import estimate_time_offset
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.calibrator import calibrate
+from hand_eye_calib.checks.agreement import check_streams
+from hand_eye_calib.checks.stream_checks import tidy
+from hand_eye_calib.engine.calibrator import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.stream_checks import tidy
-from hand_eye_calib.solvers.alignment import estimate_time_offset
 
 
 def rpy_deg(T):
@@ -61,7 +61,9 @@ class TestRoadVehicle:
     @pytest.mark.parametrize("bag", [1, 2, 3])
     def test_prior_holds_what_is_unobservable(self, bag):
         recording = real_data.zxl19(bag, "LO")
-        result = calibrate(recording.parent, recording.child, time_offset="estimate", **{"prior.z": "1.0+/-0.02"})
+        result = calibrate(
+            recording.parent, recording.child, time_offset="estimate", **{"prior.z": "1.0+/-0.02"}
+        )
         verdicts = {dof.name: dof for dof in result.observability}
         assert result.status is SolveStatus.OK
         assert verdicts["z"].verdict is DofVerdict.PRIOR
@@ -72,7 +74,9 @@ class TestRoadVehicle:
 
     def test_lidar_odometry_from_the_csv_exports(self):
         recording = real_data.zxl19_raw()
-        result = calibrate(recording.parent, recording.child, time_offset="estimate", reference="B10")
+        result = calibrate(
+            recording.parent, recording.child, time_offset="estimate", reference="B10"
+        )
         assert "z" in result.unobservable()
         assert rpy_deg(result.T_parent_child)[2] == pytest.approx(-90.78, abs=0.5)
         np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
@@ -111,7 +115,11 @@ class TestArms:
         recording = real_data.robot_arm("sim")
         result = calibrate(recording.parent, recording.child, time_offset="estimate")
         assert result.unobservable() == ["x"]
-        note = next(f for f in check_streams(recording.parent, recording.child).findings if f.code == "one_axis")
+        note = next(
+            f
+            for f in check_streams(recording.parent, recording.child).findings
+            if f.code == "one_axis"
+        )
         assert "(1.00, -0.01, 0.01)" in note.what
         assert "translation along it, x, will be unobservable" in note.what
 
@@ -124,7 +132,9 @@ class TestArms:
     )
     def test_gross_jumps(self, name, low, high):
         recording = real_data.primesense() if name == "primesense" else real_data.robot_arm(name)
-        result = calibrate(recording.parent, recording.child, time_offset="estimate", reference="B20")
+        result = calibrate(
+            recording.parent, recording.child, time_offset="estimate", reference="B20"
+        )
         translation = result.T_parent_child[:3, 3]
         outside = np.maximum(np.maximum(low - translation, translation - high), 0.0)
         assert outside.max() < 0.0035
@@ -134,7 +144,9 @@ class TestArms:
 
     def test_repeated_and_disordered_stamps_are_found(self):
         rows = real_data.asl_rows("asl_robot_arm", "robot_arm_sim_hand")
-        _, findings = tidy(np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:], "parent")
+        _, findings = tidy(
+            np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:], "parent"
+        )
         assert "duplicates" in [finding.code for finding in findings]
 
 

@@ -32,8 +32,21 @@ def documents(case, tmp_path_factory):
         topics = ["--parent-topic", "/lidar/odom", "--child-topic", "/camera/odom"]
         with pytest.MonkeyPatch.context() as patch:
             printed = []
-            patch.setattr("builtins.print", lambda *texts, printed=printed, **_: printed.extend(texts))
-            code = main(["replay", str(folder / name), *topics, "--method", "dnlo", "--reference", "B10", "--json"])
+            patch.setattr(
+                "builtins.print", lambda *texts, printed=printed, **_: printed.extend(texts)
+            )
+            code = main(
+                [
+                    "replay",
+                    str(folder / name),
+                    *topics,
+                    "--method",
+                    "dnlo",
+                    "--reference",
+                    "B10",
+                    "--json",
+                ]
+            )
         found[storage] = (code, json.loads("".join(printed)))
     return found
 
@@ -55,5 +68,7 @@ def test_replay_gives_the_published_errors(case, documents):
 @pytest.mark.parametrize("storage", ["sqlite3", "rosbag1"])
 def test_all_storages_give_the_same_numbers_bit_by_bit(documents, storage):
     code, document = documents[storage]
-    document = document | {"inputs": document["inputs"] | {"bag": documents["mcap"][1]["inputs"]["bag"]}}
+    document = document | {
+        "inputs": document["inputs"] | {"bag": documents["mcap"][1]["inputs"]["bag"]}
+    }
     assert (code, document) == documents["mcap"]

@@ -9,7 +9,9 @@ from ros_harness import NodeProcess, Peer, free_domain
 @pytest.fixture(scope="session", autouse=True)
 def _quick_discovery():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("discovery.xml")))
+        patch.setenv(
+            "FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("discovery.xml"))
+        )
         yield
 
 

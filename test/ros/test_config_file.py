@@ -1,6 +1,7 @@
 """config/calibrator.yaml and launch/calibrator.launch.py say what the code says.
 
-``python test/ros/test_config_file.py > config/calibrator.yaml`` writes the file anew after an option has changed.
+``python test/ros/test_config_file.py > config/calibrator.yaml`` writes the file anew after an
+option has changed.
 """
 
 import ast
@@ -20,7 +21,9 @@ HEADER = """\
 
 
 def fields():
-    return [field for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)]
+    return [
+        field for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)
+    ]
 
 
 def expected_file():
@@ -45,7 +48,9 @@ def comment_of(field):
     if meta["choices"]:
         parts.append(f"One of {', '.join(meta['choices'])}.")
     if meta["minimum"] is not None:
-        parts.append(f"{number(meta['minimum'])} to {number(meta['maximum'])} {meta['unit']}".rstrip() + ".")
+        parts.append(
+            f"{number(meta['minimum'])} to {number(meta['maximum'])} {meta['unit']}".rstrip() + "."
+        )
     if meta["read_only"]:
         parts.append("Fixed once the node runs.")
     return " ".join(parts)
@@ -74,7 +79,9 @@ def test_config_file_has_every_parameter_with_its_default_and_type():
     written = dict(flat(document["/**"]["ros__parameters"]))
     wanted = {option_name(field): field.default for field in fields()}
     assert written == wanted
-    assert {name: type(value) for name, value in written.items()} == {name: type(value) for name, value in wanted.items()}
+    assert {name: type(value) for name, value in written.items()} == {
+        name: type(value) for name, value in wanted.items()
+    }
 
 
 def test_config_file_comments_follow_the_options():
@@ -84,14 +91,21 @@ def test_config_file_comments_follow_the_options():
 def test_launch_file_starts_the_node_with_the_topics_remapped():
     path = PROJECT / "launch" / "calibrator.launch.py"
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    (node,) = [call for call in ast.walk(tree) if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Node"]
+    (node,) = [
+        call
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Node"
+    ]
     arguments = {keyword.arg: keyword.value for keyword in node.keywords}
     assert [ast.literal_eval(arguments[name]) for name in ("package", "executable", "name")] == [
         "hand_eye_calib",
         "calibrator",
         "calibrator",
     ]
-    remapped = {ast.literal_eval(pair.elts[0]): pair.elts[1].args[0].value for pair in arguments["remappings"].elts}
+    remapped = {
+        ast.literal_eval(pair.elts[0]): pair.elts[1].args[0].value
+        for pair in arguments["remappings"].elts
+    }
     assert remapped == {"parent_odom": "parent_topic", "child_odom": "child_topic"}
 
 

@@ -37,7 +37,9 @@ def test_every_pose_type_of_the_options_can_be_read():
     assert set(conversions.POSE_TYPES) | {"auto"} == set(config.POSE_TYPES)
 
 
-@pytest.mark.parametrize("kind", [Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped])
+@pytest.mark.parametrize(
+    "kind", [Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped]
+)
 def test_pose_and_frame_are_read_from_each_type(kind):
     message = kind()
     if kind is TransformStamped:
@@ -59,13 +61,17 @@ def test_pose_and_frame_are_read_from_each_type(kind):
         assert pose_type.sensor_frame is None
 
 
-@pytest.mark.parametrize("stamp_ns", [0, 1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789, -1, -1_500_000_000])
+@pytest.mark.parametrize(
+    "stamp_ns", [0, 1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789, -1, -1_500_000_000]
+)
 def test_stamps_survive_a_round_trip(stamp_ns):
     assert conversions.to_ns(conversions.to_time(stamp_ns)) == stamp_ns
 
 
 def test_nanoseconds_are_not_rounded():
-    assert conversions.to_ns(Time(sec=1_700_000_000, nanosec=123_456_789)) == 1_700_000_000_123_456_789
+    assert (
+        conversions.to_ns(Time(sec=1_700_000_000, nanosec=123_456_789)) == 1_700_000_000_123_456_789
+    )
 
 
 def test_messages_carry_frames_stamp_and_transform():
@@ -89,13 +95,17 @@ def test_covariance_is_about_the_fixed_axes_of_the_parent():
     samples = 400_000
     errors = rng.normal(size=(samples, 6)) @ factor.T
     moved = T_PARENT_CHILD @ se3.exp(errors)
-    # What a receiver of the message measures: where the origin went, and the rotation about fixed axes that took it there.
+    # What a receiver of the message measures: where the origin went, and the rotation about fixed
+    # axes that took it there.
     shift = moved[:, :3, 3] - T_PARENT_CHILD[:3, 3]
     turn = se3.rotation_log(moved[:, :3, :3] @ T_PARENT_CHILD[:3, :3].T)
     measured = np.cov(np.hstack([shift, turn]).T)
     converted = conversions.covariance_about_parent_axes(T_PARENT_CHILD, cov_in_child)
     scale = np.sqrt(np.outer(np.diag(measured), np.diag(measured)))
-    # Standard error of a sampled correlation is below 1 / sqrt(samples); five of them, and the second-order terms of exp.
-    np.testing.assert_allclose(converted / scale, measured / scale, atol=5 / np.sqrt(samples) + 5e-3)
+    # Standard error of a sampled correlation is below 1 / sqrt(samples); five of them, and the
+    # second-order terms of exp.
+    np.testing.assert_allclose(
+        converted / scale, measured / scale, atol=5 / np.sqrt(samples) + 5e-3
+    )
     # The test can tell: the unconverted covariance is far off.
     assert np.abs((cov_in_child - measured) / scale).max() > 0.3

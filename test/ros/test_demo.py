@@ -21,7 +21,8 @@ from hand_eye_calib.ros.player import Player
 # How long a hang takes to fail a test; the demo takes about 5 s.
 PATIENCE_S = 120.0
 
-# Over seeds 0 to 15 the largest errors were 10.1 mm and 0.14 deg, the medians 1.9 mm and 0.10 deg; the default seed had 2.7 mm and 0.07 deg.
+# Over seeds 0 to 15 the largest errors were 10.1 mm and 0.14 deg, the medians 1.9 mm and 0.10 deg;
+# the default seed had 2.7 mm and 0.07 deg.
 LARGEST_ERROR_M = 0.015
 LARGEST_ERROR_RAD = np.radians(0.3)
 
@@ -38,22 +39,34 @@ def run(*arguments, domain=0):
 
 
 def errors(T_parent_child, truth):
-    return np.linalg.norm(T_parent_child[:3, 3] - truth[:3, 3]), se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3])
+    return np.linalg.norm(T_parent_child[:3, 3] - truth[:3, 3]), se3.rotation_angle(
+        T_parent_child[:3, :3].T @ truth[:3, :3]
+    )
 
 
 def test_demo_recovers_the_truth_offline_and_live(tmp_path, domain):
     done = run("-m", "hand_eye_calib", "demo", "--out", tmp_path, "--json", domain=domain)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
-    truth, offline, online = (np.array(document[key]["T_parent_child"]) for key in ("truth", "offline", "online"))
-    assert (document["status"], document["parent_frame"], document["child_frame"]) == ("ok", "lidar", "camera")
+    truth, offline, online = (
+        np.array(document[key]["T_parent_child"]) for key in ("truth", "offline", "online")
+    )
+    assert (document["status"], document["parent_frame"], document["child_frame"]) == (
+        "ok",
+        "lidar",
+        "camera",
+    )
     assert document["poses"] == {"parent": DRIVE.poses, "child": 2 * DRIVE.poses}
     for key, estimate in (("offline", offline), ("online", online)):
         reported = document[key]["error"]
-        assert (reported["translation_m"], reported["rotation_rad"]) == pytest.approx(errors(estimate, truth), abs=1e-12)
+        assert (reported["translation_m"], reported["rotation_rad"]) == pytest.approx(
+            errors(estimate, truth), abs=1e-12
+        )
         assert 0.0 < reported["translation_m"] < LARGEST_ERROR_M
         assert 0.0 < reported["rotation_rad"] < LARGEST_ERROR_RAD
-        np.testing.assert_allclose(np.array(document[key]["T_child_parent"]) @ estimate, np.eye(4), atol=1e-12)
+        np.testing.assert_allclose(
+            np.array(document[key]["T_child_parent"]) @ estimate, np.eye(4), atol=1e-12
+        )
     np.testing.assert_allclose(online, offline, rtol=0, atol=1e-9)
     assert document["online"]["stamp_ns"] == document["offline"]["stamp_ns"]
 
@@ -70,13 +83,24 @@ def test_demo_prints_both_directions_and_replaces_an_earlier_demo(tmp_path, doma
     (tmp_path / "mine.txt").write_text("not of a demo")
     done = run("-m", "hand_eye_calib", "demo", "--out", tmp_path, "--seed", 3, domain=domain)
     assert done.returncode == 0, done.stderr
-    for title in ("Pose of camera in lidar", "Pose of lidar in camera", "Error of the pose of camera in lidar"):
-        (line,) = [number for number, line in enumerate(done.stdout.splitlines()) if line.startswith(title)]
+    for title in (
+        "Pose of camera in lidar",
+        "Pose of lidar in camera",
+        "Error of the pose of camera in lidar",
+    ):
+        (line,) = [
+            number for number, line in enumerate(done.stdout.splitlines()) if line.startswith(title)
+        ]
         rows = [row.strip() for row in done.stdout.splitlines()[line + 1 : line + 4]]
         assert any(row.startswith("replay of the bag") for row in rows)
         assert any(row.startswith("live node") for row in rows)
     assert "Offline and online differ by" in done.stdout
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo_bag", "mine.txt", "node.log", "report.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "demo_bag",
+        "mine.txt",
+        "node.log",
+        "report.html",
+    ]
 
 
 def test_demo_without_ros_says_what_to_install(tmp_path):
@@ -95,7 +119,10 @@ def test_player_gives_up_on_a_node_that_does_not_come(domain, monkeypatch):
         pytest.raises(HandEyeCalibError, match="waited 0.1 s for the node to subscribe"),
     ):
         player.play([], speed=1.0)
-    with Player(TOPICS, patience_s=0.1) as player, pytest.raises(HandEyeCalibError, match="to serve ~/solve"):
+    with (
+        Player(TOPICS, patience_s=0.1) as player,
+        pytest.raises(HandEyeCalibError, match="to serve ~/solve"),
+    ):
         player.wait_for_extrinsic(0)
 
 

@@ -12,7 +12,10 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.results import load_result
 
-NAMES = [f"calibrator: {name}" for name in ("extrinsic", "parent input", "child input", "stream checks", "journal")]
+NAMES = [
+    f"calibrator: {name}"
+    for name in ("extrinsic", "parent input", "child input", "stream checks", "journal")
+]
 
 
 @pytest.fixture
@@ -20,7 +23,10 @@ def heard(peer):
     """List of mappings of names to statuses, as they come in."""
     received = []
     peer.node.create_subscription(
-        DiagnosticArray, "/diagnostics", lambda array: received.append({each.name: each for each in array.status}), 10
+        DiagnosticArray,
+        "/diagnostics",
+        lambda array: received.append({each.name: each for each in array.status}),
+        10,
     )
     return received
 
@@ -29,7 +35,9 @@ def wait(peer, heard, name, condition):
     """The first status of a name that meets a condition, among those still to come."""
     start = len(heard)
     name = f"calibrator: {name}"
-    peer.spin_until(lambda: any(condition(each[name]) for each in heard[start:]), f"such a status of {name}")
+    peer.spin_until(
+        lambda: any(condition(each[name]) for each in heard[start:]), f"such a status of {name}"
+    )
     return next(each[name] for each in heard[start:] if condition(each[name]))
 
 
@@ -37,7 +45,9 @@ def values(status):
     return {pair.key: pair.value for pair in status.values}
 
 
-def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are_named(start_node, peer, heard):
+def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are_named(
+    start_node, peer, heard
+):
     start_node()
     peer.spin_until(lambda: heard, "diagnostics")
     assert list(heard[0]) == NAMES
@@ -45,8 +55,15 @@ def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are
     assert heard[0]["calibrator: parent input"].message == "no message on /parent_odom yet"
     publishers = peer.publishers()
     peer.feed(publishers, *drive(5))  # too few
-    wait(peer, heard, "extrinsic", lambda status: "synchronised pose pairs are needed" in status.message)
-    assert all(each.level != DiagnosticStatus.OK for statuses in heard for each in statuses.values())
+    wait(
+        peer,
+        heard,
+        "extrinsic",
+        lambda status: "synchronised pose pairs are needed" in status.message,
+    )
+    assert all(
+        each.level != DiagnosticStatus.OK for statuses in heard for each in statuses.values()
+    )
 
 
 def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, heard, tmp_path):
@@ -56,18 +73,24 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, heard, tmp_pa
     # Stamps of now, the child's 5 s behind.
     stamps_ns = stamps_ns - stamps_ns[-1] + time.time_ns()
     peer.wait_matched(*publishers)
-    for publisher, frame, Ts, late_ns in zip(publishers, ("lidar", "camera"), (Ts_pw_p, Ts_cw_c), (0, 5 * 10**9), strict=True):
+    for publisher, frame, Ts, late_ns in zip(
+        publishers, ("lidar", "camera"), (Ts_pw_p, Ts_cw_c), (0, 5 * 10**9), strict=True
+    ):
         for stamp_ns, T in zip(stamps_ns, Ts, strict=True):
             publisher.publish(message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame))
     parent = wait(peer, heard, "parent input", lambda status: "set time_offset" in status.message)
     assert parent.level == DiagnosticStatus.WARN
-    assert float(values(parent)["clock offset to the other input seen (s)"]) == pytest.approx(5.0, abs=2.0)
+    assert float(values(parent)["clock offset to the other input seen (s)"]) == pytest.approx(
+        5.0, abs=2.0
+    )
     assert peer.set_parameter("time_offset", 5.0).successful
     good = wait(
         peer,
         heard,
         "extrinsic",
-        lambda status: status.level == DiagnosticStatus.OK and "120" in values(status)["synchronised poses"],
+        lambda status: (
+            status.level == DiagnosticStatus.OK and "120" in values(status)["synchronised poses"]
+        ),
     )
     assert good.message.startswith("all is observable; translation known to ")
     found = values(good)
@@ -87,13 +110,19 @@ def test_flat_ground_is_said_in_one_sentence(start_node, peer, heard):
     stamps_ns, _, _ = drive()
     s = (stamps_ns - START_NS) * 1e-9
     flat = se3.from_rotation_translation(
-        se3.rotation_exp(np.outer(np.sin(0.4 * s), [0, 0, 1])), np.stack([s, np.sin(0.5 * s), 0 * s], axis=1)
+        se3.rotation_exp(np.outer(np.sin(0.4 * s), [0, 0, 1])),
+        np.stack([s, np.sin(0.5 * s), 0 * s], axis=1),
     )
     noise = se3.exp(np.random.default_rng(0).normal(size=(2, len(s), 6)) * 1e-3)
     peer.feed(peer.publishers(), stamps_ns, flat @ noise[0], flat @ noise[1])
-    status = wait(peer, heard, "extrinsic", lambda status: "turning about z is fine" in status.message)
+    status = wait(
+        peer, heard, "extrinsic", lambda status: "turning about z is fine" in status.message
+    )
     assert status.level == DiagnosticStatus.WARN
-    assert "roll and pitch under 1 deg: vertical offset (z) not observable, drive over a ramp" in status.message
+    assert (
+        "roll and pitch under 1 deg: vertical offset (z) not observable, drive over a ramp"
+        in status.message
+    )
     assert values(status)["sigma z (mm)"] == "unknown"
 
 
@@ -107,15 +136,27 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, heard):
         peer,
         heard,
         "child input",
-        lambda status: status.level == DiagnosticStatus.WARN and "has been silent for" in status.message,
+        lambda status: (
+            status.level == DiagnosticStatus.WARN and "has been silent for" in status.message
+        ),
     )
     for stamp_ns in stamps_ns[:3]:
-        publishers[1].publish(message(publishers[1].msg_type, int(stamp_ns) + 12 * 10**9, Ts_cw_c[0], "other_camera"))
+        publishers[1].publish(
+            message(publishers[1].msg_type, int(stamp_ns) + 12 * 10**9, Ts_cw_c[0], "other_camera")
+        )
     status = wait(peer, heard, "child input", lambda status: status.level == DiagnosticStatus.ERROR)
-    assert "/child_odom: the child stream's sensor frame changed from 'camera' to 'other_camera'" in status.message
+    assert (
+        "/child_odom: the child stream's sensor frame changed from 'camera' to 'other_camera'"
+        in status.message
+    )
     assert values(status)["refused: unusable"] == "3"
     publishers[0].publish(message(publishers[0].msg_type, 0, Ts_pw_p[0], "lidar"))
-    status = wait(peer, heard, "parent input", lambda status: values(status).get("refused: jump in time") == "1")
+    status = wait(
+        peer,
+        heard,
+        "parent input",
+        lambda status: values(status).get("refused: jump in time") == "1",
+    )
     assert status.level == DiagnosticStatus.ERROR
 
 
@@ -126,7 +167,14 @@ def test_repeated_stamps_gaps_and_rates_are_counted(start_node, peer, heard):
     kept = np.r_[0:20, 30:60, 60:60]
     peer.feed(publishers, stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept])
     peer.feed(publishers, stamps_ns[55:60], Ts_pw_p[55:60], Ts_cw_c[55:60])
-    found = values(wait(peer, heard, "parent input", lambda status: values(status)["refused: repeated stamp"] == "5"))
+    found = values(
+        wait(
+            peer,
+            heard,
+            "parent input",
+            lambda status: values(status)["refused: repeated stamp"] == "5",
+        )
+    )
     assert (found["messages"], found["poses taken"]) == ("55", "50")
     assert (found["longest gap (s)"], found["gaps above max_gap"]) == ("1.100", "1")
     assert float(found["rate (Hz)"]) > 0
@@ -136,7 +184,9 @@ def test_simulated_time_that_does_not_run_is_said(start_node, peer, heard):
     start_node("-p use_sim_time:=true", "-p solve_period:=0.2", *RELIABLE_INPUTS)
     peer.feed(peer.publishers(), *drive())
     status = wait(peer, heard, "extrinsic", lambda status: "status" in values(status))
-    assert values(status)["age of its newest pose (s)"] == "the clock does not run: nothing on /clock"
+    assert (
+        values(status)["age of its newest pose (s)"] == "the clock does not run: nothing on /clock"
+    )
 
 
 def test_a_journal_that_cannot_be_written_is_an_error(start_node, peer, heard, tmp_path):
@@ -149,7 +199,12 @@ def test_a_journal_that_cannot_be_written_is_an_error(start_node, peer, heard, t
 def test_disabled_is_said(start_node, peer, heard):
     start_node()
     assert peer.set_enabled(False).success
-    wait(peer, heard, "extrinsic", lambda status: "not accepting poses: call ~/set_enabled" in status.message)
+    wait(
+        peer,
+        heard,
+        "extrinsic",
+        lambda status: "not accepting poses: call ~/set_enabled" in status.message,
+    )
 
 
 class TestStreamChecks:
@@ -166,7 +221,9 @@ class TestStreamChecks:
     def test_faulty_streams_are_named(self, start_node, peer, heard, damage, said):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
-        peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, damage(Trajectory(stamps_ns, Ts_cw_c)).poses)
+        peer.feed(
+            peer.publishers(), stamps_ns, Ts_pw_p, damage(Trajectory(stamps_ns, Ts_cw_c)).poses
+        )
         status = wait(peer, heard, "stream checks", lambda status: said in status.message)
         assert status.level == DiagnosticStatus.WARN
         verdict = wait(peer, heard, "extrinsic", lambda status: said in status.message)
@@ -174,16 +231,27 @@ class TestStreamChecks:
         assert verdict.message.startswith("do not use the result: ")
         node.wait_for_log(said)
 
-    def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(self, start_node, peer, heard, tmp_path):
-        node = start_node("-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS)
+    def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(
+        self, start_node, peer, heard, tmp_path
+    ):
+        node = start_node(
+            "-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS
+        )
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
         Ts_cw_c[:, :3, 3] *= 1000.0
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
-        wait(peer, heard, "stream checks", lambda status: status.message.endswith(": set scale to 0.001"))
+        wait(
+            peer,
+            heard,
+            "stream checks",
+            lambda status: status.message.endswith(": set scale to 0.001"),
+        )
         assert peer.trigger("save").success
         assert any("millimetres" in warning for warning in load_result(tmp_path).warnings)
         assert peer.set_parameter("scale", 0.001).successful
-        status = wait(peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK)
+        status = wait(
+            peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK
+        )
         assert status.message == "both streams can be of one rigid body"
         wait(peer, heard, "extrinsic", lambda status: status.level == DiagnosticStatus.OK)
         log = node.wait_for_log("no longer so: the child's lengths are millimetres")
@@ -192,7 +260,9 @@ class TestStreamChecks:
     def test_sound_streams_raise_nothing(self, start_node, peer, heard):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
         peer.feed(peer.publishers(), *drive(250))
-        status = wait(peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK)
+        status = wait(
+            peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK
+        )
         assert not [key for key in values(status) if key.startswith(("warning", "error"))]
         assert "[WARN]" not in node.log
 

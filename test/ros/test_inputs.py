@@ -37,7 +37,9 @@ def test_sensor_frame_that_changes_is_refused_by_topic(start_node, peer):
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive(40)
     peer.feed(publishers, stamps_ns[:20], Ts_pw_p[:20], Ts_cw_c[:20])
-    peer.feed(publishers, stamps_ns[20:], Ts_pw_p[20:], Ts_cw_c[20:], frames=("lidar", "other_camera"))
+    peer.feed(
+        publishers, stamps_ns[20:], Ts_pw_p[20:], Ts_cw_c[20:], frames=("lidar", "other_camera")
+    )
     log = node.wait_for_log("/child_odom: message with stamp")
     assert "camera" in log
     assert "other_camera" in log
@@ -47,7 +49,10 @@ def test_poses_without_a_sensor_frame_are_used_and_said_to_be_nameless(start_nod
     node = start_node(*QUIET)
     _, extrinsic = peer.solve(peer.publishers(PoseStamped), *drive())
     node.wait_for_log("name it with parent_frame", "name it with child_frame")
-    assert (extrinsic.header.frame_id, extrinsic.child_frame_id) == ("parent_sensor", "child_sensor")
+    assert (extrinsic.header.frame_id, extrinsic.child_frame_id) == (
+        "parent_sensor",
+        "child_sensor",
+    )
 
 
 def test_bag_that_loops_starts_a_new_session(start_node, peer):
@@ -108,7 +113,9 @@ def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, pee
     assert peer.trigger("reset").success
     peer.spin_until(answer.done, "the answer of solve")
     assert not answer.result().success
-    assert answer.result().message == "the session was reset during the solve: its result is dropped"
+    assert (
+        answer.result().message == "the session was reset during the solve: its result is dropped"
+    )
     assert len(heard) == 1
 
 
@@ -120,7 +127,9 @@ def test_disabled_node_takes_no_poses(start_node, peer):
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
     peer.feed(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
     all_ignored = f"not accepting poses; {2 * len(stamps_ns)} ignored so far"
-    peer.spin_until(lambda: peer.set_enabled(False).message == all_ignored, "the node to ignore every pose")
+    peer.spin_until(
+        lambda: peer.set_enabled(False).message == all_ignored, "the node to ignore every pose"
+    )
     assert "no poses" in peer.trigger("solve").message
     assert peer.set_enabled(True).success
     _, extrinsic = peer.solve(publishers, stamps_ns + 10**12, Ts_pw_p, Ts_cw_c)

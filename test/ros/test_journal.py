@@ -24,7 +24,10 @@ def into(folder, journal="new"):
 def wait_written(peer, folder, poses):
     """Wait until the journal on disk has so many poses."""
     journal = folder / "journal"
-    peer.spin_until(lambda: has_session(journal) and count_poses(journal) == poses, f"{poses} poses in the journal")
+    peer.spin_until(
+        lambda: has_session(journal) and count_poses(journal) == poses,
+        f"{poses} poses in the journal",
+    )
 
 
 def test_a_killed_session_goes_on_where_it_ended(start_node, peer, tmp_path):
@@ -62,7 +65,9 @@ def test_an_earlier_session_is_kept_aside_once_and_an_empty_one_is_not(start_nod
     ]
     first_log = (tmp_path / "node1.log").read_text()
     assert "the session before this one (60 poses) is kept in" in first_log
-    assert "rename that folder to journal and start with the parameter journal at resume" in first_log
+    assert (
+        "rename that folder to journal and start with the parameter journal at resume" in first_log
+    )
 
 
 def test_reset_keeps_the_session_aside_too(start_node, peer, tmp_path):
@@ -81,14 +86,19 @@ def test_nothing_to_resume_and_a_damaged_journal_begin_a_new_session(start_node,
     (segment,) = (tmp_path / "journal").iterdir()
     segment.write_bytes(b"something else")
     node = start_node(*QUIET, *into(tmp_path, "resume"))
-    node.wait_for_log("cannot resume: ", "damaged from its first byte", "a damaged session is kept in")
+    node.wait_for_log(
+        "cannot resume: ", "damaged from its first byte", "a damaged session is kept in"
+    )
     wait_written(peer, tmp_path, 0)
 
 
 def test_resume_without_a_directory_is_one_line_and_code_1(start_node):
     node = start_node("-p journal:=resume")
     assert node.wait() == 1
-    assert node.log == "calibrator: journal resume needs output_directory: that is where the session to resume is\n"
+    assert (
+        node.log
+        == "calibrator: journal resume needs output_directory: that is where the session to resume is\n"
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -124,26 +134,38 @@ def test_off_writes_nothing(start_node, peer, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_disk_that_is_full_is_reported_the_node_goes_on_and_the_journal_comes_back(start_node, peer, tmp_path):
+def test_a_disk_that_is_full_is_reported_the_node_goes_on_and_the_journal_comes_back(
+    start_node, peer, tmp_path
+):
     node = start_node(*QUIET, *into(tmp_path / "out"))
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
     peer.solve(publishers, stamps_ns[:40], Ts_pw_p[:40], Ts_cw_c[:40])
     assert peer.trigger("save").success
     saved = fingerprints(tmp_path / "out")
-    # No file may grow beyond so many bytes, which its log does not reach: for the node, the disk is full.
+    # No file may grow beyond so many bytes, which its log does not reach: for the node, the disk is
+    # full.
     resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))
     answer, _ = peer.solve(publishers, stamps_ns[40:], Ts_pw_p[40:], Ts_cw_c[40:])
     assert answer.success
     peer.spin_until(lambda: not peer.trigger("save").success, "the save to fail")
     assert fingerprints(tmp_path / "out") == saved
-    resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    resource.prlimit(
+        node.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+    )
     wait_written(peer, tmp_path / "out", 240)
     assert peer.trigger("save").success
-    node.wait_for_log("cannot write the session journal in", "going on without it", "cannot save to", "is being written again")
+    node.wait_for_log(
+        "cannot write the session journal in",
+        "going on without it",
+        "cannot save to",
+        "is being written again",
+    )
 
 
-def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(start_node, peer, tmp_path):
+def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(
+    start_node, peer, tmp_path
+):
     blocked = tmp_path / "a_file"
     blocked.write_text("")
     node = start_node(*QUIET, *into(blocked / "out"))
@@ -163,7 +185,11 @@ def test_the_journal_follows_the_output_directory(start_node, peer, tmp_path):
 
 
 def fingerprints(folder):
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.is_file()}
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.iterdir()
+        if path.is_file()
+    }
 
 
 def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):

@@ -15,7 +15,8 @@ from hand_eye_calib.io.journal import has_session
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 LAX = {"threshold": 1e-9}
 
-# Parameters that change the answer while the node runs: another value, and what has to be set beforehand for it to matter.
+# Parameters that change the answer while the node runs: another value, and what has to be set
+# beforehand for it to matter.
 CHANGES = {
     "method": ("park", {}),
     "reference": ("B7", {}),
@@ -42,19 +43,29 @@ CHANGES = {
 
 @pytest.fixture(scope="module")
 def fed(tmp_path_factory):
-    """A peer of a node that has a noisy drive, the child 30 ms after the parent; and the answer with everything at its default but B5."""
+    """A peer of a node that has a noisy drive, the child 30 ms after the parent; and the answer
+    with everything at its default but B5.
+    """
     domain = free_domain()
-    node = NodeProcess(domain, tmp_path_factory.mktemp("effects") / "node.log", [*QUIET, "-p reference:=B5"])
+    node = NodeProcess(
+        domain, tmp_path_factory.mktemp("effects") / "node.log", [*QUIET, "-p reference:=B5"]
+    )
     peer = Peer(domain)
     stamps_ns, Ts_pw_p, Ts_cw_c = drive(200)
     noise = se3.exp(np.random.default_rng(0).normal(size=(2, 200, 6)) * np.repeat([0.01, 0.003], 3))
     publishers = peer.publishers()
     peer.wait_matched(*publishers)
     for publisher, frame, late_ns, Ts in zip(
-        publishers, ("lidar", "camera"), (0, 30_000_000), (Ts_pw_p @ noise[0], Ts_cw_c @ noise[1]), strict=True
+        publishers,
+        ("lidar", "camera"),
+        (0, 30_000_000),
+        (Ts_pw_p @ noise[0], Ts_cw_c @ noise[1]),
+        strict=True,
     ):
         for stamp_ns, T_world_sensor in zip(stamps_ns.tolist(), Ts, strict=True):
-            publisher.publish(message(publisher.msg_type, stamp_ns + late_ns, T_world_sensor, frame))
+            publisher.publish(
+                message(publisher.msg_type, stamp_ns + late_ns, T_world_sensor, frame)
+            )
     peer.spin_until(lambda: "199 poses" in peer.trigger("solve").message, "all poses in the result")
     yield peer
     peer.close()
@@ -86,7 +97,9 @@ def frame_is_used(start_node, peer, tmp_path, stream, text):
 
 def type_is_used(start_node, peer, tmp_path, stream):
     node = start_node(*QUIET, f"-p {stream}_type:=geometry_msgs/msg/PoseStamped")
-    node.wait_for_log(f"subscribed to /{stream}_odom (geometry_msgs/msg/PoseStamped)")  # though nobody publishes
+    node.wait_for_log(
+        f"subscribed to /{stream}_odom (geometry_msgs/msg/PoseStamped)"
+    )  # though nobody publishes
     peer.wait_matched(peer.publisher(PoseStamped, f"{stream}_odom"))
 
 
@@ -121,7 +134,9 @@ def publish_tf_is_used(start_node, peer, tmp_path):
     if importlib.util.find_spec("tf2_msgs") is None:
         refused = peer.set_parameter("publish_tf", True)
         assert not refused.successful
-        assert refused.reason.startswith("publish_tf needs the message package tf2_msgs, which is not installed")
+        assert refused.reason.startswith(
+            "publish_tf needs the message package tf2_msgs, which is not installed"
+        )
         assert peer.parameter("publish_tf") is False
         return
     from ros_harness import LATCHED
@@ -153,14 +168,22 @@ def test_effect(start_node, peer, tmp_path, name):
     EFFECTS[name](start_node, peer, tmp_path)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("tf2_msgs") is not None, reason="tf2_msgs is installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("tf2_msgs") is not None, reason="tf2_msgs is installed"
+)
 def test_tf_at_the_start_without_its_messages_is_one_line_and_code_1(start_node):
     node = start_node("-p publish_tf:=true")
     assert node.wait() == 1
-    assert node.log.startswith("calibrator: publish_tf needs the message package tf2_msgs, which is not installed: install ")
+    assert node.log.startswith(
+        "calibrator: publish_tf needs the message package tf2_msgs, which is not installed: install "
+    )
     assert node.log.count("\n") == 1
 
 
 def test_no_parameter_is_left_out():
-    declared = {option_name(field) for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)}
+    declared = {
+        option_name(field)
+        for config in (CalibratorConfig, NodeConfig)
+        for field in dataclasses.fields(config)
+    }
     assert declared == {*CHANGES, *EFFECTS}

@@ -9,7 +9,11 @@ from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
 from hand_eye_calib.config import METHODS, CalibratorConfig, NodeConfig, option_name
 
-FIELDS = {option_name(field): field for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)}
+FIELDS = {
+    option_name(field): field
+    for config in (CalibratorConfig, NodeConfig)
+    for field in dataclasses.fields(config)
+}
 
 
 def parameter_file(path, **parameters):
@@ -28,8 +32,14 @@ def test_every_option_is_a_parameter_with_its_description_and_range(start_node, 
         assert descriptor.read_only == meta["read_only"]
         assert descriptor.dynamic_typing == bool(meta["words"])
         assert peer.parameter(name) == FIELDS[name].default
-    assert peer.describe("threshold").floating_point_range[0].to_value == FIELDS["threshold"].metadata["maximum"]
-    assert peer.describe("max_pairs").integer_range[0].from_value == FIELDS["max_pairs"].metadata["minimum"]
+    assert (
+        peer.describe("threshold").floating_point_range[0].to_value
+        == FIELDS["threshold"].metadata["maximum"]
+    )
+    assert (
+        peer.describe("max_pairs").integer_range[0].from_value
+        == FIELDS["max_pairs"].metadata["minimum"]
+    )
     assert ", ".join(METHODS) in peer.describe("method").description
 
 
@@ -68,10 +78,15 @@ def test_scale_takes_a_word_or_a_number(start_node, peer):
     heard = peer.listen(TransformStamped, "extrinsic")
     assert peer.set_parameter("scale", "none").successful
     peer.trigger("solve")
-    peer.spin_until(lambda: heard and not np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3), "the unscaled result")
+    peer.spin_until(
+        lambda: heard and not np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3),
+        "the unscaled result",
+    )
     assert peer.set_parameter("scale", 2).successful
     peer.trigger("solve")
-    peer.spin_until(lambda: np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-6), "the scaled result")
+    peer.spin_until(
+        lambda: np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-6), "the scaled result"
+    )
 
 
 def test_shorter_solve_period_takes_effect_at_once(start_node, peer):
@@ -92,7 +107,11 @@ def test_shorter_solve_period_takes_effect_at_once(start_node, peer):
         ("method", "magic", f"method must be one of {', '.join(METHODS)}; got 'magic'"),
         ("scale", "huge", "scale must be none or "),
         ("scale", "[]", "a parameter that was given has no usable value, such as []"),
-        ("parent_type", "sensor_msgs/msg/Imu", "parent_type must be one of auto, nav_msgs/msg/Odometry"),
+        (
+            "parent_type",
+            "sensor_msgs/msg/Imu",
+            "parent_type must be one of auto, nav_msgs/msg/Odometry",
+        ),
     ],
 )
 def test_bad_value_in_the_file_is_one_line_and_code_1(start_node, tmp_path, name, value, expected):
@@ -113,10 +132,13 @@ def test_unreadable_file_is_one_line_and_code_1(start_node, tmp_path):
 
 def test_bad_qos_override_is_one_line_and_code_1(start_node):
     node = start_node(
-        "-p parent_type:=nav_msgs/msg/Odometry", "-p qos_overrides./parent_odom.subscription.reliability:=sometimes"
+        "-p parent_type:=nav_msgs/msg/Odometry",
+        "-p qos_overrides./parent_odom.subscription.reliability:=sometimes",
     )
     assert node.wait() == 1
-    assert node.log.startswith("calibrator: cannot subscribe to /parent_odom with the QoS overrides given: ")
+    assert node.log.startswith(
+        "calibrator: cannot subscribe to /parent_odom with the QoS overrides given: "
+    )
     assert node.log.count("\n") == 1
 
 
@@ -128,9 +150,13 @@ def test_wrong_usage_is_code_2(start_node):
 
 
 def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
-    node = start_node(parameter_file(tmp_path / "typo.yaml", treshold=0.02, nonsense=1, threshold=0.03), *RELIABLE_INPUTS)
+    node = start_node(
+        parameter_file(tmp_path / "typo.yaml", treshold=0.02, nonsense=1, threshold=0.03),
+        *RELIABLE_INPUTS,
+    )
     log = node.wait_for_log(
-        "parameter treshold does not exist and is ignored; did you mean threshold?", "parameter nonsense does not exist"
+        "parameter treshold does not exist and is ignored; did you mean threshold?",
+        "parameter nonsense does not exist",
     )
     assert log.count("does not exist") == 2
     assert node.stop()[0] == 0

@@ -8,15 +8,17 @@ from published_data import kitti_short, rotation_error_deg, translation_error_m
 from ros_harness import POSE_KINDS, RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix
 from std_msgs.msg import String
 
-from hand_eye_calib.calibrator import Calibrator
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros import conversions
 
 FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]
 
 
-@pytest.mark.parametrize("use_sim_time", ["false", "true"])  # true, and no /clock: as with a bag that is paused
+@pytest.mark.parametrize(
+    "use_sim_time", ["false", "true"]
+)  # true, and no /clock: as with a bag that is paused
 def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer, use_sim_time):
     node = start_node("-p solve_period:=0.2", f"-p use_sim_time:={use_sim_time}")
     extrinsics = peer.listen(TransformStamped, "extrinsic")
@@ -68,7 +70,9 @@ def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, pee
 
 
 def test_inputs_are_remapped_and_named_as_they_are(start_node, peer):
-    node = start_node("-p solve_period:=1000.0", "-r parent_odom:=/lidar/odom", "-r child_odom:=/camera/odom")
+    node = start_node(
+        "-p solve_period:=1000.0", "-r parent_odom:=/lidar/odom", "-r child_odom:=/camera/odom"
+    )
     publishers = peer.publisher(Odometry, "/lidar/odom"), peer.publisher(Odometry, "/camera/odom")
     peer.feed(publishers, *drive(20))
     node.wait_for_log("first pose on /lidar/odom", "first pose on /camera/odom")
@@ -88,7 +92,10 @@ def test_best_effort_publishers_are_heard(start_node, peer):
     from rclpy.qos import qos_profile_sensor_data
 
     node = start_node("-p solve_period:=1000.0")
-    publishers = [peer.node.create_publisher(Odometry, f"{name}_odom", qos_profile_sensor_data) for name in ("parent", "child")]
+    publishers = [
+        peer.node.create_publisher(Odometry, f"{name}_odom", qos_profile_sensor_data)
+        for name in ("parent", "child")
+    ]
     peer.feed(publishers, *drive(5))
     node.wait_for_log("first pose on /parent_odom", "first pose on /child_odom")
 
@@ -100,23 +107,42 @@ def test_kitti_through_the_node_equals_the_engine_fed_directly(start_node, peer)
     for stream, trajectory in (("parent", case.parent), ("child", case.child)):
         engine.set_frame(stream, {"parent": "lidar", "child": "camera"}[stream])
         for stamp_ns, T_world_sensor in zip(case.stamps_ns, trajectory.poses, strict=True):
-            engine.add_pose(stream, int(stamp_ns), T_world_sensor[:3, 3].tolist(), se3.to_quat_xyzw(T_world_sensor).tolist())
+            engine.add_pose(
+                stream,
+                int(stamp_ns),
+                T_world_sensor[:3, 3].tolist(),
+                se3.to_quat_xyzw(T_world_sensor).tolist(),
+            )
     offline = engine.estimate()
 
-    start_node("-p solve_period:=1000.0", *(f"-p {name}:={value}" for name, value in options.items()), *RELIABLE_INPUTS)
-    answer, extrinsic = peer.solve(peer.publishers(), case.stamps_ns, case.parent.poses, case.child.poses)
+    start_node(
+        "-p solve_period:=1000.0",
+        *(f"-p {name}:={value}" for name, value in options.items()),
+        *RELIABLE_INPUTS,
+    )
+    answer, extrinsic = peer.solve(
+        peer.publishers(), case.stamps_ns, case.parent.poses, case.child.poses
+    )
     np.testing.assert_allclose(matrix(extrinsic), offline.T_parent_child, rtol=0, atol=1e-9)
     assert conversions.to_ns(extrinsic.header.stamp) == offline.stamp_ns
-    assert f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers" in answer.message
-    assert translation_error_m(matrix(extrinsic), case.T_parent_child) == pytest.approx(0.20, abs=0.01)
-    assert rotation_error_deg(matrix(extrinsic), case.T_parent_child) == pytest.approx(0.23, abs=0.01)
+    assert (
+        f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers"
+        in answer.message
+    )
+    assert translation_error_m(matrix(extrinsic), case.T_parent_child) == pytest.approx(
+        0.20, abs=0.01
+    )
+    assert rotation_error_deg(matrix(extrinsic), case.T_parent_child) == pytest.approx(
+        0.23, abs=0.01
+    )
 
 
 def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, peer):
     stamps_ns, _, _ = drive()
     s = (stamps_ns - START_NS) * 1e-9
     flat = se3.from_rotation_translation(
-        se3.rotation_exp(np.outer(np.sin(0.4 * s), [0, 0, 1])), np.stack([s, np.sin(0.5 * s), 0 * s], axis=1)
+        se3.rotation_exp(np.outer(np.sin(0.4 * s), [0, 0, 1])),
+        np.stack([s, np.sin(0.5 * s), 0 * s], axis=1),
     )
     node = start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
     poses = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")

@@ -10,7 +10,9 @@ SOON_S = 5.0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("solve_period", [0.1, 1000.0])  # busy, and waiting for nothing but messages
+@pytest.mark.parametrize(
+    "solve_period", [0.1, 1000.0]
+)  # busy, and waiting for nothing but messages
 def test_signal_ends_the_node_cleanly(start_node, peer, number, solve_period):
     node = start_node(f"-p solve_period:={solve_period}")
     peer.feed(peer.publishers(), *drive())
@@ -28,7 +30,9 @@ def test_second_ctrl_c_changes_nothing(start_node):
 
 
 def test_signal_ends_the_node_while_it_solves(start_node, peer):
-    node = start_node("-p solve_period:=0.05", "-p backend:=ipopt", "-p reference:=B1", *RELIABLE_INPUTS)
+    node = start_node(
+        "-p solve_period:=0.05", "-p backend:=ipopt", "-p reference:=B1", *RELIABLE_INPUTS
+    )
     peer.feed(peer.publishers(), *drive(1500, period_ns=20_000_000))
     node.wait_for_log("first pose on /child_odom")
     code, seconds = node.stop(signal.SIGTERM)

@@ -32,7 +32,9 @@ def test_messages_in_order_and_late_ones_pass():
     assert back == sequence
 
 
-@pytest.mark.parametrize("corrupt_ns", [0, START_NS + 10**18, START_NS - 2 * BACKWARD_JUMP_NS, 2**63 - 1])
+@pytest.mark.parametrize(
+    "corrupt_ns", [0, START_NS + 10**18, START_NS - 2 * BACKWARD_JUMP_NS, 2**63 - 1]
+)
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_corrupt_stamp_is_left_out_and_changes_nothing(corrupt_ns, times):
     guard = StampGuard()
@@ -87,7 +89,10 @@ class TestTheOtherStream:
 
     def test_its_messages_of_the_old_lap_are_left_out(self):
         guard = self.guard()
-        assert run(guard, stamps(3, START_NS + 50 * STEP_NS), now_s=10.1) == ([Verdict.OUTDATED] * 3, [])
+        assert run(guard, stamps(3, START_NS + 50 * STEP_NS), now_s=10.1) == (
+            [Verdict.OUTDATED] * 3,
+            [],
+        )
         assert run(guard, stamps(10)[2:], now_s=10.2)[1] == stamps(10)
 
     def test_goes_on_where_only_the_first_stream_had_jumped(self):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, feed, wandering_poses
 
-from hand_eye_calib.calibrator import Calibrator
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.ros.worker import SolverProcess, SolveWorker
@@ -42,7 +42,11 @@ def test_outcomes_come_in_order_with_their_sessions(worker, announced):
     for _ in range(3):
         assert announced.acquire(timeout=30.0)
     for session, outcome in enumerate(worker.ready()):
-        assert (outcome.session, outcome.calibration, outcome.error) == (session, f"result {session}", None)
+        assert (outcome.session, outcome.calibration, outcome.error) == (
+            session,
+            f"result {session}",
+            None,
+        )
 
 
 def test_any_exception_is_an_outcome_and_the_next_solve_runs(worker, announced):
@@ -60,7 +64,9 @@ def test_any_exception_is_an_outcome_and_the_next_solve_runs(worker, announced):
 
 
 @pytest.mark.parametrize(("n_poses", "agreement"), [(250, "checked after result"), (50, None)])
-def test_streams_are_checked_after_the_solve_where_asked_and_where_they_suffice(worker, announced, n_poses, agreement):
+def test_streams_are_checked_after_the_solve_where_asked_and_where_they_suffice(
+    worker, announced, n_poses, agreement
+):
     work = Work(lambda: "result", lambda calibration: f"checked after {calibration}", n_poses)
     worker.submit(7, work)
     worker.submit(8, work, check=True)
@@ -102,14 +108,19 @@ class TestSolverProcess:
     @staticmethod
     def snapshot():
         calibrator = Calibrator(CalibratorConfig(backend="ipopt", reference="B3"))
-        for stream, poses in (("parent", wandering_poses(60)), ("child", child_of(wandering_poses(60)))):
+        for stream, poses in (
+            ("parent", wandering_poses(60)),
+            ("child", child_of(wandering_poses(60))),
+        ):
             feed(calibrator, stream, as_trajectory(poses))
         return calibrator.snapshot()
 
     def test_gives_the_same_answer(self, apart):
         snapshot = self.snapshot()
         for _ in range(2):
-            assert np.array_equal(apart.estimate(snapshot).T_parent_child, snapshot.estimate().T_parent_child)
+            assert np.array_equal(
+                apart.estimate(snapshot).T_parent_child, snapshot.estimate().T_parent_child
+            )
 
     def test_raises_what_was_raised_there(self, apart):
         with pytest.raises(NotEnoughDataError, match="no poses on the parent stream"):

@@ -7,7 +7,12 @@ import pytest
 from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering_poses
 
 from hand_eye_calib.adaptive import estimator, lapack, noise
-from hand_eye_calib.adaptive.block_tridiagonal import Factor, blocks_below, diagonal_blocks, to_bands
+from hand_eye_calib.adaptive.block_tridiagonal import (
+    Factor,
+    blocks_below,
+    diagonal_blocks,
+    to_bands,
+)
 from hand_eye_calib.adaptive.increments import CENTRES, NUISANCES, Increments
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.calibration import DofVerdict
@@ -37,12 +42,16 @@ def dense(bands):
     matrix = np.zeros((size, size))
     for offset in range(12):
         index = np.arange(size - offset)
-        matrix[index + offset, index] = matrix[index, index + offset] = bands[: size - offset, offset]
+        matrix[index + offset, index] = matrix[index, index + offset] = bands[
+            : size - offset, offset
+        ]
     return matrix
 
 
 def late(poses, seconds, interval_s=0.1):
-    """Poses as a sensor reports them whose stamps are that early: those of earlier instants, at its velocity between its neighbours."""
+    """Poses as a sensor reports them whose stamps are that early: those of earlier instants, at its
+    velocity between its neighbours.
+    """
     velocities = se3.log(se3.inverse(poses[:-2]) @ poses[2:]) / (2 * interval_s)
     return poses @ se3.exp(-seconds * np.concatenate([velocities[:1], velocities, velocities[-1:]]))
 
@@ -88,7 +97,9 @@ def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix():
     np.testing.assert_array_equal(diagonal_blocks(bands), diagonal)
     np.testing.assert_array_equal(blocks_below(bands), below)
     factor, right = Factor(bands), random.normal(size=(30, 3))
-    np.testing.assert_allclose(factor.whiten(right), np.linalg.solve(np.linalg.cholesky(matrix), right), atol=1e-12)
+    np.testing.assert_allclose(
+        factor.whiten(right), np.linalg.solve(np.linalg.cholesky(matrix), right), atol=1e-12
+    )
     assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1])
     with pytest.raises(np.linalg.LinAlgError):
         Factor(to_bands(-diagonal, below))
@@ -104,8 +115,12 @@ def test_lapack_is_that_of_scipy(monkeypatch):
 
 
 def without_lag(nuisance):
-    """Parameters with no lag: velocities are differences of poses, so that data with a lag is never quite free of residuals."""
-    return PARAMETERS[nuisance] * ([1.0] * (len(PARAMETERS[nuisance]) - 1) + [0.0] if "time" in nuisance else 1.0)
+    """Parameters with no lag: velocities are differences of poses, so that data with a lag is never
+    quite free of residuals.
+    """
+    return PARAMETERS[nuisance] * (
+        [1.0] * (len(PARAMETERS[nuisance]) - 1) + [0.0] if "time" in nuisance else 1.0
+    )
 
 
 @pytest.mark.parametrize("nuisance", NUISANCES)
@@ -118,7 +133,11 @@ def test_derivatives_are_the_numerical_ones(nuisance):
         change = np.zeros(jacobian.shape[2])
         change[column] = step
         ahead, behind = (
-            increments.residuals(T_PARENT_CHILD @ se3.exp(sign * change[:6]), nuisance, parameters + sign * change[6:])
+            increments.residuals(
+                T_PARENT_CHILD @ se3.exp(sign * change[:6]),
+                nuisance,
+                parameters + sign * change[6:],
+            )
             for sign in (1, -1)
         )
         np.testing.assert_allclose(jacobian[:, :, column], (ahead - behind) / (2 * step), atol=2e-8)
@@ -127,7 +146,9 @@ def test_derivatives_are_the_numerical_ones(nuisance):
 @pytest.mark.parametrize("nuisance", NUISANCES)
 def test_perfect_data_leaves_no_residual(nuisance):
     poses = systematic(wandering_poses(30), nuisance, without_lag(nuisance))
-    residuals = Increments(stamps(30), *poses).residuals(T_PARENT_CHILD, nuisance, without_lag(nuisance))
+    residuals = Increments(stamps(30), *poses).residuals(
+        T_PARENT_CHILD, nuisance, without_lag(nuisance)
+    )
     np.testing.assert_allclose(residuals, 0, atol=1e-12)
 
 
@@ -144,7 +165,9 @@ def test_the_derivative_by_time_is_what_a_lag_does():
 
     derivative = increments(0.0).jacobian(T_PARENT_CHILD, "time", [0.0])[2:-2, :, 6]
     # What is assumed of the stamps' lateness undoes it.
-    undone = (increments(-lag_s).residuals(T_PARENT_CHILD) - increments(lag_s).residuals(T_PARENT_CHILD))[2:-2] / (2 * lag_s)
+    undone = (
+        increments(-lag_s).residuals(T_PARENT_CHILD) - increments(lag_s).residuals(T_PARENT_CHILD)
+    )[2:-2] / (2 * lag_s)
     # The estimator's velocities are medians: they cut the peaks, and agree everywhere else.
     np.testing.assert_allclose(derivative, undone, atol=0.06 * np.abs(undone).max())
     assert np.median(np.abs(derivative - undone)) < 0.003 * np.abs(undone).max()
@@ -166,23 +189,35 @@ def test_white_components_are_the_covariance_of_the_increments(centre):
             return parent, disturbed_about_origin(child, run, sigma_m, sigma_rad)
         if centre == "parent":
             return disturbed_about_origin(parent, run, sigma_m, sigma_rad), child
-        return disturbed(parent, 2 * run, sigma_m, sigma_rad), disturbed(child, 2 * run + 1, sigma_m, sigma_rad)
+        return disturbed(parent, 2 * run, sigma_m, sigma_rad), disturbed(
+            child, 2 * run + 1, sigma_m, sigma_rad
+        )
 
-    samples = np.array([Increments(stamps(6), *noisy(run)).residuals(T_PARENT_CHILD).ravel() for run in range(4000)])
+    samples = np.array(
+        [
+            Increments(stamps(6), *noisy(run)).residuals(T_PARENT_CHILD).ravel()
+            for run in range(4000)
+        ]
+    )
     components = Increments(stamps(6), parent, child, centre).components(T_PARENT_CHILD)
     sources = 2 if centre == "sensors" else 1
     expected = dense(components.covariance([sources * sigma_rad**2, sources * sigma_m**2, 0, 0]))
     found = np.cov(samples.T)
     scale = np.sqrt(np.diag(expected))
-    # the standard error of a correlation from 4000 samples is 0.016; 900 of them stay within 5 sigma
-    np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.08)
+    # the standard error of a correlation from 4000 samples is 0.016; 900 of them stay within 5
+    # sigma
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.08
+    )
 
 
 def test_rows_of_separate_stretches_are_independent():
     parent = wandering_poses(40)
     linearisation = Increments(stamps(40), parent, child_of(parent)).linearise(T_PARENT_CHILD)
     part = linearisation.rows(np.r_[5:10, 20:24])
-    whole, some = (dense(each.components.covariance([1.0, 2.0, 3.0, 4.0])) for each in (linearisation, part))
+    whole, some = (
+        dense(each.components.covariance([1.0, 2.0, 3.0, 4.0])) for each in (linearisation, part)
+    )
     first, second = np.arange(30, 60), np.arange(120, 144)
     np.testing.assert_allclose(some[:30, :30], whole[np.ix_(first, first)])
     np.testing.assert_allclose(some[30:, 30:], whole[np.ix_(second, second)])
@@ -193,7 +228,9 @@ def test_rows_of_separate_stretches_are_independent():
 
 def test_generalised_least_squares_is_the_textbook_formula():
     parent = wandering_poses(15)
-    increments = Increments(stamps(15), disturbed(parent, 1, 0.01, 0.01), disturbed(child_of(parent), 2, 0.01, 0.01))
+    increments = Increments(
+        stamps(15), disturbed(parent, 1, 0.01, 0.01), disturbed(child_of(parent), 2, 0.01, 0.01)
+    )
     linearisation = increments.linearise(T_PARENT_CHILD)
     variances = np.array([1e-4, 2e-4, 1e-6, 3e-6])
     jumps = np.zeros(14, dtype=bool)
@@ -205,9 +242,17 @@ def test_generalised_least_squares_is_the_textbook_formula():
     np.testing.assert_allclose(solve.step, step, atol=1e-9)
     np.testing.assert_allclose(solve.covariance, np.linalg.inv(information), rtol=1e-6)
     rest = r + J @ step
-    expected = 0.5 * (np.linalg.slogdet(V)[1] + rest @ np.linalg.solve(V, rest) + np.linalg.slogdet(information)[1])
-    whitened = solve.factor.whiten(noise.joined_columns(linearisation.residuals, linearisation.jacobian))
-    losses = noise.restricted_losses(np.array([solve.factor.log_determinant(), np.inf]), np.array([whitened.T @ whitened] * 2))
+    expected = 0.5 * (
+        np.linalg.slogdet(V)[1]
+        + rest @ np.linalg.solve(V, rest)
+        + np.linalg.slogdet(information)[1]
+    )
+    whitened = solve.factor.whiten(
+        noise.joined_columns(linearisation.residuals, linearisation.jacobian)
+    )
+    losses = noise.restricted_losses(
+        np.array([solve.factor.log_determinant(), np.inf]), np.array([whitened.T @ whitened] * 2)
+    )
     assert losses == pytest.approx([expected, np.inf])
 
 
@@ -225,11 +270,17 @@ def noisy_drive(seed, n_poses=150, white=(0.004, 0.006), drift=(0.0, 0.0)):
 
 def test_the_search_for_noise_does_not_depend_on_its_start():
     parent, child = noisy_drive(4, n_poses=400, drift=(0.002, 0.003))
-    linearisation, jumps = Increments(stamps(400), parent, child).linearise(T_PARENT_CHILD), np.zeros(399, dtype=bool)
+    linearisation, jumps = (
+        Increments(stamps(400), parent, child).linearise(T_PARENT_CHILD),
+        np.zeros(399, dtype=bool),
+    )
 
     def found(rotation, translation):
         rotation = noise.fit_rotation_variances(linearisation, jumps, np.array(rotation))
-        return [*rotation, *noise.fit_translation_variances(linearisation, jumps, rotation, np.array(translation))]
+        return [
+            *rotation,
+            *noise.fit_translation_variances(linearisation, jumps, rotation, np.array(translation)),
+        ]
 
     usual = found([1e-4, 1e-5], [1e-4, 1e-5])
     # Noise that was once thought to have vanished, at which the loss is flat, comes back.
@@ -239,19 +290,31 @@ def test_the_search_for_noise_does_not_depend_on_its_start():
 
 def test_noise_that_is_not_there_vanishes():
     parent, child = noisy_drive(5, n_poses=400)
-    linearisation, jumps = Increments(stamps(400), parent, child).linearise(T_PARENT_CHILD), np.zeros(399, dtype=bool)
+    linearisation, jumps = (
+        Increments(stamps(400), parent, child).linearise(T_PARENT_CHILD),
+        np.zeros(399, dtype=bool),
+    )
     white, drift = noise.fit_rotation_variances(linearisation, jumps, np.array([1e-4, 1e-5]))
     assert white == pytest.approx(2 * 0.006**2, rel=0.1)
     assert drift < 0.01 * white
 
 
-@pytest.mark.parametrize(("white", "drift"), [((0.004, 0.006), (0.0, 0.0)), ((0.001, 0.001), (0.004, 0.003))])
+@pytest.mark.parametrize(
+    ("white", "drift"), [((0.004, 0.006), (0.0, 0.0)), ((0.001, 0.001), (0.004, 0.003))]
+)
 def test_the_noise_levels_are_recovered(white, drift):
     found = []
     for seed in range(12):
         parent, child = noisy_drive(seed, white=white, drift=drift)
         levels = estimator.solve(stamps(150), parent, child, nuisances=("none",)).noise
-        found.append([levels.translation_white, levels.rotation_white, levels.translation_drift, levels.rotation_drift])
+        found.append(
+            [
+                levels.translation_white,
+                levels.rotation_white,
+                levels.translation_drift,
+                levels.rotation_drift,
+            ]
+        )
     median = np.median(found, axis=0)
     expected = np.r_[np.sqrt(2) * np.array(white), drift]
     strong = expected > 0.1 * expected.max()
@@ -266,7 +329,8 @@ def test_errors_are_as_large_as_stated():
         solution = estimator.solve(stamps(150), parent, child)
         xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
         squared_distances.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
-    # the median of chi-squared with 6 degrees of freedom is 5.35; its standard error over 40 draws is 0.7
+    # the median of chi-squared with 6 degrees of freedom is 5.35; its standard error over 40 draws
+    # is 0.7
     assert 3.2 < np.median(squared_distances) < 8.0
 
 
@@ -278,7 +342,10 @@ def test_it_beats_dnl_where_the_noise_is_white():
     for seed in range(15):
         parent, child = noisy_drive(seed)
         answers = [estimator.solve(stamps(150), parent, child).T_parent_child]
-        answers += [dnl.solve(motion_pairs(parent, child, reference)).T_parent_child for reference in ("B1", "B5", "B20")]
+        answers += [
+            dnl.solve(motion_pairs(parent, child, reference)).T_parent_child
+            for reference in ("B1", "B5", "B20")
+        ]
         errors.append([np.linalg.norm(T[:3, 3] - T_PARENT_CHILD[:3, 3]) for T in answers])
     adaptive, *others = np.median(errors, axis=0)
     assert adaptive < 0.8 * min(others)
@@ -290,7 +357,9 @@ def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
     for seed in range(6):
         parent, child = systematic(wandering_poses(300, seed), nuisance, PARAMETERS[nuisance])
         solution = estimator.solve(
-            stamps(300), disturbed(parent, 100 + seed, 1e-3, 1e-3), disturbed(child, 200 + seed, 1e-3, 1e-3)
+            stamps(300),
+            disturbed(parent, 100 + seed, 1e-3, 1e-3),
+            disturbed(child, 200 + seed, 1e-3, 1e-3),
         )
         chosen.append(solution.nuisance)
         parameters.append(solution.parameters)
@@ -305,11 +374,19 @@ def test_a_lag_is_not_taken_for_a_lever():
         parent = wandering_poses(300, seed)
         child = late(child_of(parent), 0.02)
         noisy = disturbed(parent, 100 + seed, 1e-3, 1e-3), disturbed(child, 200 + seed, 1e-3, 1e-3)
-        answers = [estimator.solve(stamps(300), *noisy, nuisances=models) for models in (("none",), NUISANCES)]
+        answers = [
+            estimator.solve(stamps(300), *noisy, nuisances=models)
+            for models in (("none",), NUISANCES)
+        ]
         assert answers[1].time_offset_s == pytest.approx(-0.02, abs=1e-3)
         said = " ".join(answers[1].describe(stamps(300))["in_words"])
         assert re.search(r"the child's stamps are (19|20|21)\.\d ms late", said)
-        errors.append([np.linalg.norm(answer.T_parent_child[:3, 3] - T_PARENT_CHILD[:3, 3]) for answer in answers])
+        errors.append(
+            [
+                np.linalg.norm(answer.T_parent_child[:3, 3] - T_PARENT_CHILD[:3, 3])
+                for answer in answers
+            ]
+        )
     without, with_lag = np.median(errors, axis=0)
     assert with_lag < 0.3 * without
 
@@ -318,15 +395,21 @@ def test_a_lag_is_not_taken_for_a_lever():
 def test_on_flat_ground_no_sideways_slip_is_assumed(slipping):
     # It could not be told from a child that is mounted askew.
     parent, child = systematic(planar_poses(400), slipping, [0.0, 0.05, 0.0])
-    solution = estimator.solve(stamps(400), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3))
+    solution = estimator.solve(
+        stamps(400), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3)
+    )
     assert "bias" not in solution.nuisance
 
 
 def test_the_sensor_whose_path_is_off_is_named():
     for nuisance, sensor in (("bias", "child"), ("parent bias", "parent")):
         parent, child = systematic(wandering_poses(300), nuisance, PARAMETERS[nuisance])
-        solution = estimator.solve(stamps(300), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3))
-        said = [line for line in solution.describe(stamps(300))["in_words"] if "mm per metre" in line]
+        solution = estimator.solve(
+            stamps(300), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3)
+        )
+        said = [
+            line for line in solution.describe(stamps(300))["in_words"] if "mm per metre" in line
+        ]
         assert len(said) == 1
         assert said[0].startswith(f"the {sensor}'s path is off by x {'-' * (sensor == 'parent')}")
 
@@ -342,7 +425,9 @@ def test_poses_wrong_by_themselves_are_bridged():
     undisturbed = estimator.solve(stamps(150), *noisy_drive(4, white=(0.002, 0.002)))
     np.testing.assert_allclose(solution.T_parent_child, undisturbed.T_parent_child, atol=2e-3)
     said = " ".join(solution.describe(stamps(150))["in_words"])
-    assert "5 poses wrong by themselves and left out, at 2.000, 4.100, 4.200, 8.000, 12.000 s" in said
+    assert (
+        "5 poses wrong by themselves and left out, at 2.000, 4.100, 4.200, 8.000, 12.000 s" in said
+    )
     assert "1 jump of a trajectory, just before 10.000 s" in said
 
 
@@ -382,8 +467,12 @@ def test_where_noise_drowns_the_motion_longer_steps_are_taken():
         parent = wandering_poses(1500, seed, step_m=0.01, step_rad=0.008)
         # Noise that lasts over some ten poses, five times larger than the motion between two.
         random = np.random.default_rng(400 + seed)
-        lasting = np.apply_along_axis(np.convolve, 0, random.normal(size=(1509, 6)), np.ones(10) / np.sqrt(10), mode="valid")
-        child = child_of(parent) @ se3.exp(lasting * np.repeat([0.01, 0.02], 3) + random.normal(size=(1500, 6)) * 0.02)
+        lasting = np.apply_along_axis(
+            np.convolve, 0, random.normal(size=(1509, 6)), np.ones(10) / np.sqrt(10), mode="valid"
+        )
+        child = child_of(parent) @ se3.exp(
+            lasting * np.repeat([0.01, 0.02], 3) + random.normal(size=(1500, 6)) * 0.02
+        )
         solution = estimator.solve(stamps(1500), parent, child)
         assert solution.used.mean() < 0.4
         xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
@@ -398,10 +487,14 @@ def test_errors_that_outlast_the_model_widen_the_covariance():
     velocity = np.cumsum(random.normal(0, 1e-4, (1000, 3)), axis=0)
     child = child_of(parent)
     child[:, :3, 3] += np.cumsum(velocity, axis=0)
-    solution = estimator.solve(stamps(1000), disturbed(parent, 7, 1e-4, 1e-4), child, nuisances=("none",))
+    solution = estimator.solve(
+        stamps(1000), disturbed(parent, 7, 1e-4, 1e-4), child, nuisances=("none",)
+    )
     assert solution.misfit > 2.0
     assert "errors last longer" in solution.describe(stamps(1000))["in_words"][-1]
-    plain = estimator.solve(stamps(1000), disturbed(parent, 7, 1e-3, 1e-3), disturbed(child_of(parent), 8, 1e-3, 1e-3))
+    plain = estimator.solve(
+        stamps(1000), disturbed(parent, 7, 1e-3, 1e-3), disturbed(child_of(parent), 8, 1e-3, 1e-3)
+    )
     assert plain.misfit == 1.0
 
 
@@ -411,16 +504,20 @@ def test_resampling_leaves_out_what_it_is_told_to():
     solution = estimator.solve(stamps(150), parent, child)
     nothing, half = np.zeros((2, 149), dtype=bool)
     half[75:] = True
-    without = estimator.solve_without(stamps(150), parent, child, solution, np.array([nothing, half]))
+    without = estimator.solve_without(
+        stamps(150), parent, child, solution, np.array([nothing, half])
+    )
     np.testing.assert_allclose(without[0], solution.T_parent_child, atol=1e-6)
     first_half = noise.generalised_least_squares(
-        Increments(stamps(150)[np.r_[:70, 71:76]], parent[np.r_[:70, 71:76]], child[np.r_[:70, 71:76]]).linearise(
-            solution.T_parent_child
-        ),
+        Increments(
+            stamps(150)[np.r_[:70, 71:76]], parent[np.r_[:70, 71:76]], child[np.r_[:70, 71:76]]
+        ).linearise(solution.T_parent_child),
         solution.noise.variances(),
         np.zeros(74, dtype=bool),
     )
-    np.testing.assert_allclose(without[1], solution.T_parent_child @ se3.exp(first_half.step), atol=1e-6)
+    np.testing.assert_allclose(
+        without[1], solution.T_parent_child @ se3.exp(first_half.step), atol=1e-6
+    )
 
 
 def test_jumps_of_either_sensor_are_found_at_their_places():
@@ -447,7 +544,9 @@ def test_flat_ground_hides_the_height_and_only_that(level):
     parent, child = disturbed(parent, 1, level, level), disturbed(child_of(parent), 2, level, level)
     solution = estimator.solve(stamps(200), parent, child)
     assessment = assess_adaptive(PosePairs(stamps(200), parent, child), solution)
-    hidden = [dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
+    hidden = [
+        dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE
+    ]
     assert hidden == ["z"]
     np.testing.assert_allclose(solution.T_parent_child[:2, 3], T_PARENT_CHILD[:2, 3], atol=0.01)
 

@@ -10,29 +10,30 @@ import pytest
 PACKAGE = "hand_eye_calib"
 SOURCE = Path(__file__).resolve().parents[2] / PACKAGE
 
-# A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the public Python API.
-# In the engine each room sees only rooms before it.
+# A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the public
+# Python API. In the engine each room sees only rooms before it.
+GROUND = {"errors", "config", "arrays"}
 ENGINE = {
     "errors": set(),
+    "arrays": set(),
     "config": {"errors"},
-    "geometry": {"errors", "config"},
-    "calibration": {"errors", "geometry"},
-    "pairing": {"errors", "config", "geometry"},
-    "solvers": {"errors", "config", "geometry", "pairing"},
-    "adaptive": {"errors", "config", "geometry", "pairing", "solvers"},
-    "assessment": {"errors", "config", "geometry", "calibration", "pairing", "solvers", "adaptive"},
+    "geometry": GROUND,
+    "calibration": GROUND | {"geometry"},
+    "pairing": GROUND | {"geometry"},
 }
-ENGINE["estimation"] = set(ENGINE)
-ENGINE["calibrator"] = set(ENGINE)
+ENGINE["solvers"] = GROUND | {"geometry", "pairing"}
+ENGINE["adaptive"] = ENGINE["solvers"] | {"solvers"}
+ENGINE["assessment"] = ENGINE["adaptive"] | {"calibration", "adaptive"}
+ENGINE["alignment"] = ENGINE["solvers"] | {"solvers"}
+ENGINE["checks"] = ENGINE["alignment"] | {"calibration", "assessment", "alignment"}
+ENGINE["engine"] = set(ENGINE)
 ALLOWED = ENGINE | {
-    "calibration": ENGINE["calibration"] | {"io"},  # for Calibration.save alone, inside the method
-    "io": {"root", "errors", "config", "geometry", "calibration"},
-    "report": {"root", "errors", "config", "geometry", "calibration", "pairing", "assessment"},
-    "simulation": {"errors", "config", "geometry", "io"},
-    "root": {"errors", "config", "geometry", "calibration", "calibrator", "io"},
-    "ros": {"root", "io", "calibrator", *ENGINE},
-    "experiments": {"root", "io", "report", "simulation", "calibrator", *ENGINE},
-    "cli": {"root", "io", "report", "simulation", "ros", "experiments", "calibrator", *ENGINE},
+    "io": GROUND | {"root", "geometry", "calibration"},
+    "report": GROUND | {"root", *ENGINE},
+    "simulation": GROUND | {"geometry", "io"},
+    "root": GROUND | {"geometry", "calibration", "engine", "io"},
+    "ros": {"root", "io", *ENGINE},
+    "cli": {"root", "io", "report", "simulation", "ros", *ENGINE},
     "__main__": {"cli"},
 }
 
@@ -48,7 +49,9 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
 
 
 def imports_of(path, package_root):
-    """Dotted names a file imports, inside functions too; relative ones resolved, import_module of a literal included."""
+    """Dotted names a file imports, inside functions too; relative ones resolved, import_module of a
+    literal included.
+    """
     names = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -101,25 +104,61 @@ def test_imports_go_one_way_and_libraries_stay_in_their_rooms():
 
 def test_order_itself_has_no_cycle_in_the_engine():
     order = list(ENGINE)
-    assert all(order.index(seen) < order.index(room) for room, allowed in ENGINE.items() for seen in allowed)
+    assert all(
+        order.index(seen) < order.index(room)
+        for room, allowed in ENGINE.items()
+        for seen in allowed
+    )
 
 
 @pytest.mark.parametrize(
     ("file", "line", "message"),
     [
-        ("geometry/se3.py", "from hand_eye_calib.solvers import dnl", "geometry must not import solvers"),
-        ("geometry/se3.py", "import hand_eye_calib.solvers.dnl", "geometry must not import solvers"),
+        (
+            "geometry/se3.py",
+            "from hand_eye_calib.solvers import dnl",
+            "geometry must not import solvers",
+        ),
+        (
+            "geometry/se3.py",
+            "import hand_eye_calib.solvers.dnl",
+            "geometry must not import solvers",
+        ),
         ("geometry/se3.py", "from ..solvers import dnl", "geometry must not import solvers"),
         ("geometry/se3.py", "from .. import solvers", "geometry must not import solvers"),
-        ("geometry/se3.py", "def late():\n    from hand_eye_calib import solvers", "geometry must not import solvers"),
-        ("geometry/se3.py", "from hand_eye_calib import calibrate", "geometry must not import root"),
+        (
+            "geometry/se3.py",
+            "def late():\n    from hand_eye_calib import solvers",
+            "geometry must not import solvers",
+        ),
+        (
+            "geometry/se3.py",
+            "from hand_eye_calib import calibrate",
+            "geometry must not import root",
+        ),
         ("errors.py", "from hand_eye_calib.geometry import se3", "errors must not import geometry"),
-        ("calibrator.py", "from hand_eye_calib.ros import node", "calibrator must not import ros"),
+        (
+            "engine/calibrator.py",
+            "from hand_eye_calib.ros import node",
+            "engine must not import ros",
+        ),
         ("ros/node.py", "from hand_eye_calib.cli import main", "ros must not import cli"),
         ("cli/main.py", "import rclpy", "rclpy may be imported only in ros/"),
-        ("simulation/drive.py", "from nav_msgs.msg import Odometry", "nav_msgs may be imported only in ros/"),
-        ("io/files.py", "from rosbags.highlevel import AnyReader", "rosbags may be imported only in io/bags.py"),
-        ("solvers/dnl.py", "import casadi as ca", "casadi may be imported only in solvers/ipopt.py"),
+        (
+            "simulation/drive.py",
+            "from nav_msgs.msg import Odometry",
+            "nav_msgs may be imported only in ros/",
+        ),
+        (
+            "io/files.py",
+            "from rosbags.highlevel import AnyReader",
+            "rosbags may be imported only in io/bags.py",
+        ),
+        (
+            "solvers/dnl.py",
+            "import casadi as ca",
+            "casadi may be imported only in solvers/ipopt.py",
+        ),
         (
             "cli/main.py",
             "import importlib\nimportlib.import_module('matplotlib.pyplot')",
@@ -144,12 +183,14 @@ def test_a_breach_is_caught(tmp_path, file, line, message):
     [
         "import hand_eye_calib",
         "import hand_eye_calib as hec; hec.Trajectory; hec.Calibration; hec.calibrate",
-        "from hand_eye_calib.calibrator import Calibrator; Calibrator()",
+        "from hand_eye_calib.engine.calibrator import Calibrator; Calibrator()",
         "import hand_eye_calib.cli.main",
     ],
 )
 def test_importing_loads_nothing_heavy(code):
     heavy = sorted({"rclpy", "rosbags", "casadi", "matplotlib"})
     check = f"{code}\nimport sys; print(*[name for name in {heavy} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, cwd=SOURCE.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", check], capture_output=True, text=True, cwd=SOURCE.parent
+    )
     assert (done.returncode, done.stdout.split()) == (0, []), done.stderr

@@ -6,7 +6,12 @@ import pytest
 from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering_poses
 
 from hand_eye_calib.adaptive import estimator
-from hand_eye_calib.assessment.covariance import assess, jackknife_covariance, larger_by_direction, model_covariance
+from hand_eye_calib.assessment.covariance import (
+    assess,
+    jackknife_covariance,
+    larger_by_direction,
+    model_covariance,
+)
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.geometry import se3
@@ -20,7 +25,9 @@ DNL = Method("dnl")
 def solve_and_assess(parent, child, reference="B1", method=DNL):
     pairs = motion_pairs(parent, child, reference)
     solution = method.solve(pairs)
-    return solution, assess(pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out))
+    return solution, assess(
+        pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)
+    )
 
 
 def errors_and_covariances(n_runs, estimate):
@@ -29,7 +36,9 @@ def errors_and_covariances(n_runs, estimate):
     child = child_of(parent)
     errors, covariances = [], []
     for run in range(n_runs):
-        solution, covariance = estimate(disturbed(parent, 2 * run, 0.005, 0.005), disturbed(child, 2 * run + 1, 0.005, 0.005))
+        solution, covariance = estimate(
+            disturbed(parent, 2 * run, 0.005, 0.005), disturbed(child, 2 * run + 1, 0.005, 0.005)
+        )
         errors.append(se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD))
         covariances.append(covariance)
     return np.array(errors), np.array(covariances)
@@ -54,7 +63,9 @@ def test_the_model_alone_is_right_for_independent_pairs():
     errors, sigmas = [], []
     for _ in range(80):
         noise = se3.exp(rng.normal(0, 0.004, (len(pairs), 6)))
-        noisy = type(pairs)(pairs.Ts_parenti_parentj, pairs.Ts_childi_childj @ noise, pairs.i, pairs.j)
+        noisy = type(pairs)(
+            pairs.Ts_parenti_parentj, pairs.Ts_childi_childj @ noise, pairs.i, pairs.j
+        )
         solution = DNL.solve(noisy)
         errors.append(se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD))
         sigmas.append(np.sqrt(np.diag(model_covariance(noisy, solution)[0])))
@@ -70,7 +81,9 @@ def test_jackknife_of_a_mean_is_its_standard_error():
         means = [values[~row].mean() for row in left_out]
         return se3.exp(np.c_[means, np.zeros((len(means), 5))])
 
-    covariance = jackknife_covariance(1000, se3.exp(np.r_[values.mean(), np.zeros(5)]), mean_without)
+    covariance = jackknife_covariance(
+        1000, se3.exp(np.r_[values.mean(), np.zeros(5)]), mean_without
+    )
     assert np.sqrt(covariance[0, 0]) == pytest.approx(values.std() / np.sqrt(1000), rel=0.5)
 
 
@@ -79,12 +92,18 @@ def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_
     ratios = []
     for run in range(12):
         parent = wandering_poses(150, seed=run)
-        child = disturbed(child_of(parent), run, 0.005, 0.005) if kind == "white" else drifting(child_of(parent), run)
+        child = (
+            disturbed(child_of(parent), run, 0.005, 0.005)
+            if kind == "white"
+            else drifting(child_of(parent), run)
+        )
         stamps_ns = np.arange(len(parent)) * 100_000_000
         solution = estimator.solve(stamps_ns, parent, child, nuisances=("none",))
         model = solution.cov_parent_child_in_child / solution.misfit
         resampled = jackknife_covariance(
-            len(solution.jumps), solution.T_parent_child, partial(estimator.solve_without, stamps_ns, parent, child, solution)
+            len(solution.jumps),
+            solution.T_parent_child,
+            partial(estimator.solve_without, stamps_ns, parent, child, solution),
         )
         ratios.append(np.trace(np.linalg.solve(model, resampled)) / 6)
     # Cutting the trajectory around what is left out would give 2 and more under white noise.
@@ -108,14 +127,18 @@ def test_the_larger_covariance_covers_both_in_every_direction():
     for direction in rng.normal(size=(200, 6)):
         needed = max(direction @ first @ direction, direction @ second @ direction)
         assert direction @ larger @ direction >= needed * (1 - 1e-9)
-    np.testing.assert_allclose(larger_by_direction(first, 0.5 * first), first, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        larger_by_direction(first, 0.5 * first), first, rtol=1e-9, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 def test_flat_ground_hides_the_height_and_only_that(noise):
     parent = planar_poses(200)
     child = child_of(parent)
-    _, assessment = solve_and_assess(disturbed(parent, 1, noise, noise), disturbed(child, 2, noise, noise), "B10")
+    _, assessment = solve_and_assess(
+        disturbed(parent, 1, noise, noise), disturbed(child, 2, noise, noise), "B10"
+    )
     verdicts = {dof.name: dof.verdict for dof in assessment.observability}
     assert verdicts.pop("z") is DofVerdict.UNOBSERVABLE
     assert set(verdicts.values()) == {DofVerdict.OBSERVED}
@@ -125,23 +148,31 @@ def test_flat_ground_hides_the_height_and_only_that(noise):
 def test_turning_about_one_axis_in_place_hides_shift_and_turn_along_it():
     angles = 0.3 * np.sin(np.arange(100) / 5)
     axis = np.array([0.0, 1.0, 0.0])
-    parent = se3.from_rotation_translation(se3.rotation_exp(angles[:, None] * axis), np.zeros((100, 3)))
+    parent = se3.from_rotation_translation(
+        se3.rotation_exp(angles[:, None] * axis), np.zeros((100, 3))
+    )
     _, assessment = solve_and_assess(parent, child_of(parent), "B5")
-    hidden = [dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
+    hidden = [
+        dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE
+    ]
     assert "y" in hidden
     assert "pitch" in hidden or len(hidden) > 2
 
 
 def test_good_motion_shows_everything():
     parent = wandering_poses(200)
-    _, assessment = solve_and_assess(disturbed(parent, 1, 1e-3, 1e-3), disturbed(child_of(parent), 2, 1e-3, 1e-3), "B5")
+    _, assessment = solve_and_assess(
+        disturbed(parent, 1, 1e-3, 1e-3), disturbed(child_of(parent), 2, 1e-3, 1e-3), "B5"
+    )
     assert {dof.verdict for dof in assessment.observability} == {DofVerdict.OBSERVED}
 
 
 def test_of_references_that_promise_alike_the_one_nearest_to_the_adaptive_answer_is_chosen():
     parent = wandering_poses(150)
     poses = PosePairs(
-        np.arange(150) * 100_000_000, disturbed(parent, 1, 0.003, 0.003), disturbed(child_of(parent), 2, 0.003, 0.003)
+        np.arange(150) * 100_000_000,
+        disturbed(parent, 1, 0.003, 0.003),
+        disturbed(child_of(parent), 2, 0.003, 0.003),
     )
     method = Method("dnlo")
     choice = select_reference(poses, method)
@@ -152,7 +183,10 @@ def test_of_references_that_promise_alike_the_one_nearest_to_the_adaptive_answer
 
     def distance(reference):
         return np.linalg.norm(
-            (method.solve(motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, reference)).T_parent_child - best)[:3, 3]
+            (
+                method.solve(motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, reference)).T_parent_child
+                - best
+            )[:3, 3]
         )
 
     assert choice.reference == min(choice.alike, key=distance)
@@ -160,7 +194,8 @@ def test_of_references_that_promise_alike_the_one_nearest_to_the_adaptive_answer
 
 
 def test_the_jackknife_of_dnlo_sees_the_inliers_change_sides():
-    # Two halves of the drive with different mounts: which of them counts as inliers hangs on a few pairs.
+    # Two halves of the drive with different mounts: which of them counts as inliers hangs on a few
+    # pairs.
     parent = wandering_poses(240)
     child = child_of(parent)
     moved = child_of(parent, T_PARENT_CHILD @ se3.exp(np.r_[0.5, np.zeros(5)]))
@@ -169,6 +204,8 @@ def test_the_jackknife_of_dnlo_sees_the_inliers_change_sides():
     method = Method("dnlo", threshold=1e-4)
     solution = method.solve(pairs)
     deviations = jackknife_covariance(
-        len(pairs), solution.T_parent_child, lambda left_out: method.solve_without(pairs, solution, left_out)
+        len(pairs),
+        solution.T_parent_child,
+        lambda left_out: method.solve_without(pairs, solution, left_out),
     )
     assert 0.1 < np.sqrt(np.trace(deviations[:3, :3])) < 2.0

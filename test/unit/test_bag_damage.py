@@ -1,7 +1,9 @@
-"""Bags that are cut off or have a flipped bit, at hundreds of places: a right answer, a warning, or one line - never a traceback.
+"""Bags that are cut off or have a flipped bit, at hundreds of places: a right answer, a warning, or
+one line - never a traceback.
 
-What cannot be noticed is a flipped bit that moves one pose by less than noise might (some centimetres here), in a file without checksums; robust
-methods then give nearly the same answer, and how nearly is tested. Bits of what is not read (covariances, twists, other topics) do no harm.
+What cannot be noticed is a flipped bit that moves one pose by less than noise might (some
+centimetres here), in a file without checksums; robust methods then give nearly the same answer, and
+how nearly is tested. Bits of what is not read (covariances, twists, other topics) do no harm.
 """
 
 import faulthandler
@@ -22,7 +24,17 @@ STREAMS = {
     "/a": (as_trajectory(POSES, sensor_frame="lidar", world_frame="map"), ODOMETRY),
     "/b": (as_trajectory(child_of(POSES), sensor_frame="camera", world_frame="odom"), POSE_STAMPED),
 }
-COMMAND = ["--parent-topic", "/a", "--child-topic", "/b", "--child-frame", "camera", "--reference", "B5", "--json"]
+COMMAND = [
+    "--parent-topic",
+    "/a",
+    "--child-topic",
+    "/b",
+    "--child-frame",
+    "camera",
+    "--reference",
+    "B5",
+    "--json",
+]
 FILES = {"mcap": "bag.mcap", "sqlite3": "bag.db3", "rosbag1": ""}
 
 # Largest error of an entry of T_parent_child that may go unnoticed.
@@ -61,7 +73,11 @@ def replay(path, capsys):
     """Exit code, JSON document or None, lines of errors on stderr."""
     code = main(["replay", str(path), *COMMAND])
     out, err = capsys.readouterr()
-    return code, json.loads(out) if out else None, [line for line in err.splitlines() if ": error: " in line]
+    return (
+        code,
+        json.loads(out) if out else None,
+        [line for line in err.splitlines() if ": error: " in line],
+    )
 
 
 def places(size, seed):
@@ -89,7 +105,9 @@ def test_cut_off_anywhere(bag, capsys):
                 assert (document, len(errors)) == (None, 1)
             else:
                 assert any("what came later is lost" in warning for warning in document["warnings"])
-                np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+                np.testing.assert_allclose(
+                    document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+                )
     assert outcomes == ({"refused", "recovered"} if path.suffix == ".mcap" else {"refused"})
 
 
@@ -114,7 +132,12 @@ def test_a_bit_flipped_anywhere(bag, capsys):
         if document is None:
             assert (code, len(errors)) == (1, 1), place
         elif not document["warnings"]:
-            np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place))
+            np.testing.assert_allclose(
+                document["T_parent_child"]["matrix"],
+                T_PARENT_CHILD,
+                atol=UNNOTICED,
+                err_msg=str(place),
+            )
     assert harmed >= 10
 
 

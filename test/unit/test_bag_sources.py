@@ -1,4 +1,6 @@
-"""Where poses may come from in a bag: all types of messages, paths, chains of transforms, several and compressed bags."""
+"""Where poses may come from in a bag: all types of messages, paths, chains of transforms, several
+and compressed bags.
+"""
 
 import re
 import struct
@@ -42,7 +44,10 @@ def test_every_type_of_stamped_pose(tmp_path, storage, message_type):
     write_bag(path, {"/a": (PARENT, message_type), "/b": (CHILD, ODOMETRY)}, storage)
     trajectory = hec.read_trajectory(path, topic="/a")
     assert_same_motion(trajectory, PARENT.stamps_ns, PARENT.poses)
-    assert (trajectory.world_frame, trajectory.sensor_frame) == ("map", "lidar" if POSE_TYPES[message_type] else "")
+    assert (trajectory.world_frame, trajectory.sensor_frame) == (
+        "map",
+        "lidar" if POSE_TYPES[message_type] else "",
+    )
 
 
 def test_the_same_poses_are_bit_identical_in_all_storages(tmp_path):
@@ -51,7 +56,11 @@ def test_the_same_poses_are_bit_identical_in_all_storages(tmp_path):
         path = bag_path(tmp_path, storage, storage)
         write_bag(path, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, storage)
         results.append(
-            hec.calibrate(hec.read_trajectory(path, topic="/a"), hec.read_trajectory(path, topic="/b"), reference="B5")
+            hec.calibrate(
+                hec.read_trajectory(path, topic="/a"),
+                hec.read_trajectory(path, topic="/b"),
+                reference="B5",
+            )
         )
     for result in results[1:]:
         np.testing.assert_array_equal(result.T_parent_child, results[0].T_parent_child)
@@ -69,7 +78,11 @@ def transforms(moving, static=(), slash=""):
         for stamp_ns, matrix in zip(trajectory.stamps_ns, trajectory.poses, strict=True)
     ]
     edges = [(0, slash + parent, slash + child, matrix) for child, parent, matrix in static]
-    return [*messages, (int(PARENT.stamps_ns[0]) - 1, "/tf_static", TF, tf_message(edges))] if edges else messages
+    return (
+        [*messages, (int(PARENT.stamps_ns[0]) - 1, "/tf_static", TF, tf_message(edges))]
+        if edges
+        else messages
+    )
 
 
 MOUNT = se3.exp(np.array([0.3, 0.1, -0.4, 0.2, 0.5, -0.9]))
@@ -77,18 +90,25 @@ MOUNT = se3.exp(np.array([0.3, 0.1, -0.4, 0.2, 0.5, -0.9]))
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
-    """map <- odom at 4 Hz, odom <- base at 10 Hz, base <- lidar fixed: poses of the lidar in the map, at the slow one's stamps."""
+    """map <- odom at 4 Hz, odom <- base at 10 Hz, base <- lidar fixed: poses of the lidar in the
+    map, at the slow one's stamps.
+    """
     slow = Trajectory(
         PARENT.stamps_ns[0] + 250_000_000 * np.arange(40) + 20_000_000,
         se3.exp(np.linspace(0, 1, 40)[:, None] * np.full(6, 0.2)),
     )
     messages = transforms(
-        [("odom", "map", slow), ("base", "odom", PARENT)], [("lidar", "base", MOUNT), ("rear", "base", T_PARENT_CHILD)]
+        [("odom", "map", slow), ("base", "odom", PARENT)],
+        [("lidar", "base", MOUNT), ("rear", "base", T_PARENT_CHILD)],
     )
     path = write_messages(bag_path(tmp_path, storage), messages, storage)
     trajectory = hec.read_trajectory(path, tf="map:lidar")
     inside = slow.stamps_ns <= PARENT.stamps_ns[-1]
-    assert_same_motion(trajectory, slow.stamps_ns[inside], slow.poses[inside] @ PARENT.at(slow.stamps_ns[inside]) @ MOUNT)
+    assert_same_motion(
+        trajectory,
+        slow.stamps_ns[inside],
+        slow.poses[inside] @ PARENT.at(slow.stamps_ns[inside]) @ MOUNT,
+    )
     assert (trajectory.world_frame, trajectory.sensor_frame) == ("map", "lidar")
     # Up and down again, through the common ancestor; and against the direction of the tree.
     other = hec.read_trajectory(path, tf="odom:lidar")
@@ -108,7 +128,9 @@ def test_old_transforms_with_slashes_and_of_the_old_type(tmp_path):
         (stamp_ns, "/tf", old, tf_message([(stamp_ns, "/odom", "/base", matrix)], old))
         for stamp_ns, matrix in zip(PARENT.stamps_ns, PARENT.poses, strict=True)
     ]
-    trajectory = hec.read_trajectory(write_messages(tmp_path / "old.bag", messages, "rosbag1"), tf="odom:base")
+    trajectory = hec.read_trajectory(
+        write_messages(tmp_path / "old.bag", messages, "rosbag1"), tf="odom:base"
+    )
     assert_same_motion(trajectory, PARENT.stamps_ns, PARENT.poses)
 
 
@@ -123,15 +145,22 @@ def test_both_sensors_from_transforms_give_the_extrinsic(tmp_path):
     assert {(pose.stream, pose.world_frame, pose.sensor_frame) for pose in poses} == {
         ("parent", "map", "lidar"), ("child", "odom", "camera")
     }  # fmt: skip
-    result = hec.calibrate(*(hec.read_trajectory(path, tf=tf) for tf in ("map:lidar", "odom:camera")), reference="B5")
+    result = hec.calibrate(
+        *(hec.read_trajectory(path, tf=tf) for tf in ("map:lidar", "odom:camera")), reference="B5"
+    )
     np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
 
 def test_a_gap_in_a_chain_is_not_bridged(tmp_path):
     holey = PARENT[(np.arange(120) < 40) | (np.arange(120) >= 60)]
     steady = Trajectory(PARENT.stamps_ns[::2], np.repeat(np.eye(4)[None], 60, axis=0))
-    path = write_messages(tmp_path / "bag", transforms([("base", "odom", holey), ("odom", "map", steady)]))
-    with pytest.warns(UserWarning, match=r"transform map:base: 10 of 60 poses were left out, .* not known within 0\.5 s"):
+    path = write_messages(
+        tmp_path / "bag", transforms([("base", "odom", holey), ("odom", "map", steady)])
+    )
+    with pytest.warns(
+        UserWarning,
+        match=r"transform map:base: 10 of 60 poses were left out, .* not known within 0\.5 s",
+    ):
         trajectory = hec.read_trajectory(path, tf="map:base")
     assert len(trajectory) == 50
 
@@ -149,8 +178,14 @@ def test_repeated_transforms_count_once(tmp_path):
             [("lidar", "base", PARENT), ("odom", "map", PARENT)],
             "frames 'odom' and 'lidar' are not connected; it has base:lidar, map:odom",
         ),
-        ([("lidar", "odom", PARENT), ("lidar", "map", PARENT)], "frame 'lidar' has two parents, 'odom' and 'map'"),
-        ([("lidar", "odom", PARENT), ("odom", "lidar", PARENT)], "the transforms form a loop through frame"),
+        (
+            [("lidar", "odom", PARENT), ("lidar", "map", PARENT)],
+            "frame 'lidar' has two parents, 'odom' and 'map'",
+        ),
+        (
+            [("lidar", "odom", PARENT), ("odom", "lidar", PARENT)],
+            "the transforms form a loop through frame",
+        ),
     ],
 )
 def test_transforms_that_do_not_lead_there(tmp_path, moving, message):
@@ -168,7 +203,10 @@ def test_frames_that_are_not_a_pair(text):
 
 def test_a_bag_without_transforms_says_what_it_has(tmp_path):
     write_bag(tmp_path / "bag", {"/a": (PARENT, ODOMETRY)})
-    with pytest.raises(InputError, match=r"no transforms in .*The bag has /a \(nav_msgs/msg/Odometry, 120 messages\)"):
+    with pytest.raises(
+        InputError,
+        match=r"no transforms in .*The bag has /a \(nav_msgs/msg/Odometry, 120 messages\)",
+    ):
         hec.read_trajectory(tmp_path / "bag", tf="odom:lidar")
 
 
@@ -177,12 +215,21 @@ def test_a_bag_without_transforms_says_what_it_has(tmp_path):
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_growing_path_is_its_newest_message(tmp_path, storage):
-    """A SLAM publishes its whole past again and again; the last correction counts, the time of the first appearance is kept."""
+    """A SLAM publishes its whole past again and again; the last correction counts, the time of the
+    first appearance is kept.
+    """
     messages = []
     for end in range(10, 121, 10):
         corrected = POSES[:end].copy()
         corrected[:, 0, 3] += 0.01 * (120 - end)
-        messages.append((PARENT.stamps_ns[end - 1], "/path", PATH, path_message(PARENT.stamps_ns[:end], corrected)))
+        messages.append(
+            (
+                PARENT.stamps_ns[end - 1],
+                "/path",
+                PATH,
+                path_message(PARENT.stamps_ns[:end], corrected),
+            )
+        )
     path = write_messages(bag_path(tmp_path, storage), messages, storage)
     assert_same_motion(hec.read_trajectory(path, topic="/path"), PARENT.stamps_ns, POSES)
     with PoseBag(path) as bag:
@@ -200,7 +247,11 @@ def test_a_path_that_drops_its_oldest_poses_is_put_together(tmp_path):
         )
         for end in range(10, 121, 10)
     ]
-    assert_same_motion(hec.read_trajectory(write_messages(tmp_path / "bag", messages), topic="/path"), PARENT.stamps_ns, POSES)
+    assert_same_motion(
+        hec.read_trajectory(write_messages(tmp_path / "bag", messages), topic="/path"),
+        PARENT.stamps_ns,
+        POSES,
+    )
 
 
 def test_a_path_whose_poses_have_no_stamps_is_refused(tmp_path):
@@ -226,19 +277,28 @@ def choose(tmp_path, streams, extra=()):
 
         for topic, message_type, make in extra:
             connection = writer.add_connection(topic, message_type, typestore=JAZZY)
-            writer.write(connection, int(PARENT.stamps_ns[0]), JAZZY.serialize_cdr(make(JAZZY), message_type))
+            writer.write(
+                connection, int(PARENT.stamps_ns[0]), JAZZY.serialize_cdr(make(JAZZY), message_type)
+            )
     with PoseBag(path) as bag:
         return bag.select_topics()
 
 
 def test_a_goal_that_was_published_once_is_no_sensor(tmp_path):
-    streams = {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY), "/goal_pose": (PARENT[:1], "geometry_msgs/msg/PoseStamped")}
+    streams = {
+        "/a": (PARENT, ODOMETRY),
+        "/b": (CHILD, ODOMETRY),
+        "/goal_pose": (PARENT[:1], "geometry_msgs/msg/PoseStamped"),
+    }
     assert choose(tmp_path, streams) == ("/a", "/b")
 
 
 def test_a_path_counts_where_there_are_not_two_others(tmp_path):
     path = ("/path", PATH, path_message(PARENT.stamps_ns, POSES))
-    assert choose(tmp_path / "1", {"/a": (PARENT, ODOMETRY), "/z": (CHILD, ODOMETRY)}, [path]) == ("/a", "/z")
+    assert choose(tmp_path / "1", {"/a": (PARENT, ODOMETRY), "/z": (CHILD, ODOMETRY)}, [path]) == (
+        "/a",
+        "/z",
+    )
     assert choose(tmp_path / "2", {"/z": (CHILD, ODOMETRY)}, [path]) == ("/path", "/z")
 
 
@@ -250,7 +310,9 @@ def test_the_parts_of_a_drive_are_read_in_the_order_of_time(tmp_path, storage):
     paths = []
     for number, part in enumerate([slice(80, 120), slice(0, 40), slice(40, 80)]):
         paths.append(bag_path(tmp_path, storage, f"part{number}"))
-        write_bag(paths[-1], {"/a": (PARENT[part], ODOMETRY), "/b": (CHILD[part], ODOMETRY)}, storage)
+        write_bag(
+            paths[-1], {"/a": (PARENT[part], ODOMETRY), "/b": (CHILD[part], ODOMETRY)}, storage
+        )
     with PoseBag(*paths) as bag:
         poses = list(bag.poses("/a", "/b"))
         assert bag.topics() == [("/a", ODOMETRY, 120), ("/b", ODOMETRY, 120)]
@@ -275,11 +337,19 @@ def read_all(path):
 
 @pytest.mark.parametrize(
     ("storage", "mode"),
-    [("mcap", "STORAGE"), ("mcap", "MESSAGE"), ("mcap", "FILE"), ("sqlite3", "MESSAGE"), ("sqlite3", "FILE")],
+    [
+        ("mcap", "STORAGE"),
+        ("mcap", "MESSAGE"),
+        ("mcap", "FILE"),
+        ("sqlite3", "MESSAGE"),
+        ("sqlite3", "FILE"),
+    ],
 )
 def test_compressed_bags(tmp_path, storage, mode):
     write_bag(tmp_path / "plain", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, storage)
-    writer = rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+    writer = rosbag2.Writer(
+        tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()]
+    )
     writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
     with writer:
         bags._write_streams(writer, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, storage)
@@ -294,7 +364,9 @@ def test_compressed_bags(tmp_path, storage, mode):
 
 @pytest.mark.parametrize("compression", list(rosbag1.Writer.CompressionFormat))
 def test_compressed_chunks_of_rosbag1(tmp_path, compression):
-    write_bag(tmp_path / "plain.bag", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, "rosbag1")
+    write_bag(
+        tmp_path / "plain.bag", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, "rosbag1"
+    )
     writer = rosbag1.Writer(tmp_path / "bag.bag")
     writer.set_compression(compression)
     with writer:
@@ -326,7 +398,12 @@ def without_chunks(data):
         position += 9 + size
     half = len(messages) // 2
     (size,) = struct.unpack_from("<Q", data, 9)
-    return data[: 17 + size] + b"".join(others + messages[half:] + messages[:half]) + FOOTER + data[-8:]
+    return (
+        data[: 17 + size]
+        + b"".join(others + messages[half:] + messages[:half])
+        + FOOTER
+        + data[-8:]
+    )
 
 
 @pytest.mark.parametrize("change", [without_index, without_chunks])
@@ -344,10 +421,14 @@ def test_of_chunks_with_other_topics_only_the_wanted_bytes_are_read(tmp_path):
     """Images between the poses: their bytes are not touched."""
     from bag_making import JAZZY
 
-    with rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+    with rosbag2.Writer(
+        tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
+    ) as writer:
         image = writer.add_connection("/image", "sensor_msgs/msg/CompressedImage", typestore=JAZZY)
         blob = JAZZY.types["sensor_msgs/msg/CompressedImage"](
-            JAZZY.types["std_msgs/msg/Header"](JAZZY.types["builtin_interfaces/msg/Time"](0, 0), "camera"),
+            JAZZY.types["std_msgs/msg/Header"](
+                JAZZY.types["builtin_interfaces/msg/Time"](0, 0), "camera"
+            ),
             "jpeg",
             np.zeros(300_000, np.uint8),
         )
@@ -385,13 +466,17 @@ def turned(matrix):
 @pytest.mark.parametrize("index", [0, 1, 60, 118, 119])
 def test_a_pose_that_jumps_away_and_back_is_warned_about(tmp_path, change, by, unit, index):
     calm = as_trajectory(wandering_poses(120, step_rad=0.02), sensor_frame="camera")
-    write_bag(tmp_path / "bag", {"/a": (PARENT, ODOMETRY), "/b": (spoiled(calm, index, change), ODOMETRY)})
+    write_bag(
+        tmp_path / "bag", {"/a": (PARENT, ODOMETRY), "/b": (spoiled(calm, index, change), ODOMETRY)}
+    )
     with PoseBag(tmp_path / "bag") as bag:
         list(bag.poses("/a", "/b"))
         warnings = bag.warnings
         assert bag.warnings == warnings  # asking twice changes nothing
     assert len(warnings) == 1
-    assert f"/b: 1 of 120 poses jump away and back (first message {index + 1}, stamp " in warnings[0]
+    assert (
+        f"/b: 1 of 120 poses jump away and back (first message {index + 1}, stamp " in warnings[0]
+    )
     found, found_unit = re.search(r"by ([\d.]+) (\w+)", warnings[0]).groups()
     assert (float(found), found_unit) == (pytest.approx(by, rel=0.1), unit)
 
@@ -402,7 +487,13 @@ def test_lasting_jumps_and_quick_motion_are_nothing_unusual(tmp_path):
     jumped = Trajectory(CHILD.stamps_ns, jumped, "camera", "odom")
     write_bag(
         tmp_path / "bag",
-        {"/a": (as_trajectory(wandering_poses(120, step_m=3.0)), "geometry_msgs/msg/PoseStamped"), "/b": (jumped, ODOMETRY)},
+        {
+            "/a": (
+                as_trajectory(wandering_poses(120, step_m=3.0)),
+                "geometry_msgs/msg/PoseStamped",
+            ),
+            "/b": (jumped, ODOMETRY),
+        },
     )
     with PoseBag(tmp_path / "bag") as bag:
         list(bag.poses("/a", "/b"))
@@ -416,9 +507,15 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_warned_about(tmp_path):
         def make(typestore):
             types = typestore.types
             zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-            twist = types["geometry_msgs/msg/TwistWithCovariance"](types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36))
-            with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](pose(typestore, matrix), np.zeros(36))
-            return types[ODOMETRY](header(typestore, stamp_ns, "odom"), "lidar", with_covariance, twist)
+            twist = types["geometry_msgs/msg/TwistWithCovariance"](
+                types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
+            )
+            with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](
+                pose(typestore, matrix), np.zeros(36)
+            )
+            return types[ODOMETRY](
+                header(typestore, stamp_ns, "odom"), "lidar", with_covariance, twist
+            )
 
         return make
 
@@ -432,7 +529,9 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_warned_about(tmp_path):
     expected = r"/a: 1 of 120 stamps jump away and back against the bag's own time \(first message 31, .*by 64 s\); their poses were left out"
     with pytest.warns(UserWarning, match=expected):
         trajectory = hec.read_trajectory(path, topic="/a")
-    assert_same_motion(trajectory, np.delete(PARENT.stamps_ns, 30), np.delete(PARENT.poses, 30, axis=0))
+    assert_same_motion(
+        trajectory, np.delete(PARENT.stamps_ns, 30), np.delete(PARENT.poses, 30, axis=0)
+    )
 
 
 def test_reading_from_a_bag_takes_no_options_of_text_files(tmp_path):

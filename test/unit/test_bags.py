@@ -24,11 +24,15 @@ JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOET
 
 def trajectory(first_ns, count=40, seed=1, **frames):
     stamps_ns = first_ns + 100_000_007 * np.arange(count)
-    return Trajectory(stamps_ns, se3.exp(np.random.default_rng(seed).normal(size=(count, 6))), **frames)
+    return Trajectory(
+        stamps_ns, se3.exp(np.random.default_rng(seed).normal(size=(count, 6))), **frames
+    )
 
 
 PARENT = trajectory(1317375625661736123, sensor_frame="lidar", world_frame="map")
-CHILD = trajectory(1317375625661736130, count=30, seed=2, sensor_frame="camera_left", world_frame="odom_camera")
+CHILD = trajectory(
+    1317375625661736130, count=30, seed=2, sensor_frame="camera_left", world_frame="odom_camera"
+)
 STREAMS = {"/lidar/odom": (PARENT, ODOMETRY), "/camera/pose": (CHILD, POSE_STAMPED)}
 
 
@@ -46,7 +50,11 @@ def new_bag(tmp_path):
 
 def storage_file(path):
     """The file that holds the messages."""
-    return path if path.is_file() else next(part for part in path.iterdir() if part.suffix in (".mcap", ".db3"))
+    return (
+        path
+        if path.is_file()
+        else next(part for part in path.iterdir() if part.suffix in (".mcap", ".db3"))
+    )
 
 
 def read(path, parent="/lidar/odom", child="/camera/pose"):
@@ -58,13 +66,18 @@ def read(path, parent="/lidar/odom", child="/camera/pose"):
 def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(new_bag, storage):
     poses = read(new_bag(storage))
     assert [pose.stamp_ns for pose in poses] == sorted([*PARENT.stamps_ns, *CHILD.stamps_ns])
-    for stream, source, world, sensor in (("parent", PARENT, "map", "lidar"), ("child", CHILD, "odom_camera", None)):
+    for stream, source, world, sensor in (
+        ("parent", PARENT, "map", "lidar"),
+        ("child", CHILD, "odom_camera", None),
+    ):
         found = [pose for pose in poses if pose.stream == stream]
         assert [pose.stamp_ns for pose in found] == source.stamps_ns.tolist()
         assert [pose.number for pose in found] == list(range(1, len(source) + 1))
         assert {(pose.world_frame, pose.sensor_frame) for pose in found} == {(world, sensor)}
         np.testing.assert_array_equal([pose.position for pose in found], source.poses[:, :3, 3])
-        np.testing.assert_array_equal([pose.quat_xyzw for pose in found], se3.to_quat_xyzw(source.poses))
+        np.testing.assert_array_equal(
+            [pose.quat_xyzw for pose in found], se3.to_quat_xyzw(source.poses)
+        )
 
 
 def test_storage_files_read_alone(new_bag):
@@ -85,7 +98,9 @@ def add_text_topic(path):
         bags._write_streams(writer, STREAMS, "mcap")
         connection = writer.add_connection("/log", "std_msgs/msg/String", typestore=JAZZY)
         text = JAZZY.types["std_msgs/msg/String"]("hello")
-        writer.write(connection, int(PARENT.stamps_ns[3]), JAZZY.serialize_cdr(text, "std_msgs/msg/String"))
+        writer.write(
+            connection, int(PARENT.stamps_ns[3]), JAZZY.serialize_cdr(text, "std_msgs/msg/String")
+        )
     return path
 
 
@@ -114,12 +129,18 @@ def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
     ("named", "message"),
     [
         (("/odom", "/camera/pose"), "no topic /odom in "),
-        (("/lidar/odom", "/log"), r"topic /log of .* is of type std_msgs/msg/String; accepted are nav_msgs/msg/Odometry, "),
+        (
+            ("/lidar/odom", "/log"),
+            r"topic /log of .* is of type std_msgs/msg/String; accepted are nav_msgs/msg/Odometry, ",
+        ),
         (("/lidar/odom", "/lidar/odom"), "parent and child topic are both /lidar/odom"),
     ],
 )
 def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, message):
-    with PoseBag(add_text_topic(tmp_path / "bag")) as bag, pytest.raises(InputError, match=message) as caught:
+    with (
+        PoseBag(add_text_topic(tmp_path / "bag")) as bag,
+        pytest.raises(InputError, match=message) as caught,
+    ):
         bag.select_topics(*named)
     listing = (
         "The bag has /camera/pose (geometry_msgs/msg/PoseStamped, 30 messages), /lidar/odom (nav_msgs/msg/Odometry, 40 messages), "
@@ -134,7 +155,9 @@ def test_without_names_there_must_be_exactly_two_pose_topics(new_bag, count):
     path = new_bag(streams={f"/odom_{number}": (PARENT, ODOMETRY) for number in range(count)})
     with (
         PoseBag(path) as bag,
-        pytest.raises(InputError, match="name the topics of poses with --parent-topic and --child-topic"),
+        pytest.raises(
+            InputError, match="name the topics of poses with --parent-topic and --child-topic"
+        ),
     ):
         bag.select_topics()
 
@@ -149,7 +172,9 @@ def one_line(error):
 def test_a_bag_cut_off_is_refused(new_bag, storage, share):
     path = new_bag(storage)
     cut_off(path, share)
-    with pytest.raises(InputError, match="it is cut off, damaged or of an unsupported kind") as caught:
+    with pytest.raises(
+        InputError, match="it is cut off, damaged or of an unsupported kind"
+    ) as caught:
         read(path)
     assert str(path) in one_line(caught)
 
@@ -163,7 +188,10 @@ def cut_off(path, share):
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.9])
 def test_an_mcap_cut_off_gives_what_came_before(tmp_path, compression, share):
     """The recorder lost power: no index, the last chunk incomplete, no metadata.yaml."""
-    streams = {topic: (trajectory(1_000, count=4000), ODOMETRY) for topic in ("/lidar/odom", "/camera/pose")}
+    streams = {
+        topic: (trajectory(1_000, count=4000), ODOMETRY)
+        for topic in ("/lidar/odom", "/camera/pose")
+    }
     path = tmp_path / "bag"
     writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
     if compression == "zstd":
@@ -181,7 +209,8 @@ def test_an_mcap_cut_off_gives_what_came_before(tmp_path, compression, share):
     assert 0.9 * share - 0.2 * (compression == "zstd") < len(recovered) / len(whole) < share + 0.1
     assert recovered == whole[: len(recovered)]
     assert re.search(
-        rf"recovered are {len(recovered)} messages covering [0-9.]+ s, from the first \d+% of its \d+ bytes", warning
+        rf"recovered are {len(recovered)} messages covering [0-9.]+ s, from the first \d+% of its \d+ bytes",
+        warning,
     )
 
 
@@ -196,18 +225,21 @@ def test_an_mcap_of_which_nothing_can_be_recovered_is_refused(new_bag):
 def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):
     """Recorders write a checksum of every chunk; a file of several chunks loses one."""
     path = tmp_path / "bag"
-    streams = {topic: (trajectory(1_000, count=4000), ODOMETRY) for topic in ("/lidar/odom", "/camera/pose")}
+    streams = {
+        topic: (trajectory(1_000, count=4000), ODOMETRY)
+        for topic in ("/lidar/odom", "/camera/pose")
+    }
     write_bag(path, streams)
     whole = read(path)
     data = bytearray(storage_file(path).read_bytes())
     with McapFile(storage_file(path), None) as mcap:
         offsets = [chunk.offset for chunk in mcap._chunks]
     assert len(offsets) > 2
-    for (
-        offset
-    ) in offsets:  # 9 bytes of record header, three times 8 of times and size, 4 of checksum, 4 of no compression, 8 of size
+    for offset in offsets:  # 9 bytes of record header, three times 8 of times and size, 4 of checksum, 4 of no compression, 8 of size
         size = int.from_bytes(data[offset + 25 : offset + 33], "little")
-        data[offset + 33 : offset + 37] = zlib.crc32(data[offset + 49 : offset + 49 + size]).to_bytes(4, "little")
+        data[offset + 33 : offset + 37] = zlib.crc32(
+            data[offset + 49 : offset + 49 + size]
+        ).to_bytes(4, "little")
     storage_file(path).write_bytes(data)
     assert read(path) == whole
     data[offsets[1] + 1000] ^= 1
@@ -216,7 +248,9 @@ def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):
         poses = list(bag.poses("/lidar/odom", "/camera/pose"))
         (warning,) = bag.warnings
     assert len(whole) * 0.5 < len(poses) < len(whole)
-    assert {(pose.stream, pose.stamp_ns) for pose in poses} < {(pose.stream, pose.stamp_ns) for pose in whole}
+    assert {(pose.stream, pose.stamp_ns) for pose in poses} < {
+        (pose.stream, pose.stamp_ns) for pose in whole
+    }
     assert f"at byte {offsets[1]} is damaged (Chunk checksum mismatch.) and was left out" in warning
 
 
@@ -252,16 +286,26 @@ def test_paths_that_are_no_bag(tmp_path, new_bag):
             PoseBag(path)
         path = tmp_path / f"text.{suffix}"
         path.write_text("this is not a bag\n" * 100)
-        with pytest.raises(InputError, match=f"text.{suffix}: it is cut off, damaged or of an unsupported kind") as caught:
+        with pytest.raises(
+            InputError, match=f"text.{suffix}: it is cut off, damaged or of an unsupported kind"
+        ) as caught:
             PoseBag(path)
         one_line(caught)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_directory_without_metadata_or_with_damaged_one_is_read_by_its_files(tmp_path, new_bag, storage):
+def test_a_directory_without_metadata_or_with_damaged_one_is_read_by_its_files(
+    tmp_path, new_bag, storage
+):
     path = new_bag(storage)
     whole = read(path)
-    for text in ("", "nothing: here", "[", "{}", "rosbag2_bagfile_information: {relative_file_paths: 3}"):
+    for text in (
+        "",
+        "nothing: here",
+        "[",
+        "{}",
+        "rosbag2_bagfile_information: {relative_file_paths: 3}",
+    ):
         (path / "metadata.yaml").write_text(text)
         with PoseBag(path) as bag:
             assert list(bag.poses("/lidar/odom", "/camera/pose")) == whole
@@ -272,7 +316,10 @@ def test_a_directory_without_metadata_or_with_damaged_one_is_read_by_its_files(t
         assert list(bag.poses("/lidar/odom", "/camera/pose")) == whole
         assert bag.warnings == []
     (tmp_path / "folder").mkdir()
-    with pytest.raises(InputError, match=r"no bag in .*folder: expected metadata\.yaml or files that end in .*check the path"):
+    with pytest.raises(
+        InputError,
+        match=r"no bag in .*folder: expected metadata\.yaml or files that end in .*check the path",
+    ):
         PoseBag(tmp_path / "folder")
 
 
@@ -282,7 +329,9 @@ def test_a_file_that_metadata_names_and_that_is_missing_is_named(new_bag):
     metadata["rosbag2_bagfile_information"]["relative_file_paths"].append("bag_1.mcap")
     (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
     with PoseBag(path) as bag:
-        assert bag.warnings == [f"{path}: bag_1.mcap of 2 files in metadata.yaml is missing; its messages are left out"]
+        assert bag.warnings == [
+            f"{path}: bag_1.mcap of 2 files in metadata.yaml is missing; its messages are left out"
+        ]
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -314,7 +363,10 @@ def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, dat
         bags._write_streams(writer, {"/camera/pose": (CHILD, POSE_STAMPED)}, "sqlite3")
         connection = writer.add_connection("/lidar/odom", ODOMETRY, typestore=JAZZY)
         writer.write(connection, 1, data)
-    with pytest.raises(InputError, match=f"/lidar/odom, message 1: not a readable nav_msgs/msg/Odometry .*{reason}|{reason}"):
+    with pytest.raises(
+        InputError,
+        match=f"/lidar/odom, message 1: not a readable nav_msgs/msg/Odometry .*{reason}|{reason}",
+    ):
         read(tmp_path / "bag")
 
 
@@ -322,16 +374,27 @@ def test_several_publishers_and_types_on_one_topic(tmp_path):
     """Two connections of one type are one stream; of two types, the topic is refused."""
     for name, second_type in (("one.bag", ODOMETRY), ("two.bag", "std_msgs/msg/String")):
         with rosbag1.Writer(tmp_path / name) as writer:
-            bags._write_streams(writer, {"/odom": (PARENT, ODOMETRY), "/pose": (CHILD, POSE_STAMPED)}, "rosbag1")
-            connection = writer.add_connection("/odom", second_type, typestore=NOETIC, callerid="/second")
+            bags._write_streams(
+                writer, {"/odom": (PARENT, ODOMETRY), "/pose": (CHILD, POSE_STAMPED)}, "rosbag1"
+            )
+            connection = writer.add_connection(
+                "/odom", second_type, typestore=NOETIC, callerid="/second"
+            )
             stamp_ns = int(PARENT.stamps_ns[-1]) + 1
-            message = next(bags._stamped_messages(NOETIC, trajectory(stamp_ns, count=1), ODOMETRY, True, connection))[2]
+            message = next(
+                bags._stamped_messages(
+                    NOETIC, trajectory(stamp_ns, count=1), ODOMETRY, True, connection
+                )
+            )[2]
             text = NOETIC.types["std_msgs/msg/String"]("hello")
             message = message if second_type == ODOMETRY else text
             writer.write(connection, stamp_ns, NOETIC.serialize_ros1(message, second_type))
     poses = read(tmp_path / "one.bag", "/odom", "/pose")
     assert sum(pose.stream == "parent" for pose in poses) == len(PARENT) + 1
-    with PoseBag(tmp_path / "two.bag") as bag, pytest.raises(InputError, match="topic /odom of .* is of type several types"):
+    with (
+        PoseBag(tmp_path / "two.bag") as bag,
+        pytest.raises(InputError, match="topic /odom of .* is of type several types"),
+    ):
         bag.select_topics("/odom", "/pose")
 
 
@@ -343,7 +406,9 @@ def test_writing_refuses_what_it_cannot_do(tmp_path, new_bag):
         write_bag(tmp_path / "new", STREAMS, "rosbag1")
     with pytest.raises(InputError, match=r"must be named \.bag"):
         write_bag(tmp_path / "new.bag", STREAMS, "mcap")
-    with pytest.raises(ConfigError, match="unknown bag storage 'zip'; known are mcap, sqlite3, rosbag1"):
+    with pytest.raises(
+        ConfigError, match="unknown bag storage 'zip'; known are mcap, sqlite3, rosbag1"
+    ):
         write_bag(tmp_path / "new", STREAMS, "zip")
     with pytest.raises(ConfigError, match="cannot write messages of type 'std_msgs/msg/String'"):
         write_bag(tmp_path / "new", {"/a": (PARENT, "std_msgs/msg/String")})
@@ -354,10 +419,14 @@ def test_writing_refuses_what_it_cannot_do(tmp_path, new_bag):
 
 
 def test_bags_of_other_programs_read_or_are_refused_in_one_line():
-    """Recordings of rosbag, rosbag2 and others: split, converted, compressed, unsorted, empty, of wrong formats."""
+    """Recordings of rosbag, rosbag2 and others: split, converted, compressed, unsorted, empty, of
+    wrong formats.
+    """
     folder = data_folder() / "bags"
     paths = [
-        path for path in folder.rglob("*") if path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").exists()
+        path
+        for path in folder.rglob("*")
+        if path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").exists()
     ]
     assert paths
     refused = {}
@@ -365,7 +434,9 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
         try:
             with PoseBag(path) as bag:
                 topics = bag.topics()
-                assert sum(map(len, bag._messages([topic.name for topic in topics]))) == sum(topic.count for topic in topics)
+                assert sum(map(len, bag._messages([topic.name for topic in topics]))) == sum(
+                    topic.count for topic in topics
+                )
         except InputError as error:
             refused[path.name] = str(error)
     assert refused.keys() == {"empty-file.bag", "wrong_rmw_test", "wrong_rmw_test_0.mcap"}
@@ -374,4 +445,6 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
         poses = list(bag.poses("/odom", "/none"))
     assert len(poses) == 2741
     assert {(pose.world_frame, pose.sensor_frame) for pose in poses} == {("odom", "base_footprint")}
-    np.testing.assert_allclose(np.linalg.norm([pose.quat_xyzw for pose in poses], axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm([pose.quat_xyzw for pose in poses], axis=1), 1.0, atol=1e-6
+    )

@@ -41,7 +41,10 @@ def test_rows_like_the_baseline_are_good():
 @pytest.mark.parametrize(
     ("changes", "failures"),
     [
-        ({"seconds": 0.026}, ["dnlo ipopt / dnlo fast, 443: 38.5, below a third of the baseline's 120"]),
+        (
+            {"seconds": 0.026},
+            ["dnlo ipopt / dnlo fast, 443: 38.5, below a third of the baseline's 120"],
+        ),
         ({"objective": 2.0001}, ["dnlo fast, 443: objective 2.0001 is above ipopt's 2"]),
         (
             {"size": 442},
@@ -55,7 +58,10 @@ def test_rows_like_the_baseline_are_good():
     ],
 )
 def test_a_row_that_falls_short_is_a_failure(changes, failures):
-    assert baseline.failures([dataclasses.replace(ROWS[0], **changes), *ROWS[1:]], MEMORY, KNOWN) == failures
+    assert (
+        baseline.failures([dataclasses.replace(ROWS[0], **changes), *ROWS[1:]], MEMORY, KNOWN)
+        == failures
+    )
 
 
 def test_more_memory_is_a_failure():
@@ -71,7 +77,9 @@ def test_only_opencv_may_be_missing_and_only_a_full_run_may_have_more():
         "dnlo ipopt / dnlo fast, 443: ratio is missing",
     ]
     more = [*ROWS, Row("park", 10**6, 1.0, 0.1, 2)]
-    assert baseline.failures(more, MEMORY, KNOWN) == ["park, 1000000: not in the baseline; run with --update"]
+    assert baseline.failures(more, MEMORY, KNOWN) == [
+        "park, 1000000: not in the baseline; run with --update"
+    ]
     assert baseline.failures(more, MEMORY, KNOWN, is_more=True) == []
 
 
@@ -80,7 +88,9 @@ def test_baseline_covers_both_sources_with_equal_rows():
     assert set(known) == {"published", "simulated"}
     assert known["published"]["rows"] == known["simulated"]["rows"]
     assert known["published"]["ratios"].keys() == known["simulated"]["ratios"].keys()
-    assert {"dnlo ipopt / dnlo fast, 443", "opencv, the fastest / dnlo fast, 2338"} <= known["published"]["ratios"].keys()
+    assert {"dnlo ipopt / dnlo fast, 443", "opencv, the fastest / dnlo fast, 2338"} <= known[
+        "published"
+    ]["ratios"].keys()
 
 
 def test_measuring_repeats_what_is_quick_and_returns_the_answer():
@@ -103,7 +113,9 @@ def test_simulated_drives_have_a_known_answer_and_as_many_pairs_as_asked_for():
 def test_opencv_is_given_what_it_expects(method):
     cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
     random = np.random.default_rng(3)
-    Ts_pw_p = np.array([se3.exp(np.r_[random.normal(size=3), random.normal(size=3)]) for _ in range(12)])
+    Ts_pw_p = np.array(
+        [se3.exp(np.r_[random.normal(size=3), random.normal(size=3)]) for _ in range(12)]
+    )
     T_cw_pw = se3.exp(np.array([3.0, -2.0, 1.0, 0.5, 0.2, -2.0]))
     found = opencv.calibrate(cv2, method, Ts_pw_p, T_cw_pw @ Ts_pw_p @ data.T_PARENT_CHILD)
     np.testing.assert_allclose(found, data.T_PARENT_CHILD, atol=1e-6)
@@ -117,9 +129,15 @@ def test_growth_curves_are_drawn(tmp_path):
 
 def test_tables_replace_those_of_an_earlier_run_in_the_page(tmp_path):
     page = tmp_path / "page.md"
-    page.write_text((BENCHMARKS.parent / "docs" / "benchmarks.md").read_text(encoding="utf-8"), encoding="utf-8")
+    page.write_text(
+        (BENCHMARKS.parent / "docs" / "benchmarks.md").read_text(encoding="utf-8"), encoding="utf-8"
+    )
     for seconds in ("1.5 ms", "2.5 ms"):
-        table.write([table.Table("Growth", ["443"], [["dnlo fast", seconds]])], page, f"Measured, {seconds}.\n")
+        table.write(
+            [table.Table("Growth", ["443"], [["dnlo fast", seconds]])],
+            page,
+            f"Measured, {seconds}.\n",
+        )
     text = page.read_text(encoding="utf-8")
     assert "### Growth\n\n|  | 443 |\n| --- | ---: |\n| dnlo fast | 2.5 ms |\n" in text
     assert "1.5 ms" not in text
@@ -129,10 +147,26 @@ def test_tables_replace_those_of_an_earlier_run_in_the_page(tmp_path):
 
 def test_tables_show_every_row(capsys):
     floor = Row(baseline.FLOOR, 443, 1e-6, 0.0, 5)
-    drives = [dataclasses.replace(row, size=size, error_m=0.1, error_rad=0.01) for size in (443, 2338) for row in ROWS]
-    rows = [floor, dataclasses.replace(floor, size=2338), *drives, Row("add_pose, median", 40_000, 1.25e-6, 0.1, 5)]
+    drives = [
+        dataclasses.replace(row, size=size, error_m=0.1, error_rad=0.01)
+        for size in (443, 2338)
+        for row in ROWS
+    ]
+    rows = [
+        floor,
+        dataclasses.replace(floor, size=2338),
+        *drives,
+        Row("add_pose, median", 40_000, 1.25e-6, 0.1, 5),
+    ]
     table.show(table.tables("published", rows, MEMORY))
     shown = capsys.readouterr().out
     assert all(
-        words in shown for words in ("10 ms ± 10%", "0.573", "1.25 us", "What is aimed at", "dnlo ipopt / dnlo fast, 443")
+        words in shown
+        for words in (
+            "10 ms ± 10%",
+            "0.573",
+            "1.25 us",
+            "What is aimed at",
+            "dnlo ipopt / dnlo fast, 443",
+        )
     )

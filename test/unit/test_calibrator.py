@@ -2,13 +2,21 @@ import dataclasses
 
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, feed, planar_poses, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    feed,
+    planar_poses,
+    wandering_poses,
+)
 
 import hand_eye_calib as hec
-from hand_eye_calib import calibrator as engine
 from hand_eye_calib.calibration import SolveStatus
-from hand_eye_calib.calibrator import Calibrator, calibrate
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine import calibrator as engine
+from hand_eye_calib.engine.calibrator import Calibrator, calibrate
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 
 IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
@@ -20,7 +28,9 @@ def drive(n_poses=200, seed=0):
 
     coarse = wandering_poses(n_poses, seed)
     fine = as_trajectory(coarse, 10).at(
-        np.sort(np.r_[as_trajectory(coarse, 10).stamps_ns[:-1, None] + np.arange(5) * 2 * 10**7].ravel())
+        np.sort(
+            np.r_[as_trajectory(coarse, 10).stamps_ns[:-1, None] + np.arange(5) * 2 * 10**7].ravel()
+        )
     )
     parent = as_trajectory(coarse, 10)
     child = as_trajectory(child_of(fine), 50)
@@ -48,9 +58,12 @@ def test_the_engine_and_the_function_agree_to_the_last_bit():
     from hand_eye_calib.geometry.trajectory import Trajectory
 
     through_quaternions = [
-        Trajectory.from_quat_xyzw(t.stamps_ns, t.poses[:, :3, 3], se3.to_quat_xyzw(t.poses)) for t in (parent, child)
+        Trajectory.from_quat_xyzw(t.stamps_ns, t.poses[:, :3, 3], se3.to_quat_xyzw(t.poses))
+        for t in (parent, child)
     ]
-    assert np.array_equal(fed.T_parent_child, calibrate(*through_quaternions, reference="B3").T_parent_child)
+    assert np.array_equal(
+        fed.T_parent_child, calibrate(*through_quaternions, reference="B3").T_parent_child
+    )
 
 
 def test_auto_names_the_reference_it_chose_and_why():
@@ -206,12 +219,16 @@ class TestMissingData:
 
     def test_too_few(self):
         parent, child = drive(8)
-        with pytest.raises(NotEnoughDataError, match="10 synchronised pose pairs are needed, found 7"):
+        with pytest.raises(
+            NotEnoughDataError, match="10 synchronised pose pairs are needed, found 7"
+        ):
             calibrate(parent, child)
 
     def test_too_few_for_the_reference(self):
         parent, child = drive(12)
-        with pytest.raises(NotEnoughDataError, match="too few common poses for the chosen reference"):
+        with pytest.raises(
+            NotEnoughDataError, match="too few common poses for the chosen reference"
+        ):
             calibrate(parent, child, reference="B50")
 
     def test_gaps(self):
@@ -235,7 +252,10 @@ class TestLongSessions:
             (stamp_ns, stream, pose[:3, 3], quat)
             for stream, trajectory in (("parent", parent), ("child", child))
             for stamp_ns, pose, quat in zip(
-                trajectory.stamps_ns.tolist(), trajectory.poses, se3.to_quat_xyzw(trajectory.poses), strict=True
+                trajectory.stamps_ns.tolist(),
+                trajectory.poses,
+                se3.to_quat_xyzw(trajectory.poses),
+                strict=True,
             )
         ]
         for stamp_ns, stream, position, quat in sorted(messages, key=lambda message: message[:2]):
@@ -263,7 +283,9 @@ class TestLongSessions:
         self.interleaved(calibrator, parent, child)
         pairs = calibrator.snapshot().pose_pairs()
         assert 50 <= len(pairs) <= 100
-        assert pairs.stamps_ns[-1] - pairs.stamps_ns[0] > 0.9 * (parent.stamps_ns[-1] - parent.stamps_ns[0])
+        assert pairs.stamps_ns[-1] - pairs.stamps_ns[0] > 0.9 * (
+            parent.stamps_ns[-1] - parent.stamps_ns[0]
+        )
         np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
     def test_a_stream_on_its_own_does_not_fill_the_memory(self):

@@ -1,4 +1,6 @@
-"""The command line: what it prints where, its exit codes, and one line for everything that is wrong with the input."""
+"""The command line: what it prints where, its exit codes, and one line for everything that is wrong
+with the input.
+"""
 
 import dataclasses
 import hashlib
@@ -60,7 +62,10 @@ def new_bag(tmp_path):
 
     def write(parent=None, child=None, storage="mcap", types=(ODOMETRY, ODOMETRY)):
         good_parent, good_child = drive()
-        parent, child = good_parent if parent is None else parent, good_child if child is None else child
+        parent, child = (
+            good_parent if parent is None else parent,
+            good_child if child is None else child,
+        )
         path = tmp_path / ("drive.bag" if storage == "rosbag1" else "drive")
         streams = {PARENT_TOPIC: (parent, types[0]), CHILD_TOPIC: (child, types[1])}
         write_bag(path, streams, storage)
@@ -119,7 +124,9 @@ def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag,
     assert "Pose of camera (child) in lidar (parent)\n  coordinates of camera into lidar\n" in out
     assert "Pose of lidar (parent) in camera (child)\n  coordinates of lidar into camera\n" in out
     rows = re.findall(r"translation x +(\S+) +y +(\S+) +z +(\S+)  m", out)
-    np.testing.assert_allclose(np.array(rows, dtype=float), [TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]], atol=2e-6)
+    np.testing.assert_allclose(
+        np.array(rows, dtype=float), [TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]], atol=2e-6
+    )
     assert re.search(r"^  yaw +0\.\d+ deg +observed$", out, flags=re.MULTILINE)
     assert "Status: ok\n" in out
 
@@ -152,7 +159,11 @@ def test_topics_may_be_left_out_where_there_are_only_two(run, new_bag):
 def test_pose_stamped_takes_its_frames_from_the_options(run, new_bag):
     bag = new_bag(types=(ODOMETRY, POSE_STAMPED))
     document = json.loads(run("replay", bag, *TOPICS, "--json", "--child-frame", "cam0")[1])
-    assert (document["parent_frame"], document["child_frame"], document["warnings"]) == ("lidar", "cam0", [])
+    assert (document["parent_frame"], document["child_frame"], document["warnings"]) == (
+        "lidar",
+        "cam0",
+        [],
+    )
     document = json.loads(run("replay", bag, *TOPICS, "--json")[1])
     assert document["child_frame"] == "child_sensor"
     assert any("child_sensor" in warning for warning in document["warnings"])
@@ -166,8 +177,13 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
     options = ["--json", "--reference", "B5", "--parent-frame", "lidar", "--child-frame", "camera"]
     code, out, err = run("calibrate", *files, *options)
     assert (code, err) == (0, "")
-    from_files, from_bag = json.loads(out), json.loads(run("replay", new_bag(), *TOPICS, *options)[1])
-    np.testing.assert_allclose(from_files["T_parent_child"]["matrix"], from_bag["T_parent_child"]["matrix"], atol=1e-12)
+    from_files, from_bag = (
+        json.loads(out),
+        json.loads(run("replay", new_bag(), *TOPICS, *options)[1]),
+    )
+    np.testing.assert_allclose(
+        from_files["T_parent_child"]["matrix"], from_bag["T_parent_child"]["matrix"], atol=1e-12
+    )
     assert from_files["inputs"]["child"] == {
         "file": str(files[1]), "poses": 120, "first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000,
     }  # fmt: skip
@@ -182,7 +198,10 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
 def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     out_dir = tmp_path / "result"
     code, text, err = run("replay", new_bag(), *TOPICS, "--out", out_dir)
-    wrote = [f"hand_eye_calib: note: wrote {out_dir / name}\n" for name in ("extrinsic.yaml", "report.html")]
+    wrote = [
+        f"hand_eye_calib: note: wrote {out_dir / name}\n"
+        for name in ("extrinsic.yaml", "report.html")
+    ]
     assert (code, err) == (0, "".join(wrote))
     assert sorted(path.name for path in out_dir.iterdir()) == [
         "extrinsic.urdf.xacro",
@@ -205,7 +224,9 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
     code, out, err = run("replay", new_bag(parent, child), *TOPICS)
     assert (code, err) == (3, "")
     assert re.search(r"^  z +- +unobservable$", out, flags=re.MULTILINE)
-    assert re.search(r"^Status: unobservable: this motion does not reveal .*\bz\b", out, flags=re.MULTILINE)
+    assert re.search(
+        r"^Status: unobservable: this motion does not reveal .*\bz\b", out, flags=re.MULTILINE
+    )
 
 
 # ---- what is printed
@@ -224,11 +245,15 @@ def test_static_transform_command_carries_the_extrinsic(run, new_bag, tmp_path):
     assert (options.pop("--frame-id"), options.pop("--child-frame-id")) == ("lidar", "left camera")
     values = [float(options.pop(f"--{name}")) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     assert not options
-    np.testing.assert_allclose(se3.from_quat_xyzw(values[:3], values[3:]), calibration.T_parent_child, atol=2e-9)
+    np.testing.assert_allclose(
+        se3.from_quat_xyzw(values[:3], values[3:]), calibration.T_parent_child, atol=2e-9
+    )
 
 
 def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_bag, tmp_path):
-    calibration = some_calibration(run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED, warnings=("look here",))
+    calibration = some_calibration(
+        run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED, warnings=("look here",)
+    )
     text = as_text(calibration)
     assert "Status: not converged: do not use this result\nWarning: look here\n" in text
     assert all(dof.verdict is DofVerdict.OBSERVED for dof in calibration.observability)
@@ -236,7 +261,7 @@ def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_ba
 
 
 def test_a_solve_that_did_not_converge_fails(run, new_bag, tmp_path, monkeypatch, capsys):
-    from hand_eye_calib import calibrator
+    from hand_eye_calib.engine import calibrator
 
     calibration = some_calibration(run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED)
     monkeypatch.setattr(calibrator.Calibrator, "estimate", lambda self: calibration)
@@ -255,7 +280,9 @@ def test_missing_bag(refused, tmp_path):
 @pytest.mark.parametrize("storage", ["sqlite3", "rosbag1"])
 def test_bag_cut_in_half(refused, new_bag, storage):
     path = Path(new_bag(storage=storage))
-    file = path if path.is_file() else next(part for part in path.iterdir() if part.suffix != ".yaml")
+    file = (
+        path if path.is_file() else next(part for part in path.iterdir() if part.suffix != ".yaml")
+    )
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     assert f"cannot read bag {path}" in refused("replay", path, *TOPICS)
 
@@ -263,7 +290,10 @@ def test_bag_cut_in_half(refused, new_bag, storage):
 def test_missing_topic_lists_those_that_are_there(refused, new_bag):
     line = refused("replay", new_bag(), "--parent-topic", "/odom", "--child-topic", CHILD_TOPIC)
     assert "no topic /odom in " in line
-    assert f"{CHILD_TOPIC} ({ODOMETRY}, 120 messages), {PARENT_TOPIC} ({ODOMETRY}, 120 messages)" in line
+    assert (
+        f"{CHILD_TOPIC} ({ODOMETRY}, 120 messages), {PARENT_TOPIC} ({ODOMETRY}, 120 messages)"
+        in line
+    )
 
 
 def test_topic_of_a_wrong_type(refused, tmp_path):
@@ -282,7 +312,9 @@ def test_topic_of_a_wrong_type(refused, tmp_path):
 
 def test_too_few_poses(refused, new_bag):
     parent, child = drive(count=5)
-    assert "10 synchronised pose pairs are needed, found 5" in refused("replay", new_bag(parent, child), *TOPICS)
+    assert "10 synchronised pose pairs are needed, found 5" in refused(
+        "replay", new_bag(parent, child), *TOPICS
+    )
 
 
 def test_no_overlap_in_time(refused, new_bag):
@@ -291,7 +323,9 @@ def test_no_overlap_in_time(refused, new_bag):
 
 
 def test_no_messages_on_a_topic(refused, new_bag):
-    assert "no poses on the child stream" in refused("replay", new_bag(child=drive()[1][:0]), *TOPICS)
+    assert "no poses on the child stream" in refused(
+        "replay", new_bag(child=drive()[1][:0]), *TOPICS
+    )
 
 
 def test_nan_is_named_with_topic_message_and_stamp(refused, new_bag):
@@ -322,7 +356,10 @@ def test_quaternion_that_is_not_of_unit_length(refused, new_bag, monkeypatch):
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
-        ("", f"{CHILD_TOPIC}, message 1, stamp 1700000000.000000000: the child stream's sensor frame is empty"),
+        (
+            "",
+            f"{CHILD_TOPIC}, message 1, stamp 1700000000.000000000: the child stream's sensor frame is empty",
+        ),
         ("lidar", "both streams name 'lidar' as their sensor frame"),
     ],
 )
@@ -332,9 +369,13 @@ def test_sensor_frames_that_are_empty_or_the_same(refused, new_bag, frame, messa
 
 
 def test_files_that_cannot_be_used(refused, tmp_path):
-    assert "absent.txt: No such file" in refused("calibrate", tmp_path / "absent.txt", tmp_path / "absent.txt")
+    assert "absent.txt: No such file" in refused(
+        "calibrate", tmp_path / "absent.txt", tmp_path / "absent.txt"
+    )
     (tmp_path / "bad.txt").write_text("1 2 3\n")
-    assert "bad.txt, line 1: expected 8 numbers" in refused("calibrate", tmp_path / "bad.txt", tmp_path / "bad.txt")
+    assert "bad.txt, line 1: expected 8 numbers" in refused(
+        "calibrate", tmp_path / "bad.txt", tmp_path / "bad.txt"
+    )
     assert "No such file" in refused("info", tmp_path / "absent")
     assert "expected format" in refused("info", tmp_path / "bad.txt")
 
@@ -403,10 +444,22 @@ def parsed(options):
         (["replay"], "the following arguments are required: BAG"),
         (["replay", "bag", "--methd", "dnl"], "unrecognized arguments: --methd dnl"),
         (["replay", "bag", "--meth", "dnl"], "unrecognized arguments: --meth dnl"),
-        (["replay", "bag", "--method", "magic"], "argument --method: method must be one of dnlo, dnl"),
-        (["replay", "bag", "--threshold", "-1"], "argument --threshold: threshold must be at least 1e-12 m^2; got -1.0"),
-        (["replay", "bag", "--threshold", "big"], "argument --threshold: threshold must be of type float; got 'big'"),
-        (["replay", "bag", "--min-pairs", "3.5"], "argument --min-pairs: min_pairs must be of type int; got '3.5'"),
+        (
+            ["replay", "bag", "--method", "magic"],
+            "argument --method: method must be one of dnlo, dnl",
+        ),
+        (
+            ["replay", "bag", "--threshold", "-1"],
+            "argument --threshold: threshold must be at least 1e-12 m^2; got -1.0",
+        ),
+        (
+            ["replay", "bag", "--threshold", "big"],
+            "argument --threshold: threshold must be of type float; got 'big'",
+        ),
+        (
+            ["replay", "bag", "--min-pairs", "3.5"],
+            "argument --min-pairs: min_pairs must be of type int; got '3.5'",
+        ),
         (["replay", "bag", "--scale", "0"], "argument --scale: scale must be at least"),
         (["replay", "bag", "--reference", "D4"], "argument --reference: reference must match"),
         (["info"], "the following arguments are required: RESULT"),
@@ -445,7 +498,9 @@ def config_file(tmp_path):
 def test_config_file_plain_or_for_ros(config_file, text):
     expected = CalibratorConfig(method="dnl", threshold=1e-3, keyframe_min_interval=1.0)
     assert parsed(config_file(text)) == expected
-    assert parsed([*config_file(text), "--method", "dnlo"]) == dataclasses.replace(expected, method="dnlo")
+    assert parsed([*config_file(text), "--method", "dnlo"]) == dataclasses.replace(
+        expected, method="dnlo"
+    )
 
 
 def test_the_config_file_of_the_package_holds_the_defaults(capsys):
@@ -459,21 +514,31 @@ def test_an_empty_config_file_changes_nothing(config_file):
 
 
 def test_options_of_the_node_are_ignored_and_named(config_file, capsys):
-    config = parsed(config_file("/**: {ros__parameters: {solve_period: 1.0, use_sim_time: true, method: dnl}}"))
+    config = parsed(
+        config_file("/**: {ros__parameters: {solve_period: 1.0, use_sim_time: true, method: dnl}}")
+    )
     assert config == CalibratorConfig(method="dnl")
-    assert capsys.readouterr().err.endswith("only the node uses solve_period, use_sim_time; ignored here\n")
+    assert capsys.readouterr().err.endswith(
+        "only the node uses solve_period, use_sim_time; ignored here\n"
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; known are backend, child_frame"),
-        ("/**: {ros__parameters: {keyframe: {minimum: 1}}}", r"config\.yaml: unknown option 'keyframe.minimum'"),
+        (
+            "/**: {ros__parameters: {keyframe: {minimum: 1}}}",
+            r"config\.yaml: unknown option 'keyframe.minimum'",
+        ),
         ("{threshold: -1.0}", r"config\.yaml: threshold must be at least"),
         ("{min_pairs: 12.5}", r"config\.yaml: min_pairs must be of type int; got 12.5"),
         ("{method: 3}", r"config\.yaml: method must be of type str; got 3"),
         ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
-        ("/slam: {ros__parameters: {a: 1}}", r"no parameters for a node named calibrator; found some for /slam"),
+        (
+            "/slam: {ros__parameters: {a: 1}}",
+            r"no parameters for a node named calibrator; found some for /slam",
+        ),
     ],
 )
 def test_config_files_that_are_wrong_end_with_usage_error(refused, config_file, text, message):
@@ -497,7 +562,9 @@ def test_top_level_help_lists_all_commands_and_imports_none(run):
         "import sys; from hand_eye_calib.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
         "print([name for name in sys.modules if name in ('numpy', 'scipy', 'yaml')], file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", check], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     assert done.stderr == "[]\n"
 
 
@@ -512,7 +579,15 @@ def test_every_command_is_there_and_explains_itself(run, name):
 def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
     seen = []
     monkeypatch.setattr("hand_eye_calib.ros.node.main", lambda args: seen.append(args) or 5)
-    arguments = ["--ros-args", "-p", "method:=dnl", "--params-file", "a.yaml", "-r", "parent_odom:=/lidar/odom"]
+    arguments = [
+        "--ros-args",
+        "-p",
+        "method:=dnl",
+        "--params-file",
+        "a.yaml",
+        "-r",
+        "parent_odom:=/lidar/odom",
+    ]
     assert main(["calibrator", *arguments]) == 5
     assert main(["calibrator"]) == 5
     assert seen == [arguments, []]
@@ -528,17 +603,21 @@ def test_entry_points_put_their_command_first(monkeypatch):
     assert seen == [["replay", "bag", "--json"], ["calibrator", "--ros-args", "-p", "method:=dnl"]]
 
 
-def test_a_missing_optional_package_breaks_only_its_command(refused, run, new_bag, tmp_path, monkeypatch):
+def test_a_missing_optional_package_breaks_only_its_command(
+    refused, run, new_bag, tmp_path, monkeypatch
+):
     bag = new_bag()
     assert run("replay", bag, *TOPICS, "--out", tmp_path / "result")[0] == 0
     monkeypatch.delitem(sys.modules, "hand_eye_calib.io.bags", raising=False)
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    assert "needs the Python package 'rosbags', which is not installed" in refused("replay", bag, *TOPICS)
+    assert "needs the Python package 'rosbags', which is not installed" in refused(
+        "replay", bag, *TOPICS
+    )
     assert run("info", tmp_path / "result")[0] == 0
 
 
 def test_a_defect_keeps_its_traceback(new_bag, monkeypatch):
-    from hand_eye_calib import calibrator
+    from hand_eye_calib.engine import calibrator
 
     def defect(self):
         raise ZeroDivisionError
@@ -549,7 +628,7 @@ def test_a_defect_keeps_its_traceback(new_bag, monkeypatch):
 
 
 def test_a_configuration_that_the_engine_refuses_is_wrong_usage(refused, new_bag, monkeypatch):
-    from hand_eye_calib import calibrator
+    from hand_eye_calib.engine import calibrator
 
     def refuse(self):
         raise ConfigError("these options do not go together")

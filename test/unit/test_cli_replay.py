@@ -20,7 +20,9 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]
 POSES = wandering_poses(100)
 PARENT = as_trajectory(POSES, sensor_frame="lidar", world_frame="map")
-CHILD = as_trajectory(disturbed(child_of(POSES), 1, 0.002, 0.001), sensor_frame="camera", world_frame="odom")
+CHILD = as_trajectory(
+    disturbed(child_of(POSES), 1, 0.002, 0.001), sensor_frame="camera", world_frame="odom"
+)
 
 
 @pytest.fixture
@@ -53,7 +55,12 @@ def matrix(text):
 
 def test_frames_stand_for_topics(run, bag, tmp_path):
     messages = [
-        (stamp_ns, "/tf", TF, tf_message([(stamp_ns, "map", "lidar", parent), (stamp_ns, "odom", "camera", child)]))
+        (
+            stamp_ns,
+            "/tf",
+            TF,
+            tf_message([(stamp_ns, "map", "lidar", parent), (stamp_ns, "odom", "camera", child)]),
+        )
         for stamp_ns, parent, child in zip(PARENT.stamps_ns, PARENT.poses, CHILD.poses, strict=True)
     ]
     path = write_messages(tmp_path / "tf", messages)
@@ -69,9 +76,26 @@ def test_frames_stand_for_topics(run, bag, tmp_path):
 
 
 def test_a_topic_and_frames_together(run, bag, tmp_path):
-    path_topic = [(PARENT.stamps_ns[-1], "/path", "nav_msgs/msg/Path", path_message(PARENT.stamps_ns, PARENT.poses))]
+    path_topic = [
+        (
+            PARENT.stamps_ns[-1],
+            "/path",
+            "nav_msgs/msg/Path",
+            path_message(PARENT.stamps_ns, PARENT.poses),
+        )
+    ]
     path = write_messages(tmp_path / "path", path_topic)
-    code, out, _ = run(bag, path, "--parent-topic", "/path", "--child-topic", "/b", "--json", "--parent-frame", "lidar")
+    code, out, _ = run(
+        bag,
+        path,
+        "--parent-topic",
+        "/path",
+        "--child-topic",
+        "/b",
+        "--json",
+        "--parent-frame",
+        "lidar",
+    )
     assert code == 0
     np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
 
@@ -79,7 +103,10 @@ def test_a_topic_and_frames_together(run, bag, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["bag", "--parent-tf", "odom"], "argument --parent-tf: expected two frames as WORLD:SENSOR"),
+        (
+            ["bag", "--parent-tf", "odom"],
+            "argument --parent-tf: expected two frames as WORLD:SENSOR",
+        ),
         (["bag", "--parent-tf", "a:b", "--parent-topic", "/a"], "not allowed with argument"),
         (["bag", "--every", "soon"], "argument --every: expected a duration such as 5s"),
         (["bag", "--every", "0s"], "argument --every: expected a duration such as 5s"),
@@ -96,7 +123,11 @@ def test_wrong_usage(run, arguments, message):
 
 def test_several_bags_of_one_drive_give_what_one_gives(run, bag, tmp_path):
     for name, part in (("first", slice(0, 60)), ("second", slice(60, 100))):
-        write_bag(tmp_path / f"{name}.bag", {"/a": (PARENT[part], ODOMETRY), "/b": (CHILD[part], ODOMETRY)}, "rosbag1")
+        write_bag(
+            tmp_path / f"{name}.bag",
+            {"/a": (PARENT[part], ODOMETRY), "/b": (CHILD[part], ODOMETRY)},
+            "rosbag1",
+        )
     code, out, _ = run(tmp_path / "second.bag", tmp_path / "first.bag", *STREAMS, "--json")
     assert code == 0
     np.testing.assert_array_equal(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]))
@@ -108,18 +139,25 @@ def test_a_bag_cut_in_half_gives_what_came_before_and_a_warning(run, bag):
     code, out, err = run(bag, *STREAMS, "--json")
     assert code in (0, 3)
     (warning,) = [text for text in json.loads(out)["warnings"] if "recovered" in text]
-    assert re.search(r"the file ends at byte \d+, in the middle of a .*; recovered are \d+ messages covering [\d.]+ s", warning)
+    assert re.search(
+        r"the file ends at byte \d+, in the middle of a .*; recovered are \d+ messages covering [\d.]+ s",
+        warning,
+    )
     assert f"hand_eye_calib: note: {warning}\n" in err
 
 
 def test_absurd_positions_end_in_one_line(run, bag, tmp_path, monkeypatch):
     poses = CHILD.poses.copy()
     poses[7, 0, 3] = 1e150
-    write_bag(tmp_path / "bad", {"/a": (PARENT, ODOMETRY), "/b": (as_trajectory(poses, sensor_frame="camera"), ODOMETRY)})
+    write_bag(
+        tmp_path / "bad",
+        {"/a": (PARENT, ODOMETRY), "/b": (as_trajectory(poses, sensor_frame="camera"), ODOMETRY)},
+    )
     code, out, err = run(tmp_path / "bad", *STREAMS)
     assert (code, out) == (1, "")
     assert re.search(
-        r"error: /b, message 8, stamp 1700000000\.700000000: position \(1e\+150, .* is more than 1e\+08 m from the origin", err
+        r"error: /b, message 8, stamp 1700000000\.700000000: position \(1e\+150, .* is more than 1e\+08 m from the origin",
+        err,
     )
 
 
@@ -127,9 +165,14 @@ def test_absurd_positions_end_in_one_line(run, bag, tmp_path, monkeypatch):
 
 
 def test_list_shows_topics_types_counts_rates_durations_and_frames(run, tmp_path):
-    messages = [(PARENT.stamps_ns[0], "/tf_static", TF, tf_message([(0, "base", "lidar", np.eye(4))]))]
+    messages = [
+        (PARENT.stamps_ns[0], "/tf_static", TF, tf_message([(0, "base", "lidar", np.eye(4))]))
+    ]
     write_messages(tmp_path / "tf", messages)
-    write_bag(tmp_path / "drive", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, "geometry_msgs/msg/PoseStamped")})
+    write_bag(
+        tmp_path / "drive",
+        {"/a": (PARENT, ODOMETRY), "/b": (CHILD, "geometry_msgs/msg/PoseStamped")},
+    )
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list")
     assert (code, err) == (0, "")
     rows = [line.split() for line in out.splitlines() if line.strip().startswith("/")]
@@ -157,10 +200,15 @@ def test_every_estimates_on_the_way_and_over_everything_in_the_end(run, bag):
     history = document["convergence"]
     assert [entry["bag_time_s"] for entry in history] == [2.0, 4.0, 6.0, 8.0]
     assert [entry["calibration"]["n_poses"] for entry in history] == [20, 40, 60, 80]
-    errors = [np.linalg.norm(np.array(entry["calibration"]["T_parent_child"]["matrix"]) - T_PARENT_CHILD) for entry in history]
+    errors = [
+        np.linalg.norm(np.array(entry["calibration"]["T_parent_child"]["matrix"]) - T_PARENT_CHILD)
+        for entry in history
+    ]
     assert max(errors) < 0.05
     assert document["n_poses"] == 100
-    np.testing.assert_array_equal(matrix(out), matrix(run(bag, *STREAMS, "--json", "--reference", "B5")[1]))
+    np.testing.assert_array_equal(
+        matrix(out), matrix(run(bag, *STREAMS, "--json", "--reference", "B5")[1])
+    )
     lines = [line for line in err.splitlines() if "note: after " in line]
     assert [re.search(r"after (\d) s: x .* m, roll .* deg, (\d+) poses, ok", line).groups() for line in lines] == [
         ("2", "20"), ("4", "40"), ("6", "60"), ("8", "80")
@@ -208,16 +256,22 @@ def assert_is_result_of_the_fleet(code, out, err):
     assert list(rows) == ["drive0", "drive1", "drive2", "gone", "again"]
     for name, row in rows.items():
         if name != "gone":
-            np.testing.assert_allclose(row["calibration"]["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+            np.testing.assert_allclose(
+                row["calibration"]["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+            )
             assert row["calibration"]["reference"] == ("B1" if name == "again" else "B5")
 
 
 def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, monkeypatch):
     out_dir = tmp_path / "out"
     assert_is_result_of_the_fleet(*run("--batch", fleet, "--out", out_dir, "--json", "--jobs", "2"))
-    np.testing.assert_allclose(load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    np.testing.assert_allclose(
+        load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-6
+    )
     assert (out_dir / "drive1" / "static_transform.launch.py").exists()
-    assert "Both streams before any solve" in (out_dir / "drive1" / "report.html").read_text(encoding="utf-8")
+    assert "Both streams before any solve" in (out_dir / "drive1" / "report.html").read_text(
+        encoding="utf-8"
+    )
     done = []
     monkeypatch.setattr(batch, "_on_cores", lambda jobs: here(done))
     code, out, err = run("--batch", fleet, "--out", out_dir, "--json")
@@ -248,8 +302,14 @@ def here(done):
 
 def test_a_batch_checks_the_streams_as_a_single_bag_does(run, tmp_path):
     poses = wandering_poses(300)
-    streams = [as_trajectory(each, sensor_frame=name) for each, name in ((poses, "lidar"), (child_of(poses), "camera"))]
-    write_bag(tmp_path / "short", {"/a": (streams[0], ODOMETRY), "/b": (streams[1].scaled(1000.0), ODOMETRY)})
+    streams = [
+        as_trajectory(each, sensor_frame=name)
+        for each, name in ((poses, "lidar"), (child_of(poses), "camera"))
+    ]
+    write_bag(
+        tmp_path / "short",
+        {"/a": (streams[0], ODOMETRY), "/b": (streams[1].scaled(1000.0), ODOMETRY)},
+    )
     fleet = tmp_path / "fleet.yaml"
     fleet.write_text(yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": ["short"]}))
     (row,) = json.loads(run("--batch", fleet, "--json", "--jobs", "1")[1])["results"]
@@ -260,9 +320,15 @@ def test_a_batch_checks_the_streams_as_a_single_bag_does(run, tmp_path):
 
 
 def test_a_batch_on_a_dask_cluster(run, fleet):
-    distributed = pytest.importorskip("dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'")
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster:
-        assert_is_result_of_the_fleet(*run("--batch", fleet, "--json", "--dask", cluster.scheduler_address))
+    distributed = pytest.importorskip(
+        "dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'"
+    )
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+    ) as cluster:
+        assert_is_result_of_the_fleet(
+            *run("--batch", fleet, "--json", "--dask", cluster.scheduler_address)
+        )
 
 
 def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
@@ -285,7 +351,10 @@ def test_a_defect_in_one_bag_leaves_the_others_alone(fleet, monkeypatch):
     [
         ("3", "expected a list of bags, or a mapping with one under 'bags'"),
         ("bags: []", "expected a list of bags"),
-        ("[{bag: a, colour: red}]", "entry 1: unknown key 'colour'; known are bag, name, options, parent_topic"),
+        (
+            "[{bag: a, colour: red}]",
+            "entry 1: unknown key 'colour'; known are bag, name, options, parent_topic",
+        ),
         ("[a, {name: b}]", "entry 2: expected a bag's path or a list of paths; got None"),
         ("[{bag: a, options: {method: magic}}]", "entry 1: method must be one of"),
         ("[{bag: a, options: 3}]", "entry 1: options must be a mapping"),
@@ -310,7 +379,9 @@ def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
     path.write_text(
         "{parent_tf: 'odom:lidar', options: {method: dnl}, bags: [a, {bag: b/a, parent_topic: /p, options: {reference: A}}]}"
     )
-    first, second = batch.read_batch(path, {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"})
+    first, second = batch.read_batch(
+        path, {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"}
+    )
     assert first.options == {"method": "dnl", "max_gap": 0.3}
     assert first.sources == {"parent_tf": "odom:lidar", "child_topic": "/c"}
     assert second.options == {"method": "dnl", "max_gap": 0.3, "reference": "A"}
@@ -325,7 +396,9 @@ def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
 def test_every_bag_of_other_programs_is_listed_or_refused_in_one_line(run):
     folder = data_folder() / "bags"
     paths = [
-        path for path in folder.rglob("*") if path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").exists()
+        path
+        for path in folder.rglob("*")
+        if path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").exists()
     ]
     assert len(paths) > 20
     refused = []

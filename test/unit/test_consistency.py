@@ -8,8 +8,8 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
 
 from hand_eye_calib import calibrate
-from hand_eye_calib.assessment.consistency import consistency
 from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict
+from hand_eye_calib.engine.cross_check import consistency
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,10 @@ def answers():
     parent = wandering_poses(300)
     child = disturbed(child_of(parent), 1, 0.003, 0.003)
     whole = as_trajectory(parent), as_trajectory(child)
-    halves = [(as_trajectory(parent[part]), as_trajectory(child[part])) for part in (slice(150), slice(150, None))]
+    halves = [
+        (as_trajectory(parent[part]), as_trajectory(child[part]))
+        for part in (slice(150), slice(150, None))
+    ]
     return (
         calibrate(*whole, reference="B5"),
         [calibrate(*whole, reference=reference) for reference in ("B3", "B10", "B20")],
@@ -65,7 +68,8 @@ def test_axes_that_an_answer_does_not_know_are_not_compared():
     parent = planar_poses(200)
     child = disturbed(child_of(parent), 1, 1e-3, 1e-3)
     answers = [
-        calibrate(as_trajectory(parent), as_trajectory(child), reference=reference) for reference in ("B10", "B5", "B15", "B20")
+        calibrate(as_trajectory(parent), as_trajectory(child), reference=reference)
+        for reference in ("B10", "B5", "B15", "B20")
     ]
     found = consistency(answers[0], answers[1:], answers[1:3])
     assert np.isnan(found.of_methods[2])
@@ -84,7 +88,10 @@ def test_an_axis_known_by_a_prior_alone_counts_with_its_sigma(answers):
     calibration, others, _ = answers
     known = dataclasses.replace(
         calibration,
-        observability=(DofObservability("x", DofVerdict.PRIOR, 1.0), *calibration.observability[1:]),
+        observability=(
+            DofObservability("x", DofVerdict.PRIOR, 1.0),
+            *calibration.observability[1:],
+        ),
     )
     assert consistency(known, [moved(other, 0.3) for other in others]).warnings() == ()
 

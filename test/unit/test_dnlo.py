@@ -11,7 +11,9 @@ def brute_force_objective(costs, threshold, floor):
     """Eq. (5) minimised over the weights by a linear programme."""
     from scipy.optimize import linprog
 
-    answer = linprog(costs - threshold, A_ub=-np.ones((1, len(costs))), b_ub=[-floor], bounds=(0, 1))
+    answer = linprog(
+        costs - threshold, A_ub=-np.ones((1, len(costs))), b_ub=[-floor], bounds=(0, 1)
+    )
     return answer.fun + threshold * len(costs)
 
 
@@ -21,7 +23,9 @@ def test_truncation_is_the_optimum_over_the_weights(fraction):
     weights, objectives = dnlo.truncate(costs, 0.01, fraction * 15)
     for row in range(4):
         assert weights[row].sum() >= fraction * 15 - 1e-9
-        np.testing.assert_allclose(objectives[row], brute_force_objective(costs[row], 0.01, fraction * 15), rtol=1e-9)
+        np.testing.assert_allclose(
+            objectives[row], brute_force_objective(costs[row], 0.01, fraction * 15), rtol=1e-9
+        )
 
 
 @pytest.fixture
@@ -63,7 +67,9 @@ def test_leaving_pairs_out_agrees_with_solving_without_them(jumpy_pairs):
     left_out = np.arange(len(jumpy_pairs))[None] // 20 == np.arange(4)[:, None]
     answers = method.solve_without(jumpy_pairs, solution, left_out)
     for row, answer in zip(left_out, answers, strict=True):
-        np.testing.assert_allclose(answer, method.solve(jumpy_pairs[~row]).T_parent_child, atol=1e-5)
+        np.testing.assert_allclose(
+            answer, method.solve(jumpy_pairs[~row]).T_parent_child, atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("method", ["dnl", "dnlo"])
@@ -81,4 +87,6 @@ def test_ipopt_solves_the_noise_free_case():
     pairs = motion_pairs(parent, child_of(parent), "B3")
     for method in ("dnl", "dnlo"):
         solution = registry.solve(method, pairs, backend="ipopt")
-        assert se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD) == pytest.approx(np.zeros(6), abs=1e-6)
+        assert se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD) == pytest.approx(
+            np.zeros(6), abs=1e-6
+        )

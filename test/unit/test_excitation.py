@@ -8,7 +8,7 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 from hand_eye_calib.assessment.excitation import excitation, what_is_missing
 from hand_eye_calib.calibration import DofObservability, DofVerdict
-from hand_eye_calib.calibrator import calibrate
+from hand_eye_calib.engine.calibrator import calibrate
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 
@@ -42,7 +42,11 @@ def test_it_does_not_depend_on_the_world_and_hardly_on_the_number_of_poses():
     moved = seen_in(se3.exp(np.array([5.0, 3.0, -2.0, 0.4, 1.0, -2.0])) @ poses)
     np.testing.assert_allclose(moved.turned, seen.turned, atol=1e-9)
     np.testing.assert_allclose(moved.gain, seen.gain, atol=1e-9)
-    many = seen_in(as_trajectory(poses).at(np.linspace(*as_trajectory(poses).stamps_ns[[0, -1]], 4000).astype(np.int64)))
+    many = seen_in(
+        as_trajectory(poses).at(
+            np.linspace(*as_trajectory(poses).stamps_ns[[0, -1]], 4000).astype(np.int64)
+        )
+    )
     np.testing.assert_allclose(many.turned, seen.turned, rtol=0.2)
 
 
@@ -56,7 +60,10 @@ def test_flat_ground_is_said_in_plain_words():
     poses = disturbed(planar_poses(300), 0, 0.005, 0.002)
     text = what_is_missing(seen_in(poses))
     assert text.startswith("turning about z is fine (")
-    assert "; roll and pitch under 1 deg: vertical offset (z) not observable, drive over a ramp" in text
+    assert (
+        "; roll and pitch under 1 deg: vertical offset (z) not observable, drive over a ramp"
+        in text
+    )
 
 
 @pytest.mark.parametrize("n_poses", [0, 1, 20])
@@ -70,13 +77,21 @@ def test_nothing_is_missing_after_turns_about_all_axes():
     assert what_is_missing(seen_in(poses)) == ""
     result = calibrate(as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5")
     assert what_is_missing(seen_in(poses), result) == ""
-    weak = dataclasses.replace(result, observability=(DofObservability("x", DofVerdict.WEAK, 0.08), *result.observability[1:]))
-    assert what_is_missing(seen_in(poses), weak).startswith("x (+/- 8 cm) still more uncertain than 5 cm or 1 deg")
+    weak = dataclasses.replace(
+        result,
+        observability=(DofObservability("x", DofVerdict.WEAK, 0.08), *result.observability[1:]),
+    )
+    assert what_is_missing(seen_in(poses), weak).startswith(
+        "x (+/- 8 cm) still more uncertain than 5 cm or 1 deg"
+    )
 
 
 def test_the_verdicts_of_a_result_win():
     poses = wandering_poses(200)
     result = calibrate(as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5")
     hidden = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
-    text = what_is_missing(seen_in(poses), dataclasses.replace(result, observability=(*result.observability[:5], hidden)))
+    text = what_is_missing(
+        seen_in(poses),
+        dataclasses.replace(result, observability=(*result.observability[:5], hidden)),
+    )
     assert text.endswith("yaw not observable, turn about other axes as well")

@@ -1,4 +1,6 @@
-"""Experiments: statistics, comparison, what is stored and resumed, the command. On drives of our own simulator."""
+"""Experiments: statistics, comparison, what is stored and resumed, the command. On drives of our
+own simulator.
+"""
 
 import dataclasses
 import json
@@ -17,21 +19,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hand_eye_calib.assessment import metrics
-from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.experiments import comparison, runner, statistics
-from hand_eye_calib.experiments.catalogue import ARTEFACTS, EXPERIMENTS
-from hand_eye_calib.experiments.kitti_truth import RECTIFIED
-from hand_eye_calib.experiments.published import LEVELS, REFERENCES, check_folder
-from hand_eye_calib.experiments.rows import ALI_AS_PUBLISHED, METRICS, Cell, Row, solve_cell
-from hand_eye_calib.experiments.sources import SimulatedSource
-from hand_eye_calib.experiments.tables import PRINTED
 from hand_eye_calib.report import style
 from hand_eye_calib.solvers import park
+from reproduction import comparison, runner, statistics
+from reproduction.catalogue import ARTEFACTS, EXPERIMENTS
+from reproduction.command import main
+from reproduction.kitti_truth import RECTIFIED
+from reproduction.published import LEVELS, REFERENCES, check_folder
+from reproduction.rows import ALI_AS_PUBLISHED, METRICS, Cell, Row, solve_cell
+from reproduction.sources import SimulatedSource
+from reproduction.tables import PRINTED
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = SimulatedSource(seed=3, runs=2)
-CELLS = [Cell("noise", 0.004, "park"), Cell("mixture", None, "dnl"), Cell("outliers", 10.0, ALI_AS_PUBLISHED)]
+CELLS = [
+    Cell("noise", 0.004, "park"),
+    Cell("mixture", None, "dnl"),
+    Cell("outliers", 10.0, ALI_AS_PUBLISHED),
+]
 
 A_ROW = Row(
     "noise", 0.002, "run_01", "dnl", "B1", (0.01, 0.5, 0.02, 0.3), 1.0, True, tuple(np.eye(4).ravel()), (0.01, 0.5, 0.02, 0.3), 1.0
@@ -52,7 +58,9 @@ def test_mean_has_students_confidence_interval():
     summary = statistics.mean_summary([1.0, 2.0, 3.0, 4.0])
     # t(0.975, 3) = 3.18245 and s = 1.290994
     assert (summary.centre, summary.n, summary.is_median) == (2.5, 4, False)
-    np.testing.assert_allclose([summary.low, summary.high], [2.5 - 2.05426, 2.5 + 2.05426], atol=1e-5)
+    np.testing.assert_allclose(
+        [summary.low, summary.high], [2.5 - 2.05426, 2.5 + 2.05426], atol=1e-5
+    )
 
 
 def test_quartiles_and_whiskers_leave_out_what_is_far():
@@ -62,11 +70,15 @@ def test_quartiles_and_whiskers_leave_out_what_is_far():
 
 
 def test_rows_hold_the_errors_of_what_was_solved(rows):
-    row = next(row for row in rows if (row.method, row.run, row.reference) == ("park", "run_02", "B5"))
+    row = next(
+        row for row in rows if (row.method, row.run, row.reference) == ("park", "run_02", "B5")
+    )
     case = SOURCE.cases("noise", 0.004)[1]
     pairs = case.pairs("B5")
     expected = metrics.errors(pairs, park.solve(pairs).T_parent_child, case.T_parent_child)
-    np.testing.assert_allclose(row.errors, np.array(dataclasses.astuple(expected)) * [1, 180 / np.pi, 1, 180 / np.pi])
+    np.testing.assert_allclose(
+        row.errors, np.array(dataclasses.astuple(expected)) * [1, 180 / np.pi, 1, 180 / np.pi]
+    )
     np.testing.assert_array_equal(row.transform, park.solve(pairs).T_parent_child)
     assert (row.name, row.published) == ("noise/0.004/run_02", None)
 
@@ -77,13 +89,22 @@ def test_best_reference_is_by_mean_over_levels_and_by_median_in_the_mixture():
 
     found = []
     for reference in REFERENCES:
-        by_level = {0.0: [1.0, 1.0], 0.002: [5.0, 7.0]} if reference == "B10" else {0.0: [0.0, 0.0], 0.002: [9.0, 9.0]}
+        by_level = (
+            {0.0: [1.0, 1.0], 0.002: [5.0, 7.0]}
+            if reference == "B10"
+            else {0.0: [0.0, 0.0], 0.002: [9.0, 9.0]}
+        )
         for level, errors in by_level.items():
             found += entries("noise", level, reference, errors)
-        found += entries("mixture", None, reference, [1.0, 1.0, 90.0] if reference == "C5" else [2.0, 2.0, 2.0])
+        found += entries(
+            "mixture", None, reference, [1.0, 1.0, 90.0] if reference == "C5" else [2.0, 2.0, 2.0]
+        )
     table = statistics.Table(found)
     assert table.levels("noise", "dnl") == (0.0, 0.002)
-    assert (table.best_reference("noise", "dnl"), table.score("noise", "dnl", "B10")) == ("B10", 3.5)
+    assert (table.best_reference("noise", "dnl"), table.score("noise", "dnl", "B10")) == (
+        "B10",
+        3.5,
+    )
     assert table.best_reference("mixture", "dnl") == "C5"
 
 
@@ -95,12 +116,23 @@ def test_best_reference_is_by_mean_over_levels_and_by_median_in_the_mixture():
         ({"errors": (0.01, 0.5, 0.021, 0.3), "objective": 0.9}, "lower objective"),
         ({"errors": (0.01, 0.5, 0.021, 0.3), "objective": 1.0 + 5e-7}, "flat"),
         ({"errors": (0.01, 0.5, 0.021, 0.3), "objective": 1.0 + 2e-6}, "our objective is higher"),
-        ({"errors": (0.01, 0.5, 0.021, 0.3), "method": "ali", "published_objective": None}, "never normalised"),
         (
-            {"errors": (0.01, 0.5, 0.021, 0.3), "method": "zhuang", "published_objective": None, "converged": False},
+            {"errors": (0.01, 0.5, 0.021, 0.3), "method": "ali", "published_objective": None},
+            "never normalised",
+        ),
+        (
+            {
+                "errors": (0.01, 0.5, 0.021, 0.3),
+                "method": "zhuang",
+                "published_objective": None,
+                "converged": False,
+            },
             "not settle",
         ),
-        ({"errors": (0.01, 0.5, 0.021, 0.3), "method": "park", "published_objective": None}, "unexplained"),
+        (
+            {"errors": (0.01, 0.5, 0.021, 0.3), "method": "park", "published_objective": None},
+            "unexplained",
+        ),
         ({"errors": (0.01, 0.5, 0.021, 0.3), "published": None}, ""),
     ],
 )
@@ -114,13 +146,19 @@ def test_comparison_counts_lists_and_explains(tmp_path):
     text = comparison.describe_rows([A_ROW, differing])
     assert "1 of 2 (50.00 %)" in text
     assert "| noise/0.002/run_01 | DNL | B1 | 0.5, 30 | 0.02, 0.3 | 0.4, 1 |" in text
-    written = comparison.write_rows(tmp_path / "rows.csv", [A_ROW, differing]).read_text().splitlines()
+    written = (
+        comparison.write_rows(tmp_path / "rows.csv", [A_ROW, differing]).read_text().splitlines()
+    )
     assert len(written) == 3
-    assert written[2].endswith(",False,published answer is not the minimum: ours has the lower objective")
+    assert written[2].endswith(
+        ",False,published answer is not the minimum: ours has the lower objective"
+    )
 
 
 def test_other_trajectories_agree_where_intervals_overlap():
-    ours, near, far = (statistics.mean_summary(np.array([1.0, 2.0, 3.0]) + shift) for shift in (0.0, 1.0, 9.0))
+    ours, near, far = (
+        statistics.mean_summary(np.array([1.0, 2.0, 3.0]) + shift) for shift in (0.0, 1.0, 9.0)
+    )
     assert comparison.compare_summaries(ours, near, same_cases=False)
     assert not comparison.compare_summaries(ours, near, same_cases=True)
     assert not comparison.compare_summaries(ours, far, same_cases=False)
@@ -137,7 +175,9 @@ def test_labels_keep_their_distance_and_order(positions):
 
 def test_the_number_of_processes_does_not_matter(tmp_path, rows):
     for jobs in (1, 2):
-        solved = runner.run(SOURCE, CELLS, runner.Store(tmp_path / str(jobs), SOURCE.configuration()), jobs)
+        solved = runner.run(
+            SOURCE, CELLS, runner.Store(tmp_path / str(jobs), SOURCE.configuration()), jobs
+        )
         assert list(solved) == CELLS
         assert [row for cell in CELLS for row in solved[cell]] == rows
 
@@ -189,26 +229,39 @@ def test_simulated_cases_have_the_noise_of_their_level():
         quiet, loud = (SOURCE.cases(dataset, LEVELS[dataset][k])[0] for k in (0, -1))
         truth = quiet.child.poses @ np.linalg.inv(quiet.T_parent_child)
         np.testing.assert_allclose(
-            np.linalg.inv(truth[0]) @ truth, np.linalg.inv(quiet.parent.poses[0]) @ quiet.parent.poses, atol=1e-9
+            np.linalg.inv(truth[0]) @ truth,
+            np.linalg.inv(quiet.parent.poses[0]) @ quiet.parent.poses,
+            atol=1e-9,
         )
-        assert np.abs(loud.child.poses - quiet.child.poses).max() > 0.1 * factor * LEVELS[dataset][-1]
+        assert (
+            np.abs(loud.child.poses - quiet.child.poses).max() > 0.1 * factor * LEVELS[dataset][-1]
+        )
         np.testing.assert_array_equal(loud.T_parent_child, quiet.T_parent_child)
     assert [case.run for case in SOURCE.cases("mixture", None)] == ["run_01", "run_02"]
 
 
 def test_everything_in_the_article_is_there():
-    names = {f"figS{number}" for number in range(1, 6)} | {f"tableS{number}" for number in range(1, 13)}
+    names = {f"figS{number}" for number in range(1, 6)} | {
+        f"tableS{number}" for number in range(1, 13)
+    }
     assert (
         names | {"fig3", "fig4", "fig5", "table1", "table2"}
         <= set(EXPERIMENTS["all"])
         == set(ARTEFACTS) - {"adaptive", "repeats", "unlike"}
     )
-    assert {name for experiment in EXPERIMENTS if experiment != "all" for name in EXPERIMENTS[experiment]} >= names
+    assert {
+        name
+        for experiment in EXPERIMENTS
+        if experiment != "all"
+        for name in EXPERIMENTS[experiment]
+    } >= names
 
 
 def test_rectified_truth_of_the_long_drive_is_beside_the_camera_and_parallel():
     np.testing.assert_array_equal(RECTIFIED["kitti_long"][:3, :3], np.eye(3))
-    np.testing.assert_allclose(RECTIFIED["kitti_long"][:3, 3], [-0.0599, 0.0011, -0.0038], atol=5e-5)
+    np.testing.assert_allclose(
+        RECTIFIED["kitti_long"][:3, 3], [-0.0599, 0.0011, -0.0038], atol=5e-5
+    )
 
 
 def test_printed_gains_are_those_of_variants_other_than_b1():
@@ -219,12 +272,28 @@ def test_printed_gains_are_those_of_variants_other_than_b1():
 
 
 def test_command_draws_and_says_what_it_has_no_numbers_for(tmp_path, capsys):
-    arguments = ["experiment", "fig3", "--data", "simulated", "--runs", "3", "--seed", "1", "--out", str(tmp_path), "--json"]
+    arguments = [
+        "fig3",
+        "--data",
+        "simulated",
+        "--runs",
+        "3",
+        "--seed",
+        "1",
+        "--out",
+        str(tmp_path),
+        "--json",
+    ]
     assert main(arguments) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["experiment"], document["data"], document["runs"]) == ("fig3", "simulated", 3)
     assert document["rows"] == 19 * 3 * 6
-    assert {Path(path).name for path in document["files"]["fig3"]} == {"fig3.png", "fig3.svg", "fig3.csv", "fig3_comparison.md"}
+    assert {Path(path).name for path in document["files"]["fig3"]} == {
+        "fig3.png",
+        "fig3.svg",
+        "fig3.csv",
+        "fig3_comparison.md",
+    }
     assert (tmp_path / "fig3.png").read_bytes().startswith(b"\x89PNG")
     text = " ".join(ElementTree.parse(tmp_path / "fig3.svg").getroot().itertext())
     assert all(reference in text for reference in REFERENCES)
@@ -234,7 +303,7 @@ def test_command_draws_and_says_what_it_has_no_numbers_for(tmp_path, capsys):
 
 
 def test_components_of_the_motions_need_no_solver(tmp_path, capsys):
-    assert main(["experiment", "fig4", "--data", "simulated", "--runs", "2", "--out", str(tmp_path)]) == 0
+    assert main(["fig4", "--data", "simulated", "--runs", "2", "--out", str(tmp_path)]) == 0
     assert "fig4" in capsys.readouterr().out
     medians = {}
     for line in (tmp_path / "fig4.csv").read_text().splitlines()[1:]:
@@ -259,7 +328,10 @@ def test_components_of_the_motions_need_no_solver(tmp_path, capsys):
 )
 def test_misuse_is_told_in_one_line(tmp_path, capsys, arguments, code, said):
     (tmp_path / "file").write_text("in the way")
-    assert main(["experiment", "--out", str(tmp_path / "out"), *(text.format(tmp=tmp_path) for text in arguments)]) == code
+    assert (
+        main(["--out", str(tmp_path / "out"), *(text.format(tmp=tmp_path) for text in arguments)])
+        == code
+    )
     captured = capsys.readouterr()
     assert (captured.out, captured.err.count("\n")) == ("", 1)
     assert said in captured.err
@@ -269,7 +341,7 @@ def test_options_of_simulated_drives_are_refused_for_the_published_ones(tmp_path
     for folder in ("kitti_tests", "simulation_tests", "calib"):
         (tmp_path / folder).mkdir()
     assert check_folder(tmp_path) == tmp_path
-    assert main(["experiment", "fig3", "--data-folder", str(tmp_path), "--runs", "5"]) == 2
+    assert main(["fig3", "--data-folder", str(tmp_path), "--runs", "5"]) == 2
     assert "--data simulated" in capsys.readouterr().err
     (tmp_path / "calib").rmdir()
     with pytest.raises(InputError, match="published or calib"):
@@ -280,8 +352,7 @@ def test_ctrl_c_ends_the_command_at_once_and_keeps_what_is_solved(tmp_path):
     command = [
         sys.executable,
         "-m",
-        "hand_eye_calib",
-        "experiment",
+        "reproduction",
         "fig3",
         "--data",
         "simulated",
@@ -292,7 +363,11 @@ def test_ctrl_c_ends_the_command_at_once_and_keeps_what_is_solved(tmp_path):
     ]
     # As from a terminal: all processes get the signal.
     running = subprocess.Popen(
-        [*command, "--out", str(tmp_path)], cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
+        [*command, "--out", str(tmp_path)],
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     with running as process:
         while not list(tmp_path.glob("solved/*dnlo.json")):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, wandering_poses
 
-from hand_eye_calib import calibrator as engine
-from hand_eye_calib.calibrator import Calibrator
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine import calibrator as engine
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import JournalWriter, has_session, read_journal
@@ -19,14 +19,18 @@ CONFIG = CalibratorConfig(reference="B3")
 
 def messages(n_poses=60):
     poses = wandering_poses(n_poses)
-    for parent, child in zip(*(_rows(as_trajectory(each)) for each in (poses, child_of(poses))), strict=True):
+    for parent, child in zip(
+        *(_rows(as_trajectory(each)) for each in (poses, child_of(poses))), strict=True
+    ):
         yield ("parent", *parent)
         yield ("child", *child)
 
 
 def _rows(trajectory):
     quats = se3.to_quat_xyzw(trajectory.poses).tolist()
-    return zip(trajectory.stamps_ns.tolist(), trajectory.poses[:, :3, 3].tolist(), quats, strict=True)
+    return zip(
+        trajectory.stamps_ns.tolist(), trajectory.poses[:, :3, 3].tolist(), quats, strict=True
+    )
 
 
 def record(writer, calibrator, sequence):
@@ -69,7 +73,9 @@ def test_the_engine_state_goes_round_after_pairs_were_made(monkeypatch):
     for each in (calibrator, again):
         for message in sequence[200:]:
             each.add_pose(*message)
-    assert np.array_equal(again.snapshot().pose_pairs().stamps_ns, calibrator.snapshot().pose_pairs().stamps_ns)
+    assert np.array_equal(
+        again.snapshot().pose_pairs().stamps_ns, calibrator.snapshot().pose_pairs().stamps_ns
+    )
     assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
     assert again.statistics("parent") == calibrator.statistics("parent")
 
@@ -140,12 +146,14 @@ def test_a_half_written_new_segment_leaves_the_old_one_in_force(tmp_path):
 
 
 def test_kill_at_any_moment_costs_only_what_was_not_flushed(tmp_path):
-    """A child process journals with small segments and reports each flush; it is killed at moments of its own making."""
+    """A child process journals with small segments and reports each flush; it is killed at moments
+    of its own making.
+    """
     program = """
 import sys
 sys.path[:0] = sys.argv[3:]
 from test_journal import CONFIG, messages
-from hand_eye_calib.calibrator import Calibrator
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.io.journal import JournalWriter
 calibrator = Calibrator(CONFIG)
 writer = JournalWriter(sys.argv[1], calibrator.state(), segment_bytes=30_000)
@@ -178,5 +186,7 @@ for count, message in enumerate(sequence, 1):
                 if line.strip().isdigit():
                     flushed = int(line)
         calibrator, _, _ = resumed(directory)
-        recovered = calibrator.statistics("parent").received + calibrator.statistics("child").received
+        recovered = (
+            calibrator.statistics("parent").received + calibrator.statistics("child").received
+        )
         assert flushed <= recovered <= flushed + 10

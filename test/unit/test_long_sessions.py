@@ -1,15 +1,25 @@
-"""The engine over sessions that outgrow its waiting room: every pose is used, whatever the order, rates and gaps."""
+"""The engine over sessions that outgrow its waiting room: every pose is used, whatever the order,
+rates and gaps.
+"""
 
 import dataclasses
 
 import numpy as np
 import pytest
 from faults import reordered
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, feed, planar_poses, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    feed,
+    planar_poses,
+    wandering_poses,
+)
 
-from hand_eye_calib import calibrator as engine
-from hand_eye_calib.calibrator import Calibrator, thin
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine import calibrator as engine
+from hand_eye_calib.engine.calibrator import Calibrator, thin
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -17,7 +27,9 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 
 @pytest.fixture(autouse=True)
 def small_waiting_room(monkeypatch):
-    """10 s at 10 Hz, so that a short drive outgrows it many times; latecomers are waited for for half a second."""
+    """10 s at 10 Hz, so that a short drive outgrows it many times; latecomers are waited for for
+    half a second.
+    """
     for name, value in {
         "_MAX_WAITING_POSES": 500, "_CROWDED_POSES": 100, "_POSES_AT_A_TIME": 16, "_POSES_BETWEEN": 4, "_LATECOMERS_NS": 500_000_000,
     }.items():  # fmt: skip
@@ -28,7 +40,9 @@ def messages(stream, trajectory):
     quats = se3.to_quat_xyzw(trajectory.poses)
     return [
         (stamp_ns, stream, pose[:3, 3], quat)
-        for stamp_ns, pose, quat in zip(trajectory.stamps_ns.tolist(), trajectory.poses, quats, strict=True)
+        for stamp_ns, pose, quat in zip(
+            trajectory.stamps_ns.tolist(), trajectory.poses, quats, strict=True
+        )
     ]
 
 
@@ -46,7 +60,11 @@ def drive(n_poses=600, child_every=1):
 
 def by_stamp(*streams):
     return sorted(
-        sum((messages(name, each) for name, each in zip(("parent", "child"), streams, strict=True)), []), key=lambda m: m[:2]
+        sum(
+            (messages(name, each) for name, each in zip(("parent", "child"), streams, strict=True)),
+            [],
+        ),
+        key=lambda m: m[:2],
     )
 
 
@@ -77,8 +95,14 @@ def test_late_and_swapped_messages_within_the_horizon_change_nothing(seed):
     arrival = [message[0] + random.uniform(0, 0.4e9) for message in sequence]
     late = [sequence[k] for k in np.argsort(arrival)]
     calibrator = play(late)
-    assert calibrator.statistics("parent").refused_late == calibrator.statistics("child").refused_late == 0
-    assert np.array_equal(calibrator.estimate().T_parent_child, play(sequence).estimate().T_parent_child)
+    assert (
+        calibrator.statistics("parent").refused_late
+        == calibrator.statistics("child").refused_late
+        == 0
+    )
+    assert np.array_equal(
+        calibrator.estimate().T_parent_child, play(sequence).estimate().T_parent_child
+    )
 
 
 def test_latecomers_beyond_the_horizon_are_counted():
@@ -92,7 +116,9 @@ def test_latecomers_beyond_the_horizon_are_counted():
 def test_a_stream_that_lags_by_half_a_minute_loses_nothing():
     parent, child = drive()
     lagging = [(stamp_ns + 30 * 10**9, name) for stamp_ns, name, *_ in messages("child", child)]
-    arrivals = [message[0] for message in messages("parent", parent)] + [stamp_ns for stamp_ns, _ in lagging]
+    arrivals = [message[0] for message in messages("parent", parent)] + [
+        stamp_ns for stamp_ns, _ in lagging
+    ]
     sequence = messages("parent", parent) + messages("child", child)
     calibrator = play([sequence[k] for k in np.argsort(arrivals, kind="stable")])
     assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, child.stamps_ns)
@@ -176,7 +202,10 @@ def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
 def test_the_whole_session_is_checked_not_only_its_end(max_pairs):
     poses = wandering_poses(400)
     parked = np.concatenate([poses, np.repeat(poses[-1:], 200, axis=0)])
-    parent, child = (as_trajectory(disturbed(each, seed, 1e-4, 1e-4)) for seed, each in enumerate((parked, child_of(parked))))
+    parent, child = (
+        as_trajectory(disturbed(each, seed, 1e-4, 1e-4))
+        for seed, each in enumerate((parked, child_of(parked)))
+    )
     sound = play(by_stamp(parent, child), max_pairs=max_pairs).snapshot()
     assert sound.check().findings == ()
     assert len(sound.parent) < 150 < 250 < len(sound.streams[0])

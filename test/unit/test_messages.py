@@ -20,7 +20,9 @@ from hand_eye_calib.io.messages import (
 )
 
 JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
-NOETIC.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+NOETIC.register(
+    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+)
 ENCODINGS = ("cdr little-endian", "cdr big-endian", "ros1")
 
 names = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
@@ -31,36 +33,54 @@ poses = st.tuples(stamps_ns, names, names, numbers)
 
 def header(types, stamp_ns, frame, extra):
     return types["std_msgs/msg/Header"](
-        stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9)), frame_id=frame, **extra
+        stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9)),
+        frame_id=frame,
+        **extra,
     )
 
 
 def message_of(typestore, message_type, stamp_ns, world, sensor, values, seq=7):
     types, extra = typestore.types, {"seq": seq} if typestore is NOETIC else {}
-    head, point = header(types, stamp_ns, world, extra), types["geometry_msgs/msg/Point"](*values[:3])
-    quaternion, zero = types["geometry_msgs/msg/Quaternion"](*values[3:]), types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+    head, point = (
+        header(types, stamp_ns, world, extra),
+        types["geometry_msgs/msg/Point"](*values[:3]),
+    )
+    quaternion, zero = (
+        types["geometry_msgs/msg/Quaternion"](*values[3:]),
+        types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0),
+    )
     pose, covariance = types["geometry_msgs/msg/Pose"](point, quaternion), np.ones(36)
     with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](pose, covariance)
     if message_type == "nav_msgs/msg/Odometry":
-        twist = types["geometry_msgs/msg/TwistWithCovariance"](types["geometry_msgs/msg/Twist"](zero, zero), covariance)
+        twist = types["geometry_msgs/msg/TwistWithCovariance"](
+            types["geometry_msgs/msg/Twist"](zero, zero), covariance
+        )
         return types[message_type](head, sensor, with_covariance, twist)
     if message_type == "geometry_msgs/msg/TransformStamped":
-        transform = types["geometry_msgs/msg/Transform"](types["geometry_msgs/msg/Vector3"](*values[:3]), quaternion)
+        transform = types["geometry_msgs/msg/Transform"](
+            types["geometry_msgs/msg/Vector3"](*values[:3]), quaternion
+        )
         return types[message_type](head, sensor, transform)
     return types[message_type](head, with_covariance if "Covariance" in message_type else pose)
 
 
 def serialized(encoding, make):
-    """Bytes of ``make(typestore)``, which returns a message and its type, and whether they are of ROS 1."""
+    """Bytes of ``make(typestore)``, which returns a message and its type, and whether they are of
+    ROS 1.
+    """
     typestore = NOETIC if encoding == "ros1" else JAZZY
     message, message_type = make(typestore)
     if encoding == "ros1":
         return bytes(NOETIC.serialize_ros1(message, message_type)), True
-    return bytes(JAZZY.serialize_cdr(message, message_type, little_endian=encoding == "cdr little-endian")), False
+    return bytes(
+        JAZZY.serialize_cdr(message, message_type, little_endian=encoding == "cdr little-endian")
+    ), False
 
 
 def encoded(encoding, message_type, pose, seq=7):
-    return serialized(encoding, lambda typestore: (message_of(typestore, message_type, *pose, seq), message_type))
+    return serialized(
+        encoding, lambda typestore: (message_of(typestore, message_type, *pose, seq), message_type)
+    )
 
 
 def assert_fields(fields, pose, message_type):
@@ -74,7 +94,11 @@ def assert_fields(fields, pose, message_type):
 @given(pose=poses)
 def test_a_pose(encoding, message_type, pose):
     """Any length of the frames' names moves what follows: alignment is where a reader goes wrong."""
-    assert_fields(unpack_pose(*_order(encoded(encoding, message_type, pose), message_type)), pose, message_type)
+    assert_fields(
+        unpack_pose(*_order(encoded(encoding, message_type, pose), message_type)),
+        pose,
+        message_type,
+    )
 
 
 def _order(data_and_kind, message_type):
@@ -85,7 +109,11 @@ def _order(data_and_kind, message_type):
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @given(
     drawn=st.lists(
-        st.tuples(stamps_ns, st.sampled_from(["a", "bc", "de"]), st.sampled_from(["s", "t"]), numbers), min_size=1, max_size=8
+        st.tuples(
+            stamps_ns, st.sampled_from(["a", "bc", "de"]), st.sampled_from(["s", "t"]), numbers
+        ),
+        min_size=1,
+        max_size=8,
     )
 )
 def test_many_poses_at_once_whether_their_frames_are_alike_or_not(encoding, drawn):
@@ -95,7 +123,9 @@ def test_many_poses_at_once_whether_their_frames_are_alike_or_not(encoding, draw
         for index, pose in enumerate(drawn):
             numbers_found = found.numbers[index].tolist()
             fields = [column[index] for column in found[:3]]
-            assert_fields(PoseFields(*fields, numbers_found[:3], numbers_found[3:]), pose, message_type)
+            assert_fields(
+                PoseFields(*fields, numbers_found[:3], numbers_found[3:]), pose, message_type
+            )
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -116,20 +146,35 @@ def test_of_many_poses_the_damaged_one_is_named(encoding):
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@given(world=names, frames=st.sampled_from([["a"], ["a", "bcd"]]), drawn=st.lists(st.tuples(stamps_ns, numbers), max_size=6))
+@given(
+    world=names,
+    frames=st.sampled_from([["a"], ["a", "bcd"]]),
+    drawn=st.lists(st.tuples(stamps_ns, numbers), max_size=6),
+)
 def test_a_path(encoding, world, frames, drawn):
     def make(typestore):
         types, extra = typestore.types, {"seq": 3} if typestore is NOETIC else {}
         steps = [
-            message_of(typestore, "geometry_msgs/msg/PoseStamped", stamp_ns, frames[index % len(frames)], "", values)
+            message_of(
+                typestore,
+                "geometry_msgs/msg/PoseStamped",
+                stamp_ns,
+                frames[index % len(frames)],
+                "",
+                values,
+            )
             for index, (stamp_ns, values) in enumerate(drawn)
         ]
-        return types["nav_msgs/msg/Path"](header(types, 12, world, extra), steps), "nav_msgs/msg/Path"
+        return types["nav_msgs/msg/Path"](
+            header(types, 12, world, extra), steps
+        ), "nav_msgs/msg/Path"
 
     found_world, found_stamps_ns, found_numbers = unpack_path(*serialized(encoding, make))
     assert found_world == world
     assert found_stamps_ns.tolist() == [stamp_ns for stamp_ns, _ in drawn]
-    np.testing.assert_array_equal(found_numbers, np.array([values for _, values in drawn]).reshape(-1, 7))
+    np.testing.assert_array_equal(
+        found_numbers, np.array([values for _, values in drawn]).reshape(-1, 7)
+    )
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -137,13 +182,26 @@ def test_a_path(encoding, world, frames, drawn):
 def test_transforms_lose_the_leading_slash_of_old_frames(encoding, drawn):
     def make(typestore):
         transforms = [
-            message_of(typestore, "geometry_msgs/msg/TransformStamped", stamp_ns, f"/{world}", sensor, values)
+            message_of(
+                typestore,
+                "geometry_msgs/msg/TransformStamped",
+                stamp_ns,
+                f"/{world}",
+                sensor,
+                values,
+            )
             for stamp_ns, world, sensor, values in drawn
         ]
         return typestore.types["tf2_msgs/msg/TFMessage"](transforms), "tf2_msgs/msg/TFMessage"
 
-    for fields, (stamp_ns, world, sensor, values) in zip(unpack_transforms(*serialized(encoding, make)), drawn, strict=True):
-        assert_fields(fields, (stamp_ns, world.lstrip("/"), sensor.lstrip("/"), values), "geometry_msgs/msg/TransformStamped")
+    for fields, (stamp_ns, world, sensor, values) in zip(
+        unpack_transforms(*serialized(encoding, make)), drawn, strict=True
+    ):
+        assert_fields(
+            fields,
+            (stamp_ns, world.lstrip("/"), sensor.lstrip("/"), values),
+            "geometry_msgs/msg/TransformStamped",
+        )
 
 
 @pytest.mark.parametrize("unpack", [unpack_path, unpack_transforms])

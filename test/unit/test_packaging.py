@@ -19,7 +19,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "hand_eye_calib"
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 
-# Library imported: (requirement in setup.py, key in package.xml); None where that side has no say, as with pip and launch.
+# Library imported: (requirement in setup.py, key in package.xml); None where that side has no say,
+# as with pip and launch.
 DECLARED_AS = {
     "dask": ("distributed", None),  # optional, for replay --batch --dask alone
     "casadi": ("casadi", "casadi-pip"),
@@ -59,13 +60,21 @@ def declared():
 def run(command, **options):
     """A finished process; what it said when it fails."""
     done = subprocess.run(command, capture_output=True, text=True, **options)
-    assert done.returncode == 0, f"{command} -> {done.returncode}\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
+    assert done.returncode == 0, (
+        f"{command} -> {done.returncode}\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
+    )
     return done
 
 
 def clean_environment(**extra):
     """The environment without what a parent process's ROS wheels or another work space put there."""
-    dropped = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH"}
+    dropped = {
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+        "LD_LIBRARY_PATH",
+        "PYTHONPATH",
+        "AMENT_PREFIX_PATH",
+        "COLCON_PREFIX_PATH",
+    }
     return {name: value for name, value in os.environ.items() if name not in dropped} | extra
 
 
@@ -75,7 +84,9 @@ def source(tmp_path_factory):
     target = tmp_path_factory.mktemp("source") / PACKAGE
     target.mkdir()
     for folder in (PACKAGE, "config", "launch", "resource"):
-        shutil.copytree(ROOT / folder, target / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / folder, target / folder, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for file in ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, target)
     return target
@@ -103,7 +114,9 @@ def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
         assert rosdep_key is None or rosdep_key in keys, (
             f"{name} is imported; package.xml lacks <exec_depend>{rosdep_key}</exec_depend>"
         )
-        assert pip_name is None or pip_name in requirements, f"{name} is imported; setup.py does not require {pip_name}"
+        assert pip_name is None or pip_name in requirements, (
+            f"{name} is imported; setup.py does not require {pip_name}"
+        )
 
 
 def test_nothing_is_declared_that_is_not_imported():
@@ -113,20 +126,29 @@ def test_nothing_is_declared_that_is_not_imported():
 
 
 def test_every_folder_with_sources_is_a_package(declared):
-    folders = {path.parent.relative_to(ROOT).as_posix().replace("/", ".") for path in (ROOT / PACKAGE).rglob("*.py")}
+    folders = {
+        path.parent.relative_to(ROOT).as_posix().replace("/", ".")
+        for path in (ROOT / PACKAGE).rglob("*.py")
+    }
     assert set(declared["packages"]) == folders
 
 
 def test_oldest_versions_are_pinned_at_the_declared_lower_bounds(declared):
     lines = (ROOT / "requirements" / "oldest.txt").read_text(encoding="utf-8").splitlines()
     pins = dict(line.split("==") for line in lines if "==" in line)
-    requirements = declared["install_requires"] + declared["extras_require"]["plot"] + declared["extras_require"]["test"]
+    requirements = (
+        declared["install_requires"]
+        + declared["extras_require"]["plot"]
+        + declared["extras_require"]["test"]
+    )
     bounded = [Requirement(text) for text in requirements if ">=" in text]
     assert len(bounded) > 6
     for requirement in bounded:
         bound = next(iter(requirement.specifier)).version
         pin = pins[requirement.name]
-        assert pin == bound or pin.startswith(bound + "."), f"{requirement.name}: pinned {pin}, lower bound {bound}"
+        assert pin == bound or pin.startswith(bound + "."), (
+            f"{requirement.name}: pinned {pin}, lower bound {bound}"
+        )
 
 
 def test_version_is_stated_once_and_known_everywhere():
@@ -137,7 +159,12 @@ def test_version_is_stated_once_and_known_everywhere():
     assert hand_eye_calib.__version__ == version
     elsewhere = [
         path
-        for path in [ROOT / "setup.py", ROOT / "setup.cfg", ROOT / "pyproject.toml", *(ROOT / PACKAGE).rglob("*.py")]
+        for path in [
+            ROOT / "setup.py",
+            ROOT / "setup.cfg",
+            ROOT / "pyproject.toml",
+            *(ROOT / PACKAGE).rglob("*.py"),
+        ]
         if re.search(rf"(?<![\d.]){re.escape(version)}(?![\d.])", path.read_text(encoding="utf-8"))
     ]
     assert elsewhere == []
@@ -155,18 +182,38 @@ def test_pip_install_gives_the_commands(source, tmp_path):
         "--no-build-isolation",
         "--disable-pip-version-check",
     ]
-    run([*pip, "--prefix", str(target), "--ignore-installed", str(source)], env=clean_environment(), cwd=tmp_path)
+    run(
+        [*pip, "--prefix", str(target), "--ignore-installed", str(source)],
+        env=clean_environment(),
+        cwd=tmp_path,
+    )
     site = next(target.glob("lib/python*/site-packages"))
     environment = clean_environment(PYTHONPATH=str(site))
 
-    assert sorted(path.name for path in (target / "bin").iterdir()) == ["calibrator", PACKAGE, "replay"]
+    assert sorted(path.name for path in (target / "bin").iterdir()) == [
+        "calibrator",
+        PACKAGE,
+        "replay",
+    ]
     assert not (target / "lib" / PACKAGE).exists()
-    where = run([sys.executable, "-c", "import hand_eye_calib; print(hand_eye_calib.__file__)"], env=environment, cwd=tmp_path)
+    where = run(
+        [sys.executable, "-c", "import hand_eye_calib; print(hand_eye_calib.__file__)"],
+        env=environment,
+        cwd=tmp_path,
+    )
     assert Path(where.stdout.strip()).is_relative_to(site)
     assert (site / PACKAGE / "report" / "templates" / "report.html").is_file()
-    assert "usage: hand_eye_calib" in run([target / "bin" / PACKAGE, "--help"], env=environment, cwd=tmp_path).stdout
-    assert "usage: hand_eye_calib replay" in run([target / "bin" / "replay", "--help"], env=environment, cwd=tmp_path).stdout
-    version = run([sys.executable, "-m", PACKAGE, "--version"], env=environment, cwd=tmp_path).stdout
+    assert (
+        "usage: hand_eye_calib"
+        in run([target / "bin" / PACKAGE, "--help"], env=environment, cwd=tmp_path).stdout
+    )
+    assert (
+        "usage: hand_eye_calib replay"
+        in run([target / "bin" / "replay", "--help"], env=environment, cwd=tmp_path).stdout
+    )
+    version = run(
+        [sys.executable, "-m", PACKAGE, "--version"], env=environment, cwd=tmp_path
+    ).stdout
     assert MANIFEST.findtext("version") in version
     assert_data_files(target)
 
@@ -183,10 +230,20 @@ def assert_data_files(prefix):
 
 @pytest.fixture(scope="module", params=[[], ["--symlink-install"]], ids=["copied", "linked"])
 def install_space(source, tmp_path_factory, request):
-    """The install folder of a real colcon build; linked, the sources stay where they are and edits take effect at once."""
+    """The install folder of a real colcon build; linked, the sources stay where they are and edits
+    take effect at once.
+    """
     workspace = tmp_path_factory.mktemp("workspace")
     colcon = [sys.executable, "-m", "colcon", "--log-base", str(workspace / "log")]
-    arguments = ["build", "--base-paths", str(source), "--packages-select", PACKAGE, "--event-handlers", "console_direct+"]
+    arguments = [
+        "build",
+        "--base-paths",
+        str(source),
+        "--packages-select",
+        PACKAGE,
+        "--event-handlers",
+        "console_direct+",
+    ]
     run([*colcon, *arguments, *request.param], env=clean_environment(), cwd=workspace)
     return workspace / "install"
 
@@ -199,8 +256,15 @@ def in_install_space(install_space, command):
 def test_colcon_lays_out_the_install_space(install_space, source, request):
     prefix = install_space / PACKAGE
     assert_data_files(prefix)
-    assert sorted(path.name for path in (prefix / "lib" / PACKAGE).iterdir()) == ["calibrator", PACKAGE, "replay"]
-    where = in_install_space(install_space, f"{sys.executable} -c 'import hand_eye_calib; print(hand_eye_calib.__file__)'")
+    assert sorted(path.name for path in (prefix / "lib" / PACKAGE).iterdir()) == [
+        "calibrator",
+        PACKAGE,
+        "replay",
+    ]
+    where = in_install_space(
+        install_space,
+        f"{sys.executable} -c 'import hand_eye_calib; print(hand_eye_calib.__file__)'",
+    )
     package = Path(run(where, env=clean_environment(), cwd=install_space).stdout.strip()).resolve()
     linked = "linked" in request.node.callspec.id
     assert package.is_relative_to(source if linked else prefix)
@@ -208,10 +272,17 @@ def test_colcon_lays_out_the_install_space(install_space, source, request):
 
 def test_colcon_installed_commands_run(install_space):
     folder = install_space / PACKAGE / "lib" / PACKAGE
-    replay = run(in_install_space(install_space, f"'{folder}/replay' --help"), env=clean_environment(), cwd=install_space)
+    replay = run(
+        in_install_space(install_space, f"'{folder}/replay' --help"),
+        env=clean_environment(),
+        cwd=install_space,
+    )
     assert "usage: hand_eye_calib replay" in replay.stdout
     version = in_install_space(install_space, f"'{folder}/{PACKAGE}' --version")
-    assert MANIFEST.findtext("version") in run(version, env=clean_environment(), cwd=install_space).stdout
+    assert (
+        MANIFEST.findtext("version")
+        in run(version, env=clean_environment(), cwd=install_space).stdout
+    )
 
 
 def test_colcon_installed_node_starts_and_stops(install_space, tmp_path):
@@ -222,7 +293,9 @@ def test_colcon_installed_node_starts_and_stops(install_space, tmp_path):
     with log.open("w") as output:
         command = in_install_space(install_space, f"'{node}'")
         environment = clean_environment(ROS_DOMAIN_ID=str(domain))
-        process = subprocess.Popen(command, env=environment, cwd=tmp_path, stdout=output, stderr=output)
+        process = subprocess.Popen(
+            command, env=environment, cwd=tmp_path, stdout=output, stderr=output
+        )
     try:
         wait_for_node("calibrator", domain, process, log)
         process.send_signal(signal.SIGINT)
@@ -234,7 +307,9 @@ def test_colcon_installed_node_starts_and_stops(install_space, tmp_path):
 
 
 def wait_for_node(name, domain, process, log):
-    """Return when a node of that name is in the ROS graph; fail when its process ends or a minute passes."""
+    """Return when a node of that name is in the ROS graph; fail when its process ends or a minute
+    passes.
+    """
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
@@ -246,8 +321,12 @@ def wait_for_node(name, domain, process, log):
     try:
         deadline = time.monotonic() + 60
         while name not in observer.get_node_names():
-            assert process.poll() is None, f"the node ended with {process.returncode}: {log.read_text()}"
-            assert time.monotonic() < deadline, f"no node {name} in the graph; there are {observer.get_node_names()}"
+            assert process.poll() is None, (
+                f"the node ended with {process.returncode}: {log.read_text()}"
+            )
+            assert time.monotonic() < deadline, (
+                f"no node {name} in the graph; there are {observer.get_node_names()}"
+            )
             executor.spin_once(timeout_sec=0.1)
     finally:
         executor.shutdown()

@@ -35,7 +35,9 @@ def test_references_are_those_of_the_paper(reference, n_poses, expected):
     assert as_lists(reference_indices(reference, n_poses)) == expected
 
 
-@pytest.mark.parametrize("reference", ["", "D", "B0", "B", "C1", "B-1", "b1", "A1", "B01", "auto", None, "B1 "])
+@pytest.mark.parametrize(
+    "reference", ["", "D", "B0", "B", "C1", "B-1", "b1", "A1", "B01", "auto", None, "B1 "]
+)
 def test_anything_else_is_not_a_reference(reference):
     with pytest.raises(ConfigError, match="is not one of A, B<n>"):
         reference_indices(reference, 10)
@@ -44,8 +46,14 @@ def test_anything_else_is_not_a_reference(reference):
 def test_every_motion_pair_fulfils_ax_xb():
     parent = wandering_poses(40)
     pairs = motion_pairs(parent, child_of(parent), "C10")
-    np.testing.assert_allclose(pairs.Ts_parenti_parentj @ T_PARENT_CHILD, T_PARENT_CHILD @ pairs.Ts_childi_childj, atol=1e-12)
-    np.testing.assert_allclose(parent[pairs.i] @ pairs.Ts_parenti_parentj, parent[pairs.j], atol=1e-12)
+    np.testing.assert_allclose(
+        pairs.Ts_parenti_parentj @ T_PARENT_CHILD,
+        T_PARENT_CHILD @ pairs.Ts_childi_childj,
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(
+        parent[pairs.i] @ pairs.Ts_parenti_parentj, parent[pairs.j], atol=1e-12
+    )
 
 
 def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
@@ -53,7 +61,9 @@ def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
     far = near.copy()
     far[:, :3, 3] += np.array([456_789.0, 4_567_890.0, 120.0])
     near_motion = motion_pairs(near, near).Ts_parenti_parentj
-    np.testing.assert_allclose(motion_pairs(far, far).Ts_parenti_parentj, near_motion, atol=4e-9)  # 1 ulp of 4.5e6 is 9e-10
+    np.testing.assert_allclose(
+        motion_pairs(far, far).Ts_parenti_parentj, near_motion, atol=4e-9
+    )  # 1 ulp of 4.5e6 is 9e-10
 
 
 def test_different_numbers_of_poses_are_refused():
@@ -62,9 +72,18 @@ def test_different_numbers_of_poses_are_refused():
 
 
 def test_the_slower_stream_gives_the_stamps():
-    slow, fast = as_trajectory(wandering_poses(20), rate_hz=10), as_trajectory(wandering_poses(100), rate_hz=50)
-    assert (slower_stream(slow, fast), slower_stream(fast, slow), slower_stream(slow, slow)) == ("parent", "child", "child")
-    assert np.array_equal(synchronise(slow, fast, 0.5).stamps_ns, slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]])
+    slow, fast = (
+        as_trajectory(wandering_poses(20), rate_hz=10),
+        as_trajectory(wandering_poses(100), rate_hz=50),
+    )
+    assert (slower_stream(slow, fast), slower_stream(fast, slow), slower_stream(slow, slow)) == (
+        "parent",
+        "child",
+        "child",
+    )
+    assert np.array_equal(
+        synchronise(slow, fast, 0.5).stamps_ns, slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]]
+    )
     paired = synchronise(fast, slow, 0.5)
     assert np.array_equal(paired.stamps_ns, slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]])
     assert np.array_equal(paired.Ts_cw_c, slow.poses[: len(paired)])
@@ -78,7 +97,9 @@ def test_nothing_is_extrapolated_and_no_gap_is_bridged():
     paired = synchronise(parent, child, max_gap_s=0.5)
     seconds = (paired.stamps_ns - child.stamps_ns[0]) * 1e-9
     # the parent runs from 0.25 s to 3.24 s, with nothing between 1.24 s and 1.95 s
-    np.testing.assert_allclose(seconds, np.r_[np.arange(0.3, 1.25, 0.1), np.arange(2.0, 2.95, 0.1)], atol=1e-9)
+    np.testing.assert_allclose(
+        seconds, np.r_[np.arange(0.3, 1.25, 0.1), np.arange(2.0, 2.95, 0.1)], atol=1e-9
+    )
     assert len(synchronise(parent, child, max_gap_s=0.8)) == 27
 
 

@@ -1,4 +1,6 @@
-"""Park, Taylor, Zhuang, Ali and the four metrics, against their definitions written out pair by pair."""
+"""Park, Taylor, Zhuang, Ali and the four metrics, against their definitions written out pair by
+pair.
+"""
 
 import numpy as np
 import pytest
@@ -7,24 +9,28 @@ from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.assessment.metrics import absolute_errors, errors, relative_errors
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.experiments import ali_as_published, published
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers import ali, park, taylor, zhuang
+from reproduction import ali_as_published, published
 
 TRUTH = se3.exp(np.array([0.4, -0.2, 0.7, 0.9, -0.5, 1.1]))
 
 
 def pairs_of(Ts_parenti_parentj, Ts_childi_childj):
     index = np.arange(len(Ts_parenti_parentj))
-    return MotionPairs(np.asarray(Ts_parenti_parentj), np.asarray(Ts_childi_childj), index, index + 1)
+    return MotionPairs(
+        np.asarray(Ts_parenti_parentj), np.asarray(Ts_childi_childj), index, index + 1
+    )
 
 
 def random_pairs(noise=0.0, n_poses=25, seed=0):
     """Motions of up to a metre and 0.8 rad per axis, with noise (m and rad) on both sensors' poses."""
     random = np.random.default_rng(seed)
     poses = [np.eye(4)]
-    for step in random.uniform([-1, -1, -1, -0.8, -0.8, -0.8], [1, 1, 1, 0.8, 0.8, 0.8], (n_poses - 1, 6)):
+    for step in random.uniform(
+        [-1, -1, -1, -0.8, -0.8, -0.8], [1, 1, 1, 0.8, 0.8, 0.8], (n_poses - 1, 6)
+    ):
         poses.append(poses[-1] @ se3.exp(step))
     poses = np.array(poses)
     parent_noise, child_noise = se3.exp(noise * random.normal(size=(2, n_poses, 6)))
@@ -52,10 +58,13 @@ def noisy():
 
 
 def test_relative_errors_of_a_pair_worked_out_by_hand():
-    # The parent turns a quarter about z and moves by (1, 0, 0); X only shifts by (2, 0, 0): R_A t + t_A - R t_B - t = (-1, 2, 0) - t_B.
+    # The parent turns a quarter about z and moves by (1, 0, 0); X only shifts by (2, 0, 0): R_A t +
+    # t_A - R t_B - t = (-1, 2, 0) - t_B.
     quarter = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
     A = se3.from_rotation_translation(quarter[:3, :3], [1.0, 0.0, 0.0])
-    B = se3.from_rotation_translation(se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2 - 0.25]))[:3, :3], [-1.0, 2.0, 3.0])
+    B = se3.from_rotation_translation(
+        se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2 - 0.25]))[:3, :3], [-1.0, 2.0, 3.0]
+    )
     X = se3.from_rotation_translation(np.eye(3), [2.0, 0.0, 0.0])
     e_rt, e_rR = relative_errors(pairs_of([A], [B]), X)
     assert e_rt == pytest.approx(3.0, abs=1e-14)
@@ -90,9 +99,13 @@ def test_errors_are_all_four(noisy):
 
 
 def test_park_aligns_the_rotation_vectors(noisy):
-    rotvecs = [se3.rotation_log(T[:, :3, :3]) for T in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj)]
+    rotvecs = [
+        se3.rotation_log(T[:, :3, :3]) for T in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj)
+    ]
     expected, _ = Rotation.align_vectors(*rotvecs)
-    np.testing.assert_allclose(park.solve(noisy).T_parent_child[:3, :3], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        park.solve(noisy).T_parent_child[:3, :3], expected.as_matrix(), atol=1e-12
+    )
 
 
 def test_park_translation_is_the_best_for_its_rotation(noisy):
@@ -104,13 +117,21 @@ def test_park_translation_is_the_best_for_its_rotation(noisy):
 
 
 def test_taylor_gives_parks_answer(noisy):
-    np.testing.assert_allclose(taylor.solve(noisy).T_parent_child, park.solve(noisy).T_parent_child, atol=1e-13)
+    np.testing.assert_allclose(
+        taylor.solve(noisy).T_parent_child, park.solve(noisy).T_parent_child, atol=1e-13
+    )
 
 
 def test_rotation_is_never_a_reflection():
     # Rotation vectors in a plane leave the sign of the third axis to the determinant.
     motions = se3.exp(
-        np.array([[0.3, 0.1, 0.2, 0.5, 0.0, 0.0], [0.1, -0.3, 0.4, 0.0, 0.4, 0.0], [0.2, 0.2, 0.1, 0.3, 0.3, 0.0]])
+        np.array(
+            [
+                [0.3, 0.1, 0.2, 0.5, 0.0, 0.0],
+                [0.1, -0.3, 0.4, 0.0, 0.4, 0.0],
+                [0.2, 0.2, 0.1, 0.3, 0.3, 0.0],
+            ]
+        )
     )
     pairs = pairs_of(motions, se3.inverse(TRUTH) @ motions @ TRUTH)
     np.testing.assert_allclose(park.solve(pairs).T_parent_child, TRUTH, atol=1e-12)
@@ -156,13 +177,19 @@ def test_zhuang_is_at_a_minimum_of_its_cost(noisy):
 
 
 def test_zhuang_takes_z_for_the_axis_of_no_rotation():
-    # A parent motion without rotation beside a child's that turns about x: only the convention says what f is.
+    # A parent motion without rotation beside a child's that turns about x: only the convention says
+    # what f is.
     pairs = random_pairs(noise=0.01)
     still = se3.exp(np.array([[0.5, 0.2, 0.1, 0.0, 0.0, 0.0]]))
     turning = se3.exp(np.array([[0.2, 0.1, 0.4, 0.3, 0.0, 0.0]]))
-    pairs = pairs_of(np.concatenate([pairs.Ts_parenti_parentj, still]), np.concatenate([pairs.Ts_childi_childj, turning]))
+    pairs = pairs_of(
+        np.concatenate([pairs.Ts_parenti_parentj, still]),
+        np.concatenate([pairs.Ts_childi_childj, turning]),
+    )
     solution = zhuang.solve(pairs)
-    assert solution.objective == pytest.approx(zhuang_cost(zhuang_parameters(solution.T_parent_child), pairs), rel=1e-10)
+    assert solution.objective == pytest.approx(
+        zhuang_cost(zhuang_parameters(solution.T_parent_child), pairs), rel=1e-10
+    )
 
 
 def test_zhuang_steps_are_gauss_newton():
@@ -174,7 +201,9 @@ def test_zhuang_steps_are_gauss_newton():
     residuals = condensed @ products
     assert residuals @ residuals == pytest.approx(zhuang_cost(parameters, pairs), rel=1e-12)
     gradient = approx_fprime(parameters, zhuang_cost, 1e-7, pairs)
-    np.testing.assert_allclose(2 * residuals @ condensed @ derivative, gradient, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        2 * residuals @ condensed @ derivative, gradient, rtol=1e-4, atol=1e-4
+    )
 
 
 # Ali
@@ -187,7 +216,9 @@ def test_ali_minimises_the_translation_residual_over_rotations(noisy):
     solution = ali.solve(noisy)
     rotation, translation = split(solution.T_parent_child)
     assert solution.converged
-    assert solution.objective == pytest.approx(squared_translation_residual(noisy, rotation, translation), rel=1e-12)
+    assert solution.objective == pytest.approx(
+        squared_translation_residual(noisy, rotation, translation), rel=1e-12
+    )
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     random = np.random.default_rng(1)
     found = [minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun for _ in range(5)]
@@ -206,19 +237,27 @@ def test_ali_is_blind_to_the_rotation_of_the_child(noisy):
 def test_ali_as_published_fits_a_matrix_that_is_no_rotation(noisy):
     rows = np.linalg.qr(ali.residual_rows(noisy), mode="r")
     parameters = np.array([0.8, 0.3, -0.2, 0.4, 0.1, -0.5, 0.3])
-    value_and_gradient = [lambda p, part=part: ali_as_published._derivatives(p, rows)[part] for part in (0, 1)]
+    value_and_gradient = [
+        lambda p, part=part: ali_as_published._derivatives(p, rows)[part] for part in (0, 1)
+    ]
     assert check_grad(*value_and_gradient, parameters) < 1e-5
     hessian = ali_as_published._derivatives(parameters, rows)[2]
-    np.testing.assert_allclose(approx_fprime(parameters, value_and_gradient[1]), hessian, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(
+        approx_fprime(parameters, value_and_gradient[1]), hessian, rtol=1e-5, atol=1e-4
+    )
     # With a unit quaternion the matrix is its rotation, and the cost is ali's.
     quat = se3.to_quat_xyzw(TRUTH)
     parameters = np.concatenate([np.roll(quat, 1), TRUTH[:3, 3]])
-    assert value_and_gradient[0](parameters) == pytest.approx(squared_translation_residual(noisy, *split(TRUTH)), rel=1e-10)
+    assert value_and_gradient[0](parameters) == pytest.approx(
+        squared_translation_residual(noisy, *split(TRUTH)), rel=1e-10
+    )
     assert ali_as_published.solve(noisy).objective > ali.solve(noisy).objective
 
 
 def test_ali_as_published_finds_the_truth_without_noise():
-    np.testing.assert_allclose(ali_as_published.solve(random_pairs()).T_parent_child, TRUTH, atol=1e-9)
+    np.testing.assert_allclose(
+        ali_as_published.solve(random_pairs()).T_parent_child, TRUTH, atol=1e-9
+    )
 
 
 # The reader of the published data
@@ -238,7 +277,9 @@ def data_folder(tmp_path):
 
 
 def test_reader_names_a_missing_file(data_folder):
-    with pytest.raises(InputError, match=r"cannot read .*simulation_tests_mixture\.csv: No such file"):
+    with pytest.raises(
+        InputError, match=r"cannot read .*simulation_tests_mixture\.csv: No such file"
+    ):
         published.load_simulated(data_folder, ["mixture"])
 
 
@@ -249,7 +290,9 @@ def test_reader_names_a_missing_file(data_folder):
 )
 def test_reader_names_a_file_that_holds_something_else(data_folder, text):
     (data_folder / "published" / "simulation_tests_mixture.csv").write_text(text)
-    with pytest.raises(InputError, match=r"simulation_tests_mixture\.csv is not a file of published results"):
+    with pytest.raises(
+        InputError, match=r"simulation_tests_mixture\.csv is not a file of published results"
+    ):
         published.load_simulated(data_folder, ["mixture"])
 
 
@@ -259,6 +302,7 @@ def test_reader_refuses_results_without_their_trajectories(data_folder):
         f"algorithm,method,err_tr,err_R,abs_tr,abs_R,T\n{row}"
     )
     with pytest.raises(
-        InputError, match=r"trajectories of mixture do not go with the published results: expected 38 runs \(found 0\)"
+        InputError,
+        match=r"trajectories of mixture do not go with the published results: expected 38 runs \(found 0\)",
     ):
         published.load_simulated(data_folder, ["mixture"])

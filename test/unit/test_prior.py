@@ -7,13 +7,15 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 from hand_eye_calib.assessment.covariance import AXES, UNKNOWN_TRANSLATION, Assessment
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.calibrator import calibrate
 from hand_eye_calib.config import CalibratorConfig, parse_prior
+from hand_eye_calib.engine.calibrator import calibrate
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 
 # A sensor on a mast, looking back.
-MOUNT = se3.from_rotation_translation(se3.rotation_exp(np.array([0.0, 0.0, np.pi - 0.2])), [0.6, -0.3, 1.85])
+MOUNT = se3.from_rotation_translation(
+    se3.rotation_exp(np.array([0.0, 0.0, np.pi - 0.2])), [0.6, -0.3, 1.85]
+)
 
 
 def flat_drive(noise=0.001, mount=MOUNT):
@@ -45,7 +47,9 @@ class TestOption:
             assert parsed[axis] == pytest.approx(pair)
 
     def test_a_single_axis_goes_before_the_transform(self):
-        config = CalibratorConfig.from_options({"prior.transform": "1 2 3 0 0 90deg+/-0.1 5deg", "prior.z": "1.85+/-0.02"})
+        config = CalibratorConfig.from_options(
+            {"prior.transform": "1 2 3 0 0 90deg+/-0.1 5deg", "prior.z": "1.85+/-0.02"}
+        )
         prior = config.prior()
         assert prior["z"] == (1.85, 0.02)
         assert prior["x"] == (1.0, 0.1)
@@ -85,19 +89,31 @@ class TestFlatGround:
         assert verdicts["z"] is DofVerdict.PRIOR
         assert verdicts["yaw"] is DofVerdict.OBSERVED
         assert sigmas(result)["z"] == pytest.approx(0.02, rel=0.05)
-        assert any("z of the child sensor: mostly from the prior" in warning for warning in result.warnings)
+        assert any(
+            "z of the child sensor: mostly from the prior" in warning for warning in result.warnings
+        )
 
     def test_height_tells_the_rest_where_the_turning_axis_leans(self):
-        lean = se3.from_rotation_translation(se3.rotation_exp(np.array([0.1, 0.0, 0.0])), np.zeros(3))
+        lean = se3.from_rotation_translation(
+            se3.rotation_exp(np.array([0.1, 0.0, 0.0])), np.zeros(3)
+        )
         parent, child = flat_drive(noise=0.0005)
         tilted = as_trajectory(parent.poses @ lean)  # the parent is mounted with a roll of 0.1 rad
         mount = se3.inverse(lean) @ MOUNT
-        with_height = calibrate(tilted, child, reference="B10", **{"prior.z": f"{mount[2, 3]}+/-0.01"})
+        with_height = calibrate(
+            tilted, child, reference="B10", **{"prior.z": f"{mount[2, 3]}+/-0.01"}
+        )
         np.testing.assert_allclose(with_height.T_parent_child[:3, 3], mount[:3, 3], atol=0.03)
-        assert sigmas(with_height)["y"] < 0.1 * sigmas(calibrate(tilted, child, reference="B10"))["y"]
+        assert (
+            sigmas(with_height)["y"] < 0.1 * sigmas(calibrate(tilted, child, reference="B10"))["y"]
+        )
 
     def test_whole_nominal_transform(self):
-        result = calibrate(*flat_drive(), reference="B10", **{"prior.transform": "0.6 -0.3 1.85 0 0 168.5deg+/-0.1 10deg"})
+        result = calibrate(
+            *flat_drive(),
+            reference="B10",
+            **{"prior.transform": "0.6 -0.3 1.85 0 0 168.5deg+/-0.1 10deg"},
+        )
         assert result.status is SolveStatus.OK
         assert result.T_parent_child[2, 3] == pytest.approx(1.85, abs=0.01)
         assert sigmas(result)["z"] == pytest.approx(0.1, rel=0.1)
@@ -105,8 +121,11 @@ class TestFlatGround:
     @pytest.mark.parametrize("method", ["dnlo", "dnl", "park", "taylor", "zhuang", "ali"])
     def test_every_method_takes_it(self, method):
         # Zhuang's starts at no rotation and this mount is nearly half a turn.
-        mount = se3.from_rotation_translation(se3.rotation_exp(np.array([0.0, 0.0, 0.4])), MOUNT[:3, 3])
-        # Rotations alone do not show where x points on flat ground: the paper's two-stage methods need the yaw too.
+        mount = se3.from_rotation_translation(
+            se3.rotation_exp(np.array([0.0, 0.0, 0.4])), MOUNT[:3, 3]
+        )
+        # Rotations alone do not show where x points on flat ground: the paper's two-stage methods
+        # need the yaw too.
         prior = {"prior.z": "1.85+/-0.02", "prior.yaw": "0.4+/-0.001"}
         parent, child = flat_drive(noise=0.0005, mount=mount)
         result = calibrate(parent, child, method=method, reference="B10", **prior)
@@ -116,19 +135,24 @@ class TestFlatGround:
 class TestFullMotion:
     def drive(self):
         poses = wandering_poses(300)
-        return as_trajectory(disturbed(poses, 1, 0.01, 0.005)), as_trajectory(disturbed(child_of(poses, MOUNT), 2, 0.01, 0.005))
+        return as_trajectory(disturbed(poses, 1, 0.01, 0.005)), as_trajectory(
+            disturbed(child_of(poses, MOUNT), 2, 0.01, 0.005)
+        )
 
     def test_a_vague_prior_changes_nothing(self):
         plain = calibrate(*self.drive(), reference="B10")
         vague = calibrate(*self.drive(), reference="B10", **{"prior.z": "0+/-100"})
         np.testing.assert_allclose(vague.T_parent_child, plain.T_parent_child, atol=1e-5)
-        assert [dof.verdict for dof in vague.observability] == [dof.verdict for dof in plain.observability]
+        assert [dof.verdict for dof in vague.observability] == [
+            dof.verdict for dof in plain.observability
+        ]
 
     def test_a_contradiction_is_said(self):
         result = calibrate(*self.drive(), reference="B10", **{"prior.x": "-0.6+/-0.001"})
         assert any("prior on x is" in warning and "sign" in warning for warning in result.warnings)
         assert not any(
-            "standard deviations" in w for w in calibrate(*self.drive(), reference="B10", **{"prior.x": "0.6+/-0.05"}).warnings
+            "standard deviations" in w
+            for w in calibrate(*self.drive(), reference="B10", **{"prior.x": "0.6+/-0.05"}).warnings
         )
 
 
@@ -143,7 +167,10 @@ def test_precisions_add_up():
 
 def test_what_nobody_knows_keeps_its_variance():
     covariance = np.diag([1e-4, 1e-4, UNKNOWN_TRANSLATION**2, 1e-6, 1e-6, 1e-6])
-    dofs = tuple(DofObservability(n, DofVerdict.UNOBSERVABLE if n == "z" else DofVerdict.OBSERVED, 0.0) for n in AXES)
+    dofs = tuple(
+        DofObservability(n, DofVerdict.UNOBSERVABLE if n == "z" else DofVerdict.OBSERVED, 0.0)
+        for n in AXES
+    )
     at = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 7.0])
     fused = fuse(at, Assessment(covariance, dofs), {"x": (0.0, 0.01)})
     assert fused.T_parent_child[2, 3] == pytest.approx(0.0, abs=1e-9)

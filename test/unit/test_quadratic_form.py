@@ -10,13 +10,17 @@ from hand_eye_calib.solvers import dnl, quadratic_form
 @pytest.fixture
 def pairs():
     parent = wandering_poses(60)
-    return motion_pairs(disturbed(parent, 1, 0.02, 0.02), disturbed(child_of(parent), 2, 0.02, 0.02), "B5")
+    return motion_pairs(
+        disturbed(parent, 1, 0.02, 0.02), disturbed(child_of(parent), 2, 0.02, 0.02), "B5"
+    )
 
 
 def test_condensed_costs_are_the_matrix_costs(pairs):
     for T in (np.eye(4), T_PARENT_CHILD, se3.exp(np.array([30.0, -4.0, 2.0, 2.0, 1.0, -1.0]))):
         condensed_costs = quadratic_form.condense(pairs) @ quadratic_form.monomials(T)
-        np.testing.assert_allclose(condensed_costs, dnl.pair_costs(pairs, T), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(
+            condensed_costs, dnl.pair_costs(pairs, T), rtol=1e-12, atol=1e-12
+        )
 
 
 def test_blocks_do_not_change_the_forms(pairs, monkeypatch):

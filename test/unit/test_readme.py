@@ -20,7 +20,13 @@ HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
 def parameter_table(config):
     """The Markdown table of an option dataclass."""
     rows = [
-        [f"`{option_name(field)}`", f"`{default(field)}`", meta["unit"], allowed(field), meaning(meta)]
+        [
+            f"`{option_name(field)}`",
+            f"`{default(field)}`",
+            meta["unit"],
+            allowed(field),
+            meaning(meta),
+        ]
         for field in dataclasses.fields(config)
         for meta in [field.metadata]
     ]
@@ -29,7 +35,11 @@ def parameter_table(config):
 
 
 def default(field):
-    return str(field.default).lower() if isinstance(field.default, bool) else repr(field.default).replace("'", '"')
+    return (
+        str(field.default).lower()
+        if isinstance(field.default, bool)
+        else repr(field.default).replace("'", '"')
+    )
 
 
 def escaped(cell):
@@ -63,7 +73,9 @@ def test_parameter_table_is_that_of_the_code(config):
 def test_parameter_tables_have_no_other_rows():
     documented = re.findall(r"^\| `([a-z_.]+)` \| `[^|]*` \|", TEXT, re.MULTILINE)
     assert documented == [
-        option_name(field) for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)
+        option_name(field)
+        for config in (CalibratorConfig, NodeConfig)
+        for field in dataclasses.fields(config)
     ]
 
 
@@ -108,7 +120,12 @@ def test_relative_link_leads_somewhere(target):
 
 def test_make_targets_exist():
     makefile = (README.parent / "Makefile").read_text(encoding="utf-8")
-    mentioned = set(re.findall(r"`?make ([a-z-]+)`?", "\n".join(re.findall(r"`[^`]+`|```bash\n.*?```", TEXT, re.DOTALL))))
+    mentioned = set(
+        re.findall(
+            r"`?make ([a-z-]+)`?",
+            "\n".join(re.findall(r"`[^`]+`|```bash\n.*?```", TEXT, re.DOTALL)),
+        )
+    )
     targets = set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
     assert mentioned
     assert mentioned <= targets
@@ -117,7 +134,12 @@ def test_make_targets_exist():
 def with_tables_of_the_code(text):
     """The README with both parameter tables as they must be."""
     tables = iter([parameter_table(CalibratorConfig), parameter_table(NodeConfig)])
-    return re.sub(r"^\| Name \| Default \|.*\n(\|.*\n)*", lambda _: next(tables) + "\n", text, flags=re.MULTILINE)
+    return re.sub(
+        r"^\| Name \| Default \|.*\n(\|.*\n)*",
+        lambda _: next(tables) + "\n",
+        text,
+        flags=re.MULTILINE,
+    )
 
 
 if __name__ == "__main__":

@@ -8,10 +8,10 @@ import pytest
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 from published_data import data_folder
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.experiments import repeats, unlike
-from hand_eye_calib.experiments.recordings import RecordedSet, Recording, recorded_sets
 from hand_eye_calib.geometry import se3
+from reproduction import repeats, unlike
+from reproduction.command import main
+from reproduction.recordings import RecordedSet, Recording, recorded_sets
 
 
 def recording(seed, noise=0.004):
@@ -36,10 +36,16 @@ def test_ratios_of_right_sigmas_lie_in_the_band():
 def test_drives_are_repeats_of_each_other_and_a_changed_mount_shows():
     still = RecordedSet("still", (recording(0), recording(1)))
     shifted = dataclasses.replace(
-        recording(1), child=as_trajectory(child_of(wandering_poses(400, 1), T_PARENT_CHILD @ se3.exp([0.3, 0, 0, 0, 0, 0])))
+        recording(1),
+        child=as_trajectory(
+            child_of(wandering_poses(400, 1), T_PARENT_CHILD @ se3.exp([0.3, 0, 0, 0, 0, 0]))
+        ),
     )
     moved = RecordedSet("moved", (recording(0), shifted))
-    by_axis = [{ratio.axis: ratio for ratio in repeats._set_ratios(found, "dnlo B10")} for found in (still, moved)]
+    by_axis = [
+        {ratio.axis: ratio for ratio in repeats._set_ratios(found, "dnlo B10")}
+        for found in (still, moved)
+    ]
     assert {ratio.freedom for found in by_axis for ratio in found.values()} == {1}
     assert by_axis[0]["x"].ratio < 3
     assert max(ratio.ratio for ratio in by_axis[1].values()) > 10
@@ -105,13 +111,18 @@ def test_scenarios_have_the_errors_they_claim(scenario):
 
 
 def test_commands_are_told_which_data_they_need(tmp_path, capsys):
-    assert main(["experiment", "repeats", "--data", "simulated", "--out", str(tmp_path)]) == 2
+    assert main(["repeats", "--data", "simulated", "--out", str(tmp_path)]) == 2
     assert "--data published" in capsys.readouterr().err
 
 
 def test_unlike_writes_and_prints_its_table(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(unlike, "SCENARIOS", {"handheld": unlike.SCENARIOS["handheld"]})
-    assert main(["experiment", "unlike", "--data", "simulated", "--runs", "2", "--jobs", "1", "--out", str(tmp_path)]) == 0
+    assert (
+        main(
+            ["unlike", "--data", "simulated", "--runs", "2", "--jobs", "1", "--out", str(tmp_path)]
+        )
+        == 0
+    )
     assert "| handheld |" in capsys.readouterr().out
     with open(tmp_path / "unlike.csv", encoding="utf-8") as file:
         (row,) = csv.DictReader(file)

@@ -1,4 +1,6 @@
-"""The report: what is in it, that its numbers are the result's, and that it is one page that stands alone."""
+"""The report: what is in it, that its numbers are the result's, and that it is one page that stands
+alone.
+"""
 
 import dataclasses
 import re
@@ -14,17 +16,17 @@ pytest.importorskip("matplotlib")
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.calibrator import offline_config, whole_snapshot
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE, NOISE
 from hand_eye_calib.cli.present import static_transform_command
 from hand_eye_calib.cli.reporting import with_consistency, write_report
-from hand_eye_calib.estimation import estimate_extrinsic
+from hand_eye_calib.engine import evidence
+from hand_eye_calib.engine.calibrator import offline_config, whole_snapshot
+from hand_eye_calib.engine.estimation import estimate_extrinsic
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.pairing.synchronise import synchronise
-from hand_eye_calib.report import evidence
 from hand_eye_calib.report.report import render
 from hand_eye_calib.simulation.drive import simulate_drive
 
@@ -72,14 +74,18 @@ def simulated(planar=False, poses=200, frames=("lidar", "camera"), **options):
     flat = {"terrain_height": 0.0} if planar else {}
     names = dict(zip(("parent_frame", "child_frame"), frames, strict=True))
     drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=poses, **flat, **names), NOISE)
-    snapshot = whole_snapshot(offline_config(drive.parent, drive.child, options), drive.parent, drive.child)
+    snapshot = whole_snapshot(
+        offline_config(drive.parent, drive.child, options), drive.parent, drive.child
+    )
     return snapshot, snapshot.estimate()
 
 
 def page_of(snapshot, calibration, **more):
     more.setdefault("command", static_transform_command(calibration))
     streams = more.pop("streams", None)
-    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic, streams)
+    found = evidence.gather(
+        calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic, streams
+    )
     text = render(calibration, snapshot.config, found, **more)
     return text, Page(text)
 
@@ -87,7 +93,13 @@ def page_of(snapshot, calibration, **more):
 @pytest.fixture(scope="module")
 def hilly():
     snapshot, calibration = simulated()
-    return snapshot, calibration, *page_of(snapshot, calibration, streams={"parent": snapshot.parent, "child": snapshot.child})
+    return (
+        snapshot,
+        calibration,
+        *page_of(
+            snapshot, calibration, streams={"parent": snapshot.parent, "child": snapshot.child}
+        ),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +120,11 @@ def test_page_is_whole_and_stands_alone(drive, request):
         assert tag not in ("script", "link", "img", "iframe")
         for name in ("src", "href", "xlink:href"):
             assert attributes.get(name, "#").startswith("#")
-    referred = {target for attributes in (a for _, a in page.elements) for target in re.findall(r"#([\w-]+)", str(attributes))}
+    referred = {
+        target
+        for attributes in (a for _, a in page.elements)
+        for target in re.findall(r"#([\w-]+)", str(attributes))
+    }
     assert {target for target in referred if "-" in target} <= set(page.ids)
     assert len(text.encode()) < 1_500_000
 
@@ -120,7 +136,11 @@ def test_every_section_and_figure_is_there_verdict_first(hilly):
     figures = [attributes["id"] for attributes in page.all("figure")]
     assert figures == [f"figure-{name}" for name in FIGURES]
     assert len(page.all("svg")) == len(FIGURES)
-    described = [a["aria-label"] for a in page.all("div") if a.get("role") == "img" and a.get("class") == "scroll"]
+    described = [
+        a["aria-label"]
+        for a in page.all("div")
+        if a.get("role") == "img" and a.get("class") == "scroll"
+    ]
     assert len(described) == len(FIGURES)
     assert all(re.search(r"\d", label) for label in described)
     assert [tag for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)][:2] == ["h1", "h2"]
@@ -138,7 +158,11 @@ def test_numbers_are_the_calibrations(drive, request):
         if dof.verdict is DofVerdict.UNOBSERVABLE:
             continue
         factor, unit = (100, " cm") if dof.name in "xyz" else (180 / np.pi, "°")
-        label = next(a["aria-label"] for a in page.all("div") if a.get("aria-label", "").startswith(f"{dof.name}: "))
+        label = next(
+            a["aria-label"]
+            for a in page.all("div")
+            if a.get("aria-label", "").startswith(f"{dof.name}: ")
+        )
         number, verdict = re.fullmatch(rf"{dof.name}: ([\d.]+){unit}, (\w+)", label).groups()
         assert float(number) == pytest.approx(factor * dof.sigma, rel=0.06)
         assert verdict == dof.verdict.value
@@ -165,8 +189,18 @@ def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
 def test_hostile_names_stay_text():
     hostile = ('<script>alert("x")</script>', "_a$b$ & 'c' id=\"y\" --> ünï 雷")
     snapshot, calibration = simulated(poses=60, frames=hostile)
-    finding = {"severity": "note", "stream": "<em>", "confidence": "likely", "what": "<img src=x>", "advice": "</li>"}
-    inputs = {"bag": "</td><script>", "parent": {"topic": "<em>"}, "files": [{"file": "/a/<u>", "bytes": 1, "sha256": "0"}]}
+    finding = {
+        "severity": "note",
+        "stream": "<em>",
+        "confidence": "likely",
+        "what": "<img src=x>",
+        "advice": "</li>",
+    }
+    inputs = {
+        "bag": "</td><script>",
+        "parent": {"topic": "<em>"},
+        "files": [{"file": "/a/<u>", "bytes": 1, "sha256": "0"}],
+    }
     _, page = page_of(snapshot, calibration, findings=[finding], inputs=inputs)
     assert page.errors == []
     assert len(page.ids) == len(set(page.ids))
@@ -183,12 +217,17 @@ def test_hostile_names_stay_text():
         ({"poses": 300}, {"method": "adaptive"}),
         ({"poses": 100}, {"reference": "A"}),
         ({"poses": 100}, {"method": "park", "reference": "C5"}),
-        ({"poses": 100, "terrain_height": 0.0}, {"prior.z": "0.1+/-0.02", "scale": "estimate", "time_offset": "estimate"}),
+        (
+            {"poses": 100, "terrain_height": 0.0},
+            {"prior.z": "0.1+/-0.02", "scale": "estimate", "time_offset": "estimate"},
+        ),
     ],
 )
 def test_any_result_gets_a_page(tmp_path, motion, options):
     drive = simulate_drive(1, dataclasses.replace(DRIVE, **({"poses": 60} | motion)), NOISE)
-    snapshot = whole_snapshot(offline_config(drive.parent, drive.child, options), drive.parent, drive.child)
+    snapshot = whole_snapshot(
+        offline_config(drive.parent, drive.child, options), drive.parent, drive.child
+    )
     calibration = snapshot.estimate()
     write_report(tmp_path, *with_consistency(calibration, snapshot), snapshot.config, {})
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -223,7 +262,9 @@ def test_evidence_ends_at_the_result_and_halves_are_halves(hilly):
         parent_frame="a",
         child_frame="b",
     )
-    np.testing.assert_allclose(found.halves[0].calibration.T_parent_child, alone.T_parent_child, atol=1e-9)
+    np.testing.assert_allclose(
+        found.halves[0].calibration.T_parent_child, alone.T_parent_child, atol=1e-9
+    )
     labels = [one.label for one in found.comparison]
     assert {"dnl B1", "park B10"} <= set(labels)
     assert any(label.startswith("adaptive") for label in labels)
@@ -232,16 +273,26 @@ def test_evidence_ends_at_the_result_and_halves_are_halves(hilly):
 
 def test_tracks_of_perfect_odometry_coincide():
     rng = np.random.default_rng(0)
-    steps = se3.exp(np.c_[np.full((80, 1), 0.1), np.zeros((80, 2)), 0.1 * rng.standard_normal((80, 3))])
+    steps = se3.exp(
+        np.c_[np.full((80, 1), 0.1), np.zeros((80, 2)), 0.1 * rng.standard_normal((80, 3))]
+    )
     poses = [np.eye(4)]
     for step in steps:
         poses.append(poses[-1] @ step)
-    X, world = se3.exp(np.array([0.4, -0.1, 0.2, 0.3, -0.2, 1.1])), se3.exp(np.array([5.0, -3.0, 1.0, 0.1, 0.4, -2.0]))
+    X, world = (
+        se3.exp(np.array([0.4, -0.1, 0.2, 0.3, -0.2, 1.1])),
+        se3.exp(np.array([5.0, -3.0, 1.0, 0.1, 0.4, -2.0])),
+    )
     stamps_ns = 100_000_000 * np.arange(81)
-    parent, child = Trajectory(stamps_ns, np.array(poses)), Trajectory(stamps_ns, world @ np.array(poses) @ X)
+    parent, child = (
+        Trajectory(stamps_ns, np.array(poses)),
+        Trajectory(stamps_ns, world @ np.array(poses) @ X),
+    )
     calibration = hec.calibrate(parent, child, parent_frame="a", child_frame="b", reference="B1")
     config = offline_config(parent, child, {"reference": "B1"})
-    found = evidence.gather(calibration, config, synchronise(parent, child, 0.5), estimate_extrinsic)
+    found = evidence.gather(
+        calibration, config, synchronise(parent, child, 0.5), estimate_extrinsic
+    )
     np.testing.assert_allclose(found.tracks.child, found.tracks.parent, atol=1e-7)
     np.testing.assert_allclose(found.residuals.translation_m, 0, atol=1e-7)
     np.testing.assert_allclose(deviation(calibration.T_parent_child, X), 0, atol=1e-6)
@@ -255,7 +306,10 @@ def test_long_drives_are_thinned(monkeypatch):
     found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic)
     assert max(one.calibration.n_poses for one in found.convergence[:-1]) <= 50
     assert max(one.calibration.n_poses for one in (*found.halves, *found.comparison)) <= 100
-    assert [half.calibration.reference for half in found.halves] == ["B5", "B5"]  # every second pose
+    assert [half.calibration.reference for half in found.halves] == [
+        "B5",
+        "B5",
+    ]  # every second pose
     assert "dnlo B4" in [one.label for one in found.comparison]  # B1 of every fourth
     assert "one pose in" in page_of(snapshot, calibration)[1].text
 
@@ -270,7 +324,18 @@ def files(tmp_path):
 
 
 def calibrate(files, out):
-    return cli.main(["calibrate", *files, "--parent-frame", "lidar", "--child-frame", "camera", "--out", str(out)])
+    return cli.main(
+        [
+            "calibrate",
+            *files,
+            "--parent-frame",
+            "lidar",
+            "--child-frame",
+            "camera",
+            "--out",
+            str(out),
+        ]
+    )
 
 
 def test_command_writes_it_beside_the_result(files, tmp_path, capsys):

@@ -1,23 +1,34 @@
-"""Scale: estimated for every method, by whatever motion there is, with outliers, with its standard deviation."""
+"""Scale: estimated for every method, by whatever motion there is, with outliers, with its standard
+deviation.
+"""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, planar_poses, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    planar_poses,
+    wandering_poses,
+)
 
-from hand_eye_calib.calibrator import calibrate
+from hand_eye_calib.alignment.alignment import estimate_scale
+from hand_eye_calib.engine.calibrator import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.solvers.alignment import estimate_scale
 
 
 def streams(n_poses=400, seed=0, scale=1.0, noise=0.0, poses=wandering_poses):
     """Both at 10 Hz; the child's lengths must be multiplied by ``scale``."""
     parent = poses(n_poses, seed)
     child = disturbed(child_of(parent), seed + 2, noise, noise)
-    return as_trajectory(disturbed(parent, seed + 1, noise, noise)), as_trajectory(child).scaled(1 / scale)
+    return as_trajectory(disturbed(parent, seed + 1, noise, noise)), as_trajectory(child).scaled(
+        1 / scale
+    )
 
 
 def pose_pairs(parent, child):
@@ -43,7 +54,10 @@ def test_most_pairs_decide_whatever_the_others_say():
 
 
 def test_standard_deviation_is_of_the_size_of_the_errors():
-    found = [estimate_scale(pose_pairs(*streams(seed=seed, scale=1.7, noise=0.01))) for seed in range(0, 60, 5)]
+    found = [
+        estimate_scale(pose_pairs(*streams(seed=seed, scale=1.7, noise=0.01)))
+        for seed in range(0, 60, 5)
+    ]
     ratios = [(scale.value - 1.7) / scale.sigma for scale in found]
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 3.0
 
@@ -70,7 +84,10 @@ def test_uncertainty_of_the_scale_enters_that_of_the_extrinsic():
     estimated = calibrate(parent, child, reference="B10", scale="estimate")
     given = calibrate(parent, child, reference="B10", scale=estimated.scale)
     assert np.trace(estimated.covariance) > np.trace(given.covariance)
-    assert all(one.sigma >= other.sigma for one, other in zip(estimated.observability, given.observability, strict=True))
+    assert all(
+        one.sigma >= other.sigma
+        for one, other in zip(estimated.observability, given.observability, strict=True)
+    )
 
 
 def test_a_scale_that_explains_nothing_is_refused():

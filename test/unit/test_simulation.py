@@ -1,4 +1,6 @@
-"""The simulator: exact relations without noise, the statistics of each kind of noise, and the likeness to the published drives."""
+"""The simulator: exact relations without noise, the statistics of each kind of noise, and the
+likeness to the published drives.
+"""
 
 import dataclasses
 import json
@@ -16,7 +18,13 @@ from hand_eye_calib.io.trajectory_files import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.simulation import noise, terrain
 from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE, MIXTURE, PUBLISHED_DRIVE, DriveConfig, NoiseConfig
+from hand_eye_calib.simulation.options import (
+    HILLY_DRIVE,
+    MIXTURE,
+    PUBLISHED_DRIVE,
+    DriveConfig,
+    NoiseConfig,
+)
 
 REFERENCES = ("A", "B1", "B5", "B10", "C5", "C10")
 N_PUBLISHED = 38
@@ -45,7 +53,9 @@ def test_noise_free_sensors_move_as_one_body():
     drive = simulate_drive(4)
     pairs = motion_pairs(drive.parent.poses, drive.child.poses, "B5")
     np.testing.assert_allclose(
-        pairs.Ts_parenti_parentj @ drive.T_parent_child, drive.T_parent_child @ pairs.Ts_childi_childj, atol=1e-12
+        pairs.Ts_parenti_parentj @ drive.T_parent_child,
+        drive.T_parent_child @ pairs.Ts_childi_childj,
+        atol=1e-12,
     )
     np.testing.assert_allclose(
         drive.parent.poses @ drive.T_parent_child @ se3.inverse(drive.child.poses),
@@ -55,7 +65,9 @@ def test_noise_free_sensors_move_as_one_body():
 
 
 def test_sensors_at_different_rates_are_on_one_body():
-    config = dataclasses.replace(DriveConfig(), parent_rate=200.0, child_rate=31.0, child_delay=0.0051, poses=400)
+    config = dataclasses.replace(
+        DriveConfig(), parent_rate=200.0, child_rate=31.0, child_delay=0.0051, poses=400
+    )
     drive = simulate_drive(1, config)
     inside = drive.child.stamps_ns <= drive.parent.stamps_ns[-1]
     Ts_pw_p = drive.parent.at(drive.child.stamps_ns[inside])
@@ -88,25 +100,35 @@ def test_vehicle_stands_on_the_terrain():
     position, normal = np.moveaxis(simulate_drive(2, HILLY_DRIVE).parent.poses[:, :3, [3, 2]], 2, 0)
 
     def height(x, y):
-        return terrain.surface(x, y, HILLY_DRIVE.terrain_height, HILLY_DRIVE.terrain_scale, HILLY_DRIVE.terrain_limit)[0]
+        return terrain.surface(
+            x, y, HILLY_DRIVE.terrain_height, HILLY_DRIVE.terrain_scale, HILLY_DRIVE.terrain_limit
+        )[0]
 
     x, y, z = position.T
     np.testing.assert_allclose(z, height(x, y), atol=1e-12)
     assert np.ptp(z) > 0.5
     step = 1e-6
     slopes = [height(x + step, y) - height(x - step, y), height(x, y + step) - height(x, y - step)]
-    np.testing.assert_allclose(-normal[:, :2] / normal[:, 2:], np.transpose(slopes) / (2 * step), atol=1e-5)
+    np.testing.assert_allclose(
+        -normal[:, :2] / normal[:, 2:], np.transpose(slopes) / (2 * step), atol=1e-5
+    )
 
 
 def test_peaks_has_the_known_extrema():
     # MATLAB's documentation of peaks, three of its extrema to four decimals.
-    for x, y, height in [(-0.0093, 1.5814, 8.1062), (0.2283, -1.6255, -6.5511), (1.2857, -0.0048, 3.5925)]:
+    for x, y, height in [
+        (-0.0093, 1.5814, 8.1062),
+        (0.2283, -1.6255, -6.5511),
+        (1.2857, -0.0048, 3.5925),
+    ]:
         assert terrain.peaks(np.array(x), np.array(y)) == pytest.approx(height, abs=1e-3)
         np.testing.assert_allclose(terrain.peaks_gradient(np.array(x), np.array(y)), 0.0, atol=2e-2)
 
 
 def test_extrinsics_and_worlds_have_the_published_distribution():
-    drives = [simulate_drive(seed, dataclasses.replace(PUBLISHED_DRIVE, poses=2)) for seed in range(1500)]
+    drives = [
+        simulate_drive(seed, dataclasses.replace(PUBLISHED_DRIVE, poses=2)) for seed in range(1500)
+    ]
     offsets = np.array([drive.T_parent_child[:3, 3] for drive in drives])
     assert np.abs(offsets).max() <= 0.5
     np.testing.assert_allclose(offsets.std(axis=0), 0.5 / np.sqrt(3), rtol=0.06)
@@ -132,8 +154,13 @@ def test_noise_does_not_change_the_drive_under_it():
 
 
 def test_hilly_drive_reveals_every_direction():
-    """Information of the translation: how far the terms (R_A - I) t spread; on flat ground its smallest eigenvalue is zero."""
-    drive, flat = simulate_drive(0, HILLY_DRIVE), simulate_drive(0, dataclasses.replace(HILLY_DRIVE, terrain_height=0.0))
+    """Information of the translation: how far the terms (R_A - I) t spread; on flat ground its
+    smallest eigenvalue is zero.
+    """
+    drive, flat = (
+        simulate_drive(0, HILLY_DRIVE),
+        simulate_drive(0, dataclasses.replace(HILLY_DRIVE, terrain_height=0.0)),
+    )
 
     def weakest(poses):
         turn = motion_pairs(poses, poses, "B10").Ts_parenti_parentj[:, :3, :3] - np.eye(3)
@@ -147,14 +174,23 @@ def test_hilly_drive_reveals_every_direction():
 
 
 @pytest.mark.parametrize(
-    "options", [{"poses": 1}, {"speed": -1.0}, {"hold_time": 0.0}, {"attitude": "sideways"}, {"child_rate": float("nan")}]
+    "options",
+    [
+        {"poses": 1},
+        {"speed": -1.0},
+        {"hold_time": 0.0},
+        {"attitude": "sideways"},
+        {"child_rate": float("nan")},
+    ],
 )
 def test_impossible_drives_are_refused(options):
     with pytest.raises(ConfigError, match=next(iter(options))):
         DriveConfig(**options)
 
 
-@pytest.mark.parametrize("options", [{"gaussian": -0.1}, {"outliers": 1.5}, {"drift": float("inf")}])
+@pytest.mark.parametrize(
+    "options", [{"gaussian": -0.1}, {"outliers": 1.5}, {"drift": float("inf")}]
+)
 def test_impossible_noise_is_refused(options):
     with pytest.raises(ConfigError, match=next(iter(options))):
         NoiseConfig(**options)
@@ -188,11 +224,15 @@ def test_jumps_last_and_have_variance_002_along_world_axes():
 def test_drift_lengthens_every_step_along_one_axis_of_the_sensor():
     poses = simulate_drive(3).child.poses
     drifted = noise.add_drift(poses, 0.05, rng())
-    steps, drifted_steps = (motion_pairs(stack, stack, "B1").Ts_parenti_parentj for stack in (poses, drifted))
+    steps, drifted_steps = (
+        motion_pairs(stack, stack, "B1").Ts_parenti_parentj for stack in (poses, drifted)
+    )
     np.testing.assert_allclose(drifted_steps[:, :3, :3], steps[:, :3, :3], atol=1e-12)
     added = drifted_steps[:, :3, 3] - steps[:, :3, 3]
     axis = np.argmax(np.abs(added).sum(axis=0))
-    np.testing.assert_allclose(added[:, axis], 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1), rtol=1e-9)
+    np.testing.assert_allclose(
+        added[:, axis], 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1), rtol=1e-9
+    )
     np.testing.assert_allclose(np.delete(added, axis, axis=1), 0.0, atol=1e-12)
     np.testing.assert_array_equal(drifted[0], poses[0])
 
@@ -200,7 +240,12 @@ def test_drift_lengthens_every_step_along_one_axis_of_the_sensor():
 def test_drift_chooses_every_axis():
     poses = still(3)
     poses[:, 0, 3] += np.arange(3)
-    moved = [np.argmax(np.abs(poses[0, :3, :3].T @ (noise.add_drift(poses, 1.0, rng(s)) - poses)[2, :3, 3])) for s in range(40)]
+    moved = [
+        np.argmax(
+            np.abs(poses[0, :3, :3].T @ (noise.add_drift(poses, 1.0, rng(s)) - poses)[2, :3, 3])
+        )
+        for s in range(40)
+    ]
     assert set(moved) == {0, 1, 2}
 
 
@@ -215,7 +260,10 @@ def test_mixture_is_noise_then_drift_then_jumps():
 
 def test_drift_and_noise_touch_the_sensors_they_should():
     clean = simulate_drive(8)
-    drift, gaussian = simulate_drive(8, noise=NoiseConfig(drift=0.05)), simulate_drive(8, noise=NoiseConfig(gaussian=0.01))
+    drift, gaussian = (
+        simulate_drive(8, noise=NoiseConfig(drift=0.05)),
+        simulate_drive(8, noise=NoiseConfig(gaussian=0.01)),
+    )
     np.testing.assert_array_equal(drift.parent.poses, clean.parent.poses)
     assert np.abs(drift.child.poses - clean.child.poses).max() > 0.05
     parent_error, child_error = (
@@ -243,29 +291,45 @@ def published_runs(folder, level):
 
 
 def quartiles(drives, reference):
-    """First quartile, median and third quartile (3, 6) of the absolute components x, y, z, roll, pitch, yaw, as in Figure 4."""
-    motions = np.concatenate([motion_pairs(poses, poses, reference).Ts_parenti_parentj for poses in drives])
+    """First quartile, median and third quartile (3, 6) of the absolute components x, y, z, roll,
+    pitch, yaw, as in Figure 4.
+    """
+    motions = np.concatenate(
+        [motion_pairs(poses, poses, reference).Ts_parenti_parentj for poses in drives]
+    )
     angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler("ZYX")[:, ::-1]
-    return np.percentile(np.abs(np.concatenate([motions[:, :3, 3], angles], axis=1)), [25, 50, 75], axis=0)
+    return np.percentile(
+        np.abs(np.concatenate([motions[:, :3, 3], angles], axis=1)), [25, 50, 75], axis=0
+    )
 
 
 def test_relative_motions_are_distributed_as_in_figure_4(published_folder):
     """The 38 published drives must look like one of many groups of 38 drawn from the simulator.
 
-    A z-score is the distance from the groups' mean in the groups' standard deviations. The largest of the 108 strongly correlated
-    scores was 3.4 when this was written; a vehicle whose orientation follows its heading gives scores above a thousand.
+    A z-score is the distance from the groups' mean in the groups' standard deviations. The largest
+    of the 108 strongly correlated scores was 3.4 when this was written; a vehicle whose orientation
+    follows its heading gives scores above a thousand.
     """
     published = [parent for parent, _ in published_runs(published_folder, "noise/noise_0.000000")]
     assert len(published) == N_PUBLISHED
 
     def scores(config):
-        groups = [[simulate_drive((group, run), config).parent.poses for run in range(N_PUBLISHED)] for group in range(20)]
-        ours = np.array([[quartiles(group, reference) for reference in REFERENCES] for group in groups])
-        return (np.array([quartiles(published, reference) for reference in REFERENCES]) - ours.mean(axis=0)) / ours.std(
-            axis=0, ddof=1
+        groups = [
+            [simulate_drive((group, run), config).parent.poses for run in range(N_PUBLISHED)]
+            for group in range(20)
+        ]
+        ours = np.array(
+            [[quartiles(group, reference) for reference in REFERENCES] for group in groups]
         )
+        return (
+            np.array([quartiles(published, reference) for reference in REFERENCES])
+            - ours.mean(axis=0)
+        ) / ours.std(axis=0, ddof=1)
 
-    worst, typical = np.abs(scores(PUBLISHED_DRIVE)).max(), np.median(np.abs(scores(PUBLISHED_DRIVE)))
+    worst, typical = (
+        np.abs(scores(PUBLISHED_DRIVE)).max(),
+        np.median(np.abs(scores(PUBLISHED_DRIVE))),
+    )
     assert worst < 5.0
     assert typical < 2.0
     assert np.abs(scores(DriveConfig())).max() > 20.0
@@ -278,7 +342,9 @@ def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder)
         np.testing.assert_allclose(parent[:, 2, 3], z, atol=1e-12)
         normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        yaw, pitch, roll = Rotation.from_matrix(np.swapaxes(parent[:, :3, :3], 1, 2)).as_euler("ZYX").T
+        yaw, pitch, roll = (
+            Rotation.from_matrix(np.swapaxes(parent[:, :3, :3], 1, 2)).as_euler("ZYX").T
+        )
         np.testing.assert_allclose(np.sin(pitch), normals[:, 0], atol=0.01)
         np.testing.assert_allclose(np.sin(roll), normals[:, 1], atol=0.01)
         # Circular arcs: a chord points half-way between the headings at its ends.
@@ -300,14 +366,23 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
     """Root mean square error of the poses, both sensors: median over the runs, ours and published."""
     clean = published_runs(published_folder, "noise/noise_0.000000")
     noisy = published_runs(published_folder, level)
-    theirs = np.array([[rms(*pair) for pair in zip(*sensors, strict=True)] for sensors in zip(noisy, clean, strict=True)])
+    theirs = np.array(
+        [
+            [rms(*pair) for pair in zip(*sensors, strict=True)]
+            for sensors in zip(noisy, clean, strict=True)
+        ]
+    )
     ours = np.array(
         [
             [rms(drive.parent.poses, base.parent.poses), rms(drive.child.poses, base.child.poses)]
-            for drive, base in ((simulate_drive(run, noise=config), simulate_drive(run)) for run in range(200))
+            for drive, base in (
+                (simulate_drive(run, noise=config), simulate_drive(run)) for run in range(200)
+            )
         ]
     )
-    np.testing.assert_allclose(np.median(ours, axis=0), np.median(theirs, axis=0), rtol=0.25, atol=1e-9)
+    np.testing.assert_allclose(
+        np.median(ours, axis=0), np.median(theirs, axis=0), rtol=0.25, atol=1e-9
+    )
 
 
 # --- the command -------------------------------------------------------------------------------------------------------------
@@ -320,35 +395,65 @@ def simulate(capsys, *arguments):
 
 def test_command_writes_the_published_layout(tmp_path, capsys):
     code, output, _ = simulate(
-        capsys, "--out", tmp_path / "sims", "--runs", 3, "--seed", 4, "--poses", 20, "--mixture", "--drift", 0
+        capsys,
+        "--out",
+        tmp_path / "sims",
+        "--runs",
+        3,
+        "--seed",
+        4,
+        "--poses",
+        20,
+        "--mixture",
+        "--drift",
+        0,
     )
     assert (code, output) == (0, f"3 drives written to {tmp_path / 'sims'}\n")
-    assert sorted(path.name for path in (tmp_path / "sims").iterdir()) == ["run_01", "run_02", "run_03"]
+    assert sorted(path.name for path in (tmp_path / "sims").iterdir()) == [
+        "run_01",
+        "run_02",
+        "run_03",
+    ]
     for number in range(3):
         folder = tmp_path / "sims" / f"run_0{number + 1}"
         expected = simulate_drive(
-            (4, number), dataclasses.replace(PUBLISHED_DRIVE, poses=20), dataclasses.replace(MIXTURE, drift=0.0)
+            (4, number),
+            dataclasses.replace(PUBLISHED_DRIVE, poses=20),
+            dataclasses.replace(MIXTURE, drift=0.0),
         )
         for name, trajectory in (("T_S1_W1", expected.parent), ("T_S2_W2", expected.child)):
             written = read_trajectory(folder / f"{name}.txt")
             np.testing.assert_array_equal(written.stamps_ns, trajectory.stamps_ns)
             np.testing.assert_allclose(written.poses, trajectory.poses, atol=1e-12)
-        np.testing.assert_allclose(read_trajectory(folder / "T_S2_S1.txt").poses, [expected.T_parent_child], atol=1e-12)
+        np.testing.assert_allclose(
+            read_trajectory(folder / "T_S2_S1.txt").poses, [expected.T_parent_child], atol=1e-12
+        )
 
 
-@pytest.mark.parametrize(("storage", "name"), [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")])
+@pytest.mark.parametrize(
+    ("storage", "name"), [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")]
+)
 def test_command_writes_bags(tmp_path, capsys, storage, name):
     from hand_eye_calib.io.bags import PoseBag
 
-    assert simulate(capsys, "--out", tmp_path / "sims", "--drive", "hilly", "--poses", 30, "--bag", storage)[0] == 0
+    assert (
+        simulate(
+            capsys, "--out", tmp_path / "sims", "--drive", "hilly", "--poses", 30, "--bag", storage
+        )[0]
+        == 0
+    )
     drive = simulate_drive((0, 0), dataclasses.replace(HILLY_DRIVE, poses=30))
     with PoseBag(tmp_path / "sims" / "run_01" / name) as bag:
         poses = list(bag.poses(simulate_command.PARENT_TOPIC, simulate_command.CHILD_TOPIC))
     for stream, trajectory in (("parent", drive.parent), ("child", drive.child)):
         ours = [pose for pose in poses if pose.stream == stream]
         assert [pose.stamp_ns for pose in ours] == trajectory.stamps_ns.tolist()
-        assert {(pose.sensor_frame, pose.world_frame) for pose in ours} == {(stream, f"{stream}_odom")}
-        np.testing.assert_allclose([pose.position for pose in ours], trajectory.poses[:, :3, 3], atol=0)
+        assert {(pose.sensor_frame, pose.world_frame) for pose in ours} == {
+            (stream, f"{stream}_odom")
+        }
+        np.testing.assert_allclose(
+            [pose.position for pose in ours], trajectory.poses[:, :3, 3], atol=0
+        )
 
 
 def test_command_speaks_json(tmp_path, capsys):
@@ -356,7 +461,12 @@ def test_command_speaks_json(tmp_path, capsys):
     document = json.loads(output)
     assert code == 0
     assert document["runs"] == [str(tmp_path / "run_01")]
-    assert document["noise"] == {"gaussian": 0.002, "rotation_per_metre": 2.0, "outliers": 0.0, "drift": 0.0}
+    assert document["noise"] == {
+        "gaussian": 0.002,
+        "rotation_per_metre": 2.0,
+        "outliers": 0.0,
+        "drift": 0.0,
+    }
 
 
 def test_command_overwrites_nothing(tmp_path, capsys):
@@ -375,14 +485,18 @@ def test_command_refuses_a_file_as_directory(tmp_path, capsys):
     assert "--out" in error
 
 
-@pytest.mark.parametrize(("option", "value"), [("--noise", -1), ("--outliers", 2), ("--drift", "nan"), ("--poses", 1)])
+@pytest.mark.parametrize(
+    ("option", "value"), [("--noise", -1), ("--outliers", 2), ("--drift", "nan"), ("--poses", 1)]
+)
 def test_command_refuses_impossible_values(tmp_path, capsys, option, value):
     code, _, error = simulate(capsys, "--out", tmp_path / "sims", option, value)
     assert (code, len(error.splitlines())) == (2, 1)
     assert not (tmp_path / "sims").exists()
 
 
-@pytest.mark.parametrize(("option", "value"), [("--runs", "0"), ("--seed", "-1"), ("--drive", "boat")])
+@pytest.mark.parametrize(
+    ("option", "value"), [("--runs", "0"), ("--seed", "-1"), ("--drive", "boat")]
+)
 def test_command_explains_wrong_usage(tmp_path, capsys, option, value):
     with pytest.raises(SystemExit, match="2"):
         simulate(capsys, "--out", tmp_path / "sims", option, value)

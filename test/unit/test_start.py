@@ -1,4 +1,6 @@
-"""The command line is quick to start because it loads little: what is loaded is counted, not how long that takes."""
+"""The command line is quick to start because it loads little: what is loaded is counted, not how
+long that takes.
+"""
 
 import os
 import subprocess
@@ -6,8 +8,8 @@ import sys
 
 import pytest
 
-from hand_eye_calib.cli.experiment import EXPERIMENTS
 from hand_eye_calib.cli.main import COMMANDS, main
+from reproduction.command import EXPERIMENTS
 
 # Each takes from a tenth of a second to a second to load.
 HEAVY = {"casadi", "matplotlib", "numpy", "rclpy", "rich", "rosbags", "scipy", "yaml"}
@@ -24,7 +26,9 @@ print(*{name.partition(".")[0] for name in sys.modules}, file=sys.stderr)
 
 
 def loaded_by(code, *arguments):
-    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+    )
     return set(done.stderr.split())
 
 
@@ -34,7 +38,7 @@ def test_help_loads_no_library(arguments):
 
 
 def test_the_engine_loads_only_what_it_computes_with():
-    code = "import sys, hand_eye_calib.calibrator; print(*sys.modules, file=sys.stderr)"
+    code = "import sys, hand_eye_calib.engine.calibrator; print(*sys.modules, file=sys.stderr)"
     loaded = loaded_by(code)
     assert not {name.partition(".")[0] for name in loaded} & (HEAVY - {"numpy", "scipy"})
     # Any part of scipy takes as long as all the rest, but for the wrapper of LAPACK alone.
@@ -54,6 +58,6 @@ def test_commands_use_one_thread_unless_told_otherwise(monkeypatch):
 
 
 def test_the_help_names_every_experiment():
-    from hand_eye_calib.experiments import catalogue
+    from reproduction import catalogue
 
     assert tuple(EXPERIMENTS) == tuple(catalogue.EXPERIMENTS)

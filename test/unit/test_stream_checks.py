@@ -9,17 +9,24 @@ import pytest
 from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
 from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
 
-from hand_eye_calib.assessment.agreement import check_streams
+from hand_eye_calib.alignment.alignment import estimate_time_offset
+from hand_eye_calib.checks.agreement import check_streams
+from hand_eye_calib.checks.findings import Severity
+from hand_eye_calib.checks.stream_checks import (
+    check_stamps,
+    check_stream,
+    frozen_share,
+    summarise,
+    tidy,
+)
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.trajectory_files import write_trajectory
-from hand_eye_calib.pairing.stream_checks import Severity, check_stamps, check_stream, frozen_share, summarise, tidy
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
-from hand_eye_calib.solvers.alignment import estimate_time_offset
 
 
 def drive(seed=0, noise=0.001, wander=wandering_poses, n_poses=500):
@@ -34,7 +41,11 @@ def drive(seed=0, noise=0.001, wander=wandering_poses, n_poses=500):
 
 
 def grave(agreement):
-    return [(finding.code, finding.stream) for finding in agreement.findings if finding.severity is not Severity.NOTE]
+    return [
+        (finding.code, finding.stream)
+        for finding in agreement.findings
+        if finding.severity is not Severity.NOTE
+    ]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -47,8 +58,18 @@ def test_no_false_alarm(seed, wander):
 
 def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     seconds = np.arange(400) * 0.05
-    turns = np.stack([0.3 * np.sin(0.7 * seconds), 0.2 * np.sin(0.9 * seconds + 1.0), 1.2 * np.sin(0.1 * seconds)], axis=1)
-    places = np.stack([20 * np.sin(0.05 * seconds), 20 * np.sin(0.07 * seconds), 0.5 * np.cos(0.8 * seconds)], axis=1)
+    turns = np.stack(
+        [
+            0.3 * np.sin(0.7 * seconds),
+            0.2 * np.sin(0.9 * seconds + 1.0),
+            1.2 * np.sin(0.1 * seconds),
+        ],
+        axis=1,
+    )
+    places = np.stack(
+        [20 * np.sin(0.05 * seconds), 20 * np.sin(0.07 * seconds), 0.5 * np.cos(0.8 * seconds)],
+        axis=1,
+    )
     poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     parent, child = as_trajectory(poses, 20), as_trajectory(child_of(poses, T_cw_pw=np.eye(4)), 20)
     assert grave(check_streams(parent, child)) == []
@@ -68,7 +89,9 @@ def test_every_fault_is_named(fault):
 @pytest.mark.parametrize("noise", [MIXTURE, NoiseConfig(gaussian=0.01, outliers=0.1, drift=0.05)])
 def test_strong_noise_is_no_fault_of_the_rig(seed, noise):
     simulated = simulate_drive((seed, 0), PUBLISHED_DRIVE, noise)
-    assert {code for code, _ in grave(check_streams(simulated.parent, simulated.child))} <= {"jumps"}
+    assert {code for code, _ in grave(check_streams(simulated.parent, simulated.child))} <= {
+        "jumps"
+    }
 
 
 class TestWhichStreamAndWhatToDo:
@@ -81,10 +104,16 @@ class TestWhichStreamAndWhatToDo:
 
     def test_offset_and_scale_come_as_options(self):
         parent, child = drive()
-        findings = {f.code: f for f in check_streams(parent, child.shifted(-7.25).scaled(0.5)).findings}
-        assert dict(findings["time_offset"].options)["time_offset"] == pytest.approx(7.25, abs=0.002)
+        findings = {
+            f.code: f for f in check_streams(parent, child.shifted(-7.25).scaled(0.5)).findings
+        }
+        assert dict(findings["time_offset"].options)["time_offset"] == pytest.approx(
+            7.25, abs=0.002
+        )
         assert dict(findings["scale"].options)["scale"] == pytest.approx(2.0, rel=0.005)
-        known = check_streams(parent, child.shifted(-7.25).scaled(0.5), time_offset_s=7.25, scale=2.0)
+        known = check_streams(
+            parent, child.shifted(-7.25).scaled(0.5), time_offset_s=7.25, scale=2.0
+        )
         assert grave(known) == []
 
     def test_which_axes_are_swapped(self):
@@ -100,10 +129,16 @@ class TestWhichStreamAndWhatToDo:
     def test_two_mistakes_at_once(self):
         parent, child = drive()
         found = grave(check_streams(parent, reordered(child).shifted(-33.0).scaled(1000.0)))
-        assert sorted(found) == [("quaternion_order", "child"), ("time_offset", "child"), ("units", "child")]
+        assert sorted(found) == [
+            ("quaternion_order", "child"),
+            ("time_offset", "child"),
+            ("units", "child"),
+        ]
 
     def test_turning_about_one_axis_is_named_in_the_parent_frame(self):
-        lying = se3.from_rotation_translation(se3.rotation_exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
+        lying = se3.from_rotation_translation(
+            se3.rotation_exp(np.array([np.pi / 2, 0, 0])), np.zeros(3)
+        )
         parent, child = drive(wander=planar_poses)
         note = check_streams(as_trajectory(parent.poses @ lying), child).findings[0]
         assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
@@ -131,12 +166,18 @@ class TestOneStream:
         poses = parent.poses.copy()
         poses[200:, :3, 3] += 3.0  # a lasting one
         poses[[50, 300], :3, 3] -= 2.0  # there and back
-        jumps = [f for f in check_stream(dataclasses.replace(parent, poses=poses), "child") if f.code == "jumps"]
+        jumps = [
+            f
+            for f in check_stream(dataclasses.replace(parent, poses=poses), "child")
+            if f.code == "jumps"
+        ]
         assert "1.0% of the child stream's steps" in jumps[0].what
 
     def test_disorder_and_repeated_stamps(self):
         stamps_ns = np.array([0, 10, 20, 20, 40, 30, 50]) * 10**7
-        trajectory, findings = tidy(stamps_ns, np.arange(21).reshape(7, 3), np.tile([0, 0, 0, 1.0], (7, 1)), "child")
+        trajectory, findings = tidy(
+            stamps_ns, np.arange(21).reshape(7, 3), np.tile([0, 0, 0, 1.0], (7, 1)), "child"
+        )
         assert np.array_equal(trajectory.stamps_ns, np.array([0, 10, 20, 30, 40, 50]) * 10**7)
         assert trajectory.poses[2, 0, 3] == 6.0
         assert [f.code for f in findings] == ["duplicates", "disorder"]
@@ -175,7 +216,9 @@ class TestOneStream:
         assert summary.longest_interval_s == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds")])
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds")]
+)
 def test_stamps_in_another_unit(factor, unit):
     parent, child = drive()
     wrong = (parent.stamps_ns / factor).astype(np.int64)
@@ -222,16 +265,37 @@ class TestCommand:
 
     def test_bag(self, tmp_path, capsys):
         parent, child = drive()
-        streams = {"/a": (parent, "geometry_msgs/msg/PoseStamped"), "/b": (reordered(child), "geometry_msgs/msg/PoseStamped")}
+        streams = {
+            "/a": (parent, "geometry_msgs/msg/PoseStamped"),
+            "/b": (reordered(child), "geometry_msgs/msg/PoseStamped"),
+        }
         write_bag(tmp_path / "bag", streams)
-        assert main(["check", str(tmp_path / "bag"), "--parent-topic", "/a", "--child-topic", "/b", "--json"]) == 1
-        assert [f["code"] for f in json.loads(capsys.readouterr().out)["findings"]] == ["quaternion_order"]
+        assert (
+            main(
+                [
+                    "check",
+                    str(tmp_path / "bag"),
+                    "--parent-topic",
+                    "/a",
+                    "--child-topic",
+                    "/b",
+                    "--json",
+                ]
+            )
+            == 1
+        )
+        assert [f["code"] for f in json.loads(capsys.readouterr().out)["findings"]] == [
+            "quaternion_order"
+        ]
 
     def test_out_is_a_page_with_a_picture(self, files, tmp_path, capsys):
         pytest.importorskip("matplotlib")
         parent, child = drive()
         out = tmp_path / "out"
-        assert main(["check", *files(parent, reordered(child).shifted(-100.0)), "--out", str(out)]) == 1
+        assert (
+            main(["check", *files(parent, reordered(child).shifted(-100.0)), "--out", str(out)])
+            == 1
+        )
         assert f"wrote {out / 'check.html'}" in capsys.readouterr().err
         page = (out / "check.html").read_text(encoding="utf-8")
         assert "Not as they are" in page

@@ -1,23 +1,43 @@
-"""Clock offsets: found from turning alone, refined with the extrinsic, refused where the evidence is weak."""
+"""Clock offsets: found from turning alone, refined with the extrinsic, refused where the evidence
+is weak.
+"""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, feed, planar_poses, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    feed,
+    planar_poses,
+    wandering_poses,
+)
 
-from hand_eye_calib import calibrator as engine
-from hand_eye_calib.calibrator import Calibrator, calibrate
+from hand_eye_calib.alignment.alignment import estimate_time_offset
+from hand_eye_calib.alignment.angular_rates import correlate_turning
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine import calibrator as engine
+from hand_eye_calib.engine.calibrator import Calibrator, calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.time_offset import correlate_turning
-from hand_eye_calib.solvers.alignment import estimate_time_offset
 
 
-def drive(seed=0, seconds=60, parent_hz=20.0, child_hz=33.0, shift_s=0.0, noise=0.0, wander=wandering_poses):
-    """Both sensors at rates of their own; the child's clock is ``shift_s`` behind, so that this is the offset to find."""
+def drive(
+    seed=0,
+    seconds=60,
+    parent_hz=20.0,
+    child_hz=33.0,
+    shift_s=0.0,
+    noise=0.0,
+    wander=wandering_poses,
+):
+    """Both sensors at rates of their own; the child's clock is ``shift_s`` behind, so that this is
+    the offset to find.
+    """
     truth = as_trajectory(wander(seconds * 10, seed), 10.0)
     start_ns, end_ns = (int(stamp) for stamp in truth.stamps_ns[[0, -1]])
 
@@ -28,7 +48,9 @@ def drive(seed=0, seconds=60, parent_hz=20.0, child_hz=33.0, shift_s=0.0, noise=
     stamps_ns, poses = sampled(parent_hz, start_ns)
     parent = Trajectory(stamps_ns, disturbed(poses, seed + 1, noise, noise))
     stamps_ns, poses = sampled(child_hz, start_ns + 7_000_000)
-    child = Trajectory(stamps_ns, disturbed(child_of(poses), seed + 2, noise, noise)).shifted(-shift_s)
+    child = Trajectory(stamps_ns, disturbed(child_of(poses), seed + 2, noise, noise)).shifted(
+        -shift_s
+    )
     return parent, child
 
 
@@ -65,7 +87,9 @@ def test_jumps_do_no_harm():
     random = np.random.default_rng(3)
     jumping = random.random(len(child)) < 0.05
     poses[jumping] = poses[jumping] @ se3.exp(random.normal(size=(int(jumping.sum()), 6)) * 0.5)
-    assert estimate_time_offset(parent, dataclasses.replace(child, poses=poses)).seconds == pytest.approx(41.0, abs=0.01)
+    assert estimate_time_offset(
+        parent, dataclasses.replace(child, poses=poses)
+    ).seconds == pytest.approx(41.0, abs=0.01)
 
 
 def test_planar_motion_and_an_unknown_scale_do_no_harm():
@@ -87,7 +111,10 @@ def test_turning_does_not_depend_on_conventions():
 class TestWeakEvidenceIsRefused:
     def test_streams_that_have_nothing_to_do_with_each_other(self):
         for seed in range(5):
-            with pytest.raises(NotEnoughDataError, match="time offset cannot be estimated: .*(correlated by|times better)"):
+            with pytest.raises(
+                NotEnoughDataError,
+                match="time offset cannot be estimated: .*(correlated by|times better)",
+            ):
                 estimate_time_offset(drive(seed)[0], drive(seed + 50)[1])
 
     def test_motion_without_turns(self):
@@ -121,7 +148,10 @@ class TestInTheEngine:
         np.testing.assert_array_equal(given.T_parent_child, estimated.T_parent_child)
         assert given.time_offset_sigma_s == 0.0
         assert np.linalg.eigvalsh(estimated.covariance - given.covariance)[-1] > 0
-        assert any(one.sigma > other.sigma for one, other in zip(estimated.observability, given.observability, strict=True))
+        assert any(
+            one.sigma > other.sigma
+            for one, other in zip(estimated.observability, given.observability, strict=True)
+        )
 
     def test_long_sessions_settle_it_when_the_waiting_room_is_full(self, monkeypatch):
         monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 900)
@@ -129,7 +159,11 @@ class TestInTheEngine:
         calibrator = Calibrator(CalibratorConfig(time_offset="estimate", reference="B5"))
         for part in range(8):
             for stream, trajectory in (("parent", parent), ("child", child)):
-                feed(calibrator, stream, trajectory[part * len(trajectory) // 8 : (part + 1) * len(trajectory) // 8])
+                feed(
+                    calibrator,
+                    stream,
+                    trajectory[part * len(trajectory) // 8 : (part + 1) * len(trajectory) // 8],
+                )
         snapshot = calibrator.snapshot()
         assert len(snapshot.kept) > 0
         assert snapshot.time_offset.seconds == pytest.approx(0.2, abs=0.002)
@@ -140,7 +174,9 @@ class TestInTheEngine:
     def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self, monkeypatch):
         monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 300)
         calibrator = Calibrator(CalibratorConfig(time_offset="estimate"))
-        for stream, trajectory in zip(("parent", "child"), (drive(1)[0], drive(77)[1]), strict=True):
+        for stream, trajectory in zip(
+            ("parent", "child"), (drive(1)[0], drive(77)[1]), strict=True
+        ):
             feed(calibrator, stream, trajectory)
         assert calibrator.statistics("child").dropped_unpaired > 0
         with pytest.raises(NotEnoughDataError):

@@ -37,7 +37,11 @@ def test_extrapolation_is_refused_unless_asked_for():
         (STAMPS.astype(float), POSES, "one-dimensional integers"),
         (STAMPS, POSES[:2], r"shape \(3, 4, 4\)"),
         (np.array([0, 10, 10]), POSES, "pose 2 has stamp 10 ns after 10 ns"),
-        (STAMPS, np.where(np.arange(3)[:, None, None] == 1, np.nan, POSES), "pose 1 has a value that is not finite"),
+        (
+            STAMPS,
+            np.where(np.arange(3)[:, None, None] == 1, np.nan, POSES),
+            "pose 1 has a value that is not finite",
+        ),
         (STAMPS, POSES * np.array([1, 1, 2])[:, None, None], "pose 2 is not a rigid transform"),
         (STAMPS, POSES @ np.diag([1.0, 1.0, -1.0, 1.0]), "pose 0 is not a rigid transform"),
     ],
@@ -49,7 +53,11 @@ def test_unusable_input_names_the_first_offender(stamps, poses, message):
 
 @pytest.mark.parametrize(
     ("quat", "message"),
-    [((0, 0, 0, 0.9), "length 0.9"), ((0, 0, 0, 0), "length 0,"), ((0, 0, np.nan, 1), "not finite")],
+    [
+        ((0, 0, 0, 0.9), "length 0.9"),
+        ((0, 0, 0, 0), "length 0,"),
+        ((0, 0, np.nan, 1), "not finite"),
+    ],
 )
 def test_unusable_quaternions_are_refused(quat, message):
     quats = np.array([(0, 0, 0, 1), quat, (0, 0, 0, 1)])

@@ -86,10 +86,19 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         ),
         ([f"0 {POSE}", "1 nan 2 3 0 0 0 1"], "line 2: found a value that is not finite"),
         ([f"0 {POSE}", "1 1 2 3 0 0 0 inf"], "line 2: found a value that is not finite"),
-        (["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"], "line 3: found a quaternion of length 1.1, expected 1"),
+        (
+            ["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"],
+            "line 3: found a quaternion of length 1.1, expected 1",
+        ),
         (["0 1 2 3 0 0 0 0"], "line 1: found a quaternion of length 0, expected 1"),
-        ([f"5 {POSE}", f"4.5 {POSE}"], "line 2: timestamps must increase, found 4.500000000 after 5.000000000"),
-        ([f"5 {POSE}", "#", f"5.0 {POSE}"], "line 3: timestamps must increase, found 5.000000000 after 5.000000000"),
+        (
+            [f"5 {POSE}", f"4.5 {POSE}"],
+            "line 2: timestamps must increase, found 4.500000000 after 5.000000000",
+        ),
+        (
+            [f"5 {POSE}", "#", f"5.0 {POSE}"],
+            "line 3: timestamps must increase, found 5.000000000 after 5.000000000",
+        ),
     ],
 )
 def test_an_unusable_line_is_named(tum, lines, message):

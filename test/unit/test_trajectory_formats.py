@@ -1,4 +1,6 @@
-"""KITTI, EuRoC and CSV files: columns, units of stamps, order of quaternions; and stamps out of order."""
+"""KITTI, EuRoC and CSV files: columns, units of stamps, order of quaternions; and stamps out of
+order.
+"""
 
 import json
 
@@ -15,7 +17,10 @@ from hand_eye_calib.io.trajectory_files import FORMATS, read_trajectory_file, wr
 
 START_NS = 1_700_000_000_123_456_789
 TRAJECTORY = as_trajectory(wandering_poses(30), start_ns=START_NS)
-POSITIONS, QUATS_XYZW = TRAJECTORY.poses[:, :3, 3].tolist(), se3.to_quat_xyzw(TRAJECTORY.poses).tolist()
+POSITIONS, QUATS_XYZW = (
+    TRAJECTORY.poses[:, :3, 3].tolist(),
+    se3.to_quat_xyzw(TRAJECTORY.poses).tolist(),
+)
 
 
 @pytest.fixture
@@ -45,19 +50,31 @@ def assert_is_the_trajectory(found, stamps_ns=TRAJECTORY.stamps_ns):
 
 
 def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
-    poses = file([" ".join(map(repr, pose[:3].ravel().tolist())) for pose in TRAJECTORY.poses], "poses.txt")
+    poses = file(
+        [" ".join(map(repr, pose[:3].ravel().tolist())) for pose in TRAJECTORY.poses], "poses.txt"
+    )
     times = file(
-        [f"{(stamp - START_NS) // 10**9}.{(stamp - START_NS) % 10**9:09d}" for stamp in TRAJECTORY.stamps_ns.tolist()],
+        [
+            f"{(stamp - START_NS) // 10**9}.{(stamp - START_NS) % 10**9:09d}"
+            for stamp in TRAJECTORY.stamps_ns.tolist()
+        ],
         "times.txt",
     )
-    assert_is_the_trajectory(hec.read_trajectory(poses, "kitti", times=times), TRAJECTORY.stamps_ns - START_NS)
-    with pytest.raises(ConfigError, match=r"poses\.txt: the poses of format kitti have no stamps; name their file with times"):
+    assert_is_the_trajectory(
+        hec.read_trajectory(poses, "kitti", times=times), TRAJECTORY.stamps_ns - START_NS
+    )
+    with pytest.raises(
+        ConfigError,
+        match=r"poses\.txt: the poses of format kitti have no stamps; name their file with times",
+    ):
         hec.read_trajectory(poses, "kitti")
     short = file(["0.0", "0.1"], "short.txt")
     with pytest.raises(InputError, match=r"30 poses, but .*short\.txt has 2 stamps"):
         hec.read_trajectory(poses, "kitti", times=short)
     scaled = file([" ".join(["2"] * 12)], "scaled.txt")
-    with pytest.raises(InputError, match=r"scaled\.txt, line 1: the 3x3 part is not a rotation matrix"):
+    with pytest.raises(
+        InputError, match=r"scaled\.txt, line 1: the 3x3 part is not a rotation matrix"
+    ):
         hec.read_trajectory(scaled, "kitti", times=file(["0.0"], "one.txt"))
     with pytest.raises(InputError, match=r"line 1: expected 12 numbers.* found 2"):
         hec.read_trajectory(file(["1 2"], "pair.txt"), "kitti", times=times)
@@ -93,15 +110,29 @@ def test_csv_finds_its_columns_by_their_names(file, header, order, separator):
 def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
     header = 'time, .header.stamp.secs, .header.stamp.nsecs, .child, .p.position.x, .p.position.y, .p.position.z, .p.orientation.x, .p.orientation.y, .p.orientation.z, .p.orientation.w, .covariance'  # fmt: skip
     lines = [
-        ", ".join(["7", str(stamp // 10**9), str(stamp % 10**9), '"a, b"', *map(repr, position + quat), '"(0.0, 1.0)"'])
-        for stamp, position, quat in zip(TRAJECTORY.stamps_ns.tolist(), POSITIONS, QUATS_XYZW, strict=True)
+        ", ".join(
+            [
+                "7",
+                str(stamp // 10**9),
+                str(stamp % 10**9),
+                '"a, b"',
+                *map(repr, position + quat),
+                '"(0.0, 1.0)"',
+            ]
+        )
+        for stamp, position, quat in zip(
+            TRAJECTORY.stamps_ns.tolist(), POSITIONS, QUATS_XYZW, strict=True
+        )
     ]
     assert_is_the_trajectory(hec.read_trajectory(file([header, *lines]), "csv"))
 
 
 def test_without_a_header_the_columns_must_be_named(file):
     path = file(rows(TRAJECTORY.stamps_ns, "wxyz", " "))
-    with pytest.raises(InputError, match="so the order of the quaternion is unknown; name them with columns .* there are 8"):
+    with pytest.raises(
+        InputError,
+        match="so the order of the quaternion is unknown; name them with columns .* there are 8",
+    ):
         hec.read_trajectory(path, "csv")
     assert_is_the_trajectory(hec.read_trajectory(path, "csv", columns="t,x,y,z,qw,qx,qy,qz"))
     with pytest.raises(InputError, match=r"line 1: expected 9 columns: .*; found 8"):
@@ -111,7 +142,10 @@ def test_without_a_header_the_columns_must_be_named(file):
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        ("t,x,y,z,roll,pitch,yaw", "no column for qx, qy, qz, qw among t, x, y, z, roll, pitch, yaw; name all columns"),
+        (
+            "t,x,y,z,roll,pitch,yaw",
+            "no column for qx, qy, qz, qw among t, x, y, z, roll, pitch, yaw; name all columns",
+        ),
         ("t,x,y,z,q0,q1,q2,q3", "no column for qx, qy, qz, qw among"),
         ("t,time,x,y,z,qx,qy,qz,qw", "columns t, time could all be t; name them with columns"),
     ],
@@ -124,10 +158,16 @@ def test_columns_that_are_missing_or_not_clear(file, header, message):
 @pytest.mark.parametrize(("unit", "ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3), ("ns", 1)])
 def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, unit, ns):
     stamps_ns = START_NS // 10**9 * 10**9 + 100_000_000 * np.arange(30)
-    stamps = [f"{stamp // ns}" if ns < 10**9 else f"{stamp / ns:.1f}" for stamp in stamps_ns.tolist()]
-    assert_is_the_trajectory(hec.read_trajectory(file(rows(stamps, separator=" ")), "tum"), stamps_ns)
+    stamps = [
+        f"{stamp // ns}" if ns < 10**9 else f"{stamp / ns:.1f}" for stamp in stamps_ns.tolist()
+    ]
+    assert_is_the_trajectory(
+        hec.read_trajectory(file(rows(stamps, separator=" ")), "tum"), stamps_ns
+    )
     relative_ns = stamps_ns - stamps_ns[0]
-    relative = [f"{stamp // ns}" if ns < 10**9 else f"{stamp / ns:.1f}" for stamp in relative_ns.tolist()]
+    relative = [
+        f"{stamp // ns}" if ns < 10**9 else f"{stamp / ns:.1f}" for stamp in relative_ns.tolist()
+    ]
     path = file(rows(relative, separator=" "))
     assert_is_the_trajectory(hec.read_trajectory(path, "tum", stamp_unit=unit), relative_ns)
     for name in (f"time [{unit}]", f"t_{unit}", f"timestamp ({unit})"):
@@ -146,11 +186,13 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
     lines = rows(TRAJECTORY.stamps_ns)
     path = file(["t,x,y,z,qx,qy,qz,qw", *(lines[index] for index in order)])
     with pytest.raises(
-        InputError, match=r"line 12: timestamps must increase, .*; 4 such lines; sort .* repair \(--repair-stamps\)"
+        InputError,
+        match=r"line 12: timestamps must increase, .*; 4 such lines; sort .* repair \(--repair-stamps\)",
     ):
         hec.read_trajectory(path, "csv")
     with pytest.warns(
-        UserWarning, match="stamps went back at 3 of 32 poses, which were sorted; dropped 2 whose stamp was there already"
+        UserWarning,
+        match="stamps went back at 3 of 32 poses, which were sorted; dropped 2 whose stamp was there already",
     ):
         assert_is_the_trajectory(hec.read_trajectory(path, "csv", repair=True))
 
@@ -159,12 +201,20 @@ def test_options_that_do_not_go_with_the_format(file):
     path = file(rows(TRAJECTORY.stamps_ns))
     for file_format in FORMATS:
         if file_format != "csv":
-            with pytest.raises(ConfigError, match=f"columns are named for format csv only; the format is {file_format}"):
+            with pytest.raises(
+                ConfigError,
+                match=f"columns are named for format csv only; the format is {file_format}",
+            ):
                 hec.read_trajectory(path, file_format, columns="t")
         if file_format != "kitti":
-            with pytest.raises(ConfigError, match=f"a file of times belongs to format kitti only; the format is {file_format}"):
+            with pytest.raises(
+                ConfigError,
+                match=f"a file of times belongs to format kitti only; the format is {file_format}",
+            ):
                 hec.read_trajectory(path, file_format, times=path)
-    with pytest.raises(ConfigError, match="unknown unit of stamps 'minutes'; known are s, ms, us, ns"):
+    with pytest.raises(
+        ConfigError, match="unknown unit of stamps 'minutes'; known are s, ms, us, ns"
+    ):
         hec.read_trajectory(path, stamp_unit="minutes")
     with pytest.raises(ConfigError, match="trajectories are written in format tum; got 'kitti'"):
         write_trajectory(path, TRAJECTORY, "kitti")
@@ -203,10 +253,16 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
     )
     out, err = capsys.readouterr()
     assert code == 0
-    assert "stamps went back at 1 of 31 poses, which were sorted; dropped 1 whose stamp was there already" in err
+    assert (
+        "stamps went back at 1 of 31 poses, which were sorted; dropped 1 whose stamp was there already"
+        in err
+    )
     document = json.loads(out)
     np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
-    assert [entry["file"] for entry in document["inputs"]["files"]] == [str(parent), str(tmp_path / "child.tum")]
+    assert [entry["file"] for entry in document["inputs"]["files"]] == [
+        str(parent),
+        str(tmp_path / "child.tum"),
+    ]
     assert main([*command, "--columns", "t,x,y,z,qw,qx,qy,qz"]) == 2
     assert "columns are named for format csv only; the format is tum" in capsys.readouterr().err
 
@@ -217,15 +273,25 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
 def test_published_files_of_other_programs():
     folder = data_folder()
     counts = {}
-    for pattern, columns in (("asl_*/*.csv", "t,x,y,z,qx,qy,qz,qw"), ("zxl19/bag*/[ILV]*_FCPE.mat", "t,x,y,z,qw,qx,qy,qz")):
+    for pattern, columns in (
+        ("asl_*/*.csv", "t,x,y,z,qx,qy,qz,qw"),
+        ("zxl19/bag*/[ILV]*_FCPE.mat", "t,x,y,z,qw,qx,qy,qz"),
+    ):
         for path in sorted(folder.glob(pattern)):
             trajectory, notes = read_trajectory_file(path, "csv", columns=columns, repair=True)
             counts[path.name] = len(trajectory)
             assert 30 < trajectory.duration_s < 100, path
-            assert all(path.name in note and ("were sorted" in note or "dropped" in note) for note in notes)
+            assert all(
+                path.name in note and ("were sorted" in note or "dropped" in note) for note in notes
+            )
     assert len(counts) >= 10
     export = folder / "zxl19" / "raw_bag1" / "bag1-aft_mapped_to_init.csv"
     trajectory, _ = read_trajectory_file(export, "csv")
-    assert (len(trajectory), trajectory.stamps_ns[0]) == (572, 1636512749922900677)  # of the header, not of the arrival
+    assert (len(trajectory), trajectory.stamps_ns[0]) == (
+        572,
+        1636512749922900677,
+    )  # of the header, not of the arrival
     with pytest.raises(InputError, match="no column for qx, qy, qz, qw among GPSTime, easting"):
-        read_trajectory_file(folder / "boreas" / "boreas-2021-08-05-13-34" / "lidar_poses.csv", "csv")
+        read_trajectory_file(
+            folder / "boreas" / "boreas-2021-08-05-13-34" / "lidar_poses.csv", "csv"
+        )

@@ -1,0 +1,1 @@
+"""How the two streams relate before a solve: time offset and scale."""

@@ -1,0 +1,1 @@
+"""Checks that the two streams are believable before anything is solved."""

@@ -1,0 +1,1 @@
+"""From poses to a calibration: the engine that the node, the replay and Python share."""

@@ -1,0 +1,48 @@
+"""Leaps in time: stamps that lie days apart from the others, which no recording has."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# No recording pauses for so long (s): a stamp is wrong.
+_LEAP_S = 86_400.0
+
+
+@dataclass(frozen=True)
+class Leap:
+    """The longest leap in a stream's stamps.
+
+    Attributes
+    ----------
+    seconds : float
+        Time between the two poses.
+    before, after : int
+        Number of poses before and after it.
+    """
+
+    seconds: float
+    before: int
+    after: int
+
+    def what(self):
+        """What was found, to follow "the parent stream's"."""
+        return f"stamps leap by {self.seconds / _LEAP_S:,.0f} days after pose {self.before} of {self.before + self.after}"
+
+    def advice(self):
+        """What to do."""
+        few = f"the first {self.before}" if self.before < self.after else f"the last {self.after}"
+        return f"repair the stamps, or remove {few} of its poses"
+
+
+def find_leap(stamps_ns):
+    """The Leap in these stamps, (N,) int64 in rising order; None without one.
+
+    A stream of fewer than two poses has none.
+    """
+    if len(stamps_ns) < 2:
+        return None
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    before = int(np.argmax(intervals_s)) + 1
+    if intervals_s[before - 1] <= _LEAP_S:
+        return None
+    return Leap(float(intervals_s[before - 1]), before, len(stamps_ns) - before)

@@ -1,0 +1,151 @@
+"""The variant of Ali that made the published simulation results; for comparison only, no method of
+this package.
+
+There the quaternion q = (w, x, y, z) was never normalised, and the matrix made of it is a rotation
+only where its length is 1:
+
+    M(q) = I + 2 sqrt(|q|) P(q),    P(q) = [[-yy-zz, xy-wz, xz+wy], [xy+wz, -xx-zz, yz-wx], [xz-wy,
+    yz+wx, -xx-yy]]
+
+where a rotation would have ``1 / |q|^2`` for ``sqrt(|q|)``. The translation residual is minimised
+over q and t from the identity, and q is normalised only afterwards, so the rotation reported is not
+the one that was fitted (lengths between 0.5 and 1 are common with noise).
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.solvers.ali import residual_rows
+from hand_eye_calib.solvers.separable import squared_translation_residual
+from hand_eye_calib.solvers.solution import Solution
+
+_IDENTITY = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+_MAX_ITERATIONS = 300
+_STEP_TOLERANCE = 1e-10
+_LARGEST_START_GRADIENT = 100.0
+_SUFFICIENT_DECREASE = 1e-8
+
+# Share of the cost below which a rise is rounding.
+_ROUNDING = 10 * np.finfo(float).eps
+
+
+def solve(pairs):
+    """Minimise the translation residual over an unnormalised quaternion, by Newton's method from
+    the identity.
+
+    The cost has several minima, and which one is found depends on the steps. These are Ipopt's
+    (Wächter, Biegler 2006) as they are without constraints: the cost scaled to a start gradient of
+    at most 100, the Hessian shifted until it is positive definite, the step halved until the cost
+    falls.
+
+    Parameters
+    ----------
+    pairs : MotionPairs
+        K pairs, K >= 1.
+
+    Returns
+    -------
+    Solution
+        ``objective`` is the squared translation residual of the transform returned, not of the
+        matrix that was fitted. Where the cost keeps falling as q grows without bound, the answer is
+        not converged.
+    """
+    # Residuals through the triangular factor, not through its square: on noise-free data the square
+    # loses half of the digits.
+    rows = np.linalg.qr(residual_rows(pairs), mode="r")
+    start_gradient = np.abs(_derivatives(_IDENTITY, rows)[1]).max()
+    rows *= np.sqrt(min(1.0, _LARGEST_START_GRADIENT / max(start_gradient, np.finfo(float).tiny)))
+    parameters, shift = _IDENTITY, 0.0
+    converged, iterations = False, 0
+    while iterations < _MAX_ITERATIONS and not converged:
+        iterations += 1
+        value, gradient, hessian = _derivatives(parameters, rows)
+        step, shift = _descent_step(gradient, hessian, shift)
+        length = 1.0
+        while (
+            _value(parameters + length * step, rows) - value
+            > _SUFFICIENT_DECREASE * length * (gradient @ step) + _ROUNDING * value
+        ):
+            length /= 2
+        parameters = parameters + length * step
+        converged = bool(np.abs(step).max() < _STEP_TOLERANCE)
+    rotation = Rotation.from_quat(np.roll(parameters[:4], -1)).as_matrix()
+    T_parent_child = se3.from_rotation_translation(rotation, parameters[4:])
+    objective = squared_translation_residual(pairs, T_parent_child)
+    return Solution(T_parent_child, objective, converged, iterations, np.ones(len(pairs)))
+
+
+def _descent_step(gradient, hessian, last_shift):
+    """Newton step and the shift of the Hessian's diagonal it took: none, else about a third of the
+    last one and up.
+    """
+    shift, growth = 0.0, 8.0 if last_shift else 100.0
+    while np.linalg.eigvalsh(hessian)[0] + shift <= 0.0:
+        if shift:
+            shift *= growth
+        else:
+            shift = max(last_shift / 3, 1e-20) if last_shift else 1e-4
+    return -np.linalg.solve(hessian + shift * np.eye(7), gradient), shift or last_shift
+
+
+def _symmetric(*entries):
+    matrix = np.zeros((4, 4))
+    for row, column, value in entries:
+        matrix[row, column] += value / 2
+        matrix[column, row] += value / 2
+    return matrix
+
+
+_W, _X, _Y, _Z = range(4)
+# Entry k of P, row by row, is q^T _P[k] q.
+_P = np.array(
+    [
+        _symmetric((_Y, _Y, -1), (_Z, _Z, -1)), _symmetric((_X, _Y, 1), (_W, _Z, -1)), _symmetric((_X, _Z, 1), (_W, _Y, 1)),
+        _symmetric((_X, _Y, 1), (_W, _Z, 1)), _symmetric((_X, _X, -1), (_Z, _Z, -1)), _symmetric((_Y, _Z, 1), (_W, _X, -1)),
+        _symmetric((_X, _Z, 1), (_W, _Y, -1)), _symmetric((_Y, _Z, 1), (_W, _X, 1)), _symmetric((_X, _X, -1), (_Y, _Y, -1)),
+    ]
+)  # fmt: skip
+
+
+def _factor(q):
+    """``sqrt(|q|)`` with its gradient and Hessian."""
+    squared = q @ q
+    factor = squared**0.25
+    return (
+        factor,
+        factor * q / (2 * squared),
+        factor * (np.eye(4) / (2 * squared) - 0.75 * np.outer(q, q) / squared**2),
+    )
+
+
+def _lift(parameters):
+    """The thirteen numbers x = (vec M(q), t, 1) and their derivative (13, 7)."""
+    q = parameters[:4]
+    factor, factor_gradient, _ = _factor(q)
+    half_gradient = _P @ q
+    P = half_gradient @ q
+    derivative = np.zeros((13, 7))
+    derivative[:9, :4] = 2 * np.outer(P, factor_gradient) + 4 * factor * half_gradient
+    derivative[9:12, 4:] = np.eye(3)
+    return np.concatenate([np.eye(3).ravel() + 2 * factor * P, parameters[4:], [1.0]]), derivative
+
+
+def _value(parameters, rows):
+    residuals = rows @ _lift(parameters)[0]
+    return residuals @ residuals
+
+
+def _derivatives(parameters, rows):
+    """Cost, gradient (7,) and Hessian (7, 7)."""
+    x, derivative = _lift(parameters)
+    q = parameters[:4]
+    residuals, slope = rows @ x, rows @ derivative
+    factor, factor_gradient, factor_hessian = _factor(q)
+    weighted = np.tensordot((residuals @ rows)[:9], _P, axes=1)
+    cross = np.outer(factor_gradient, 2 * weighted @ q)
+    hessian = 2 * slope.T @ slope
+    hessian[:4, :4] += 4 * (
+        factor_hessian * (q @ weighted @ q) + cross + cross.T + 2 * factor * weighted
+    )
+    return residuals @ residuals, 2 * residuals @ slope, hessian

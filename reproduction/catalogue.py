@@ -1,0 +1,246 @@
+"""Experiments by name: what each needs solved and what it writes."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from hand_eye_calib.errors import ConfigError, InputError
+from reproduction import (
+    conclusions,
+    figures,
+    findings,
+    past_the_paper,
+    repeats,
+    runner,
+    statistics,
+    tables,
+    unlike,
+)
+from reproduction.published import KITTI, LEVELS, METHODS, SIMULATED
+from reproduction.rows import ALI_AS_PUBLISHED, cells
+
+_SIMULATION_METHODS = (*METHODS, ALI_AS_PUBLISHED)
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A figure, a table or a text, with its comparison.
+
+    Attributes
+    ----------
+    name : str
+        Files begin with it.
+    cells : list of Cell
+        What must be solved for it.
+    write : callable
+        Given :class:`Results`, writes the files and returns their paths.
+    data : tuple of str
+        The kinds of source it can be made from.
+    """
+
+    name: str
+    cells: list
+    write: object
+    data: tuple = ("published", "simulated")
+
+    def fits(self, source):
+        """Whether a source has what it needs."""
+        return source.data in self.data and all(
+            cell.dataset in source.datasets for cell in self.cells
+        )
+
+
+def _artefacts():
+    found = {
+        "fig4": Artefact("fig4", [], lambda results: figures.write_components("fig4", results))
+    }
+    for name, methods in figures.FIGURE_METHODS.items():
+        found[name] = Artefact(
+            name,
+            cells(SIMULATED, methods),
+            lambda results, name=name: figures.write_error_figure(name, results),
+        )
+    for name, dataset in tables.SUMMARY_TABLES.items():
+        found[name] = Artefact(
+            name,
+            cells([dataset], METHODS),
+            lambda results, name=name: tables.write_summary_table(name, results),
+        )
+    for name, (dataset, method) in tables.VARIANT_TABLES.items():
+        found[name] = Artefact(
+            name,
+            cells([dataset], [method]),
+            lambda results, name=name: tables.write_variant_table(name, results),
+        )
+    everything = cells(SIMULATED, _SIMULATION_METHODS) + cells(KITTI, METHODS)
+    found["conclusions"] = Artefact("conclusions", everything, conclusions.write)
+    found["findings"] = Artefact("findings", everything, findings.write)
+    found["adaptive"] = Artefact(
+        "adaptive", [], lambda results: past_the_paper.write("adaptive", results)
+    )
+    found["repeats"] = Artefact(
+        "repeats", [], lambda results: repeats.write("repeats", results), ("published",)
+    )
+    found["unlike"] = Artefact(
+        "unlike", [], lambda results: unlike.write("unlike", results), ("simulated",)
+    )
+    return found
+
+
+ARTEFACTS = _artefacts()
+_S_FIGURES = tuple(name for name in figures.FIGURE_METHODS if name.startswith("figS"))
+EXPERIMENTS = {
+    **{name: (name,) for name in ("fig3", "fig4", "fig5", "table1", "table2")},
+    "s-figures": _S_FIGURES,
+    "s-tables": tuple(tables.VARIANT_TABLES),
+    "adaptive": ("adaptive",),
+    "repeats": ("repeats",),
+    "unlike": ("unlike",),
+    "all": (
+        "fig3",
+        "fig4",
+        "fig5",
+        *_S_FIGURES,
+        "table1",
+        "table2",
+        *tables.VARIANT_TABLES,
+        "conclusions",
+        "findings",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Results:
+    """What was solved, and where the files go.
+
+    Attributes
+    ----------
+    source : PublishedSource or SimulatedSource
+    theirs_source : PublishedSource or None
+        Whose published results ours are compared with.
+    rows : list of Row
+    out : pathlib.Path
+    jobs : int
+        Number of processes, for what is not solved cell by cell.
+    """
+
+    source: object
+    theirs_source: object
+    rows: list
+    out: Path
+    jobs: int = 1
+
+    @property
+    def same_cases(self):
+        """Whether ours and the published results are of the same trajectories."""
+        return self.source == self.theirs_source
+
+    @property
+    def n_runs(self):
+        """Number of runs per level of the simulated data sets."""
+        return self.source.runs
+
+    @cached_property
+    def ours(self):
+        """:class:`~reproduction.statistics.Table` of our errors."""
+        return statistics.ours(self.rows)
+
+    @cached_property
+    def theirs(self):
+        """The same of the published errors; None where they are not at hand."""
+        if self.same_cases:
+            return statistics.theirs(self.rows)
+        if self.theirs_source is None:
+            return None
+        cases = (
+            case
+            for dataset in SIMULATED
+            for level in LEVELS[dataset]
+            for case in self.theirs_source.cases(dataset, level)
+        )
+        return statistics.theirs_of_cases(cases, _SIMULATION_METHODS)
+
+    def of(self, dataset, method):
+        """Rows of a method on a data set."""
+        return [row for row in self.rows if (row.dataset, row.method) == (dataset, method)]
+
+
+class Experiment:
+    """An experiment on a source of cases.
+
+    Parameters
+    ----------
+    name : str
+        A key of :data:`EXPERIMENTS`.
+    source : PublishedSource or SimulatedSource
+    theirs_source : PublishedSource, optional
+        Whose published results to compare with.
+
+    Raises
+    ------
+    ConfigError
+        Where the source has no cases of this experiment.
+    """
+
+    def __init__(self, name, source, theirs_source=None):
+        artefacts = [ARTEFACTS[artefact] for artefact in EXPERIMENTS[name]]
+        self.artefacts = [artefact for artefact in artefacts if artefact.fits(source)]
+        self.left_out = [artefact.name for artefact in artefacts if artefact not in self.artefacts]
+        if not self.artefacts:
+            only = artefacts[0].data[0]
+            raise ConfigError(
+                f"{name} is about simulated drives; use --data simulated"
+                if only == "simulated"
+                else f"{name} is about recorded drives (KITTI), which are not simulated; use --data published"
+            )
+        self.cells = list(
+            dict.fromkeys(cell for artefact in self.artefacts for cell in artefact.cells)
+        )
+        self._source, self._theirs_source = source, theirs_source
+
+    def run(self, out, jobs, on_solved=lambda cell: None, on_written=lambda name: None):
+        """Solve what is not solved yet, and write the files.
+
+        Parameters
+        ----------
+        out : pathlib.Path
+            Directory for the files; the solved cells are kept in its folder ``solved``.
+        jobs : int
+            Number of processes.
+        on_solved, on_written : callable
+            Called with every Cell, then with every artefact's name.
+
+        Returns
+        -------
+        Results
+        dict
+            Artefact's name to list of paths.
+
+        Raises
+        ------
+        InputError
+            Where data cannot be read or files cannot be written.
+        """
+        if any(artefact.name.startswith("fig") for artefact in self.artefacts):
+            # Where Matplotlib is missing, say so before minutes of solving, not after.
+            from reproduction import paper_figures  # noqa: F401
+        store = runner.Store(out / "solved", self._source.configuration())
+        solved = runner.run(self._source, self.cells, store, jobs, on_solved)
+        results = Results(
+            self._source,
+            self._theirs_source,
+            [row for rows in solved.values() for row in rows],
+            out,
+            jobs,
+        )
+        files = {}
+        for artefact in self.artefacts:
+            try:
+                files[artefact.name] = artefact.write(results)
+            except OSError as error:
+                raise InputError(
+                    f"cannot write {error.filename}: {error.strerror}; choose another directory with --out"
+                ) from None
+            on_written(artefact.name)
+        return results, files

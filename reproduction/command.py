@@ -1,0 +1,238 @@
+"""``python -m reproduction ID``: a figure or table of the article, from one command, beside the
+published numbers.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections import Counter
+from contextlib import contextmanager
+from pathlib import Path
+
+from hand_eye_calib.cli.console import note
+from hand_eye_calib.cli.main import exit_code_of
+from hand_eye_calib.cli.options import add_json_argument
+from hand_eye_calib.errors import ConfigError
+
+_SILENT_S = 2.0
+
+EXPERIMENTS = {
+    "fig3": "DNLO's errors for every reference, against noise, outliers, drift and with all three",
+    "fig4": "components of the relative motions",
+    "fig5": "the best variant of every method",
+    "table1": "KITTI 2011_09_30_drive_0027, lidar and camera",
+    "table2": "KITTI 2011_10_03_drive_0027, two cameras",
+    "s-figures": "S1-S5: as fig3, for the other methods",
+    "s-tables": "S1-S12: every method and reference on both drives",
+    "adaptive": "past the article: the adaptive estimator and reference auto against the best choice with hindsight",
+    "repeats": "the stated sigmas against the spread of repeats on real drives, and against KITTI's ground truth; zxl19 and asl_tango_easy "
+    "count\n           too where they lie beside the published data",
+    "unlike": "drives that are not like the article's (--data simulated): where the estimators fail",
+    "all": "everything in the article, its conclusions checked, and what is wrong with the published results",
+}
+
+_EPILOG = (
+    "\n".join(f"{name:<11}{about}" for name, about in EXPERIMENTS.items())
+    + """
+
+Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV; beside each, *_comparison.csv and *_comparison.md say
+cell by cell how it compares with the published results. What was solved is kept in DIR/solved: an interrupted run goes on from there.
+
+Published data: clone https://github.com/tau-alma/trajectory_calibration_experiments and name its folder with --data-folder."""
+)
+
+
+def main(argv=None):
+    """Run an experiment; returns the exit code.
+
+    Parameters
+    ----------
+    argv : list of str, optional
+        Arguments; those of the process if left out.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m reproduction", description=__doc__, allow_abbrev=False
+    )
+    add_arguments(parser)
+    return exit_code_of(lambda: run(parser.parse_args(argv)))
+
+
+def add_arguments(parser):
+    """Declare the command's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("id", metavar="ID", choices=tuple(EXPERIMENTS), help=", ".join(EXPERIMENTS))
+    parser.add_argument(
+        "--data",
+        choices=("published", "simulated"),
+        default="published",
+        help="the published trajectories, or drives of our own simulator. Default: published",
+    )
+    parser.add_argument(
+        "--data-folder",
+        metavar="DIR",
+        type=Path,
+        help="folder of the published data, or the one that holds it as valimaki2023. With --data simulated, what to compare with. "
+        "Default: $HAND_EYE_CALIB_DATA",
+    )
+    parser.add_argument(
+        "--seed", type=int, help="with --data simulated: another seed, other drives. Default: 0"
+    )
+    parser.add_argument(
+        "--runs", type=int, metavar="N", help="with --data simulated: number of drives. Default: 38"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        default=Path("reproduced"),
+        help="directory for the files. Default: reproduced",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="number of processes; the numbers do not depend on it. Default: all cores",
+    )
+    add_json_argument(parser)
+
+
+def run(arguments):
+    """Run the experiment; returns the exit code."""
+    from reproduction.catalogue import Experiment
+
+    source, theirs = _sources(arguments)
+    jobs = _cores() if arguments.jobs is None else arguments.jobs
+    if jobs < 1:
+        raise ConfigError(f"--jobs must be at least 1; got {jobs}")
+    experiment = Experiment(arguments.id, source, theirs)
+    if experiment.left_out:
+        note(f"left out, since they need the published data: {', '.join(experiment.left_out)}")
+    with _progress(len(experiment.cells) + len(experiment.artefacts)) as advance:
+        results, files = experiment.run(arguments.out, jobs, advance, advance)
+    document = _document(arguments, results, files)
+    print(
+        json.dumps(document, indent=2, allow_nan=False)
+        if arguments.json
+        else _text(document, files)
+    )
+    return 0
+
+
+def _sources(arguments):
+    """The source of the cases, and that of the published results to compare with (None without)."""
+    from reproduction import sources
+
+    folder = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
+    published = sources.PublishedSource(sources.find_folder(folder)) if folder else None
+    if arguments.data == "published":
+        if published is None:
+            raise ConfigError(
+                "--data published needs the published data: clone github.com/tau-alma/trajectory_calibration_experiments and name its "
+                "folder with --data-folder or $HAND_EYE_CALIB_DATA, or use --data simulated"
+            )
+        if arguments.seed is not None or arguments.runs is not None:
+            raise ConfigError(
+                "--seed and --runs are for --data simulated; the published trajectories are given"
+            )
+        return published, published
+    simulated = sources.SimulatedSource(
+        **{
+            name: value
+            for name in ("seed", "runs")
+            if (value := getattr(arguments, name)) is not None
+        }
+    )
+    if simulated.seed < 0 or simulated.runs < 2:
+        raise ConfigError(
+            f"--seed must be at least 0 and --runs at least 2; got {simulated.seed} and {simulated.runs}"
+        )
+    return simulated, published
+
+
+def _cores():
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _progress(total):
+    """A function that moves the bar on by one; on a terminal the bar appears once two seconds have
+    passed.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    bar = Progress(
+        TextColumn("{task.description:<24}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeRemainingColumn(),
+        console=Console(file=sys.stderr), transient=True,
+    )  # fmt: skip
+    task = bar.add_task("", total=total)
+    appears_at = time.monotonic() + _SILENT_S
+
+    def advance(what):
+        if not bar.live.is_started and sys.stderr.isatty() and time.monotonic() >= appears_at:
+            bar.start()
+        bar.update(task, advance=1, description=getattr(what, "name", what))
+
+    try:
+        yield advance
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+def _document(arguments, results, files):
+    document = {
+        "experiment": arguments.id,
+        "data": results.source.configuration()["data"],
+        "runs": results.n_runs,
+        "files": {name: [str(path) for path in paths] for name, paths in files.items()},
+        "rows": len(results.rows),
+    }
+    if results.same_cases and results.rows:
+        document["agreement"] = [
+            _agreement(results.rows, method)
+            for method in sorted({row.method for row in results.rows})
+        ]
+    return document
+
+
+def _agreement(rows, method):
+    chosen = [row for row in rows if row.method == method]
+    found = {"method": method, "rows": len(chosen), "agreeing": sum(row.agrees for row in chosen)}
+    found["differing"] = dict(Counter(row.why() for row in chosen if not row.agrees))
+    if method == "dnlo":
+        verdicts = Counter(row.objective_verdict for row in chosen)
+        found["objective"] = {
+            verdict: verdicts[verdict] for verdict in ("lower", "equal", "higher")
+        }
+    return found
+
+
+def _text(document, files):
+    from reproduction.rows import TITLES
+
+    lines = []
+    if len(files) == 1:
+        # One artefact alone: what it says is read here and now.
+        lines += [
+            path.read_text(encoding="utf-8")
+            for name, paths in files.items()
+            for path in paths
+            if path.name == f"{name}.md"
+        ]
+    for agreement in document.get("agreement", ()):
+        reasons = "; ".join(f"{count} {why}" for why, count in agreement["differing"].items())
+        lines.append(
+            f"{TITLES[agreement['method']]:<20}{agreement['agreeing']:>6} of {agreement['rows']:>5} rows as published"
+            + (f"; {reasons}" if reasons else "")
+        )
+    n_files = sum(len(paths) for paths in files.values())
+    return "\n".join(
+        [
+            *lines,
+            f"{n_files} files written to {next(iter(files.values()))[0].parent}: {', '.join(files)}",
+        ]
+    )

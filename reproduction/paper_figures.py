@@ -1,0 +1,230 @@
+"""The figures of Välimäki et al. 2023: errors against the level of noise, box plots, components of
+the motions.
+"""
+
+import math
+from dataclasses import dataclass
+
+from hand_eye_calib.report import style
+
+REFERENCE_LOOKS = {
+    "A": (style.BLACK, "D", "-"), "B1": (style.VERMILION, "o", "-"), "B5": (style.SKY, "o", "-"), "B10": (style.BLUE, "o", "-"),
+    "C5": (style.PURPLE, "s", "--"), "C10": (style.GREEN, "s", "--"),
+}  # fmt: skip
+METHOD_LOOKS = {
+    "ali": (style.BLACK, "v", ":"), "ali_as_published": (style.GREY, "^", "--"), "dnl": (style.SKY, "o", "-"),
+    "dnlo": (style.VERMILION, "D", "-"), "park": (style.GREEN, "s", "-"), "taylor": (style.BLUE, "x", "-"),
+    "zhuang": (style.PURPLE, "P", "--"),
+}  # fmt: skip
+
+METRIC_TITLES = {
+    "e_rt": "$e_{rt}$ (m)\nrelative translation", "e_rR": "$e_{rR}$ (deg)\nrelative rotation",
+    "e_at": "$e_{at}$ (m)\nabsolute translation", "e_aR": "$e_{aR}$ (deg)\nabsolute rotation",
+}  # fmt: skip
+_DATASET_TITLES = {
+    "noise": ("(a) Gaussian noise", "level $a$ (m, 2$a$ rad)"),
+    "outliers": ("(b) outliers", "share of poses (%)"),
+    "drift": ("(c) drift", "rate (m/m)"),
+    "mixture": ("(d) mixed noise", ""),
+}
+# Below a power of ten, at least this, the axis is linear, above logarithmic: errors span five
+# decades and some are zero.
+_LINEAR_BELOW = {"e_rt": 1e-3, "e_rR": 1e-2, "e_at": 1e-3, "e_aR": 1e-2}
+
+# Errors (m or deg) below this are rounding.
+_ZERO = 1e-6
+
+# Of the axes' height: distance of labels. Of the levels' range: room for a label, and for each of
+# its letters.
+_LABEL_GAP, _LABEL_ROOM, _LETTER = 0.088, 0.12, 0.075
+
+
+@dataclass(frozen=True)
+class Line:
+    """What a panel shows of one reference or method.
+
+    Attributes
+    ----------
+    label : str
+        Short, beside the line.
+    name : str
+        In full, for the legend; empty where the label says it all.
+    look : (colour, marker, line style)
+    levels : sequence of float
+        Empty in a box plot.
+    summaries : sequence of Summary
+        One per level; one in a box plot.
+    """
+
+    label: str
+    name: str
+    look: tuple
+    levels: tuple
+    summaries: tuple
+
+
+def draw_errors(title, note, panels, stem):
+    """Errors of several references or methods: a row per data set, a column per metric.
+
+    Parameters
+    ----------
+    title, note : str
+        Above and below the figure.
+    panels : dict
+        (dataset, metric) to list of :class:`Line`.
+    stem : pathlib.Path
+        Files without their ending.
+
+    Returns
+    -------
+    list of pathlib.Path
+    """
+    datasets = [name for name in _DATASET_TITLES if any(key[0] == name for key in panels)]
+    with style.house_style():
+        figure = style.new_page(2.05 * len(datasets) + 0.7, title, note)
+        axes = figure.subplots(len(datasets), len(METRIC_TITLES), squeeze=False)
+        for row, dataset in zip(axes, datasets, strict=True):
+            for ax, metric in zip(row, METRIC_TITLES, strict=True):
+                lines = panels[dataset, metric]
+                _scale(ax, lines, metric)
+                (_draw_boxes if dataset == "mixture" else _draw_lines)(ax, lines)
+                ax.set_xlabel(_DATASET_TITLES[dataset][1])
+            row[0].set_ylabel(_DATASET_TITLES[dataset][0], fontweight="bold", fontsize=8)
+            _legend(row[-1], panels[dataset, "e_at"])
+        for ax, metric in zip(axes[0], METRIC_TITLES, strict=True):
+            ax.set_title(METRIC_TITLES[metric], fontsize=6.8)
+        return style.save(figure, stem)
+
+
+def _scale(ax, lines, metric):
+    """A logarithmic axis that reaches zero; box plots, whose errors are never zero, need no zero."""
+    centres = [summary.centre for line in lines for summary in line.summaries]
+    if not lines[0].levels:
+        ax.set_yscale("log")
+        style.plain_decades(ax.yaxis, (1, 2, 5))
+        return
+    above = [centre for centre in centres if centre > _LINEAR_BELOW[metric]]
+    decade = 10.0 ** math.floor(math.log10(min(above))) if above else _LINEAR_BELOW[metric]
+    ax.set_yscale("symlog", linthresh=decade, linscale=0.35)
+    style.plain_decades(ax.yaxis)
+
+
+def _legend(ax, lines):
+    """The full names, where there are any, to the right of a row of panels."""
+    if not any(line.name for line in lines):
+        return
+    handles = [
+        style.handle(line.name, *line.look)
+        for line in sorted(lines, key=lambda line: line.summaries[-1].centre, reverse=True)
+    ]
+    ax.legend(
+        handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=2.0, fontsize=6.5,
+        title="by $e_{at}$, worst first", title_fontsize=6.0, alignment="left",
+    )  # fmt: skip
+
+
+def _draw_lines(ax, lines):
+    span = lines[0].levels[-1] - lines[0].levels[0]
+    for number, line in enumerate(lines):
+        # Side by side, so that the intervals can be told apart.
+        shift = 0.012 * span * (number - (len(lines) - 1) / 2)
+        centres = [summary.centre for summary in line.summaries]
+        # An error is not negative, however wide the interval of its mean.
+        below = [summary.centre - max(summary.low, 0.0) for summary in line.summaries]
+        above = [summary.high - summary.centre for summary in line.summaries]
+        colour, marker, dashes = line.look
+        ax.errorbar(
+            [level + shift for level in line.levels], centres, yerr=[below, above], color=colour, marker=marker, ls=dashes,
+            elinewidth=0.7, capsize=1.2, capthick=0.7, mew=0.8,
+        )  # fmt: skip
+    largest = max(summary.high for line in lines for summary in line.summaries)
+    if largest < _ZERO:
+        ax.text(0.5, 0.5, "all zero", transform=ax.transAxes, ha="center", color=style.GREY)
+    ax.set_ylim(0.0, None if largest >= _ZERO else 1.0)
+    room = _LABEL_ROOM + _LETTER * max(len(line.label) for line in lines)
+    ax.set_xlim(lines[0].levels[0] - 0.06 * span, lines[0].levels[-1] + room * span)
+    ends = lines[0].levels[0], lines[0].levels[-1]
+    ax.set_xticks(ends, [f"{level:g}" for level in ends])
+    ax.set_xticks(lines[0].levels, minor=True)
+    _label_ends(ax, lines, span)
+
+
+def _label_ends(ax, lines, span):
+    """The name of each line at its right end, moved apart where they would overlap."""
+    to_fraction = ax.transData + ax.transAxes.inverted()
+    last = lines[0].levels[-1]
+    heights = [to_fraction.transform((last, line.summaries[-1].centre))[1] for line in lines]
+    placed = style.spread(heights, _LABEL_GAP)
+    shift = max(0.0, 0.02 - min(placed)) - max(0.0, max(placed) - 0.98)
+    for line, height, place in zip(lines, heights, placed, strict=True):
+        right = to_fraction.transform((last + 0.04 * span, 0.0))[0]
+        text = to_fraction.transform((last + 0.09 * span, 0.0))[0]
+        ax.plot(
+            [right, text],
+            [height, place + shift],
+            color=line.look[0],
+            lw=0.5,
+            transform=ax.transAxes,
+        )
+        ax.text(
+            text, place + shift, f" {line.label}", color=line.look[0], fontsize=6.2, fontweight="bold", va="center",
+            transform=ax.transAxes,
+        )  # fmt: skip
+
+
+def _draw_boxes(ax, lines):
+    for place, line in enumerate(lines):
+        _draw_box(ax, place, line.summaries[0], line.look[0])
+    ax.set_xticks(
+        range(len(lines)),
+        [line.label for line in lines],
+        rotation=90 if max(len(ln.label) for ln in lines) > 4 else 0,
+    )
+    for tick, line in zip(ax.get_xticklabels(), lines, strict=True):
+        tick.set(color=line.look[0], fontweight="bold", fontsize=6.2)
+
+
+def _draw_box(ax, place, summary, colour):
+    statistics = {
+        "med": summary.centre, "q1": summary.low, "q3": summary.high, "whislo": summary.whiskers[0], "whishi": summary.whiskers[1],
+    }  # fmt: skip
+    thin = {"color": colour, "lw": 0.8}
+    ax.bxp(
+        [statistics], positions=[place], widths=0.62, showfliers=False, patch_artist=True, whiskerprops=thin, capprops=thin,
+        boxprops={"facecolor": colour, "alpha": 0.3, "edgecolor": colour, "lw": 0.8}, medianprops={"color": colour, "lw": 1.8},
+        manage_ticks=False,
+    )  # fmt: skip
+
+
+def draw_components(title, note, components, stem):
+    """Box plots of the components of the relative motions.
+
+    Parameters
+    ----------
+    title, note : str
+        Above and below the figure.
+    components : dict
+        Name of the component with its unit to a dict of reference to Summary.
+    stem : pathlib.Path
+        Files without their ending.
+
+    Returns
+    -------
+    list of pathlib.Path
+    """
+    with style.house_style():
+        figure = style.new_page(4.0, title, note)
+        axes = figure.subplots(2, 3, sharey="row")
+        for ax, (name, summaries) in zip(axes.flat, components.items(), strict=True):
+            for place, (reference, summary) in enumerate(summaries.items()):
+                _draw_box(ax, place, summary, REFERENCE_LOOKS[reference][0])
+            ax.set_title(name)
+            ax.set_xticks(range(len(summaries)), summaries)
+            for tick, reference in zip(ax.get_xticklabels(), summaries, strict=True):
+                tick.set(color=REFERENCE_LOOKS[reference][0], fontweight="bold")
+        for row, unit, least in zip(axes, ("m", "deg"), (3e-4, 3e-2), strict=True):
+            row[0].set_ylabel(unit)
+            row[0].set_yscale("log")
+            style.plain_decades(row[0].yaxis)
+            row[0].set_ylim(bottom=least)
+        return style.save(figure, stem)

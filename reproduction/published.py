@@ -1,0 +1,299 @@
+"""Trajectories and results published with Välimäki et al. 2023
+(github.com/tau-alma/trajectory_calibration_experiments, MIT licence).
+
+The folder is a clone of that repository: ``kitti_tests`` and ``simulation_tests`` hold trajectories
+in TUM format, ``calib`` (or ``published``) one CSV of results per test set.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hand_eye_calib.assessment.metrics import Errors
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files import read_trajectory
+from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.solvers import park
+
+METHODS = ("ali", "dnl", "dnlo", "park", "taylor", "zhuang")
+REFERENCES = ("A", "B1", "B5", "B10", "C5", "C10")
+N_RUNS = 38
+
+# Level folders of a simulated data set and the levels' values, and the column of its CSV that has
+# them.
+_LEVELS = {
+    "noise": {f"noise_{level:.6f}": level for level in (0.0, 0.002, 0.004, 0.006, 0.008, 0.01)},
+    "outliers": {f"outliers_{level:.0f}": level for level in (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)},
+    "drift": {f"drift_{level:.6f}": level for level in (0.0, 0.01, 0.02, 0.03, 0.04, 0.05)},
+    "mixture": {".": None},
+}
+_LEVEL_COLUMNS = {
+    "noise": "noise_var",
+    "outliers": "outliers",
+    "drift": "drift_rate",
+    "mixture": None,
+}
+SIMULATED = tuple(_LEVELS)
+KITTI = ("kitti_short", "kitti_long")
+LEVELS = {dataset: tuple(folders.values()) for dataset, folders in _LEVELS.items()}
+_RESULTS_FOLDERS = ("published", "calib")
+
+# The answers of a closed-form method agree to the eight digits that are printed.
+_SAME_ANSWER = 1e-6
+
+
+@dataclass(frozen=True)
+class PublishedResult:
+    """A row of the published results: the answer, printed with eight digits, and its errors (m,
+    rad) with all of them.
+    """
+
+    T_parent_child: np.ndarray
+    errors: Errors
+
+
+@dataclass(frozen=True)
+class Case:
+    """A pair of synchronised trajectories with ground truth and published results.
+
+    Attributes
+    ----------
+    dataset : str
+        noise, outliers, drift, mixture, kitti_short or kitti_long.
+    level : float or None
+        noise: standard deviation per pose, m (twice that in rad). outliers: per cent of the poses.
+        drift: m per m. None for the others.
+    run : str
+        Name of the trajectory within its data set.
+    parent, child : Trajectory
+        Poses at the same stamps.
+    T_parent_child : (4, 4) array
+        Ground truth as published, metres.
+    results : dict
+        (method, reference) to :class:`PublishedResult`.
+    """
+
+    dataset: str
+    level: float | None
+    run: str
+    parent: Trajectory
+    child: Trajectory
+    T_parent_child: np.ndarray
+    results: dict
+
+    @property
+    def name(self):
+        """Such as noise/0.002/run_12."""
+        level = [] if self.level is None else [f"{self.level:g}"]
+        return "/".join([self.dataset, *level, self.run])
+
+    @property
+    def stamps_ns(self):
+        """(N,) int64 array: stamps of both trajectories."""
+        return self.child.stamps_ns
+
+    def pairs(self, reference):
+        """Motion pairs of a reference."""
+        return motion_pairs(self.parent.poses, self.child.poses, reference)
+
+
+def check_folder(folder):
+    """The folder as a path.
+
+    Raises
+    ------
+    InputError
+        Where it is not that of the published data.
+    """
+    folder = Path(folder)
+    missing = [name for name in ("kitti_tests", "simulation_tests") if not (folder / name).is_dir()]
+    if not any((folder / name).is_dir() for name in _RESULTS_FOLDERS):
+        missing.append(" or ".join(_RESULTS_FOLDERS))
+    if missing:
+        raise InputError(
+            f"{folder}: expected the published data, a clone of github.com/tau-alma/trajectory_calibration_experiments, with "
+            f"kitti_tests, simulation_tests and calib (the results, also as published) in it; found no {', no '.join(missing)}"
+        )
+    return folder
+
+
+def results_folder(folder):
+    """Where in the checked folder the CSV files of results are."""
+    return next(folder / name for name in _RESULTS_FOLDERS if (folder / name).is_dir())
+
+
+def load_kitti_short(folder):
+    """Drive 2011_09_30_drive_0027: parent lidar, child grey stereo camera without its first pose,
+    which precedes the lidar's first.
+
+    Raises
+    ------
+    InputError
+        Where a file is missing or cannot be used.
+    """
+    folder = check_folder(folder)
+    drive = folder / "kitti_tests" / "2011_09_30_drive_0027"
+    return _kitti_case(
+        "kitti_short",
+        read_trajectory(drive / "LIDAR_HDL64E" / "traj_HDL_aft_opt.csv"),
+        read_trajectory(drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt")[1:],
+        drive / "camera_gray_left_in_velo_link.txt",
+        results_folder(folder) / "kitti_tests_keyframe.csv",
+    )
+
+
+def load_kitti_long(folder):
+    """Drive 2011_10_03_drive_0027: parent grey stereo camera, child colour stereo camera.
+
+    Raises
+    ------
+    InputError
+        Where a file is missing or cannot be used.
+    """
+    folder = check_folder(folder)
+    drive = folder / "kitti_tests" / "2011_10_03_drive_0027"
+    return _kitti_case(
+        "kitti_long",
+        read_trajectory(drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt"),
+        read_trajectory(drive / "cam23" / "KeyFrameTrajectory_TUM_Format.txt"),
+        drive / "camera_color_left_in_camera_gray_left.txt",
+        results_folder(folder) / "kitti_tests_long_cam.csv",
+    )
+
+
+def _kitti_case(dataset, parent, child, truth_file, results_file):
+    # As in the article: the parent's poses at the child's stamps, its end segments extended where
+    # the child's run longer.
+    parent_at_child = Trajectory(child.stamps_ns, parent.at(child.stamps_ns, extrapolate=True))
+    results = {key: rows[0] for key, rows in _read_results(results_file, None)[None].items()}
+    return Case(
+        dataset,
+        None,
+        truth_file.parent.name,
+        parent_at_child,
+        child,
+        read_trajectory(truth_file).poses[0],
+        results,
+    )
+
+
+def load_simulated(folder, datasets=SIMULATED, levels=None):
+    """The simulated cases: 38 trajectories at each of six levels of noise, outliers and drift, and
+    in the mixture.
+
+    Parameters
+    ----------
+    folder : path
+    datasets : sequence of str
+        Which of noise, outliers, drift, mixture.
+    levels : sequence of float, optional
+        Only these levels; the mixture has none and always comes whole.
+
+    Returns
+    -------
+    list of Case
+        By data set, level and the order of the published results.
+
+    Raises
+    ------
+    InputError
+        Where a file is missing or cannot be used.
+    """
+    folder = check_folder(folder)
+    cases = []
+    for dataset in datasets:
+        results = _read_results(
+            results_folder(folder) / f"simulation_tests_{dataset}.csv", _LEVEL_COLUMNS[dataset]
+        )
+        for level_folder, level in _LEVELS[dataset].items():
+            if levels is None or level is None or level in levels:
+                runs_folder = folder / "simulation_tests" / dataset / level_folder
+                cases += _match_runs(
+                    dataset, level, _read_runs(runs_folder), results.get(level, {})
+                )
+    return cases
+
+
+def _read_runs(folder):
+    """(name, parent, child, truth) of every run."""
+    return [
+        (
+            run.name,
+            read_trajectory(run / "T_S1_W1.txt"),
+            read_trajectory(run / "T_S2_W2.txt"),
+            read_trajectory(run / "T_S2_S1.txt").poses[0],
+        )
+        for run in sorted(folder.glob("run_*"))
+    ]
+
+
+def _match_runs(dataset, level, runs, results):
+    """Cases in the order of the published rows, which do not name their trajectory.
+
+    Every (method, reference) block lists the same trajectories in the same order, and park has a
+    single answer: its block tells which.
+    """
+    complete = all(
+        len(results.get((method, reference), ())) == N_RUNS
+        for method in METHODS
+        for reference in REFERENCES
+    )
+    if len(runs) == N_RUNS and complete:
+        published = np.array([row.T_parent_child for row in results["park", "B1"]])
+        ours = np.array(
+            [
+                park.solve(motion_pairs(parent.poses, child.poses)).T_parent_child
+                for _, parent, child, _ in runs
+            ]
+        )
+        distance = np.abs(published[:, None] - ours).max(axis=(2, 3))
+        order = distance.argmin(axis=1)
+        if len(set(order)) == N_RUNS and distance.min(axis=1).max() < _SAME_ANSWER:
+            return [
+                Case(
+                    dataset,
+                    level,
+                    *runs[run],
+                    {key: rows[position] for key, rows in results.items()},
+                )
+                for position, run in enumerate(order)
+            ]
+    raise InputError(
+        f"the trajectories of {dataset}{'' if level is None else f' at level {level:g}'} do not go with the published results: expected "
+        f"{N_RUNS} runs (found {len(runs)}) and {N_RUNS} rows of every method and reference, one for each run; get the data again"
+    )
+
+
+def _read_results(path, level_column):
+    """Level (None without a column), then (method, reference), to the list of results in the file's
+    order.
+    """
+    results = {}
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                level = float(row[level_column]) if level_column else None
+                key = row["algorithm"].lower(), "A" if row["method"] == "A1" else row["method"]
+                results.setdefault(level, {}).setdefault(key, []).append(_result(row))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except (KeyError, ValueError) as error:
+        raise InputError(
+            f"{path} is not a file of published results ({error!r}); get the data again"
+        ) from None
+    return results
+
+
+def _result(row):
+    matrix = np.array(row["T"].replace("[", " ").replace("]", " ").split(), dtype=float).reshape(
+        4, 4
+    )
+    e_rt, e_rR_deg, e_at, e_aR_deg = (
+        float(row[column]) for column in ("err_tr", "err_R", "abs_tr", "abs_R")
+    )
+    return PublishedResult(
+        matrix, Errors(e_rt, float(np.radians(e_rR_deg)), e_at, float(np.radians(e_aR_deg)))
+    )

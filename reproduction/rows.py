@@ -1,0 +1,204 @@
+"""One row of results per (case, method, reference), ours beside the published one, and whether they
+agree.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.assessment import metrics
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.solvers import dnl, dnlo
+from hand_eye_calib.solvers.registry import Method
+from reproduction import ali_as_published
+from reproduction.published import KITTI, LEVELS, REFERENCES
+
+METRICS = ("e_rt", "e_rR", "e_at", "e_aR")
+UNITS = {"e_rt": "m", "e_rR": "deg", "e_at": "m", "e_aR": "deg"}
+
+# The published simulation results of Ali come from a quaternion that was not normalised; under this
+# name we do the same.
+ALI_AS_PUBLISHED = "ali_as_published"
+TITLES = {
+    "ali": "Ali", ALI_AS_PUBLISHED: "Ali (as published)", "dnl": "DNL", "dnlo": "DNLO", "park": "Park", "taylor": "Taylor",
+    "zhuang": "Zhuang",
+}  # fmt: skip
+
+# Errors agree within this share of the published one, or this many metres or degrees.
+_RELATIVE, _ABSOLUTE = 1e-3, 1e-6
+
+# An objective is above another when it is so by more than this share, and by more than the rounding
+# of a perfect fit.
+_OBJECTIVE_SHARE, _OBJECTIVE_FLOOR = 1e-6, 1e-15
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What is solved and stored as a whole: all runs and references of a method at a level of a
+    data set.
+    """
+
+    dataset: str
+    level: float | None
+    method: str
+
+    @property
+    def name(self):
+        """Such as noise_0.002_dnlo."""
+        level = [] if self.level is None else [f"{self.level:g}"]
+        return "_".join([self.dataset, *level, self.method])
+
+
+@dataclass(frozen=True)
+class Row:
+    """A solved case.
+
+    Attributes
+    ----------
+    dataset, level, run, method, reference
+        What was solved, and how.
+    errors : tuple of 4 float
+        e_rt (m), e_rR (deg), e_at (m), e_aR (deg).
+    objective : float
+        The method's own cost.
+    converged : bool
+    T_parent_child : tuple of 16 float
+        Row by row.
+    published : tuple of 4 float or None
+        As ``errors``; None where nothing is published.
+    published_objective : float or None
+        Our formula at the published answer; dnl and dnlo only.
+    """
+
+    dataset: str
+    level: float | None
+    run: str
+    method: str
+    reference: str
+    errors: tuple
+    objective: float
+    converged: bool
+    T_parent_child: tuple
+    published: tuple | None
+    published_objective: float | None
+
+    @property
+    def name(self):
+        """Such as noise/0.002/run_12."""
+        return "/".join(
+            [self.dataset, *([] if self.level is None else [f"{self.level:g}"]), self.run]
+        )
+
+    @property
+    def transform(self):
+        """``T_parent_child`` as (4, 4) array."""
+        return np.reshape(self.T_parent_child, (4, 4))
+
+    @property
+    def agrees(self):
+        """Whether all four errors are the published ones."""
+        return all(
+            agree(ours, theirs) for ours, theirs in zip(self.errors, self.published, strict=True)
+        )
+
+    @property
+    def objective_verdict(self):
+        """Of dnl and dnlo: whether our objective is "lower", "equal" or "higher" than at the
+        published answer.
+        """
+        if is_above(self.objective, self.published_objective):
+            return "higher"
+        return "lower" if is_above(self.published_objective, self.objective) else "equal"
+
+    def why(self):
+        """Why this row does not agree with the published one; empty where it does."""
+        if self.published is None or self.agrees:
+            return ""
+        if self.published_objective is not None:
+            return {
+                "lower": "published answer is not the minimum: ours has the lower objective",
+                "equal": "same objective, another answer: the minimum is flat",
+                "higher": "our objective is higher",
+            }[self.objective_verdict]
+        if self.method == "ali" and self.dataset not in KITTI:
+            return "published quaternion was never normalised"
+        if not self.converged:
+            return "the iteration does not settle: its last step depends on rounding"
+        return "unexplained"
+
+
+def agree(ours, theirs):
+    """Whether two errors (m or deg) are the same."""
+    return abs(ours - theirs) <= max(_RELATIVE * abs(theirs), _ABSOLUTE)
+
+
+def is_above(objective, other):
+    """Whether an objective is larger by more than rounding."""
+    return objective > other * (1 + _OBJECTIVE_SHARE) + _OBJECTIVE_FLOOR
+
+
+def cells(datasets, methods):
+    """Cells of data sets at all levels, by method in turn."""
+    return [
+        Cell(dataset, level, method)
+        for dataset in datasets
+        for level in LEVELS.get(dataset, (None,))
+        for method in methods
+    ]
+
+
+def solve_cell(source, cell):
+    """List of Row of a cell, by run and reference."""
+    return [
+        _solve(case, cell.method, reference)
+        for case in source.cases(cell.dataset, cell.level)
+        for reference in REFERENCES
+    ]
+
+
+def in_m_and_deg(errors):
+    """The four metrics as a tuple, rotations in degrees."""
+    return (
+        errors.e_rt,
+        float(np.degrees(errors.e_rR)),
+        errors.e_at,
+        float(np.degrees(errors.e_aR)),
+    )
+
+
+def published_name(method):
+    """Name of a method in the published results."""
+    return "ali" if method == ALI_AS_PUBLISHED else method
+
+
+def _solve(case, method, reference):
+    pairs = case.pairs(reference)
+    solution = (
+        ali_as_published.solve(pairs) if method == ALI_AS_PUBLISHED else Method(method).solve(pairs)
+    )
+    result = case.results.get((published_name(method), reference))
+    return Row(
+        case.dataset,
+        case.level,
+        case.run,
+        method,
+        reference,
+        in_m_and_deg(metrics.errors(pairs, solution.T_parent_child, case.T_parent_child)),
+        solution.objective,
+        solution.converged,
+        tuple(solution.T_parent_child.ravel().tolist()),
+        in_m_and_deg(result.errors) if result else None,
+        _objective(method, pairs, result.T_parent_child) if result else None,
+    )
+
+
+def _objective(method, pairs, T_parent_child):
+    if method not in ("dnl", "dnlo"):
+        return None
+    costs = dnl.pair_costs(pairs, T_parent_child)
+    if method == "dnl":
+        return float(costs.sum())
+    options = CalibratorConfig()
+    return float(
+        dnlo.truncate(costs, options.threshold, options.min_inlier_fraction * len(pairs))[1]
+    )

@@ -1,0 +1,203 @@
+"""Solves the cells of an experiment on several cores, and keeps what is solved: an interrupted run
+goes on where it ended.
+"""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import threading
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
+from reproduction.rows import Row, solve_cell
+
+_HERE = Path(__file__).parent
+_PACKAGE = Path(se3.__file__).parents[1]
+# The code that results depend on; another version of it makes stored ones stale.
+_CODE = (
+    *(_HERE / f"{name}.py" for name in ("published", "ali_as_published", "sources", "rows")),
+    _PACKAGE / "assessment" / "metrics.py",
+    *(_PACKAGE / name for name in ("pairing", "solvers", "geometry", "simulation")),
+)
+
+# One thread each: the processes share the cores, and sums are taken in one order whatever the
+# number of cores.
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+class Store:
+    """Solved cells in a folder, one file each.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Made where it does not exist. Results of another configuration that an earlier run left
+        there are removed.
+    configuration : dict
+        What the results depend on, besides this package.
+
+    Raises
+    ------
+    InputError
+        Where the folder cannot be made.
+    """
+
+    def __init__(self, folder, configuration):
+        self._folder = folder
+        manifest = folder / "configuration.json"
+        wanted = json.loads(json.dumps(configuration | _versions()))
+        try:
+            if manifest.exists() and _read(manifest) != wanted:
+                shutil.rmtree(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            _write(manifest, wanted)
+        except OSError as error:
+            raise InputError(
+                f"cannot keep results in {folder}: {error.strerror}; choose another directory with --out"
+            ) from None
+
+    def load(self, cell):
+        """Rows of a cell, None where it is not solved yet."""
+        rows = _read(self._path(cell))
+        return (
+            None
+            if rows is None
+            else [Row(**{name: _frozen(value) for name, value in row.items()}) for row in rows]
+        )
+
+    def save(self, cell, rows):
+        """Keep the rows of a cell."""
+        _write(self._path(cell), [dataclasses.asdict(row) for row in rows])
+
+    def _path(self, cell):
+        return self._folder / f"{cell.name}.json"
+
+
+def run(source, cells, store, jobs, on_done=lambda cell: None):
+    """Solve the cells that are not in the store yet.
+
+    Parameters
+    ----------
+    source : PublishedSource or SimulatedSource
+    cells : sequence of Cell
+    store : Store
+    jobs : int
+        Number of processes.
+    on_done : callable, optional
+        Called with every cell as it becomes available, in any order.
+
+    Returns
+    -------
+    dict
+        Cell to list of Row, in the order of ``cells``.
+    """
+    found = {}
+    for cell in cells:
+        rows = store.load(cell)
+        if rows is not None:
+            found[cell] = rows
+            on_done(cell)
+    missing = [cell for cell in cells if cell not in found]
+    if missing:
+        with _workers(min(jobs, len(missing))) as executor:
+            with _interrupts_held():
+                futures = {executor.submit(solve_cell, source, cell): cell for cell in missing}
+            for future in as_completed(futures):
+                cell, rows = futures[future], future.result()
+                store.save(cell, rows)
+                found[cell] = rows
+                on_done(cell)
+    return {cell: found[cell] for cell in cells}
+
+
+def in_parallel(function, tasks, jobs):
+    """``function(*task)`` of every task, on so many processes; a list in their order."""
+    with _workers(min(jobs, len(tasks))) as executor:
+        with _interrupts_held():
+            futures = [executor.submit(function, *task) for task in tasks]
+        return [future.result() for future in futures]
+
+
+@contextmanager
+def _workers(count):
+    """Processes that end at once when this block is left early."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    others = set(multiprocessing.active_children())
+    os.environ.update(_ONE_THREAD)
+    executor = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _start_worker)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        ours = set(multiprocessing.active_children()) - others
+        for child in ours:
+            child.terminate()
+        for child in ours:
+            child.join()
+        raise
+    else:
+        executor.shutdown()
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _interrupts_held():
+    """Ctrl-C waits for the end of this block; processes started in it never get it, their parent
+    ends them.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker():
+    """Do not outlive the parent, however it ends."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent():
+    multiprocessing.parent_process().join()
+    os._exit(1)
+
+
+def _versions():
+    code = hashlib.sha256()
+    for entry in _CODE:
+        for path in sorted(entry.rglob("*.py")) or [entry]:
+            code.update(path.read_bytes())
+    return {"code": code.hexdigest()} | {
+        name: importlib.metadata.version(name) for name in ("numpy", "scipy")
+    }
+
+
+def _frozen(value):
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _read(path):
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return None
+
+
+def _write(path, document):
+    """Whole or not at all: an interrupted run leaves no half file."""
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(json.dumps(document), encoding="utf-8")
+    os.replace(unfinished, path)

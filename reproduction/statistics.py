@@ -1,0 +1,154 @@
+"""What the article's figures show of many runs: mean and 95 % confidence interval, or median and
+quartiles.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from reproduction.published import REFERENCES
+from reproduction.rows import METRICS, in_m_and_deg, published_name
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Statistics of one error over the runs of a level.
+
+    Attributes
+    ----------
+    centre, low, high : float
+        Mean and its 95 % confidence interval (Student's t), or median and quartiles.
+    whiskers : (float, float)
+        The farthest values within 1.5 times the interquartile range of the quartiles.
+    n : int
+        Number of runs.
+    is_median : bool
+        Median and quartiles, not mean and interval.
+    """
+
+    centre: float
+    low: float
+    high: float
+    whiskers: tuple
+    n: int
+    is_median: bool
+
+
+def mean_summary(values):
+    """Mean and 95 % confidence interval of (N,) values."""
+    values = np.asarray(values)
+    mean, n = values.mean(), len(values)
+    half = stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
+    return Summary(
+        float(mean),
+        float(mean - half),
+        float(mean + half),
+        (float(values.min()), float(values.max())),
+        n,
+        False,
+    )
+
+
+def quartile_summary(values):
+    """Median and quartiles of (N,) values."""
+    values = np.sort(values)
+    low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
+    inside = values[(values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))]
+    return Summary(
+        float(median),
+        float(low),
+        float(high),
+        (float(inside[0]), float(inside[-1])),
+        len(values),
+        True,
+    )
+
+
+def summarise(dataset, values):
+    """As the article does: the mixture by quartiles, the others by mean."""
+    return quartile_summary(values) if dataset == "mixture" else mean_summary(values)
+
+
+class Table:
+    """Errors of many rows by what was solved.
+
+    Parameters
+    ----------
+    entries : iterable of (dataset, level, method, reference, errors)
+        ``errors``: the four metrics, m and deg.
+    """
+
+    def __init__(self, entries):
+        collected = {}
+        for *key, errors in entries:
+            collected.setdefault(tuple(key), []).append(errors)
+        self._errors = {key: np.array(errors) for key, errors in collected.items()}
+
+    def values(self, dataset, level, method, reference, metric):
+        """(N,) errors of the runs; m or deg."""
+        return self._errors[dataset, level, method, reference][:, METRICS.index(metric)]
+
+    def levels(self, dataset, method):
+        """Levels of a data set, ascending; (None,) for the mixture."""
+        found = {key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)}
+        return tuple(sorted(found, key=lambda level: level or 0.0))
+
+    def has(self, dataset, method):
+        """Whether there is anything of a method on a data set."""
+        return bool(self.levels(dataset, method))
+
+    def summary(self, dataset, level, method, reference, metric):
+        """:class:`Summary` of the runs."""
+        return summarise(dataset, self.values(dataset, level, method, reference, metric))
+
+    def score(self, dataset, method, reference, metric="e_at"):
+        """What variants are compared by: the mean over the levels of the mean over the runs, or the
+        mixture's median.
+        """
+        levels = self.levels(dataset, method)
+        return float(
+            np.mean(
+                [self.summary(dataset, level, method, reference, metric).centre for level in levels]
+            )
+        )
+
+    def best_reference(self, dataset, method, metric="e_at"):
+        """The reference with the smallest score."""
+        return min(REFERENCES, key=lambda reference: self.score(dataset, method, reference, metric))
+
+    def ranking(self, dataset, method, metric="e_at"):
+        """References from the smallest score to the largest."""
+        return sorted(
+            REFERENCES, key=lambda reference: self.score(dataset, method, reference, metric)
+        )
+
+
+def ours(rows):
+    """:class:`Table` of our errors."""
+    return Table((row.dataset, row.level, row.method, row.reference, row.errors) for row in rows)
+
+
+def theirs(rows):
+    """:class:`Table` of the published errors of the same rows."""
+    return Table(
+        (row.dataset, row.level, row.method, row.reference, row.published)
+        for row in rows
+        if row.published
+    )
+
+
+def theirs_of_cases(cases, methods):
+    """:class:`Table` of the published errors of cases, whatever was solved."""
+    return Table(
+        (
+            case.dataset,
+            case.level,
+            method,
+            reference,
+            in_m_and_deg(case.results[published_name(method), reference].errors),
+        )
+        for case in cases
+        for method in methods
+        for reference in REFERENCES
+    )
