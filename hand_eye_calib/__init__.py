@@ -17,7 +17,7 @@ _HOMES = {
     "CalibratorConfig": "config",
     "HandEyeCalibError": "errors",
     "Trajectory": "geometry.trajectory",
-    "calibrate": "engine.calibrator",
+    "calibrate": "engine.offline",
     "load": "io.results",
     "read_trajectory": "io.trajectory_files",
     "save": "io.results",

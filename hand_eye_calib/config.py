@@ -7,7 +7,9 @@ tables are made from these dataclasses or tested against them.
 import dataclasses
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from hand_eye_calib.errors import ConfigError
 
@@ -152,6 +154,36 @@ class OptionSet:
 AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
 _IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
 _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
+
+
+# What is known of the pose of the child sensor in the parent sensor's frame: for each of x, y, z (m),
+# roll, pitch, yaw (rad) its value and standard deviation, or both as the text of the option
+# ``prior.<axis>``. "transform" takes the text of ``prior.transform``.
+Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
+
+
+def prior_fields(prior: Prior) -> dict[str, str]:
+    """The prior options of a CalibratorConfig, by attribute, that say the same.
+
+    Raises
+    ------
+    ConfigError
+        If an axis is unknown or its value is not a text or a pair of numbers.
+    """
+    fields = {}
+    for axis, known in prior.items():
+        if axis not in (*AXIS_UNITS, "transform"):
+            raise ConfigError(f"prior takes {', '.join(AXIS_UNITS)} or transform; got {axis!r}")
+        if not isinstance(known, str):
+            try:
+                value, sigma = map(float, known)
+            except (TypeError, ValueError):
+                raise ConfigError(
+                    f"prior {axis} must be (value, standard deviation) or a text; got {known!r}"
+                ) from None
+            known = f"{value!r}+/-{sigma!r}"
+        fields[f"prior_{axis}"] = known
+    return fields
 
 
 def parse_prior(name, text):

@@ -135,7 +135,7 @@ def _zxl19(folder):
         )
         for bag in (1, 2, 3)
     )
-    return [RecordedSet("zxl19", bags, {"prior.z": "0+/-0.3"})]
+    return [RecordedSet("zxl19", bags, {"prior": {"z": (0.0, 0.3)}})]
 
 
 def _tango(folder):

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import DofVerdict
-from hand_eye_calib.engine.calibrator import calibrate
+from hand_eye_calib.engine.offline import calibrate
 from reproduction.recordings import PARTS, recorded_sets
 from reproduction.runner import in_parallel
 from reproduction.writing import markdown_table, write_csv, write_text

@@ -96,7 +96,7 @@ def run(arguments):
     """Calibrate from files; returns the exit code."""
     from hand_eye_calib.cli.findings import with_findings
     from hand_eye_calib.cli.present import deliver
-    from hand_eye_calib.engine.calibrator import offline_config, whole_snapshot
+    from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
     options = options_from(arguments)
     trajectories, notes = read_files(arguments)

@@ -1,7 +1,7 @@
 """The calibrator: poses of two streams in, the extrinsic out.
 
-The one engine behind the node, the replay of bags and the Python function :func:`calibrate`. It
-knows neither ROS nor files.
+The one engine behind the node, the replay of bags and the Python function
+:func:`~hand_eye_calib.engine.offline.calibrate`. It knows neither ROS nor files.
 """
 
 import dataclasses
@@ -601,9 +601,7 @@ class Calibrator:
     def snapshot(self):
         """What is known now, for an estimate in this or another thread."""
         parent, child = self._streams["parent"], self._streams["child"]
-        frames, warnings = _name_frames(
-            self._config, {"parent": parent.frame, "child": child.frame}
-        )
+        frames, warnings = name_frames(self._config, {"parent": parent.frame, "child": child.frame})
         return Snapshot(
             self._config,
             self._kept,
@@ -752,47 +750,6 @@ def _what_is_wrong(position, quat_xyzw):
     )
 
 
-def calibrate(parent, child, **options):
-    """Extrinsic between two sensors from their trajectories.
-
-    Parameters
-    ----------
-    parent, child : Trajectory
-        Poses of each sensor in its own world.
-    **options
-        Options of :class:`~hand_eye_calib.config.CalibratorConfig` by their public names, such as
-        ``method="dnlo"``, ``reference="B5"``, ``time_offset=0.02``. Unlike the node, all poses are
-        used: ``max_pairs`` does not apply unless given.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    ConfigError
-        For an unknown option or an impossible value.
-    NotEnoughDataError
-        Where too few poses could be paired.
-    """
-    return whole_snapshot(offline_config(parent, child, options), parent, child).estimate()
-
-
-def whole_snapshot(config, parent, child):
-    """The Snapshot of two whole trajectories."""
-    frames, warnings = _name_frames(
-        config, {"parent": parent.sensor_frame, "child": child.sensor_frame}
-    )
-    return Snapshot(config, PosePairs.empty(), parent, child, None, *frames, warnings)
-
-
-def offline_config(parent, child, options):
-    """The CalibratorConfig for two whole trajectories: no limit on the pairs unless the options set
-    one.
-    """
-    return CalibratorConfig.from_options({"max_pairs": max(len(parent), len(child), 10), **options})
-
-
 def _offset_state(offset):
     """A TimeOffset as a flat mapping of names to arrays."""
     state = {"offset.seconds": offset.seconds, "offset.sigma_s": offset.sigma_s}
@@ -820,7 +777,7 @@ def _as_trajectory(poses):
     return poses if isinstance(poses, Trajectory) else poses.trajectory
 
 
-def _name_frames(config, known):
+def name_frames(config, known):
     """Names of the parent's and the child's sensor frame, and a warning for each that nobody named."""
     names, warnings = [], []
     for stream in STREAMS:

@@ -9,7 +9,7 @@ from hand_eye_calib.alignment.alignment import estimate_time_offset
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.checks.agreement import check_streams
 from hand_eye_calib.checks.stream_checks import tidy
-from hand_eye_calib.engine.calibrator import calibrate
+from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 
@@ -62,7 +62,7 @@ class TestRoadVehicle:
     def test_prior_holds_what_is_unobservable(self, bag):
         recording = real_data.zxl19(bag, "LO")
         result = calibrate(
-            recording.parent, recording.child, time_offset="estimate", **{"prior.z": "1.0+/-0.02"}
+            recording.parent, recording.child, time_offset="estimate", prior={"z": (1.0, 0.02)}
         )
         verdicts = {dof.name: dof for dof in result.observability}
         assert result.status is SolveStatus.OK

@@ -8,7 +8,7 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 from hand_eye_calib.assessment.excitation import excitation, what_is_missing
 from hand_eye_calib.calibration import DofObservability, DofVerdict
-from hand_eye_calib.engine.calibrator import calibrate
+from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 

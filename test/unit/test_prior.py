@@ -8,7 +8,7 @@ from hand_eye_calib.assessment.covariance import AXES, UNKNOWN_TRANSLATION, Asse
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.config import CalibratorConfig, parse_prior
-from hand_eye_calib.engine.calibrator import calibrate
+from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 
@@ -81,7 +81,7 @@ class TestFlatGround:
         assert any("prior z=VALUE+/-SIGMA" in warning for warning in result.warnings)
 
     def test_prior_fills_in_what_is_unknown(self):
-        result = calibrate(*flat_drive(), reference="B10", **{"prior.z": "1.85+/-0.02"})
+        result = calibrate(*flat_drive(), reference="B10", prior={"z": (1.85, 0.02)})
         assert result.status is SolveStatus.OK
         assert result.unobservable() == []
         np.testing.assert_allclose(result.T_parent_child[:3, 3], MOUNT[:3, 3], atol=0.03)
@@ -100,9 +100,7 @@ class TestFlatGround:
         parent, child = flat_drive(noise=0.0005)
         tilted = as_trajectory(parent.poses @ lean)  # the parent is mounted with a roll of 0.1 rad
         mount = se3.inverse(lean) @ MOUNT
-        with_height = calibrate(
-            tilted, child, reference="B10", **{"prior.z": f"{mount[2, 3]}+/-0.01"}
-        )
+        with_height = calibrate(tilted, child, reference="B10", prior={"z": (mount[2, 3], 0.01)})
         np.testing.assert_allclose(with_height.T_parent_child[:3, 3], mount[:3, 3], atol=0.03)
         assert (
             sigmas(with_height)["y"] < 0.1 * sigmas(calibrate(tilted, child, reference="B10"))["y"]
@@ -112,7 +110,7 @@ class TestFlatGround:
         result = calibrate(
             *flat_drive(),
             reference="B10",
-            **{"prior.transform": "0.6 -0.3 1.85 0 0 168.5deg+/-0.1 10deg"},
+            prior={"transform": "0.6 -0.3 1.85 0 0 168.5deg+/-0.1 10deg"},
         )
         assert result.status is SolveStatus.OK
         assert result.T_parent_child[2, 3] == pytest.approx(1.85, abs=0.01)
@@ -126,9 +124,9 @@ class TestFlatGround:
         )
         # Rotations alone do not show where x points on flat ground: the paper's two-stage methods
         # need the yaw too.
-        prior = {"prior.z": "1.85+/-0.02", "prior.yaw": "0.4+/-0.001"}
+        prior = {"z": (1.85, 0.02), "yaw": (0.4, 0.001)}
         parent, child = flat_drive(noise=0.0005, mount=mount)
-        result = calibrate(parent, child, method=method, reference="B10", **prior)
+        result = calibrate(parent, child, method=method, reference="B10", prior=prior)
         assert result.T_parent_child[2, 3] == pytest.approx(1.85, abs=0.03)
 
 
@@ -141,18 +139,18 @@ class TestFullMotion:
 
     def test_a_vague_prior_changes_nothing(self):
         plain = calibrate(*self.drive(), reference="B10")
-        vague = calibrate(*self.drive(), reference="B10", **{"prior.z": "0+/-100"})
+        vague = calibrate(*self.drive(), reference="B10", prior={"z": (0.0, 100.0)})
         np.testing.assert_allclose(vague.T_parent_child, plain.T_parent_child, atol=1e-5)
         assert [dof.verdict for dof in vague.observability] == [
             dof.verdict for dof in plain.observability
         ]
 
     def test_a_contradiction_is_said(self):
-        result = calibrate(*self.drive(), reference="B10", **{"prior.x": "-0.6+/-0.001"})
+        result = calibrate(*self.drive(), reference="B10", prior={"x": (-0.6, 0.001)})
         assert any("prior on x is" in warning and "sign" in warning for warning in result.warnings)
         assert not any(
             "standard deviations" in w
-            for w in calibrate(*self.drive(), reference="B10", **{"prior.x": "0.6+/-0.05"}).warnings
+            for w in calibrate(*self.drive(), reference="B10", prior={"x": (0.6, 0.05)}).warnings
         )
 
 

@@ -21,8 +21,8 @@ from hand_eye_calib.cli.demo import DRIVE, NOISE
 from hand_eye_calib.cli.present import static_transform_command
 from hand_eye_calib.cli.reporting import with_consistency, write_report
 from hand_eye_calib.engine import evidence
-from hand_eye_calib.engine.calibrator import offline_config, whole_snapshot
 from hand_eye_calib.engine.estimation import estimate_extrinsic
+from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import write_trajectory

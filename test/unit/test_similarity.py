@@ -16,7 +16,7 @@ from motions import (
 )
 
 from hand_eye_calib.alignment.alignment import estimate_scale
-from hand_eye_calib.engine.calibrator import calibrate
+from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs

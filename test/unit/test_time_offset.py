@@ -20,7 +20,8 @@ from hand_eye_calib.alignment.alignment import estimate_time_offset
 from hand_eye_calib.alignment.angular_rates import correlate_turning
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine import calibrator as engine
-from hand_eye_calib.engine.calibrator import Calibrator, calibrate
+from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory

@@ -1,0 +1,82 @@
+"""Two whole trajectories in, the extrinsic out: the Python function :func:`calibrate`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.config import CalibratorConfig, Prior, prior_fields
+from hand_eye_calib.engine.calibrator import Snapshot, name_frames
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+
+def calibrate(
+    parent: Trajectory,
+    child: Trajectory,
+    *,
+    method: str | None = None,
+    reference: str | None = None,
+    backend: str | None = None,
+    threshold: float | None = None,
+    min_inlier_fraction: float | None = None,
+    min_pairs: int | None = None,
+    max_pairs: int | None = None,
+    keyframe_min_translation: float | None = None,
+    keyframe_min_rotation: float | None = None,
+    keyframe_min_interval: float | None = None,
+    max_gap: float | None = None,
+    time_offset: float | str | None = None,
+    scale: float | str | None = None,
+    prior: Prior | None = None,
+    parent_frame: str | None = None,
+    child_frame: str | None = None,
+) -> Calibration:
+    """Estimate the pose of the child sensor in the parent sensor's frame from two trajectories.
+
+    Every keyword is the option of :class:`~hand_eye_calib.config.CalibratorConfig` of that name,
+    which has its meaning, unit, range and default; None takes the default. ``max_pairs`` is without
+    limit unless given.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+        Poses of each sensor in its own world.
+    prior : mapping of str to (float, float) or str, optional
+        What is known beforehand, as value and standard deviation in m or rad, such as
+        ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.config.Prior`.
+
+    Raises
+    ------
+    ConfigError
+        If an option has a value it cannot have.
+    NotEnoughDataError
+        If too few poses can be paired.
+    """
+    options = dict(locals())
+    for name in ("parent", "child", "prior"):
+        del options[name]
+    options = {name: value for name, value in options.items() if value is not None}
+    config = CalibratorConfig(**(_no_limit(parent, child) | options | prior_fields(prior or {})))
+    return whole_snapshot(config, parent, child).estimate()
+
+
+def offline_config(
+    parent: Trajectory, child: Trajectory, options: Mapping[str, object]
+) -> CalibratorConfig:
+    """The CalibratorConfig for two whole trajectories, from options by their public names: no limit
+    on the pairs unless they set one.
+    """
+    return CalibratorConfig.from_options({**_no_limit(parent, child), **options})
+
+
+def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajectory) -> Snapshot:
+    """The Snapshot of two whole trajectories."""
+    frames, warnings = name_frames(
+        config, {"parent": parent.sensor_frame, "child": child.sensor_frame}
+    )
+    return Snapshot(config, PosePairs.empty(), parent, child, None, *frames, warnings)
+
+
+def _no_limit(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
+    """Options under which all poses of both trajectories are used."""
+    return {"max_pairs": max(len(parent), len(child), 10)}

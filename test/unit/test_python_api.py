@@ -1,0 +1,98 @@
+"""The Python API: typed, complete, and without a second list of options."""
+
+import dataclasses
+import inspect
+
+import numpy as np
+import pytest
+from motions import as_trajectory, child_of, wandering_poses
+
+import hand_eye_calib as hec
+from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, prior_fields
+from hand_eye_calib.engine.offline import offline_config
+from hand_eye_calib.errors import ConfigError
+
+PRIOR_FIELDS = {f"prior_{axis}" for axis in (*AXIS_UNITS, "transform")}
+
+
+def streams(n_poses=40):
+    poses = wandering_poses(n_poses)
+    return as_trajectory(poses), as_trajectory(child_of(poses))
+
+
+class TestOptionsOfCalibrate:
+    def keywords(self):
+        parameters = inspect.signature(hec.calibrate).parameters.values()
+        return {p.name: p for p in parameters if p.kind is p.KEYWORD_ONLY}
+
+    def test_they_are_those_of_the_config(self):
+        fields = {field.name: field for field in dataclasses.fields(CalibratorConfig)}
+        assert set(fields) >= PRIOR_FIELDS
+        keywords = self.keywords()
+        assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior"}
+        for name, field in fields.items():
+            if name not in PRIOR_FIELDS:
+                assert keywords[name].annotation == field.type | None, name
+
+    def test_defaults_are_the_config_s(self):
+        assert {p.default for p in self.keywords().values()} == {None}
+
+    def test_each_has_the_effect_of_its_option(self, monkeypatch):
+        """Every keyword reaches the configuration that is solved with."""
+        seen = []
+        monkeypatch.setattr(
+            "hand_eye_calib.engine.offline.whole_snapshot",
+            lambda config, parent, child: seen.append(config) or _Unsolved(),
+        )
+        given = dict(
+            method="dnl", reference="C7", backend="ipopt", threshold=0.25, min_inlier_fraction=0.125, min_pairs=4, max_pairs=77,
+            keyframe_min_translation=0.5, keyframe_min_rotation=0.25, keyframe_min_interval=2.0, max_gap=3.0, time_offset="estimate",
+            scale=2.0, parent_frame="lidar", child_frame="camera",
+        )  # fmt: skip
+        assert set(given) | {"prior"} == set(self.keywords())
+        hec.calibrate(*streams(), **given, prior={"z": (1.85, 0.02)})
+        (config,) = seen
+        assert {name: getattr(config, name) for name in given} == given
+        assert config.prior() == {"z": (1.85, 0.02)}
+        default = CalibratorConfig()
+        assert all(getattr(default, name) != value for name, value in given.items())
+
+    def test_all_poses_are_used_unless_limited(self):
+        parent, child = streams(60)
+        result = hec.calibrate(parent, child, reference="B1", max_pairs=20)
+        assert result.n_poses <= 20
+        assert offline_config(parent, child, {}).max_pairs == 60
+
+    def test_a_typing_error_is_an_error(self):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'metod'"):
+            hec.calibrate(*streams(), metod="dnlo")
+
+
+class _Unsolved:
+    def estimate(self):
+        return None
+
+
+class TestPrior:
+    def test_values_come_through_to_the_last_bit(self):
+        known = {"x": (np.float64(1 / 3), 1e-7), "yaw": (-2.0e-12, np.pi / 7)}
+        assert CalibratorConfig(**prior_fields(known)).prior() == known
+
+    def test_texts_are_those_of_the_options(self):
+        config = CalibratorConfig(**prior_fields({"z": "185cm+/-2cm", "transform": ""}))
+        assert (config.prior_z, config.prior_transform) == ("185cm+/-2cm", "")
+
+    @pytest.mark.parametrize(
+        ("prior", "message"),
+        [
+            ({"height": (1.85, 0.02)}, "prior takes x, y, z, roll, pitch, yaw or transform; got"),
+            ({"z": 1.85}, r"prior z must be \(value, standard deviation\) or a text; got 1.85"),
+            ({"z": (1.85, 0.02, 3)}, r"prior z must be \(value, standard deviation\)"),
+            ({"z": (1.85, 0.0)}, "prior.z needs a standard deviation above 0"),
+            ({"z": (1.85, float("nan"))}, "prior.z must be numbers in m"),
+            ({"transform": (1.85, 0.02)}, "prior.transform must be X Y Z ROLL PITCH YAW"),
+        ],
+    )
+    def test_what_says_too_little_is_refused(self, prior, message):
+        with pytest.raises(ConfigError, match=message):
+            hec.calibrate(*streams(), prior=prior)
