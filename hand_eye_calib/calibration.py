@@ -7,10 +7,20 @@ import numpy as np
 
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.printed_angles import (
+    inverse_covariance,
+    is_near_gimbal_lock,
+    printed_rotation,
+    sigmas_rpy,
+    sigmas_translation,
+)
 
 # Of to_dict: a change that an older reader cannot understand raises the version.
 _FORMAT = "hand_eye_calib/extrinsic"
 _VERSION = 1
+
+# Where the motion leaves something unknown, a standard deviation above this (m) comes from that.
+_UNKNOWN_M = 0.9
 
 
 class SolveStatus(str, Enum):
@@ -126,6 +136,13 @@ class Calibration:
         """
         return np.array([dof.sigma for dof in self.observability])
 
+    @property
+    def sigmas_rpy(self):
+        """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed; infinite
+        where one is unknown. Those of ``sigmas`` are of rotations about the parent's axes instead.
+        """
+        return sigmas_rpy(self.T_parent_child, self.covariance)
+
     def unobservable(self):
         """Names of the degrees of freedom the motion did not reveal."""
         return [dof.name for dof in self.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
@@ -139,12 +156,8 @@ class Calibration:
             "version": _VERSION,
             "parent_frame": self.parent_frame,
             "child_frame": self.child_frame,
-            "T_parent_child": _transform_dict(
-                self.T_parent_child, self.parent_frame, self.child_frame
-            ),
-            "T_child_parent": _transform_dict(
-                self.T_child_parent, self.child_frame, self.parent_frame
-            ),
+            "T_parent_child": self._transform_dict(),
+            "T_child_parent": self._inverse_dict(),
             "status": self.status.value,
             "covariance": {
                 "of": "error xi in T_parent_child @ exp(xi)",
@@ -179,6 +192,28 @@ class Calibration:
             "stamp_ns": self.stamp_ns,
             "warnings": list(self.warnings),
         }
+
+    def _transform_dict(self):
+        return _transform_dict(
+            self.T_parent_child,
+            self.parent_frame,
+            self.child_frame,
+            self.sigmas[:3],
+            self.covariance,
+        )
+
+    def _inverse_dict(self):
+        covariance = inverse_covariance(self.T_parent_child, self.covariance)
+        sigmas_m = sigmas_translation(self.T_child_parent, covariance)
+        if self.unobservable():
+            sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
+        return _transform_dict(
+            self.T_child_parent,
+            self.child_frame,
+            self.parent_frame,
+            sigmas_m,
+            covariance,
+        )
 
     @classmethod
     def from_dict(cls, data):
@@ -238,11 +273,27 @@ def _finite(value):
     return float(value) if np.isfinite(value) else None
 
 
-def _transform_dict(T_target_source, target, source):
-    return {
+def _transform_dict(T_target_source, target, source, sigmas_m, covariance):
+    """A transform in the notations people and programs use, with the standard deviation of each
+    number that is printed (None for unknown).
+    """
+    rotation = T_target_source[:3, :3]
+    document = {
         "maps": f"coordinates of {source} into {target}",
         "translation": T_target_source[:3, 3].tolist(),
+        "sigma_translation": [_finite(value) for value in sigmas_m],
         "quat_xyzw": se3.to_quat_xyzw(T_target_source).tolist(),
-        "rpy_deg": np.degrees(se3.rotation_to_rpy(T_target_source[:3, :3])).tolist(),
+        "rpy_deg": np.degrees(se3.rotation_to_rpy(rotation)).tolist(),
+        "sigma_rpy_deg": _degrees(sigmas_rpy(T_target_source, covariance)),
         "matrix": T_target_source.tolist(),
     }
+    if is_near_gimbal_lock(rotation, covariance):
+        # Here roll and yaw mean nothing one by one.
+        printed = printed_rotation(T_target_source, covariance)
+        document["rotation_vector_deg"] = np.degrees(printed.values).tolist()
+        document["sigma_rotation_vector_deg"] = _degrees(printed.sigmas)
+    return document
+
+
+def _degrees(values):
+    return [_finite(value) for value in np.degrees(values)]

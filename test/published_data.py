@@ -23,8 +23,7 @@ def data_folder():
     folder = Path(os.environ.get("HAND_EYE_CALIB_DATA", beside_the_project))
     if not (folder / "valimaki2023").is_dir():
         pytest.skip(
-            f"no published data in {folder}; set HAND_EYE_CALIB_DATA to the folder that "
-            "holds valimaki2023"
+            f"no published data in {folder}; set HAND_EYE_CALIB_DATA to the folder that holds valimaki2023"
         )
     return folder
 

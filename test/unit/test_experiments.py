@@ -40,18 +40,8 @@ CELLS = [
 ]
 
 A_ROW = Row(
-    "noise",
-    0.002,
-    "run_01",
-    "dnl",
-    "B1",
-    (0.01, 0.5, 0.02, 0.3),
-    1.0,
-    True,
-    tuple(np.eye(4).ravel()),
-    (0.01, 0.5, 0.02, 0.3),
-    1.0,
-)
+    "noise", 0.002, "run_01", "dnl", "B1", (0.01, 0.5, 0.02, 0.3), 1.0, True, tuple(np.eye(4).ravel()), (0.01, 0.5, 0.02, 0.3), 1.0
+)  # fmt: skip
 
 
 @pytest.fixture(autouse=True)

@@ -46,7 +46,7 @@ def errors_of(noisy, clean):
     return difference[:, :3, 3], Rotation.from_matrix(difference[:, :3, :3]).as_euler("ZYX")
 
 
-# --- the drive ------------------------------------------------------------------------
+# --- the drive ---------------------------------------------------------------------------------------------------------------
 
 
 def test_noise_free_sensors_move_as_one_body():
@@ -196,7 +196,7 @@ def test_impossible_noise_is_refused(options):
         NoiseConfig(**options)
 
 
-# --- noise ----------------------------------------------------------------------------
+# --- noise -------------------------------------------------------------------------------------------------------------------
 
 
 def test_gaussian_noise_has_standard_deviations_a_and_2a_and_is_white():
@@ -275,7 +275,7 @@ def test_drift_and_noise_touch_the_sensors_they_should():
     assert abs(np.corrcoef(parent_error.ravel(), child_error.ravel())[0, 1]) < 0.2
 
 
-# --- against the published trajectories -----------------------------------------------
+# --- against the published trajectories --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -363,7 +363,7 @@ def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder)
     ],
 )
 def test_noise_is_as_strong_as_published(published_folder, level, config):
-    """RMS error of the poses, both sensors: median over the runs, ours and published."""
+    """Root mean square error of the poses, both sensors: median over the runs, ours and published."""
     clean = published_runs(published_folder, "noise/noise_0.000000")
     noisy = published_runs(published_folder, level)
     theirs = np.array(
@@ -385,7 +385,7 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
     )
 
 
-# --- the command ----------------------------------------------------------------------
+# --- the command -------------------------------------------------------------------------------------------------------------
 
 
 def simulate(capsys, *arguments):

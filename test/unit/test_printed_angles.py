@@ -1,0 +1,146 @@
+"""The standard deviations beside the printed angles are those of these angles."""
+
+import numpy as np
+import pytest
+
+from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.printed_angles import (
+    inverse_covariance,
+    printed_rotation,
+    sigmas_rpy,
+    sigmas_translation,
+)
+
+SAMPLES = 20_000
+# A camera that looks ahead on a lidar: z of the camera is x of the lidar.
+LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def transform(rotation, translation=(0.3, -0.2, 0.1)):
+    return se3.from_rotation_translation(rotation, np.array(translation))
+
+
+def covariance_about_parent(rotation, sigmas_deg, sigmas_m=(0.01, 0.02, 0.03)):
+    """Covariance in the child's frame of errors that are independent about the parent's axes."""
+    to_child = np.kron(np.eye(2), rotation.T)
+    return to_child @ np.diag(np.square(np.r_[sigmas_m, np.radians(sigmas_deg)])) @ to_child.T
+
+
+def samples_of(T, covariance):
+    xi = np.random.default_rng(3).multivariate_normal(np.zeros(6), covariance, SAMPLES)
+    return T @ se3.exp(xi)
+
+
+def spread_of_angles(angles, around):
+    return np.std((angles - around + np.pi) % (2 * np.pi) - np.pi, axis=0)
+
+
+@pytest.mark.parametrize(
+    "rotation",
+    [LIDAR_CAMERA, se3.rotation_from_rpy([0.4, -0.9, 2.5]), se3.rotation_from_rpy([2.0, 0.9, 0.0])],
+    ids=["lidar-camera", "oblique", "steep"],
+)
+def test_sigmas_are_the_spread_of_the_angles(rotation):
+    T, covariance = transform(rotation), covariance_about_parent(rotation, (0.57, 0.028, 0.2))
+    angles = se3.rotation_to_rpy(samples_of(T, covariance)[:, :3, :3])
+    spread = spread_of_angles(angles, se3.rotation_to_rpy(rotation))
+    np.testing.assert_allclose(sigmas_rpy(T, covariance), spread, rtol=0.03)
+
+
+def test_angles_of_a_camera_are_not_about_the_axes_of_the_lidar():
+    """As on a recorded drive: roll beside the sigma about x would be wrong by a factor of 20."""
+    rotation = se3.rotation_from_rpy(np.radians([-90.14, 0.55, -90.0]))
+    covariance = covariance_about_parent(rotation, (0.57, 0.028, 0.1))
+    roll, pitch, _ = np.degrees(sigmas_rpy(transform(rotation), covariance))
+    assert roll == pytest.approx(0.028, rel=0.05)
+    assert pitch == pytest.approx(0.57, rel=0.05)
+
+
+def test_near_gimbal_lock_the_rotation_vector_is_printed():
+    rotation = se3.rotation_from_rpy(np.radians([20.0, 89.5, 70.0]))
+    T, covariance = transform(rotation), covariance_about_parent(rotation, (0.3, 0.2, 0.1))
+    printed = printed_rotation(T, covariance)
+    assert printed.is_near_gimbal_lock
+    assert printed.names == ("rx", "ry", "rz")
+    np.testing.assert_allclose(se3.rotation_exp(printed.values), rotation, atol=1e-12)
+    vectors = se3.rotation_log(samples_of(T, covariance)[:, :3, :3])
+    np.testing.assert_allclose(printed.sigmas, vectors.std(axis=0), rtol=0.03)
+    roll, pitch, yaw = sigmas_rpy(T, covariance)
+    assert (roll, yaw) == (np.inf, np.inf)
+    assert pitch < np.radians(0.4)
+
+
+def test_what_is_near_gimbal_lock_depends_on_the_uncertainty():
+    rotation = se3.rotation_from_rpy(np.radians([20.0, 89.5, 70.0]))
+    sure = covariance_about_parent(rotation, (0.01, 0.01, 0.01))
+    assert printed_rotation(transform(rotation), sure).names == ("roll", "pitch", "yaw")
+    exact = se3.rotation_from_rpy([0.1, np.pi / 2, 0.0])
+    assert printed_rotation(transform(exact), np.zeros((6, 6))).is_near_gimbal_lock
+
+
+def test_an_unknown_rotation_has_no_sigma():
+    covariance = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, np.pi**2])
+    assert sigmas_rpy(np.eye(4), covariance).tolist() == pytest.approx([1e-3, 1e-3, np.inf])
+    assert not printed_rotation(np.eye(4), covariance).is_near_gimbal_lock
+    assert np.isinf(sigmas_rpy(np.eye(4), np.full((6, 6), np.inf))).all()
+    assert np.isinf(sigmas_translation(np.eye(4), np.full((6, 6), np.inf))).all()
+
+
+def test_the_other_direction_has_its_own_sigmas():
+    T = transform(se3.rotation_from_rpy([0.4, -0.9, 2.5]), (3.0, -2.0, 1.0))
+    covariance = covariance_about_parent(T[:3, :3], (0.5, 0.1, 0.2))
+    inverse, its_covariance = se3.inverse(T), inverse_covariance(T, covariance)
+    drawn = se3.inverse(samples_of(T, covariance))
+    np.testing.assert_allclose(
+        sigmas_translation(inverse, its_covariance), drawn[:, :3, 3].std(axis=0), rtol=0.03
+    )
+    angles = se3.rotation_to_rpy(drawn[:, :3, :3])
+    np.testing.assert_allclose(
+        sigmas_rpy(inverse, its_covariance),
+        spread_of_angles(angles, se3.rotation_to_rpy(inverse[:3, :3])),
+        rtol=0.03,
+    )
+
+
+def calibration(rotation, sigmas_deg):
+    T, covariance = transform(rotation), covariance_about_parent(rotation, sigmas_deg)
+    sigmas = np.r_[0.01, 0.02, 0.03, np.radians(sigmas_deg)]
+    axes = ("x", "y", "z", "roll", "pitch", "yaw")
+    return Calibration(
+        T_parent_child=T,
+        covariance=covariance,
+        status=SolveStatus.OK,
+        observability=tuple(
+            DofObservability(name, DofVerdict.OBSERVED, sigma)
+            for name, sigma in zip(axes, sigmas, strict=True)
+        ),
+        objective=0.0,
+        method="dnlo",
+        reference="B5",
+        backend="fast",
+        n_poses=100,
+        n_pairs=95,
+        n_inliers=95,
+    )
+
+
+def test_a_result_has_the_sigmas_of_its_printed_numbers_in_both_directions():
+    result = calibration(LIDAR_CAMERA, (0.57, 0.028, 0.1))
+    document = result.to_dict()
+    there, back = document["T_parent_child"], document["T_child_parent"]
+    np.testing.assert_allclose(there["sigma_rpy_deg"], np.degrees(result.sigmas_rpy))
+    assert there["sigma_rpy_deg"][1] == pytest.approx(0.57)
+    np.testing.assert_allclose(there["sigma_translation"], [0.01, 0.02, 0.03])
+    # An error of the rotation moves the parent, which is 0.37 m from the child.
+    assert back["sigma_translation"][0] > 0.02
+    assert "rotation_vector_deg" not in there
+
+
+def test_a_result_near_gimbal_lock_has_the_rotation_vector():
+    rotation = se3.rotation_from_rpy(np.radians([20.0, 89.9, 70.0]))
+    there = calibration(rotation, (0.3, 0.2, 0.1)).to_dict()["T_parent_child"]
+    assert there["sigma_rpy_deg"][0] is None
+    vector = np.radians(there["rotation_vector_deg"])
+    np.testing.assert_allclose(se3.rotation_exp(vector), rotation, atol=1e-9)
+    assert all(0 < sigma < 1 for sigma in there["sigma_rotation_vector_deg"])
