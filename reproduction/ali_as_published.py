@@ -101,11 +101,17 @@ _W, _X, _Y, _Z = range(4)
 # Entry k of P, row by row, is q^T _P[k] q.
 _P = np.array(
     [
-        _symmetric((_Y, _Y, -1), (_Z, _Z, -1)), _symmetric((_X, _Y, 1), (_W, _Z, -1)), _symmetric((_X, _Z, 1), (_W, _Y, 1)),
-        _symmetric((_X, _Y, 1), (_W, _Z, 1)), _symmetric((_X, _X, -1), (_Z, _Z, -1)), _symmetric((_Y, _Z, 1), (_W, _X, -1)),
-        _symmetric((_X, _Z, 1), (_W, _Y, -1)), _symmetric((_Y, _Z, 1), (_W, _X, 1)), _symmetric((_X, _X, -1), (_Y, _Y, -1)),
+        _symmetric((_Y, _Y, -1), (_Z, _Z, -1)),
+        _symmetric((_X, _Y, 1), (_W, _Z, -1)),
+        _symmetric((_X, _Z, 1), (_W, _Y, 1)),
+        _symmetric((_X, _Y, 1), (_W, _Z, 1)),
+        _symmetric((_X, _X, -1), (_Z, _Z, -1)),
+        _symmetric((_Y, _Z, 1), (_W, _X, -1)),
+        _symmetric((_X, _Z, 1), (_W, _Y, -1)),
+        _symmetric((_Y, _Z, 1), (_W, _X, 1)),
+        _symmetric((_X, _X, -1), (_Y, _Y, -1)),
     ]
-)  # fmt: skip
+)
 
 
 def _factor(q):

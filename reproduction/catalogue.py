@@ -1,4 +1,4 @@
-"""Experiments by name: what each needs solved and what it writes."""
+"""Experiments by name: the cells each needs and the files it writes."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,17 +112,17 @@ EXPERIMENTS = {
 
 @dataclass(frozen=True)
 class Results:
-    """What was solved, and where the files go.
+    """Solved rows and the output directory.
 
     Attributes
     ----------
     source : PublishedSource or SimulatedSource
     theirs_source : PublishedSource or None
-        Whose published results ours are compared with.
+        Source of the published results to compare with.
     rows : list of Row
     out : pathlib.Path
     jobs : int
-        Number of processes, for what is not solved cell by cell.
+        Number of processes of the studies, which are not solved cell by cell.
     """
 
     source: object
@@ -148,7 +148,7 @@ class Results:
 
     @cached_property
     def theirs(self):
-        """The same of the published errors; None where they are not at hand."""
+        """Table of the published errors; None without published data."""
         if self.same_cases:
             return statistics.theirs(self.rows)
         if self.theirs_source is None:
@@ -175,12 +175,12 @@ class Experiment:
         A key of :data:`EXPERIMENTS`.
     source : PublishedSource or SimulatedSource
     theirs_source : PublishedSource, optional
-        Whose published results to compare with.
+        Source of the published results to compare with.
 
     Raises
     ------
     ConfigError
-        Where the source has no cases of this experiment.
+        If the source has no cases of this experiment.
     """
 
     def __init__(self, name, source, theirs_source=None):
@@ -192,7 +192,8 @@ class Experiment:
             raise ConfigError(
                 f"{name} is about simulated drives; use --data simulated"
                 if only == "simulated"
-                else f"{name} is about recorded drives (KITTI), which are not simulated; use --data published"
+                else f"{name} is about recorded drives (KITTI), which are not simulated; use "
+                "--data published"
             )
         self.cells = list(
             dict.fromkeys(cell for artefact in self.artefacts for cell in artefact.cells)
@@ -220,10 +221,10 @@ class Experiment:
         Raises
         ------
         InputError
-            Where data cannot be read or files cannot be written.
+            If data cannot be read or files cannot be written.
         """
         if any(artefact.name.startswith("fig") for artefact in self.artefacts):
-            # Where Matplotlib is missing, say so before minutes of solving, not after.
+            # If Matplotlib is missing, say so before minutes of solving, not after.
             from reproduction import paper_figures  # noqa: F401
         store = runner.Store(out / "solved", self._source.configuration())
         solved = runner.run(self._source, self.cells, store, jobs, on_solved)
@@ -240,7 +241,8 @@ class Experiment:
                 files[artefact.name] = artefact.write(results)
             except OSError as error:
                 raise InputError(
-                    f"cannot write {error.filename}: {error.strerror}; choose another directory with --out"
+                    f"cannot write {error.filename}: {error.strerror}; choose another "
+                    "directory with --out"
                 ) from None
             on_written(artefact.name)
         return results, files

@@ -1,5 +1,5 @@
-"""``python -m reproduction ID``: a figure or table of the article, from one command, beside the
-published numbers.
+"""``python -m reproduction ID``: a figure or table of the paper, with a comparison with the
+published results.
 """
 
 import argparse
@@ -19,28 +19,31 @@ from hand_eye_calib.errors import ConfigError
 _SILENT_S = 2.0
 
 EXPERIMENTS = {
-    "fig3": "DNLO's errors for every reference, against noise, outliers, drift and with all three",
+    "fig3": "errors of DNLO for every reference: noise, outliers, drift, mixture",
     "fig4": "components of the relative motions",
     "fig5": "the best variant of every method",
     "table1": "KITTI 2011_09_30_drive_0027, lidar and camera",
     "table2": "KITTI 2011_10_03_drive_0027, two cameras",
     "s-figures": "S1-S5: as fig3, for the other methods",
     "s-tables": "S1-S12: every method and reference on both drives",
-    "adaptive": "past the article: the adaptive estimator and reference auto against the best choice with hindsight",
-    "repeats": "the stated sigmas against the spread of repeats on real drives, and against KITTI's ground truth; zxl19 and asl_tango_easy "
-    "count\n           too where they lie beside the published data",
-    "unlike": "drives that are not like the article's (--data simulated): where the estimators fail",
-    "all": "everything in the article, its conclusions checked, and what is wrong with the published results",
+    "adaptive": "study: adaptive and reference auto against the best choice with hindsight",
+    "repeats": "study: stated sigmas against the spread of repeats on real recordings",
+    "unlike": "study: simulations unlike the paper's (--data simulated)",
+    "all": "all figures and tables of the paper, its conclusions and our findings",
 }
 
 _EPILOG = (
     "\n".join(f"{name:<11}{about}" for name, about in EXPERIMENTS.items())
     + """
 
-Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV; beside each, *_comparison.csv and *_comparison.md say
-cell by cell how it compares with the published results. What was solved is kept in DIR/solved: an interrupted run goes on from there.
+Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV. Beside each,
+*_comparison.csv and *_comparison.md compare it with the published results, cell by cell.
+Solved calibrations are kept in DIR/solved: an interrupted run continues from there.
 
-Published data: clone https://github.com/tau-alma/trajectory_calibration_experiments and name its folder with --data-folder."""
+repeats reads zxl19 and asl_tango_easy too, if they lie beside the published data.
+
+Published data: clone github.com/tau-alma/trajectory_calibration_experiments and name its
+folder with --data-folder."""
 )
 
 
@@ -68,14 +71,14 @@ def add_arguments(parser):
         "--data",
         choices=("published", "simulated"),
         default="published",
-        help="the published trajectories, or drives of our own simulator. Default: published",
+        help="the published trajectories, or drives of our simulator. Default: published",
     )
     parser.add_argument(
         "--data-folder",
         metavar="DIR",
         type=Path,
-        help="folder of the published data, or the one that holds it as valimaki2023. With --data simulated, what to compare with. "
-        "Default: $HAND_EYE_CALIB_DATA",
+        help="folder of the published data, or the one that holds it as valimaki2023. With --data "
+        "simulated, what to compare with. Default: $HAND_EYE_CALIB_DATA",
     )
     parser.add_argument(
         "--seed", type=int, help="with --data simulated: another seed, other drives. Default: 0"
@@ -122,7 +125,7 @@ def run(arguments):
 
 
 def _sources(arguments):
-    """The source of the cases, and that of the published results to compare with (None without)."""
+    """The source of the cases, and the published source to compare with or None."""
     from reproduction import sources
 
     folder = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
@@ -130,7 +133,8 @@ def _sources(arguments):
     if arguments.data == "published":
         if published is None:
             raise ConfigError(
-                "--data published needs the published data: clone github.com/tau-alma/trajectory_calibration_experiments and name its "
+                "--data published needs the published data: clone "
+                "github.com/tau-alma/trajectory_calibration_experiments and name its "
                 "folder with --data-folder or $HAND_EYE_CALIB_DATA, or use --data simulated"
             )
         if arguments.seed is not None or arguments.runs is not None:
@@ -147,7 +151,8 @@ def _sources(arguments):
     )
     if simulated.seed < 0 or simulated.runs < 2:
         raise ConfigError(
-            f"--seed must be at least 0 and --runs at least 2; got {simulated.seed} and {simulated.runs}"
+            f"--seed must be at least 0 and --runs at least 2; got {simulated.seed} and "
+            f"{simulated.runs}"
         )
     return simulated, published
 
@@ -158,16 +163,20 @@ def _cores():
 
 @contextmanager
 def _progress(total):
-    """A function that moves the bar on by one; on a terminal the bar appears once two seconds have
-    passed.
+    """A function that advances the progress bar by one; the bar appears after two seconds, on a
+    terminal only.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     bar = Progress(
-        TextColumn("{task.description:<24}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeRemainingColumn(),
-        console=Console(file=sys.stderr), transient=True,
-    )  # fmt: skip
+        TextColumn("{task.description:<24}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeRemainingColumn(),
+        console=Console(file=sys.stderr),
+        transient=True,
+    )
     task = bar.add_task("", total=total)
     appears_at = time.monotonic() + _SILENT_S
 
@@ -216,7 +225,7 @@ def _text(document, files):
 
     lines = []
     if len(files) == 1:
-        # One artefact alone: what it says is read here and now.
+        # A single artefact: print its text.
         lines += [
             path.read_text(encoding="utf-8")
             for name, paths in files.items()
@@ -226,13 +235,14 @@ def _text(document, files):
     for agreement in document.get("agreement", ()):
         reasons = "; ".join(f"{count} {why}" for why, count in agreement["differing"].items())
         lines.append(
-            f"{TITLES[agreement['method']]:<20}{agreement['agreeing']:>6} of {agreement['rows']:>5} rows as published"
-            + (f"; {reasons}" if reasons else "")
+            f"{TITLES[agreement['method']]:<20}{agreement['agreeing']:>6} of "
+            f"{agreement['rows']:>5} rows as published" + (f"; {reasons}" if reasons else "")
         )
     n_files = sum(len(paths) for paths in files.values())
     return "\n".join(
         [
             *lines,
-            f"{n_files} files written to {next(iter(files.values()))[0].parent}: {', '.join(files)}",
+            f"{n_files} files written to {next(iter(files.values()))[0].parent}: "
+            f"{', '.join(files)}",
         ]
     )

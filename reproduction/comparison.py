@@ -1,4 +1,4 @@
-"""Our numbers beside the published ones: every row, every plotted point, what differs and why."""
+"""Comparison with the published results: every row, every plotted point, differences and why."""
 
 from collections import Counter
 
@@ -18,17 +18,34 @@ def write_rows(path, rows):
     """Every row with ours, theirs and why they differ, as CSV; returns the path."""
     named = [f"{metric}_{UNITS[metric]}" for metric in METRICS]
     header = [
-        "case", "method", "reference", *named, *(f"published_{name}" for name in named), "objective", "objective_at_published",
-        "agrees", "why",
-    ]  # fmt: skip
+        "case",
+        "method",
+        "reference",
+        *named,
+        *(f"published_{name}" for name in named),
+        "objective",
+        "objective_at_published",
+        "agrees",
+        "why",
+    ]
     return write_csv(
         path,
         header,
         (
-            [row.name, row.method, row.reference, *row.errors, *row.published, row.objective, row.published_objective, row.agrees, row.why()]
+            [
+                row.name,
+                row.method,
+                row.reference,
+                *row.errors,
+                *row.published,
+                row.objective,
+                row.published_objective,
+                row.agrees,
+                row.why(),
+            ]
             for row in rows
         ),
-    )  # fmt: skip
+    )
 
 
 def describe_rows(rows):
@@ -58,7 +75,8 @@ def describe_rows(rows):
         lines,
     )
     return (
-        "A row agrees where each of its four errors is within 0.1 % or 1e-6 (m, deg) of the published one.\n\n"
+        "A row agrees where each of its four errors is within 0.1 % or 1e-6 (m, deg) of "
+        "the published one.\n\n"
         + text
         + _list_differing(
             [row for row in rows if not row.agrees and row.method not in ("ali", "dnlo")]
@@ -130,14 +148,16 @@ def describe_dnlo(rows):
         if not agree(row.errors[2], row.published[2])
     )
     text = (
-        f"DNLO has many local minima and is compared by its objective, eq. (5), taken by the same formula at our and at the published "
-        f"answer: lower in {verdicts['lower']} of {len(rows)} rows, equal within 1e-6 in {verdicts['equal']}, higher in "
-        f"{verdicts['higher']}. e_at is the published one in {percent(same, len(rows))}."
+        "DNLO has many local minima and is compared by its objective, eq. (5), taken by the same "
+        f"formula at our and at the published answer: lower in {verdicts['lower']} of {len(rows)} "
+        f"rows, equal within 1e-6 in {verdicts['equal']}, higher in {verdicts['higher']}. e_at is "
+        f"the published one in {percent(same, len(rows))}."
     )
     if len(moved):
         text += (
-            f" Where it is not, it moved by {np.median(moved):.2g} m (median; at most {moved.max():.2g} m) and is smaller than the "
-            f"published one in {percent(nearer, len(moved))}: a lower objective is not always a smaller error."
+            f" Where it is not, it moved by {np.median(moved):.2g} m (median; at most "
+            f"{moved.max():.2g} m) and is smaller than the published one in "
+            f"{percent(nearer, len(moved))}: a lower objective is not always a smaller error."
         )
     return text
 

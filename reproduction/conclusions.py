@@ -1,4 +1,4 @@
-"""The article's conclusions, one by one: does our run show them, and by which number."""
+"""The paper's conclusions, one by one: whether our run shows them, and by which figures."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ _NOISE_FREE = 1e-6
 
 @dataclass(frozen=True)
 class Conclusion:
-    """A claim of the article, whether our numbers bear it out, and the numbers."""
+    """A claim of the paper, a verdict, and the figures behind it."""
 
     section: str
     claim: str
@@ -31,10 +31,11 @@ def write(results):
     blocks = []
     for number, conclusion in enumerate(found, start=1):
         blocks.append(
-            f"**{number}. {conclusion.claim}** (section {conclusion.section})\n\n*{conclusion.verdict}.* {conclusion.evidence}"
+            f"**{number}. {conclusion.claim}** (section "
+            f"{conclusion.section})\n\n*{conclusion.verdict}.* {conclusion.evidence}"
         )
     return [
-        write_text(results.out / "conclusions.md", "# The article's conclusions, checked", *blocks),
+        write_text(results.out / "conclusions.md", "# The paper's conclusions, checked", *blocks),
         write_csv(
             results.out / "conclusions.csv",
             ["section", "claim", "verdict", "evidence"],
@@ -45,7 +46,7 @@ def write(results):
 
 def check(results):
     """List of Conclusion for results of all methods on all data sets; Ali on simulated drives is
-    the article's own unless named proper.
+    the paper's own unless named proper.
     """
     table = results.ours
     return [
@@ -115,10 +116,11 @@ def _on_references(table):
     rank = sorted(score, key=score.get).index("A") + 1
     yield Conclusion(
         "4.2.1",
-        "Reference A is not the best even with Gaussian noise, and noticeably worse with outliers and drift (DNLO).",
+        "Reference A is not the best even with Gaussian noise, and noticeably worse with "
+        "outliers and drift (DNLO).",
         _verdict(rank > 1 and min(ratio.values()) > 2),
-        f"With noise A is number {rank} of 6, with {noise_ratio:.1f} times the e_at of the best; with outliers {ratio['outliers']:.1f} "
-        f"times, with drift {ratio['drift']:.1f} times.",
+        f"With noise A is number {rank} of 6, with {noise_ratio:.1f} times the e_at of the best; "
+        f"with outliers {ratio['outliers']:.1f} times, with drift {ratio['drift']:.1f} times.",
     )
     orders = {dataset: table.ranking(dataset, "dnlo") for dataset in ("outliers", "drift")}
     monotone = {
@@ -128,7 +130,8 @@ def _on_references(table):
     }
     yield Conclusion(
         "4.2.1",
-        "With outliers and drift the references rank from the smallest motions to the largest, B1 first (DNLO).",
+        "With outliers and drift the references rank from the smallest motions to the "
+        "largest, B1 first (DNLO).",
         _verdict(
             all(monotone.values()) and all(order[0] == "B1" for order in orders.values()),
             any(monotone.values()),
@@ -145,7 +148,8 @@ def _on_references(table):
         "4.2.1, 4.2.2",
         "With drift the differences between the references are minute, apart from A (DNLO).",
         _verdict(max(without_a) < 2 * min(without_a) and drift["A"] > 3 * max(without_a)),
-        f"At rate 0.05 the worst of the other five has {max(without_a) / min(without_a):.2f} times the e_at of the best, A has "
+        "At rate 0.05 the worst of the other five has "
+        f"{max(without_a) / min(without_a):.2f} times the e_at of the best, A has "
         f"{drift['A'] / min(without_a):.1f} times.",
     )
 
@@ -165,7 +169,8 @@ def _on_components(results):
         "4.2.1, Figure 4",
         "The motions are heavily partial to x, y and yaw.",
         _verdict(worst_z < 0.5 and tilt < 0.5),
-        f"Medians over all references: |z| is at most {worst_z:.2f} of the smaller of |x| and |y|; the larger of |roll| and |pitch| is at most "
+        f"Medians over all references: |z| is at most {worst_z:.2f} of the smaller of |x| "
+        "and |y|; the larger of |roll| and |pitch| is at most "
         f"{tilt:.2f} of |yaw| ({at_a:.2f} for A).",
     )
 
@@ -177,13 +182,18 @@ def _on_relative_errors(results, table):
     }
     yield Conclusion(
         "4.2.1",
-        "With mixed noise B1 is clearly best by the relative errors, but not by the absolute ones (DNLO).",
+        "With mixed noise B1 is clearly best by the relative errors, but not by the "
+        "absolute ones (DNLO).",
         _verdict(
             relative["e_rt"] == "B1" and relative["e_rR"] == "B1" and relative["e_at"] != "B1",
             relative["e_at"] != "B1",
         ),
-        f"Smallest median: {', '.join(f'{metric} {name}' for metric, name in relative.items())}. Medians of e_rt: "
-        f"{_scores(table, 'mixture', 'dnlo', 'e_rt')}; of e_rR: {_scores(table, 'mixture', 'dnlo', 'e_rR')}; of e_at: {_scores(table, 'mixture', 'dnlo')}.",
+        "Smallest median: "
+        f"{', '.join(f'{metric} {name}' for metric, name in relative.items())}. Medians "
+        "of e_rt: "
+        f"{_scores(table, 'mixture', 'dnlo', 'e_rt')}; of e_rR: "
+        f"{_scores(table, 'mixture', 'dnlo', 'e_rR')}; of e_at: "
+        f"{_scores(table, 'mixture', 'dnlo')}.",
     )
     picks = {
         method: (
@@ -197,7 +207,8 @@ def _on_relative_errors(results, table):
         "4.2.1, 6",
         "Relative errors are no criterion for choosing the reference.",
         _verdict(all(by_relative != by_absolute for by_relative, by_absolute in picks.values())),
-        "With mixed noise, reference with the smallest median e_rt against that with the smallest e_at: "
+        "With mixed noise, reference with the smallest median e_rt against that with the "
+        "smallest e_at: "
         + ", ".join(
             f"{TITLES[method]} {first} / {second}" for method, (first, second) in picks.items()
         )
@@ -258,7 +269,8 @@ def _on_methods(table):
         "4.2.2",
         "With outliers DNLO clearly outperforms the others.",
         _verdict(scores["dnlo"] < 0.5 * scores[rival]),
-        f"Mean e_at of the best variants: DNLO {scores['dnlo']:.4f} m, next is {TITLES[rival]} with {scores[rival]:.4f} m, "
+        f"Mean e_at of the best variants: DNLO {scores['dnlo']:.4f} m, next is "
+        f"{TITLES[rival]} with {scores[rival]:.4f} m, "
         f"{scores[rival] / scores['dnlo']:.0f} times as much.",
     )
     proper, published = (
@@ -276,12 +288,17 @@ def _on_methods(table):
     }
     yield Conclusion(
         "4.2.2",
-        "The poor performance of Ali with outliers is explained by the rotation error not entering its cost.",
-        _verdict(proper["e_at"] > 0.8 * published["e_at"] and proper["e_aR"] > 0.8 * published["e_aR"],
-                 proper["e_at"] > 1.2 * dnl["e_at"] or proper["e_aR"] > 1.2 * dnl["e_aR"]),
-        f"Mean errors of the best variants: as published {published['e_at']:.3f} m, {published['e_aR']:.1f} deg; with the same cost and a normalised quaternion "
-        f"{proper['e_at']:.3f} m, {proper['e_aR']:.1f} deg; DNL, whose cost has the rotation, {dnl['e_at']:.3f} m, {dnl['e_aR']:.1f} deg.",
-    )  # fmt: skip
+        "The poor performance of Ali with outliers is explained by the rotation error not "
+        "entering its cost.",
+        _verdict(
+            proper["e_at"] > 0.8 * published["e_at"] and proper["e_aR"] > 0.8 * published["e_aR"],
+            proper["e_at"] > 1.2 * dnl["e_at"] or proper["e_aR"] > 1.2 * dnl["e_aR"],
+        ),
+        f"Mean errors of the best variants: as published {published['e_at']:.3f} m, "
+        f"{published['e_aR']:.1f} deg; with the same cost and a normalised quaternion "
+        f"{proper['e_at']:.3f} m, {proper['e_aR']:.1f} deg; DNL, whose cost has the "
+        f"rotation, {dnl['e_at']:.3f} m, {dnl['e_aR']:.1f} deg.",
+    )
     rotation = {
         dataset: max(
             table.values(dataset, level, method, reference, "e_aR").max()
@@ -295,7 +312,8 @@ def _on_methods(table):
         "4.2.2",
         "The separable methods have very small rotation errors with outliers and drift.",
         _verdict(max(rotation.values()) < 1e-3),
-        f"Largest e_aR of Park and Taylor in any run: {rotation['outliers']:.1e} deg with outliers, {rotation['drift']:.1e} deg with drift.",
+        f"Largest e_aR of Park and Taylor in any run: {rotation['outliers']:.1e} deg with "
+        f"outliers, {rotation['drift']:.1e} deg with drift.",
     )
     factors = {}
     for method in _AS_PUBLISHED:
@@ -307,7 +325,8 @@ def _on_methods(table):
         factors[method] = max(values) / min(values)
     yield Conclusion(
         "4.2.2",
-        "With drift there is very little difference between the references, apart from A, for any of the methods.",
+        "With drift there is very little difference between the references, apart from A, "
+        "for any of the methods.",
         _verdict(max(factors.values()) < 2, min(factors.values()) < 2),
         "At rate 0.05, e_at of the worst of the other five over that of the best: "
         + ", ".join(f"{TITLES[method]} {factor:.1f}" for method, factor in factors.items())
@@ -385,13 +404,16 @@ def _on_kitti(results):
     lowest = min(short.values(), key=lambda row: row.errors[0])
     yield Conclusion(
         "5.2, Table 1",
-        "On the short drive Zhuang has the lowest relative errors and converges to a wrong solution.",
+        "On the short drive Zhuang has the lowest relative errors and converges to a "
+        "wrong solution.",
         _verdict(
             lowest.method == "zhuang"
             and max(short.values(), key=lambda row: row.errors[2]).method == "zhuang"
         ),
-        f"Zhuang {short['zhuang'].reference}: e_rt {short['zhuang'].errors[0]:.3f} m, e_at {short['zhuang'].errors[2]:.3f} m. It is compared in its B1 variant, and "
-        f"relative errors over short steps are small for every method: DNL with B1 has e_rt {rows['kitti_short']['dnl']['B1'].errors[0]:.3f} m.",
+        f"Zhuang {short['zhuang'].reference}: e_rt {short['zhuang'].errors[0]:.3f} m, "
+        f"e_at {short['zhuang'].errors[2]:.3f} m. It is compared in its B1 variant, and "
+        "relative errors over short steps are small for every method: DNL with B1 has "
+        f"e_rt {rows['kitti_short']['dnl']['B1'].errors[0]:.3f} m.",
     )
     references = {row.reference for method, row in short.items() if method != "zhuang"}
     yield Conclusion(
@@ -406,9 +428,11 @@ def _on_kitti(results):
     marginally = long["dnlo"].reference == "C5" and dnlo["B5"].errors[2] > dnlo["C5"].errors[2]
     yield Conclusion(
         "5.2, Table 2",
-        "On the long drive the middle step lengths are best: B5, and for DNLO C5, marginally better than B5.",
+        "On the long drive the middle step lengths are best: B5, and for DNLO C5, "
+        "marginally better than B5.",
         _verdict(middle and marginally, middle),
-        f"Published truth: {named(long, lambda row: row.errors[2])}; DNLO with B5 {dnlo['B5'].errors[2]:.3f} m. Against the rectified truth: "
+        f"Published truth: {named(long, lambda row: row.errors[2])}; DNLO with B5 "
+        f"{dnlo['B5'].errors[2]:.3f} m. Against the rectified truth: "
         f"{named(against_rectified['kitti_long'], lambda row: rectified_errors(row)[0])}.",
     )
     n_b1 = {
@@ -424,8 +448,10 @@ def _on_kitti(results):
         "5.2, 6",
         "The usual reference B1 is worse than others on realistic data.",
         _verdict(n_b1["published"] <= 1),
-        f"On the two KITTI drives B1 is the best variant of {n_b1['published']} of 12 (method, drive) against the published truth and of {n_b1['rectified']} "
-        f"against the rectified one. With mixed noise B1 is in the worse half of the six references for {len(mixture)} of {len(_AS_PUBLISHED)} methods.",
+        f"On the two KITTI drives B1 is the best variant of {n_b1['published']} of 12 "
+        f"(method, drive) against the published truth and of {n_b1['rectified']} "
+        "against the rectified one. With mixed noise B1 is in the worse half of the six "
+        f"references for {len(mixture)} of {len(_AS_PUBLISHED)} methods.",
     )
 
 
@@ -458,9 +484,8 @@ def _reference_against_method(results, table):
         "5.2, 6",
         "The choice of the reference matters more than the choice of the method.",
         _verdict(all(holds), sum(holds) > len(holds) / 2),
-        "Worst e_at over best e_at, across references (median over the methods) against across methods (median over the references): "
-        + ", ".join(evidence)
-        + ".",
+        "Worst e_at over best e_at, across references (median over the methods) against "
+        "across methods (median over the references): " + ", ".join(evidence) + ".",
     )
 
 

@@ -24,7 +24,10 @@ FIGURE_METHODS = {
     "figS4": ("taylor",),
     "figS5": ("zhuang",),
 }
-_INTERVALS = "Mean and 95 % confidence interval; mixed noise: median, quartiles, whiskers to 1.5 interquartile ranges. Axes linear near zero, then logarithmic."
+_INTERVALS = (
+    "Mean and 95 % confidence interval; mixed noise: median, quartiles, whiskers to 1.5 "
+    "interquartile ranges. Axes linear near zero, then logarithmic."
+)
 _COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -89,7 +92,10 @@ def _titles(name, results):
         else f"{runs} drives of our simulator"
     )
     if name == "fig5":
-        note = f"{_INTERVALS}\nThe variant of each method is the one with the smallest e_at; Ali as published: its quaternion was never normalised."
+        note = (
+            f"{_INTERVALS}\nThe variant of each method is the one with the smallest e_at; Ali "
+            "as published: its quaternion was never normalised."
+        )
         return f"{number}. Calibration errors of each method's best variant on {where}", note
     method = TITLES[FIGURE_METHODS[name][0]]
     if name == "figS1_proper":
@@ -177,8 +183,23 @@ def _compare(name, points, choices, results):
         same = comparison.compare_summaries(ours, theirs, results.same_cases)
         why = "" if same else _why(point, rows, results.same_cases)
         compared.append([*_numbers(point, ours), theirs.centre, theirs.low, theirs.high, same, why])
-    header = ["dataset", "level", "method", "reference", "metric", "statistic", "centre", "low", "high", "runs",
-              "published_centre", "published_low", "published_high", "agrees", "why"]  # fmt: skip
+    header = [
+        "dataset",
+        "level",
+        "method",
+        "reference",
+        "metric",
+        "statistic",
+        "centre",
+        "low",
+        "high",
+        "runs",
+        "published_centre",
+        "published_low",
+        "published_high",
+        "agrees",
+        "why",
+    ]
     paths = [write_csv(results.out / f"{name}_comparison.csv", header, compared)]
     measure = (
         "to 0.1 % or 1e-6 (m, deg)"
@@ -215,7 +236,7 @@ def _why(point, rows, same_cases):
 
 
 def _count(compared, measure):
-    """How many points agree; the proper Ali, which the article does not have, is counted by itself."""
+    """How many points agree; the proper Ali, which the paper does not have, counts separately."""
     lines = []
     for proper in (False, True):
         chosen = [line for line in compared if (line[2] == "ali") == proper]
@@ -297,7 +318,8 @@ def write_components(name, results):
     number = "Figure 4" if results.same_cases else "As Figure 4"
     paths = paper_figures.draw_components(
         f"{number}. Components of the relative motions of {results.n_runs} {where}",
-        "Median, quartiles, whiskers to 1.5 interquartile ranges. Of the parent sensor; angles are ZYX Euler angles.",
+        "Median, quartiles, whiskers to 1.5 interquartile ranges. Of the parent sensor; "
+        "angles are ZYX Euler angles.",
         {titles[component]: ours[component] for component in _COMPONENTS},
         results.out / name,
     )
@@ -336,17 +358,21 @@ def _component_rows(found):
             yield [component, reference, unit, summary.centre, summary.low, summary.high, summary.n]
 
 
+def _describe_ratios(reference, ours):
+    x, y, z, roll, pitch, yaw = (ours[name][reference].centre for name in _COMPONENTS)
+    return (
+        f"{reference}: |z| is {z / max(x, y):.2f} of the larger of |x| and |y|; |roll| and |pitch| "
+        f"are {roll / yaw:.2f} and {pitch / yaw:.2f} of |yaw| (medians)"
+    )
+
+
 def _compare_components(name, ours, results):
-    heading = f"# {name}: comparison with the article"
-    ratios = [
-        f"{reference}: |z| is {ours['z'][reference].centre / max(ours['x'][reference].centre, ours['y'][reference].centre):.2f} of the "
-        f"larger of |x| and |y|; |roll| and |pitch| are {ours['roll'][reference].centre / ours['yaw'][reference].centre:.2f} and "
-        f"{ours['pitch'][reference].centre / ours['yaw'][reference].centre:.2f} of |yaw| (medians)"
-        for reference in REFERENCES
-    ]
+    heading = f"# {name}: comparison with the paper"
+    ratios = [_describe_ratios(reference, ours) for reference in REFERENCES]
     blocks = [
         heading,
-        "The article gives no numbers for this figure; it says that the motions are heavily partial to x, y and yaw:",
+        "The paper gives no numbers for this figure; it says that the motions are "
+        "heavily partial to x, y and yaw:",
         bullets(ratios),
     ]
     if results.same_cases or results.theirs_source is None:
@@ -370,8 +396,18 @@ def _compare_components(name, ours, results):
                 overlap,
             ]
         )
-    header = ["component", "reference", "unit", "median", "lower_quartile", "upper_quartile", "published_median",
-              "published_lower_quartile", "published_upper_quartile", "medians_within_quartiles"]  # fmt: skip
+    header = [
+        "component",
+        "reference",
+        "unit",
+        "median",
+        "lower_quartile",
+        "upper_quartile",
+        "published_median",
+        "published_lower_quartile",
+        "published_upper_quartile",
+        "medians_within_quartiles",
+    ]
     blocks += [
         "Our simulator beside the published trajectories:",
         markdown_table(

@@ -1,5 +1,5 @@
-"""What our run says about the published results themselves: agreement, false minima, Ali, DNLO, the
-KITTI ground truth.
+"""What our run shows about the published results: agreement, false minima, Ali, DNLO, the KITTI
+ground truth.
 """
 
 import numpy as np
@@ -57,7 +57,8 @@ def _agreement(rows):
             if row.method in methods and not (row.method == "ali" and row.dataset in SIMULATED)
         ]
         lines.append(
-            f"{title}: {percent(sum(row.agrees for row in chosen), len(chosen))} of the published rows are reproduced."
+            f"{title}: {percent(sum(row.agrees for row in chosen), len(chosen))} of the "
+            "published rows are reproduced."
         )
     return "\n".join(lines)
 
@@ -114,7 +115,10 @@ def _ali(table):
         best = {
             method: table.best_reference(dataset, method) for method in (ALI_AS_PUBLISHED, "ali")
         }
-        choice = f"Best variant over all levels: {best[ALI_AS_PUBLISHED]} as published, {best['ali']} properly."
+        choice = (
+            f"Best variant over all levels: {best[ALI_AS_PUBLISHED]} as published, "
+            f"{best['ali']} properly."
+        )
         blocks.append(f"Medians, {where}. {choice}\n\n{markdown_table(header, lines)}")
     return "\n\n".join(blocks)
 
@@ -133,9 +137,12 @@ def _zhuang(rows):
         }
     )
     return (
-        f"The published answer is more than {_WRONG_DEG:.0f} deg wrong in {percent(wrong, len(chosen))} simulated rows, {len(free)} of them "
-        f"without any noise: {', '.join(runs) or 'none'}, whose extrinsic is a turn by {', '.join(map(str, angles))} deg. Zhuang's parameters, the axis "
-        f"times the tangent of half the angle, grow without bound near 180 deg. Our iteration does the same steps and says so: it has not converged in {unsettled} rows."
+        f"The published answer is more than {_WRONG_DEG:.0f} deg wrong in "
+        f"{percent(wrong, len(chosen))} simulated rows, {len(free)} of them without any noise: "
+        f"{', '.join(runs) or 'none'}, whose extrinsic is a turn by {', '.join(map(str, angles))} "
+        "deg. Zhuang's parameters, the axis times the tangent of half the angle, grow without "
+        "bound near 180 deg. Our iteration does the same steps and says so: it has not converged "
+        f"in {unsettled} rows."
     )
 
 
@@ -146,8 +153,14 @@ def _truths(source):
         published, rectified = case.T_parent_child, RECTIFIED[dataset]
         angle = _angle_deg(published[:3, :3], rectified[:3, :3])
         lines.append(
-            [dataset, _vector(published[:3, 3]), _vector(rectified[:3, 3]), f"{np.linalg.norm(published[:3, 3] - rectified[:3, 3]):.3f}", f"{angle:.3f}"]
-        )  # fmt: skip
+            [
+                dataset,
+                _vector(published[:3, 3]),
+                _vector(rectified[:3, 3]),
+                f"{np.linalg.norm(published[:3, 3] - rectified[:3, 3]):.3f}",
+                f"{angle:.3f}",
+            ]
+        )
     header = ["drive", "published t (m)", "rectified t (m)", "apart (m)", "apart (deg)"]
     return markdown_table(header, lines)
 
@@ -166,9 +179,13 @@ def _scale(case):
     for method in ("dnl", "dnlo"):
         for reference in ("B5", "B10"):
             scaled = minimize_scalar(
-                lambda scale, method=method, reference=reference: _solve_scaled(case, method, reference, scale).objective,
-                bounds=(0.9, 1.1), method="bounded", options={"xatol": 1e-5},
-            )  # fmt: skip
+                lambda scale, method=method, reference=reference: (
+                    _solve_scaled(case, method, reference, scale).objective
+                ),
+                bounds=(0.9, 1.1),
+                method="bounded",
+                options={"xatol": 1e-5},
+            )
             line = [f"{TITLES[method]} {reference}"]
             for scale in (1.0, float(scaled.x)):
                 T = _solve_scaled(case, method, reference, scale).T_parent_child

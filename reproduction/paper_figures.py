@@ -8,14 +8,22 @@ from dataclasses import dataclass
 from hand_eye_calib.report import style
 
 REFERENCE_LOOKS = {
-    "A": (style.BLACK, "D", "-"), "B1": (style.VERMILION, "o", "-"), "B5": (style.SKY, "o", "-"), "B10": (style.BLUE, "o", "-"),
-    "C5": (style.PURPLE, "s", "--"), "C10": (style.GREEN, "s", "--"),
-}  # fmt: skip
+    "A": (style.BLACK, "D", "-"),
+    "B1": (style.VERMILION, "o", "-"),
+    "B5": (style.SKY, "o", "-"),
+    "B10": (style.BLUE, "o", "-"),
+    "C5": (style.PURPLE, "s", "--"),
+    "C10": (style.GREEN, "s", "--"),
+}
 METHOD_LOOKS = {
-    "ali": (style.BLACK, "v", ":"), "ali_as_published": (style.GREY, "^", "--"), "dnl": (style.SKY, "o", "-"),
-    "dnlo": (style.VERMILION, "D", "-"), "park": (style.GREEN, "s", "-"), "taylor": (style.BLUE, "x", "-"),
+    "ali": (style.BLACK, "v", ":"),
+    "ali_as_published": (style.GREY, "^", "--"),
+    "dnl": (style.SKY, "o", "-"),
+    "dnlo": (style.VERMILION, "D", "-"),
+    "park": (style.GREEN, "s", "-"),
+    "taylor": (style.BLUE, "x", "-"),
     "zhuang": (style.PURPLE, "P", "--"),
-}  # fmt: skip
+}
 
 METRIC_TITLES = {
     "e_rt": "$e_{rt}$ (m)\nrelative translation", "e_rR": "$e_{rR}$ (deg)\nrelative rotation",
@@ -41,14 +49,14 @@ _LABEL_GAP, _LABEL_ROOM, _LETTER = 0.088, 0.12, 0.075
 
 @dataclass(frozen=True)
 class Line:
-    """What a panel shows of one reference or method.
+    """One reference or method in a panel.
 
     Attributes
     ----------
     label : str
-        Short, beside the line.
+        Short name beside the line.
     name : str
-        In full, for the legend; empty where the label says it all.
+        Full name for the legend; empty if the label is enough.
     look : (colour, marker, line style)
     levels : sequence of float
         Empty in a box plot.
@@ -97,7 +105,7 @@ def draw_errors(title, note, panels, stem):
 
 
 def _scale(ax, lines, metric):
-    """A logarithmic axis that reaches zero; box plots, whose errors are never zero, need no zero."""
+    """A logarithmic axis that includes zero; box plots need none, their errors are never zero."""
     centres = [summary.centre for line in lines for summary in line.summaries]
     if not lines[0].levels:
         ax.set_yscale("log")
@@ -118,9 +126,16 @@ def _legend(ax, lines):
         for line in sorted(lines, key=lambda line: line.summaries[-1].centre, reverse=True)
     ]
     ax.legend(
-        handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=2.0, fontsize=6.5,
-        title="by $e_{at}$, worst first", title_fontsize=6.0, alignment="left",
-    )  # fmt: skip
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        frameon=False,
+        handlelength=2.0,
+        fontsize=6.5,
+        title="by $e_{at}$, worst first",
+        title_fontsize=6.0,
+        alignment="left",
+    )
 
 
 def _draw_lines(ax, lines):
@@ -134,9 +149,17 @@ def _draw_lines(ax, lines):
         above = [summary.high - summary.centre for summary in line.summaries]
         colour, marker, dashes = line.look
         ax.errorbar(
-            [level + shift for level in line.levels], centres, yerr=[below, above], color=colour, marker=marker, ls=dashes,
-            elinewidth=0.7, capsize=1.2, capthick=0.7, mew=0.8,
-        )  # fmt: skip
+            [level + shift for level in line.levels],
+            centres,
+            yerr=[below, above],
+            color=colour,
+            marker=marker,
+            ls=dashes,
+            elinewidth=0.7,
+            capsize=1.2,
+            capthick=0.7,
+            mew=0.8,
+        )
     largest = max(summary.high for line in lines for summary in line.summaries)
     if largest < _ZERO:
         ax.text(0.5, 0.5, "all zero", transform=ax.transAxes, ha="center", color=style.GREY)
@@ -167,9 +190,15 @@ def _label_ends(ax, lines, span):
             transform=ax.transAxes,
         )
         ax.text(
-            text, place + shift, f" {line.label}", color=line.look[0], fontsize=6.2, fontweight="bold", va="center",
+            text,
+            place + shift,
+            f" {line.label}",
+            color=line.look[0],
+            fontsize=6.2,
+            fontweight="bold",
+            va="center",
             transform=ax.transAxes,
-        )  # fmt: skip
+        )
 
 
 def _draw_boxes(ax, lines):
@@ -186,14 +215,25 @@ def _draw_boxes(ax, lines):
 
 def _draw_box(ax, place, summary, colour):
     statistics = {
-        "med": summary.centre, "q1": summary.low, "q3": summary.high, "whislo": summary.whiskers[0], "whishi": summary.whiskers[1],
-    }  # fmt: skip
+        "med": summary.centre,
+        "q1": summary.low,
+        "q3": summary.high,
+        "whislo": summary.whiskers[0],
+        "whishi": summary.whiskers[1],
+    }
     thin = {"color": colour, "lw": 0.8}
     ax.bxp(
-        [statistics], positions=[place], widths=0.62, showfliers=False, patch_artist=True, whiskerprops=thin, capprops=thin,
-        boxprops={"facecolor": colour, "alpha": 0.3, "edgecolor": colour, "lw": 0.8}, medianprops={"color": colour, "lw": 1.8},
+        [statistics],
+        positions=[place],
+        widths=0.62,
+        showfliers=False,
+        patch_artist=True,
+        whiskerprops=thin,
+        capprops=thin,
+        boxprops={"facecolor": colour, "alpha": 0.3, "edgecolor": colour, "lw": 0.8},
+        medianprops={"color": colour, "lw": 1.8},
         manage_ticks=False,
-    )  # fmt: skip
+    )
 
 
 def draw_components(title, note, components, stem):

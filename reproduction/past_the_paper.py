@@ -1,5 +1,5 @@
-"""``experiment adaptive``: the adaptive estimator and ``reference: auto`` against the best that
-hindsight could choose.
+"""``python -m reproduction adaptive``: the adaptive estimator and ``reference: auto`` against the
+best choice with hindsight.
 """
 
 from dataclasses import dataclass
@@ -68,18 +68,32 @@ def write(name, results):
     ]
     studies = in_parallel(study_level, tasks, results.jobs)
     header = [
-        "set", "level", "e_at (m)", "best published", "ratio", "e_aR (deg)", "best published", "ratio", "median NEES",
-        "90 % interval covers", "systematic error chosen", "DNLO auto e_at (m)", "best fixed reference", "ratio",
-    ]  # fmt: skip
+        "set",
+        "level",
+        "e_at (m)",
+        "best published",
+        "ratio",
+        "e_aR (deg)",
+        "best published",
+        "ratio",
+        "median NEES",
+        "90 % interval covers",
+        "systematic error chosen",
+        "DNLO auto e_at (m)",
+        "best fixed reference",
+        "ratio",
+    ]
     rows = [_cells(study) for study in studies]
     return [
         write_csv(results.out / f"{name}.csv", header, rows),
         write_text(
             results.out / f"{name}.md",
             "# The adaptive estimator and reference auto against hindsight",
-            f"Medians over {results.n_runs} trajectories. The best published result is the smallest of the 36 medians of method and reference at "
-            f"that level; the best fixed reference is the one of {', '.join(CANDIDATES)} with the smallest median for DNLO. Both are picked "
-            "knowing the truth, the adaptive estimator and auto are not. NEES has 6 degrees of freedom: 5.35 is expected.",
+            f"Medians over {results.n_runs} trajectories. The best published result is the "
+            "smallest of the 36 medians of method and reference at that level; the best fixed "
+            f"reference is the one of {', '.join(CANDIDATES)} with the smallest median for DNLO. "
+            "Both are picked knowing the truth, the adaptive estimator and auto are not. NEES has "
+            "6 degrees of freedom: 5.35 is expected.",
             markdown_table(header, rows),
         ),
     ]

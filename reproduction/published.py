@@ -106,7 +106,7 @@ def check_folder(folder):
     Raises
     ------
     InputError
-        Where it is not that of the published data.
+        If it is not the folder of the published data.
     """
     folder = Path(folder)
     missing = [name for name in ("kitti_tests", "simulation_tests") if not (folder / name).is_dir()]
@@ -114,8 +114,10 @@ def check_folder(folder):
         missing.append(" or ".join(_RESULTS_FOLDERS))
     if missing:
         raise InputError(
-            f"{folder}: expected the published data, a clone of github.com/tau-alma/trajectory_calibration_experiments, with "
-            f"kitti_tests, simulation_tests and calib (the results, also as published) in it; found no {', no '.join(missing)}"
+            f"{folder}: expected the published data, a clone of "
+            "github.com/tau-alma/trajectory_calibration_experiments, with "
+            "kitti_tests, simulation_tests and calib (the results, also as published) in "
+            f"it; found no {', no '.join(missing)}"
         )
     return folder
 
@@ -132,7 +134,7 @@ def load_kitti_short(folder):
     Raises
     ------
     InputError
-        Where a file is missing or cannot be used.
+        If a file is missing or cannot be used.
     """
     folder = check_folder(folder)
     drive = folder / "kitti_tests" / "2011_09_30_drive_0027"
@@ -151,7 +153,7 @@ def load_kitti_long(folder):
     Raises
     ------
     InputError
-        Where a file is missing or cannot be used.
+        If a file is missing or cannot be used.
     """
     folder = check_folder(folder)
     drive = folder / "kitti_tests" / "2011_10_03_drive_0027"
@@ -165,8 +167,8 @@ def load_kitti_long(folder):
 
 
 def _kitti_case(dataset, parent, child, truth_file, results_file):
-    # As in the article: the parent's poses at the child's stamps, its end segments extended where
-    # the child's run longer.
+    # As in the paper: the parent's poses at the child's stamps, extrapolated along its end segments
+    # if the child's stamps reach further.
     parent_at_child = Trajectory(child.stamps_ns, parent.at(child.stamps_ns, extrapolate=True))
     results = {key: rows[0] for key, rows in _read_results(results_file, None)[None].items()}
     return Case(
@@ -190,7 +192,7 @@ def load_simulated(folder, datasets=SIMULATED, levels=None):
     datasets : sequence of str
         Which of noise, outliers, drift, mixture.
     levels : sequence of float, optional
-        Only these levels; the mixture has none and always comes whole.
+        Only these levels; the mixture has none and is always loaded.
 
     Returns
     -------
@@ -200,7 +202,7 @@ def load_simulated(folder, datasets=SIMULATED, levels=None):
     Raises
     ------
     InputError
-        Where a file is missing or cannot be used.
+        If a file is missing or cannot be used.
     """
     folder = check_folder(folder)
     cases = []
@@ -233,8 +235,8 @@ def _read_runs(folder):
 def _match_runs(dataset, level, runs, results):
     """Cases in the order of the published rows, which do not name their trajectory.
 
-    Every (method, reference) block lists the same trajectories in the same order, and park has a
-    single answer: its block tells which.
+    Every (method, reference) block lists the same trajectories in the same order. Park has a
+    unique answer, so its block identifies them.
     """
     complete = all(
         len(results.get((method, reference), ())) == N_RUNS
@@ -262,8 +264,10 @@ def _match_runs(dataset, level, runs, results):
                 for position, run in enumerate(order)
             ]
     raise InputError(
-        f"the trajectories of {dataset}{'' if level is None else f' at level {level:g}'} do not go with the published results: expected "
-        f"{N_RUNS} runs (found {len(runs)}) and {N_RUNS} rows of every method and reference, one for each run; get the data again"
+        f"the trajectories of {dataset}{'' if level is None else f' at level {level:g}'} "
+        "do not go with the published results: expected "
+        f"{N_RUNS} runs (found {len(runs)}) and {N_RUNS} rows of every method and "
+        "reference, one for each run; get the data again"
     )
 
 

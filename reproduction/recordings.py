@@ -1,8 +1,8 @@
-"""Recorded drives that can be calibrated more than once: parts of one drive, or several drives of
-one rig.
+"""Recordings that can be calibrated more than once: parts of one drive, or several drives of one
+rig.
 
-They lie in folders of their own beside the published data of Välimäki et al. 2023; a set whose
-folder is absent is left out.
+Their folders lie beside the published data of Välimäki et al. 2023; sets without a folder are left
+out.
 """
 
 import dataclasses
@@ -23,8 +23,10 @@ _SHORT, _LONG = (
 )
 _CAMERA = "KeyFrameTrajectory_TUM_Format.txt"
 _DEVICES = {
-    "CALIGULA": "CALIGULA_2017-04-06-18-21-33", "MARS": "MARS_2017-04-06-18-23-37", "NERO": "NERO_2017-04-06-18-25-25",
-}  # fmt: skip
+    "CALIGULA": "CALIGULA_2017-04-06-18-21-33",
+    "MARS": "MARS_2017-04-06-18-23-37",
+    "NERO": "NERO_2017-04-06-18-25-25",
+}
 _ASL_COLUMNS, _ZXL19_COLUMNS = "t,x,y,z,qx,qy,qz,qw", "t,x,y,z,qw,qx,qy,qz"
 
 # A part's parent stream reaches this far over the child's (ns), for interpolation and for the
@@ -78,9 +80,9 @@ class RecordedSet:
     drives : tuple of Recording
         One, to be cut into parts, or several, each of which is a repeat.
     options : dict
-        What a user would give, beside ``time_offset: estimate`` and ``scale: auto``.
+        Options a user would give, besides ``time_offset: estimate`` and ``scale: auto``.
     truth : (4, 4) array or None
-        T_parent_child, where it is known from elsewhere.
+        T_parent_child from another source, if known.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The figure of ``experiment repeats``: how far repeats scatter against what was stated of them."""
+"""The figure of ``python -m reproduction repeats``: scatter of repeats over stated sigma."""
 
 from hand_eye_calib.report import style
 
@@ -27,7 +27,10 @@ def draw_ratios(title, ratios, chance, stem):
     list of pathlib.Path
     """
     with style.house_style():
-        note = "1: the sigma was right. Dotted: a factor of two. Grey: 95 % of all marks would be here by chance"
+        note = (
+            "1: the sigma was right. Dotted: a factor of two. Grey: 95 % of all marks would "
+            "be here by chance"
+        )
         figure = style.new_page(2.6, title, note)
         axes = figure.subplots(1, len(ratios), sharey=True, squeeze=False)[0]
         for ax, (method, of_sets) in zip(axes, ratios.items(), strict=True):

@@ -1,11 +1,11 @@
-"""``experiment repeats``: does the stated standard deviation predict how far independent repeats on
-real data lie apart?
+"""``python -m reproduction repeats``: does the stated standard deviation predict the spread of
+independent repeats on real data?
 
 A rig is calibrated from several drives, or from halves and thirds of one. If a stated sigma is
 right, the answers of R repeats scatter by it: their sample variance over the mean stated variance
-follows chi2(R - 1) / (R - 1). Repeats share what is wrong in all of them (a miscalibrated sensor, a
-scan that is distorted in every turn): that shows against ground truth only, which the second table
-does.
+follows chi2(R - 1) / (R - 1). Repeats share
+systematic errors (a miscalibrated sensor, scan distortion in every turn); only the comparison with
+ground truth, the second table, shows those.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ METHODS = {
     "dnlo B10": {"method": "dnlo", "reference": "B10"},
 }
 
-# What a user does who knows neither clock nor scale.
+# Options of a user who knows neither clock offset nor scale.
 _OPTIONS = {"time_offset": "estimate", "scale": "auto"}
 
 # The references among which the error on KITTI is followed.
@@ -45,7 +45,7 @@ _UNIT_NAMES = ("m",) * 3 + ("deg",) * 3
 
 @dataclass(frozen=True)
 class AxisRatio:
-    """Scatter of repeats against what was stated of them, on one axis.
+    """Scatter of repeats over their stated standard deviation, on one axis.
 
     Attributes
     ----------
@@ -87,15 +87,17 @@ def write(name, results):
     text = [
         "# Does the stated sigma predict the spread between repeats?",
         f"Left out, since their folders are absent: {', '.join(absent)}." if absent else "",
-        "Standard deviation of the repeats over root mean square of the sigmas stated for them, per axis of the parent sensor. Repeats are halves and thirds of a "
-        "drive (together three degrees of freedom; they are cut from the same drive), or three drives (zxl19: two). "
-        f"If every sigma were right, {_CONFIDENCE:.0%} of the ratios would lie within {_band_text(2)} (two degrees) or {_band_text(3)} (three).",
+        "Standard deviation of the repeats over root mean square of the sigmas stated for them, "
+        "per axis of the parent sensor. Repeats are halves and thirds of a drive (together three "
+        "degrees of freedom; they are cut from the same drive), or three drives (zxl19: two). If "
+        f"every sigma were right, {_CONFIDENCE:.0%} of the ratios would lie within {_band_text(2)} "
+        f"(two degrees) or {_band_text(3)} (three).",
         _ratio_table(ratios),
         "All sets and axes together:",
         _pooled_table(ratios),
         "# Against the rectified ground truth of KITTI",
-        f"Every z above {_SUSPICIOUS:g} has a reason beside it, from the same axis: how far the thirds of the drive scatter, and what other references "
-        "(DNLO) say.",
+        f"Every z above {_SUSPICIOUS:g} has a reason beside it, from the same axis: how far the "
+        "thirds of the drive scatter, and what other references (DNLO) say.",
         _truth_table(truths),
     ]
     paths = [
@@ -138,8 +140,8 @@ def _band_text(freedom):
 
 
 def spread_and_sigma(calibrations):
-    """Variance (6,) of several answers, mean stated variance (6,), and which axes (6,) all of them
-    know.
+    """Variance (6,) of several answers, mean stated variance (6,), and whether all of them observe
+    the axis (6,).
     """
     sigmas = np.array([answer.sigmas for answer in calibrations])
     known = np.array(
@@ -175,7 +177,7 @@ def _groups(found, method):
 
 
 def _set_ratios(found, method):
-    """AxisRatio of every axis that all repeats of a set know."""
+    """AxisRatio of every axis that all repeats of a set observe."""
     groups = [(len(answers) - 1, *spread_and_sigma(answers)) for answers in _groups(found, method)]
     freedom = sum(degrees for degrees, *_ in groups)
     known = np.logical_and.reduce([known for *_, known in groups])
@@ -200,13 +202,32 @@ def _set_ratios(found, method):
     ]
 
 
-_RATIO_HEADER = ["set", "method", "axis", "spread (m or deg)", "stated sigma (m or deg)", "ratio", "degrees of freedom",
-                 "95 % from", "95 % to", "within a factor of two"]  # fmt: skip
+_RATIO_HEADER = [
+    "set",
+    "method",
+    "axis",
+    "spread (m or deg)",
+    "stated sigma (m or deg)",
+    "ratio",
+    "degrees of freedom",
+    "95 % from",
+    "95 % to",
+    "within a factor of two",
+]
 
 
 def _ratio_row(ratio):
-    return [ratio.dataset, ratio.method, ratio.axis, ratio.spread, ratio.sigma, ratio.ratio, ratio.freedom, *band(ratio.freedom),
-            ratio.is_within_two]  # fmt: skip
+    return [
+        ratio.dataset,
+        ratio.method,
+        ratio.axis,
+        ratio.spread,
+        ratio.sigma,
+        ratio.ratio,
+        ratio.freedom,
+        *band(ratio.freedom),
+        ratio.is_within_two,
+    ]
 
 
 def _ratio_table(ratios):
@@ -231,10 +252,17 @@ def _pooled_table(ratios):
             below = sum(ratio.ratio < 0.5 for ratio in chosen)
             too_small = sum(chi2.sf(4.0 * ratio.freedom, ratio.freedom) for ratio in chosen)
             too_large = sum(chi2.cdf(0.25 * ratio.freedom, ratio.freedom) for ratio in chosen)
-            rows.append([
-                method, len(chosen), f"{pooled:.2f}", f"{np.median([ratio.ratio for ratio in chosen]):.2f}",
-                sum(ratio.is_within_two for ratio in chosen), f"{above} ({too_small:.1f} by chance)", f"{below} ({too_large:.1f} by chance)",
-            ])  # fmt: skip
+            rows.append(
+                [
+                    method,
+                    len(chosen),
+                    f"{pooled:.2f}",
+                    f"{np.median([ratio.ratio for ratio in chosen]):.2f}",
+                    sum(ratio.is_within_two for ratio in chosen),
+                    f"{above} ({too_small:.1f} by chance)",
+                    f"{below} ({too_large:.1f} by chance)",
+                ]
+            )
     header = [
         "method",
         "ratios",
@@ -248,7 +276,7 @@ def _pooled_table(ratios):
 
 
 def _against_truth(found, method):
-    """A dict per axis: error, sigma, z, and what else bears on it."""
+    """A dict per axis: error, sigma, z, and possible causes."""
     whole = found.drives[0]
     answer = _answer(whole, found, method)
     as_given = _answer(whole, found, method, time_offset=0.0)
@@ -266,18 +294,26 @@ def _against_truth(found, method):
     sigma = answer.sigmas * _UNITS
     return [
         {
-            "drive": found.name, "method": method, "axis": axis, "unit": unit, "error": float(error[k]), "sigma": float(sigma[k]),
-            "z": float(error[k] / sigma[k]), "error, clock as given": float(without_offset[k]),
-            "error, scale as given": float(without_scale[k]), "scatter of thirds": float(of_thirds[:, k].std(ddof=1)),
-            "least error of a reference": float(of_others[:, k].min()), "largest error of a reference": float(of_others[:, k].max()),
+            "drive": found.name,
+            "method": method,
+            "axis": axis,
+            "unit": unit,
+            "error": float(error[k]),
+            "sigma": float(sigma[k]),
+            "z": float(error[k] / sigma[k]),
+            "error, clock as given": float(without_offset[k]),
+            "error, scale as given": float(without_scale[k]),
+            "scatter of thirds": float(of_thirds[:, k].std(ddof=1)),
+            "least error of a reference": float(of_others[:, k].min()),
+            "largest error of a reference": float(of_others[:, k].max()),
             "why": _reason(error[k], sigma[k], of_thirds[:, k], of_others[:, k]),
         }
         for k, (axis, unit) in enumerate(zip(AXES, _UNIT_NAMES, strict=True))
-    ]  # fmt: skip
+    ]
 
 
 def _reason(error, sigma, of_thirds, of_others):
-    """Why a z-score is large; empty where it is not."""
+    """Why a z-score is large; empty if it is not."""
     if not abs(error) > _SUSPICIOUS * sigma:
         return ""
     reach = of_others.max() - of_others.min()
@@ -288,7 +324,10 @@ def _reason(error, sigma, of_thirds, of_others):
         or of_others.min() * of_others.max() < 0
     ):
         return "depends on the reference: errors that last longer than the noise model knows"
-    return "the same in all thirds and with all references: wrong in the recordings as a whole, or in the ground truth"
+    return (
+        "the same in all thirds and with all references: wrong in the recordings as a whole, "
+        "or in the ground truth"
+    )
 
 
 def _truth_table(truths):
@@ -307,10 +346,18 @@ def _truth_table(truths):
     ]
     rows = [
         [
-            row["drive"], row["method"], f"{row['axis']} ({row['unit']})", f"{row['error']:.3f}", f"{row['sigma']:.3f}", f"{row['z']:.1f}",
-            f"{row['error, clock as given']:.3f}", f"{row['error, scale as given']:.3f}", f"{row['scatter of thirds']:.3f}",
-            f"{row['least error of a reference']:.3f} to {row['largest error of a reference']:.3f}", row["why"],
+            row["drive"],
+            row["method"],
+            f"{row['axis']} ({row['unit']})",
+            f"{row['error']:.3f}",
+            f"{row['sigma']:.3f}",
+            f"{row['z']:.1f}",
+            f"{row['error, clock as given']:.3f}",
+            f"{row['error, scale as given']:.3f}",
+            f"{row['scatter of thirds']:.3f}",
+            f"{row['least error of a reference']:.3f} to {row['largest error of a reference']:.3f}",
+            row["why"],
         ]
         for row in truths
-    ]  # fmt: skip
+    ]
     return markdown_table(header, rows)

@@ -1,6 +1,4 @@
-"""One row of results per (case, method, reference), ours beside the published one, and whether they
-agree.
-"""
+"""One row of results per (case, method, reference): ours, the published one, whether they agree."""
 
 from dataclasses import dataclass
 
@@ -20,9 +18,14 @@ UNITS = {"e_rt": "m", "e_rR": "deg", "e_at": "m", "e_aR": "deg"}
 # name we do the same.
 ALI_AS_PUBLISHED = "ali_as_published"
 TITLES = {
-    "ali": "Ali", ALI_AS_PUBLISHED: "Ali (as published)", "dnl": "DNL", "dnlo": "DNLO", "park": "Park", "taylor": "Taylor",
+    "ali": "Ali",
+    ALI_AS_PUBLISHED: "Ali (as published)",
+    "dnl": "DNL",
+    "dnlo": "DNLO",
+    "park": "Park",
+    "taylor": "Taylor",
     "zhuang": "Zhuang",
-}  # fmt: skip
+}
 
 # Errors agree within this share of the published one, or this many metres or degrees.
 _RELATIVE, _ABSOLUTE = 1e-3, 1e-6
@@ -34,9 +37,7 @@ _OBJECTIVE_SHARE, _OBJECTIVE_FLOOR = 1e-6, 1e-15
 
 @dataclass(frozen=True)
 class Cell:
-    """What is solved and stored as a whole: all runs and references of a method at a level of a
-    data set.
-    """
+    """Unit of solving and storing: all runs and references of a method at a level of a data set."""
 
     dataset: str
     level: float | None

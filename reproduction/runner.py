@@ -1,5 +1,5 @@
-"""Solves the cells of an experiment on several cores, and keeps what is solved: an interrupted run
-goes on where it ended.
+"""Solves the cells of an experiment on several cores and stores them, so that an interrupted run
+continues.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from reproduction.rows import Row, solve_cell
 
 _HERE = Path(__file__).parent
 _PACKAGE = Path(se3.__file__).parents[1]
-# The code that results depend on; another version of it makes stored ones stale.
+# The code that results depend on: if it changes, stored results are discarded.
 _CODE = (
     *(_HERE / f"{name}.py" for name in ("published", "ali_as_published", "sources", "rows")),
     _PACKAGE / "assessment" / "metrics.py",
@@ -39,15 +39,15 @@ class Store:
     Parameters
     ----------
     folder : pathlib.Path
-        Made where it does not exist. Results of another configuration that an earlier run left
-        there are removed.
+        Created if absent. Results that an earlier run stored for another configuration are
+        removed.
     configuration : dict
-        What the results depend on, besides this package.
+        Settings that the results depend on, besides the code.
 
     Raises
     ------
     InputError
-        Where the folder cannot be made.
+        If the folder cannot be made.
     """
 
     def __init__(self, folder, configuration):
@@ -61,11 +61,12 @@ class Store:
             _write(manifest, wanted)
         except OSError as error:
             raise InputError(
-                f"cannot keep results in {folder}: {error.strerror}; choose another directory with --out"
+                f"cannot keep results in {folder}: {error.strerror}; choose another "
+                "directory with --out"
             ) from None
 
     def load(self, cell):
-        """Rows of a cell, None where it is not solved yet."""
+        """Rows of a cell; None if it is not solved yet."""
         rows = _read(self._path(cell))
         return (
             None
@@ -74,7 +75,7 @@ class Store:
         )
 
     def save(self, cell, rows):
-        """Keep the rows of a cell."""
+        """Store the rows of a cell."""
         _write(self._path(cell), [dataclasses.asdict(row) for row in rows])
 
     def _path(self, cell):
@@ -119,7 +120,7 @@ def run(source, cells, store, jobs, on_done=lambda cell: None):
 
 
 def in_parallel(function, tasks, jobs):
-    """``function(*task)`` of every task, on so many processes; a list in their order."""
+    """``function(*task)`` of every task on ``jobs`` processes; a list in the order of tasks."""
     with _workers(min(jobs, len(tasks))) as executor:
         with _interrupts_held():
             futures = [executor.submit(function, *task) for task in tasks]
@@ -128,7 +129,7 @@ def in_parallel(function, tasks, jobs):
 
 @contextmanager
 def _workers(count):
-    """Processes that end at once when this block is left early."""
+    """Worker processes that are terminated if the block raises."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     others = set(multiprocessing.active_children())
     os.environ.update(_ONE_THREAD)
@@ -155,9 +156,7 @@ def _workers(count):
 
 @contextmanager
 def _interrupts_held():
-    """Ctrl-C waits for the end of this block; processes started in it never get it, their parent
-    ends them.
-    """
+    """Block SIGINT: processes started in this block inherit that and are ended by their parent."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -166,7 +165,7 @@ def _interrupts_held():
 
 
 def _start_worker():
-    """Do not outlive the parent, however it ends."""
+    """End with the parent process, however it ends."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -197,7 +196,7 @@ def _read(path):
 
 
 def _write(path, document):
-    """Whole or not at all: an interrupted run leaves no half file."""
+    """Write atomically: an interrupted run leaves no partial file."""
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_text(json.dumps(document), encoding="utf-8")
     os.replace(unfinished, path)

@@ -1,4 +1,4 @@
-"""Where the cases of an experiment come from: the published trajectories, or drives simulated here."""
+"""Sources of the cases of an experiment: the published trajectories, or simulated drives."""
 
 import hashlib
 from dataclasses import asdict, dataclass
@@ -59,7 +59,7 @@ class SimulatedSource:
     ----------
     seed : int
     runs : int
-        Drives; every one appears at every level, as in the article.
+        Drives; every one appears at every level, as in the paper.
     """
 
     seed: int = 0

@@ -1,5 +1,5 @@
-"""What the article's figures show of many runs: mean and 95 % confidence interval, or median and
-quartiles.
+"""Summaries of many runs as in the paper's figures: mean and 95 % confidence interval, or median
+and quartiles.
 """
 
 from dataclasses import dataclass
@@ -66,12 +66,12 @@ def quartile_summary(values):
 
 
 def summarise(dataset, values):
-    """As the article does: the mixture by quartiles, the others by mean."""
+    """As the paper does: the mixture by quartiles, the others by mean."""
     return quartile_summary(values) if dataset == "mixture" else mean_summary(values)
 
 
 class Table:
-    """Errors of many rows by what was solved.
+    """Errors of many rows by data set, level, method and reference.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Table:
         return tuple(sorted(found, key=lambda level: level or 0.0))
 
     def has(self, dataset, method):
-        """Whether there is anything of a method on a data set."""
+        """Whether the table has a method on a data set."""
         return bool(self.levels(dataset, method))
 
     def summary(self, dataset, level, method, reference, metric):
@@ -103,8 +103,8 @@ class Table:
         return summarise(dataset, self.values(dataset, level, method, reference, metric))
 
     def score(self, dataset, method, reference, metric="e_at"):
-        """What variants are compared by: the mean over the levels of the mean over the runs, or the
-        mixture's median.
+        """The value that variants are compared by: the mean over levels of the mean over runs; of
+        the mixture, the median.
         """
         levels = self.levels(dataset, method)
         return float(

@@ -23,7 +23,7 @@ VARIANT_TABLES = {
     )
 }
 
-# As printed in the article: variant; e_rt, e_rR, e_at, e_aR; improvement of e_at and e_aR over B1
+# As printed in the paper: variant; e_rt, e_rR, e_at, e_aR; improvement of e_at and e_aR over B1
 # (none where B1 is the best).
 PRINTED = {
     "kitti_short": {
@@ -54,8 +54,9 @@ _COLUMNS = (
 _ERROR_COLUMNS = (0, 1, 2, 3, 6, 7)
 _RECTIFIED_COLUMNS = tuple(f"rectified: {column}" for column in _COLUMNS[2:])
 _NOTE = (
-    "Columns 'rectified' are against the calibration of the rectified images that the SLAM saw; the others against the ground truth as published. "
-    "Gain: error of the method's B1 variant less that of this one."
+    "Columns 'rectified' are against the calibration of the rectified images that the SLAM saw; "
+    "the others against the ground truth as published. Gain: error of the method's B1 variant "
+    "less that of this one."
 )
 
 
@@ -90,16 +91,21 @@ def write_summary_table(name, results):
         ]
         for method, (variant, values) in lines.items()
     ]
-    table = [[TITLES[method], variant, *("" if value is None else value for value in values)] for method, (variant, values) in lines.items()]  # fmt: skip
+    table = [
+        [TITLES[method], variant, *("" if value is None else value for value in values)]
+        for method, (variant, values) in lines.items()
+    ]
     return [
         write_text(
-            results.out / f"{name}.md", f"# Table {name[-1]}. {_DRIVES[dataset]}", markdown_table(header, body),
+            results.out / f"{name}.md",
+            f"# Table {name[-1]}. {_DRIVES[dataset]}",
+            markdown_table(header, body),
             f"Best variant of each method by e_at; the smallest error of a column is bold. {_NOTE}",
             _best_against_rectified(rows),
         ),
         write_csv(results.out / f"{name}.csv", ["method", "variant", *header[1:]], table),
         *_compare_with_print(name, rows, lines, results),
-    ]  # fmt: skip
+    ]
 
 
 def _line(row, b1):
@@ -146,7 +152,7 @@ def _best_against_rectified(rows):
 
 
 def _compare_with_print(name, rows, lines, results):
-    """Cell by cell: ours (of our best variant, and of the article's), the published file's, and as
+    """Cell by cell: ours (of our best variant, and of the paper's), the published file's, and as
     printed.
     """
     dataset, compared = SUMMARY_TABLES[name], []
@@ -169,12 +175,36 @@ def _compare_with_print(name, rows, lines, results):
             )
             there_same = (ours_there is theirs) or abs(ours_there - theirs) <= 0.00051
             note = "" if same else f"best variant is {variant} here" if there_same else why
-            compared.append([TITLES[method], variant, printed_variant, column, _blank(ours), _blank(ours_there), _blank(theirs), same, there_same, note])  # fmt: skip
-    header = ["method", "our_best_variant", "articles_variant", "column", "ours", "ours_with_the_articles_variant", "printed", "agrees",
-              "agrees_with_the_articles_variant", "why"]  # fmt: skip
+            compared.append(
+                [
+                    TITLES[method],
+                    variant,
+                    printed_variant,
+                    column,
+                    _blank(ours),
+                    _blank(ours_there),
+                    _blank(theirs),
+                    same,
+                    there_same,
+                    note,
+                ]
+            )
+    header = [
+        "method",
+        "our_best_variant",
+        "papers_variant",
+        "column",
+        "ours",
+        "ours_with_the_papers_variant",
+        "printed",
+        "agrees",
+        "agrees_with_the_papers_variant",
+        "why",
+    ]
     text = [
-        f"Cells that agree with the printed table to its three decimals: {percent(sum(line[7] for line in compared), len(compared))}; "
-        f"with the article's variant of each method: {percent(sum(line[8] for line in compared), len(compared))}.",
+        "Cells that agree with the printed table to its three decimals: "
+        f"{percent(sum(line[7] for line in compared), len(compared))}; with the paper's variant of "
+        f"each method: {percent(sum(line[8] for line in compared), len(compared))}.",
         markdown_table(
             header,
             [
@@ -192,7 +222,7 @@ def _compare_with_print(name, rows, lines, results):
     return [
         write_csv(results.out / f"{name}_comparison.csv", header, compared),
         write_text(
-            results.out / f"{name}_comparison.md", f"# {name}: comparison with the article", *text
+            results.out / f"{name}_comparison.md", f"# {name}: comparison with the paper", *text
         ),
     ]
 
@@ -207,7 +237,10 @@ def write_variant_table(name, results):
     rows = results.of(dataset, method)
     best = best_variant(rows)
     header = ["reference", *_COLUMNS[:4], "rectified: e_at (m)", "rectified: e_aR (deg)"]
-    lines = [[row.reference, *row.errors, *rectified_errors(row)] for row in sorted(rows, key=lambda row: REFERENCES.index(row.reference))]  # fmt: skip
+    lines = [
+        [row.reference, *row.errors, *rectified_errors(row)]
+        for row in sorted(rows, key=lambda row: REFERENCES.index(row.reference))
+    ]
     printed = [
         [
             line[0],
@@ -233,16 +266,41 @@ def write_variant_table(name, results):
         blocks.append(comparison.describe_dnlo(rows))
         blocks.append(
             markdown_table(
-                ["reference", "objective", "objective at the published answer", "e_at (m)", "published e_at (m)"],
                 [
-                    [row.reference, f"{row.objective:.6f}", f"{row.published_objective:.6f}", f"{row.errors[2]:.4f}", f"{row.published[2]:.4f}"]
+                    "reference",
+                    "objective",
+                    "objective at the published answer",
+                    "e_at (m)",
+                    "published e_at (m)",
+                ],
+                [
+                    [
+                        row.reference,
+                        f"{row.objective:.6f}",
+                        f"{row.published_objective:.6f}",
+                        f"{row.errors[2]:.4f}",
+                        f"{row.published[2]:.4f}",
+                    ]
                     for row in rows
                 ],
             )
-        )  # fmt: skip
+        )
     return [
-        write_text(results.out / f"{name}.md", title, markdown_table(header, printed), f"The best variant by e_at is bold. {_NOTE}"),
+        write_text(
+            results.out / f"{name}.md",
+            title,
+            markdown_table(header, printed),
+            f"The best variant by e_at is bold. {_NOTE}",
+        ),
         write_csv(results.out / f"{name}.csv", header, lines),
-        write_csv(results.out / f"{name}_comparison.csv", ["reference", "column", "ours", "published", "agrees", "why"], compared),
-        write_text(results.out / f"{name}_comparison.md", f"# {name}: comparison with the published results", *blocks),
-    ]  # fmt: skip
+        write_csv(
+            results.out / f"{name}_comparison.csv",
+            ["reference", "column", "ours", "published", "agrees", "why"],
+            compared,
+        ),
+        write_text(
+            results.out / f"{name}_comparison.md",
+            f"# {name}: comparison with the published results",
+            *blocks,
+        ),
+    ]

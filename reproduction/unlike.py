@@ -1,6 +1,4 @@
-"""``experiment unlike``: simulated drives that are not like the published ones, and what becomes of
-the estimators on them.
-"""
+"""``python -m reproduction unlike``: the estimators on simulations unlike the published ones."""
 
 from dataclasses import dataclass
 
@@ -34,8 +32,8 @@ class Scenario:
         ``disturb(Ts_pw_p, Ts_cw_c, rng)`` gives both with their errors.
     drive : DriveConfig
     handheld : bool
-        Full motion in three dimensions; only number and rate of the poses and the lever are the
-        drive's.
+        Full motion in three dimensions; only the number and rate of the poses and the lever arm
+        are the drive's.
     """
 
     title: str
@@ -60,7 +58,7 @@ def _parent_drifts(parent, child, rng):
 
 
 def _random_walks(parent, child, rng):
-    """Both odometries wander: 0.05 deg and 1 mm per pose."""
+    """Random walk of both odometries: 0.05 deg and 1 mm per pose."""
     return tuple(
         _moved_from(poses, np.ones(len(poses), dtype=bool), 0.001, np.radians(0.05), rng)
         for poses in (parent, child)
@@ -68,8 +66,8 @@ def _random_walks(parent, child, rng):
 
 
 def _turning_jumps(parent, child, rng):
-    """At 3 % of the poses of either the rest of the track is turned by 2 deg and moved by 0.1 m per
-    axis.
+    """At 3 % of the poses of either stream the rest of the track is rotated by 2 deg and shifted by
+    0.1 m per axis.
     """
     jumped = (
         _moved_from(poses, rng.random(len(poses)) < 0.03, 0.1, np.radians(2.0), rng)
@@ -79,7 +77,7 @@ def _turning_jumps(parent, child, rng):
 
 
 def _spikes(parent, child, rng):
-    """5 % of the poses of either are off by 0.3 m and 5 deg per axis, each for itself."""
+    """5 % of the poses of either stream are off by 0.3 m and 5 deg per axis, independently."""
 
     def spiky(poses):
         spiked = np.where(rng.random(len(poses)) < 0.05, 1.0, 0.0)[:, None]
@@ -91,7 +89,7 @@ def _spikes(parent, child, rng):
 
 
 def _slow_noise(parent, child, rng):
-    """Errors of 1 cm and 0.5 deg that last a second (ten poses): neither white nor a random walk."""
+    """Errors of 1 cm and 0.5 deg correlated over 1 s (ten poses): not white, no random walk."""
     return tuple(
         poses @ se3.exp(_lasting(len(poses), rng) * np.repeat([0.01, np.radians(0.5)], 3))
         for poses in (parent, child)
@@ -126,21 +124,33 @@ def _lasting(count, rng, memory=0.9):
 
 
 SCENARIOS = {
-    "as the article": Scenario("its mixture, twice as long", _mixture),
-    "handheld": Scenario("full motion in three dimensions, white noise", _white(0.005), handheld=True),
+    "as the paper": Scenario("its mixture, twice as long", _mixture),
+    "handheld": Scenario(
+        "full motion in three dimensions, white noise", _white(0.005), handheld=True
+    ),
     "handheld mixture": Scenario("the same with jumps and drift too", _mixture, handheld=True),
     "parent drifts": Scenario("3 % on the parent, not the child", _parent_drifts),
     "random walks": Scenario("both odometries wander, rotation too", _random_walks),
     "turning jumps": Scenario("jumps in rotation and place, both sensors", _turning_jumps),
-    "lever of 3 m": Scenario("sensors up to 3 m apart per axis, white noise", _white(0.005), DriveConfig(poses=200, max_offset=3.0)),
-    "2 Hz": Scenario(
-        "few poses, far apart", _white(0.005), DriveConfig(poses=60, parent_rate=2.0, child_rate=2.0, hold_time=2.5, max_yaw_rate=1.0)
+    "lever of 3 m": Scenario(
+        "sensors up to 3 m apart per axis, white noise",
+        _white(0.005),
+        DriveConfig(poses=200, max_offset=3.0),
     ),
-    "100 Hz": Scenario("many poses, close together", _white(0.005), DriveConfig(poses=1500, parent_rate=100.0, child_rate=100.0)),
+    "2 Hz": Scenario(
+        "few poses, far apart",
+        _white(0.005),
+        DriveConfig(poses=60, parent_rate=2.0, child_rate=2.0, hold_time=2.5, max_yaw_rate=1.0),
+    ),
+    "100 Hz": Scenario(
+        "many poses, close together",
+        _white(0.005),
+        DriveConfig(poses=1500, parent_rate=100.0, child_rate=100.0),
+    ),
     "spikes": Scenario("single poses far off", _spikes),
     "slow noise": Scenario("errors that last a second", _slow_noise),
     "scale of 3 %": Scenario("the child's lengths are too long", _scaled),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -172,7 +182,7 @@ class UnlikeSource:
 
 
 def _handheld(drive, rng):
-    """Poses (N, 4, 4) of something carried about, turning about all axes."""
+    """Poses (N, 4, 4) of a handheld device that rotates about all axes."""
     times_s = np.arange(drive.poses * _SUBSTEPS) / (drive.parent_rate * _SUBSTEPS)
     frequency = rng.uniform(0.05, _FASTEST_HZ, (6, _SINES))
     phase = rng.uniform(0.0, 2 * np.pi, (6, _SINES))
@@ -195,23 +205,41 @@ def write(name, results):
     studies = in_parallel(
         study_level, [(source, scenario, None) for scenario in SCENARIOS], results.jobs
     )
-    header = ["scenario", "what it is", "adaptive e_at (m)", "e_aR (deg)", "best fixed DNLO (m)", "adaptive / fixed", "auto / fixed", "median NEES",
-              "90 % interval covers", "systematic error chosen"]  # fmt: skip
+    header = [
+        "scenario",
+        "what it is",
+        "adaptive e_at (m)",
+        "e_aR (deg)",
+        "best fixed DNLO (m)",
+        "adaptive / fixed",
+        "auto / fixed",
+        "median NEES",
+        "90 % interval covers",
+        "systematic error chosen",
+    ]
     rows = [
         [
-            study.dataset, SCENARIOS[study.dataset].title, f"{study.e_at:.5f}", f"{study.e_aR:.4f}", f"{study.fixed_e_at[0]:.5f} ({study.fixed_e_at[1]})",
-            f"{study.e_at / study.fixed_e_at[0]:.2f}", f"{study.auto_e_at / study.fixed_e_at[0]:.2f}", f"{study.nees:.2f}", f"{study.coverage:.0%}",
+            study.dataset,
+            SCENARIOS[study.dataset].title,
+            f"{study.e_at:.5f}",
+            f"{study.e_aR:.4f}",
+            f"{study.fixed_e_at[0]:.5f} ({study.fixed_e_at[1]})",
+            f"{study.e_at / study.fixed_e_at[0]:.2f}",
+            f"{study.auto_e_at / study.fixed_e_at[0]:.2f}",
+            f"{study.nees:.2f}",
+            f"{study.coverage:.0%}",
             ", ".join(f"{nuisance} {count}" for nuisance, count in study.nuisances.items()),
         ]
         for study in studies
-    ]  # fmt: skip
+    ]
     return [
         write_csv(results.out / f"{name}.csv", header, rows),
         write_text(
             results.out / f"{name}.md",
-            "# Drives unlike the article's",
-            f"Medians over {source.runs} drives of our simulator (seed {source.seed}). The best fixed reference is picked for each scenario knowing the truth. NEES has "
-            "6 degrees of freedom: 5.35 is expected.",
+            "# Drives unlike the paper's",
+            f"Medians over {source.runs} drives of our simulator (seed {source.seed}). The best "
+            "fixed reference is picked for each scenario knowing the truth. NEES has 6 degrees of "
+            "freedom: 5.35 is expected.",
             markdown_table(header, rows),
         ),
     ]
