@@ -65,9 +65,9 @@ clean:
 
 # The package is installed editable, so that what runs and what is tested is this work tree. A stamp is touched last: set-up
 # is repeated when it was interrupted or when one of the files that decide on it is newer.
-$(VENV)/.ready-demo: EXTRAS := ros,plot
-$(VENV)/.ready-test: EXTRAS := ros,plot,cluster,test,lint
-$(OLDEST)/.ready-test: EXTRAS := ros,plot,cluster,test
+$(VENV)/.ready-demo: EXTRAS := ros
+$(VENV)/.ready-test: EXTRAS := ros,cluster,test,lint
+$(OLDEST)/.ready-test: EXTRAS := ros,cluster,test
 $(OLDEST)/.ready-test: CONSTRAINTS := --constraint requirements/oldest.txt
 $(OLDEST)/.ready-test: requirements/oldest.txt
 

@@ -2,6 +2,7 @@
 licence come from package.xml.
 """
 
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,6 +13,13 @@ from setuptools import find_packages, setup
 HERE = Path(__file__).resolve().parent
 manifest = ElementTree.parse(HERE / "package.xml").getroot()
 name = manifest.findtext("name")
+
+# For `ros2 run hand_eye_calib COMMAND` every command is an executable in the package's own folder.
+# pip puts executables on PATH, where names such as `info` belong to others: there only these two.
+PIP_COMMANDS = ("calibrator", "replay")
+ROS_COMMANDS = (*PIP_COMMANDS, "calibrate", "check", "demo", "info", "simulate")
+# colcon and bloom call these commands of setup.py, pip others.
+is_for_ros = not {"install", "develop"}.isdisjoint(sys.argv)
 
 
 def files(pattern):
@@ -40,6 +48,8 @@ setup(
     python_requires=">=3.11",
     install_requires=[
         "casadi>=3.7",
+        "jinja2>=3.1.2",
+        "matplotlib>=3.6",
         "numpy>=1.26",
         "PyYAML>=6.0",
         "rich>=13.7",
@@ -48,7 +58,6 @@ setup(
     ],
     extras_require={
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
-        "plot": ["jinja2>=3.1.2", "matplotlib>=3.6"],
         "cluster": ["distributed>=2024.1"],
         "test": [
             "colcon-common-extensions",
@@ -62,8 +71,10 @@ setup(
     entry_points={
         "console_scripts": [
             f"{name} = hand_eye_calib.cli.main:main",
-            "calibrator = hand_eye_calib.cli.main:calibrator",
-            "replay = hand_eye_calib.cli.main:replay",
+            *(
+                f"{command} = hand_eye_calib.cli.main:named_command"
+                for command in (ROS_COMMANDS if is_for_ros else PIP_COMMANDS)
+            ),
         ]
     },
 )

@@ -9,6 +9,7 @@ import argparse
 import importlib
 import os
 import sys
+from pathlib import Path
 
 from hand_eye_calib.cli.console import fail
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
@@ -80,14 +81,11 @@ def exit_code_of(run):
         return EXIT_BROKEN_PIPE
 
 
-def replay():
-    """Entry point of ``ros2 run hand_eye_calib replay BAG``."""
-    return main(["replay", *sys.argv[1:]])
-
-
-def calibrator():
-    """Entry point of ``ros2 run hand_eye_calib calibrator``."""
-    return main(["calibrator", *sys.argv[1:]])
+def named_command():
+    """Entry point of the executables that are called like a command, as in ``ros2 run
+    hand_eye_calib replay BAG``.
+    """
+    return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
 
 
 def _run(argv):

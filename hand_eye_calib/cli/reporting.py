@@ -97,7 +97,7 @@ def can_draw(file_name):
         library = error.name.partition(".")[0]
         if library not in _OPTIONAL:
             raise
-        note(f"no {file_name}: {library} is missing; pip install 'hand_eye_calib[plot]'")
+        note(f"no {file_name}: {library} is missing; pip install {library}")
         return False
     return True
 

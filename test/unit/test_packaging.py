@@ -15,6 +15,8 @@ from xml.etree import ElementTree
 import pytest
 from packaging.requirements import Requirement
 
+from hand_eye_calib.cli.main import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "hand_eye_calib"
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
@@ -75,7 +77,10 @@ def clean_environment(**extra):
         "AMENT_PREFIX_PATH",
         "COLCON_PREFIX_PATH",
     }
-    return {name: value for name, value in os.environ.items() if name not in dropped} | extra
+    kept = {name: value for name, value in os.environ.items() if name not in dropped}
+    # As in an activated virtual environment: installed commands take the interpreter on PATH.
+    kept["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), kept.get("PATH", "")])
+    return kept | extra
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +126,14 @@ def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
 
 def test_nothing_is_declared_that_is_not_imported():
     imported = third_party_imports(ROOT / PACKAGE) | third_party_imports(ROOT / "launch")
-    wanted = {DECLARED_AS[name][1] for name in imported}
+    # The saved launch file and the printed command run an executable of it.
+    wanted = {DECLARED_AS[name][1] for name in imported} | {"tf2_ros"}
     assert {element.text for element in MANIFEST.iter("exec_depend")} - wanted == set()
+
+
+def test_reports_plots_and_bags_need_no_extra(declared):
+    names = {Requirement(text).name for text in declared["install_requires"]}
+    assert {"jinja2", "matplotlib", "rosbags", "rich", "PyYAML"} <= names
 
 
 def test_every_folder_with_sources_is_a_package(declared):
@@ -136,11 +147,7 @@ def test_every_folder_with_sources_is_a_package(declared):
 def test_oldest_versions_are_pinned_at_the_declared_lower_bounds(declared):
     lines = (ROOT / "requirements" / "oldest.txt").read_text(encoding="utf-8").splitlines()
     pins = dict(line.split("==") for line in lines if "==" in line)
-    requirements = (
-        declared["install_requires"]
-        + declared["extras_require"]["plot"]
-        + declared["extras_require"]["test"]
-    )
+    requirements = declared["install_requires"] + declared["extras_require"]["test"]
     bounded = [Requirement(text) for text in requirements if ">=" in text]
     assert len(bounded) > 6
     for requirement in bounded:
@@ -256,28 +263,30 @@ def in_install_space(install_space, command):
 def test_colcon_lays_out_the_install_space(install_space, source, request):
     prefix = install_space / PACKAGE
     assert_data_files(prefix)
-    assert sorted(path.name for path in (prefix / "lib" / PACKAGE).iterdir()) == [
-        "calibrator",
-        PACKAGE,
-        "replay",
-    ]
+    executables = {path.name: path for path in (prefix / "lib" / PACKAGE).iterdir()}
+    assert set(executables) == {PACKAGE, *COMMANDS}
+    linked = "linked" in request.node.callspec.id
+    for path in executables.values():
+        first_line = path.read_text(encoding="utf-8").splitlines()[0]
+        # setuptools' develop, which links, knows no other interpreter than its own.
+        assert first_line == f"#!{sys.executable if linked else '/usr/bin/env python3'}"
     where = in_install_space(
         install_space,
         f"{sys.executable} -c 'import hand_eye_calib; print(hand_eye_calib.__file__)'",
     )
     package = Path(run(where, env=clean_environment(), cwd=install_space).stdout.strip()).resolve()
-    linked = "linked" in request.node.callspec.id
     assert package.is_relative_to(source if linked else prefix)
 
 
 def test_colcon_installed_commands_run(install_space):
     folder = install_space / PACKAGE / "lib" / PACKAGE
-    replay = run(
-        in_install_space(install_space, f"'{folder}/replay' --help"),
-        env=clean_environment(),
-        cwd=install_space,
-    )
-    assert "usage: hand_eye_calib replay" in replay.stdout
+    for command in COMMANDS:
+        help_text = run(
+            in_install_space(install_space, f"'{folder}/{command}' --help"),
+            env=clean_environment(),
+            cwd=install_space,
+        ).stdout
+        assert f"usage: hand_eye_calib {command}" in help_text
     version = in_install_space(install_space, f"'{folder}/{PACKAGE}' --version")
     assert (
         MANIFEST.findtext("version")
