@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.methods import BACKENDS, METHODS
 
-METHODS = ("dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive")
-BACKENDS = ("fast", "ipopt")
 REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]*|C([2-9]|[1-9][0-9]+)"
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -260,7 +259,7 @@ class CalibratorConfig(OptionSet):
     method: str = option(
         "dnlo",
         "Solver; dnlo rejects outliers, adaptive models the noise and needs no reference, the others use every pair.",
-        choices=METHODS,
+        choices=tuple(METHODS),
     )
     reference: str = option(
         "auto",

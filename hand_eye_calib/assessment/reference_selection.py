@@ -85,8 +85,7 @@ def select_reference(pose_pairs, method, candidates=CANDIDATES):
         )
     poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     solution = estimator.solve(*poses)
-    rejection = (method.threshold, method.min_inlier_fraction) if method.name == "dnlo" else ()
-    predictor = ReferencePredictor(*poses, solution, *rejection)
+    predictor = ReferencePredictor(*poses, solution, *method.rejection)
     covariances = {reference: predictor.covariance(reference) for reference in candidates}
     predicted_m = {
         reference: float(np.sqrt(np.trace(covariance[:3, :3])))

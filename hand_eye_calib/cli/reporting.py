@@ -10,9 +10,9 @@ from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.engine.cross_check import consistency
 from hand_eye_calib.engine.estimation import estimate_extrinsic
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.methods import METHODS
 
 REPORT, CHECK = "report.html", "check.html"
-_REJECT_OUTLIERS = ("dnlo", "adaptive")
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 
 
@@ -38,7 +38,7 @@ def with_consistency(calibration, snapshot):
     )
     # Where there are jumps, methods that use every pair disagree for a reason that says nothing
     # about the result.
-    robust = [other for other in others if other.method in _REJECT_OUTLIERS]
+    robust = [other for other in others if METHODS[other.method].rejects_outliers]
     found = consistency(calibration, robust, halves)
     warnings = (*calibration.warnings, *found.warnings())
     return dataclasses.replace(

@@ -13,7 +13,8 @@ from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adap
 from hand_eye_calib.assessment.prior import fuse, widened
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
-from hand_eye_calib.errors import ConfigError, NotEnoughDataError
+from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method
@@ -69,7 +70,7 @@ def estimate_extrinsic(pose_pairs, config, time_offset=None):
     scaled = PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, Ts_cw_c)
     evaluation = (
         _solve_adaptive(scaled, config)
-        if config.method == "adaptive"
+        if not METHODS[config.method].uses_reference
         else _solve_pairs(scaled, config)
     )
     solution = evaluation.solution
@@ -77,7 +78,7 @@ def estimate_extrinsic(pose_pairs, config, time_offset=None):
     assessment = widened(evaluation.assessment, solution.T_parent_child[:3, :3], spread)
     fused = fuse(solution.T_parent_child, assessment, config.prior())
     status, warnings = _judge(solution, fused)
-    if config.method == "adaptive" and np.mean(evaluation.weights < 0.5) > _MOST_JUMPS:
+    if evaluation.noise is not None and np.mean(evaluation.weights < 0.5) > _MOST_JUMPS:
         warnings += (
             f"{np.mean(evaluation.weights < 0.5):.0%} of the increments are jumps: these errors are hardly the noise that method adaptive "
             "models; compare with method dnlo",
@@ -147,8 +148,7 @@ def _unobservable(assessment):
 
 def _solve_adaptive(pose_pairs, config):
     """The adaptive estimator, which has no use for a reference."""
-    if config.backend != "fast":
-        raise ConfigError(f"method adaptive has no {config.backend} backend; only dnl and dnlo do")
+    METHODS[config.method].require_backend(config.backend)
     solution = adaptive_estimator.solve(
         pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     )

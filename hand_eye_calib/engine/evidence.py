@@ -16,21 +16,14 @@ from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
-# Poses that a method solves again with, at most, in each of many and in each of few solves: by how
-# long it takes.
-_MANY_TIMES, _FEW_TIMES = (
-    {"dnlo": 20_000, "dnl": 20_000, "adaptive": 600},
-    {"dnlo": 50_000, "dnl": 50_000, "adaptive": 600},
-)
-_MOST_POSES_OF_OTHERS = 3_000
-
-# Parts of the drive that the convergence is shown by.
-_PARTS, _FEWER_PARTS = 10, {"adaptive": 4}
-
+# Methods the result is compared with, the most poses each of them gets, and references.
 _COMPARED_METHODS = ("dnlo", "dnl", "park")
+_COMPARED_ESTIMATOR = "adaptive"
+_MOST_POSES_OF_OTHERS = 3_000
 _COMPARED_BASELINES = (1, 5, 10, 20)
 _FEWEST_POSES = 20
 
@@ -241,10 +234,12 @@ class _Questions:
 
     def growing(self, config):
         """From the first part of the drive, the first two ... to all of it."""
-        parts = _FEWER_PARTS.get(config.method, _PARTS)
-        ends = np.linspace(0, len(self._poses), parts + 1).astype(int)[1:-1]
+        method = METHODS[config.method]
+        ends = np.linspace(0, len(self._poses), method.parts + 1).astype(int)[1:-1]
         return (
-            *self._asked([(str(end), slice(0, end), config) for end in ends], _MANY_TIMES),
+            *self._asked(
+                [(str(end), slice(0, end), config) for end in ends], method.most_poses_of_many
+            ),
             self._result("all"),
         )
 
@@ -253,7 +248,7 @@ class _Questions:
         half = len(self._poses) // 2
         return self._asked(
             [("first half", slice(0, half), config), ("second half", slice(half, None), config)],
-            _FEW_TIMES,
+            METHODS[config.method].most_poses_of_few,
         )
 
     def others(self, config):
@@ -274,12 +269,13 @@ class _Questions:
             for label, config in questions
             if label != result
         ]
-        if self._calibration.method != "adaptive":
-            every = slice(None, None, _stride(len(self._poses), _FEW_TIMES["adaptive"]))
-            label = "adaptive" if every.step == 1 else f"adaptive (1 in {every.step})"
-            asked.append(
-                (label, every, dataclasses.replace(config, method="adaptive", reference="auto"))
-            )
+        label, most = _COMPARED_ESTIMATOR, METHODS[_COMPARED_ESTIMATOR].most_poses_of_few
+        if self._calibration.method != label:
+            config = dataclasses.replace(config, method=label, reference="auto")
+            stride = _stride(len(self._poses), most)
+            if stride > 1:
+                label = f"{label} (1 in {stride})"
+            asked.append((label, slice(None, None, stride), config))
         return tuple(filter(None, (self._answer(*question) for question in asked)))
 
     def _asked(self, questions, most):
@@ -287,11 +283,11 @@ class _Questions:
         answers = []
         for label, part, config in questions:
             start, end, _ = part.indices(len(self._poses))
-            stride = _stride(end - start, most.get(config.method, _MOST_POSES_OF_OTHERS))
+            stride = _stride(end - start, most)
             reference = (
-                "auto"
-                if config.method == "adaptive"
-                else _coarser(self._calibration.reference, stride)
+                _coarser(self._calibration.reference, stride)
+                if METHODS[config.method].uses_reference
+                else "auto"
             )
             config = dataclasses.replace(config, reference=reference)
             answers.append(self._answer(label, slice(start, end, stride), config))
@@ -338,7 +334,7 @@ def _scaled(Ts, scale):
 
 
 def _residuals(calibration, pose_pairs):
-    reference = "B1" if calibration.method == "adaptive" else calibration.reference
+    reference = calibration.reference if METHODS[calibration.method].uses_reference else "B1"
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
     rotation, translation = calibration.T_parent_child[:3, :3], calibration.T_parent_child[:3, 3]
     rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
@@ -350,7 +346,7 @@ def _residuals(calibration, pose_pairs):
         np.swapaxes(rotation_a @ rotation, 1, 2) @ (rotation @ rotation_b)
     )
     ends_ns = pose_pairs.stamps_ns[pairs.j]
-    if calibration.method == "adaptive":
+    if calibration.noise is not None:
         is_outlier = np.isin(ends_ns, calibration.noise["jumps_before_stamp_ns"])
     else:
         is_outlier = np.zeros(len(pairs), dtype=bool)

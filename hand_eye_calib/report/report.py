@@ -16,6 +16,7 @@ from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.checks.stream_checks import summarise
+from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.report_figures import draw_all, time_axis
 
 _TITLES = {
@@ -270,16 +271,14 @@ def _said_of_methods(calibration, evidence):
     if not known.any():
         return "No axis is revealed, so there is nothing to compare."
     # What a method itself calls unobservable is not held against it.
-    moved = {
-        one.label: np.where(
+    robust, others = {}, {}
+    for one in evidence.comparison:
+        group = robust if METHODS[one.calibration.method].rejects_outliers else others
+        group[one.label] = np.where(
             np.isfinite(one.calibration.sigmas),
             deviation(one.calibration.T_parent_child, calibration.T_parent_child),
             0.0,
         )
-        for one in evidence.comparison
-    }
-    robust = {label: d for label, d in moved.items() if label.startswith(("dnlo", "adaptive"))}
-    others = {label: d for label, d in moved.items() if label not in robust}
     texts = []
     if robust:
         worst = np.max(np.abs(list(robust.values())), axis=0)

@@ -1,13 +1,34 @@
-"""All methods by name: the one place that knows which solver takes which option."""
+"""The solvers of AX = XB by the name of their method, with the options they take."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
+from hand_eye_calib.methods import METHODS, MethodRecord
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import ali, dnl, dnlo, park, taylor, zhuang
+from hand_eye_calib.solvers.solution import Solution
 
-_PLAIN = {"park": park, "taylor": taylor, "zhuang": zhuang, "ali": ali}
+# ``solve(pairs, *rejection)``; what rejection is, Method.rejection says.
+_SOLVE: dict[str, Callable[..., Solution]] = {
+    "dnlo": dnlo.solve,
+    "dnl": dnl.solve,
+    "park": park.solve,
+    "taylor": taylor.solve,
+    "zhuang": zhuang.solve,
+    "ali": ali.solve,
+}
+
+# ``solve_without(pairs, solution, left_out, *rejection)`` of the methods that are quicker from a
+# solution than from nothing.
+_SOLVE_WITHOUT: dict[str, Callable[..., FloatArray]] = {
+    "dnlo": dnlo.solve_without,
+    "dnl": dnl.solve_without,
+}
 
 
 @dataclass(frozen=True)
@@ -17,34 +38,41 @@ class Method:
     Parameters
     ----------
     name : str
-        A name in :data:`hand_eye_calib.config.METHODS`.
+        Name of a method in :data:`hand_eye_calib.methods.METHODS` that uses a reference.
     threshold : float
-        dnlo only: c of eq. (5), in m^2.
+        c of eq. (5), in m^2. Only dnlo uses it.
     min_inlier_fraction : float
-        dnlo only: d of eq. (5) as a share of the pairs.
+        d of eq. (5) over the number of pairs. Only dnlo uses it.
     backend : str
-        dnl and dnlo only: "fast" or "ipopt".
+        "fast", or "ipopt" for dnl and dnlo.
 
     Raises
     ------
     ConfigError
-        For an unknown method, or a backend that the method does not have.
+        If the method is unknown or does not have the backend.
     """
 
     name: str
-    threshold: float = 0.01
-    min_inlier_fraction: float = 0.5
-    backend: str = "fast"
+    threshold: float = CalibratorConfig.threshold
+    min_inlier_fraction: float = CalibratorConfig.min_inlier_fraction
+    backend: str = CalibratorConfig.backend
 
-    def __post_init__(self):
-        if self.name not in ("dnl", "dnlo", *_PLAIN):
-            raise ConfigError(
-                f"method {self.name!r} is unknown; known are dnlo, dnl, {', '.join(_PLAIN)}"
-            )
-        if self.backend == "ipopt" and self.name in _PLAIN:
-            raise ConfigError(f"method {self.name} has no ipopt backend; only dnl and dnlo do")
+    def __post_init__(self) -> None:
+        if self.name not in _SOLVE:
+            raise ConfigError(f"method {self.name!r} is unknown; known are {', '.join(_SOLVE)}")
+        self.record.require_backend(self.backend)
 
-    def solve(self, pairs):
+    @property
+    def record(self) -> MethodRecord:
+        """Properties of the method."""
+        return METHODS[self.name]
+
+    @property
+    def rejection(self) -> tuple[float, ...]:
+        """``threshold`` and ``min_inlier_fraction`` of a method that rejects outliers, else empty."""
+        return (self.threshold, self.min_inlier_fraction) if self.record.rejects_outliers else ()
+
+    def solve(self, pairs: MotionPairs) -> Solution:
         """Solve AX = XB.
 
         Parameters
@@ -58,25 +86,18 @@ class Method:
         Raises
         ------
         NotEnoughDataError
-            Without any pair.
+            If there is no pair.
         """
         if len(pairs) == 0:
             raise NotEnoughDataError(
                 "no motion pairs: there are too few common poses for the chosen reference"
             )
-        if self.backend == "ipopt":
-            from hand_eye_calib.solvers import ipopt
+        solve = _SOLVE[self.name] if self.backend == "fast" else _ipopt_solve(self.name)
+        return solve(pairs, *self.rejection)
 
-            return (
-                ipopt.solve_dnl(pairs)
-                if self.name == "dnl"
-                else ipopt.solve_dnlo(pairs, *self._rejection)
-            )
-        if self.name == "dnlo":
-            return dnlo.solve(pairs, *self._rejection)
-        return dnl.solve(pairs) if self.name == "dnl" else _PLAIN[self.name].solve(pairs)
-
-    def solve_without(self, pairs, solution, left_out):
+    def solve_without(
+        self, pairs: MotionPairs, solution: Solution, left_out: BoolArray
+    ) -> FloatArray:
         """Answers near a solution when some pairs are left out, for resampling.
 
         Parameters
@@ -91,17 +112,13 @@ class Method:
         -------
         (B, 4, 4) array
         """
-        if self.name == "dnlo":
-            return dnlo.solve_without(pairs, solution, left_out, *self._rejection)
-        if self.name == "dnl":
-            return dnl.solve_without(pairs, solution, left_out)
+        if self.name in _SOLVE_WITHOUT:
+            return _SOLVE_WITHOUT[self.name](pairs, solution, left_out, *self.rejection)
         return np.stack([self.solve(pairs[~row]).T_parent_child for row in left_out])
 
-    @property
-    def _rejection(self):
-        return self.threshold, self.min_inlier_fraction
 
+def _ipopt_solve(name: str) -> Callable[..., Solution]:
+    """The solver of a method with CasADi and Ipopt, which take a second to import."""
+    from hand_eye_calib.solvers import ipopt
 
-def solve(method, pairs, **options):
-    """``Method(method, **options).solve(pairs)``, for a single solve."""
-    return Method(method, **options).solve(pairs)
+    return {"dnl": ipopt.solve_dnl, "dnlo": ipopt.solve_dnlo}[name]

@@ -7,7 +7,8 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
-from hand_eye_calib.config import METHODS, CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.methods import METHODS
 
 FIELDS = {
     option_name(field): field

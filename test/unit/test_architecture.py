@@ -12,11 +12,12 @@ SOURCE = Path(__file__).resolve().parents[2] / PACKAGE
 
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the public
 # Python API. In the engine each room sees only rooms before it.
-GROUND = {"errors", "config", "arrays"}
+GROUND = {"errors", "config", "methods", "arrays"}
 ENGINE = {
     "errors": set(),
     "arrays": set(),
-    "config": {"errors"},
+    "methods": {"errors"},
+    "config": {"errors", "methods"},
     "geometry": GROUND,
     "calibration": GROUND | {"geometry"},
     "pairing": GROUND | {"geometry"},

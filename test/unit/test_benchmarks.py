@@ -15,7 +15,7 @@ from suite import baseline, data, figure, measuring, opencv, table  # noqa: E402
 from suite.measuring import Row  # noqa: E402
 
 from hand_eye_calib.geometry import se3  # noqa: E402
-from hand_eye_calib.solvers.registry import solve  # noqa: E402
+from hand_eye_calib.solvers.registry import Method  # noqa: E402
 
 ROWS = [
     Row("dnlo fast", 443, 0.01, 0.1, 5, 2.0),
@@ -105,7 +105,7 @@ def test_measuring_repeats_what_is_quick_and_returns_the_answer():
 def test_simulated_drives_have_a_known_answer_and_as_many_pairs_as_asked_for():
     drive = data.simulated_drive(data.SHORT + 5)
     assert len(drive.pairs) == data.SHORT
-    found = solve("dnlo", drive.pairs).T_parent_child
+    found = Method("dnlo").solve(drive.pairs).T_parent_child
     np.testing.assert_allclose(found, drive.T_parent_child, atol=0.05)
 
 

@@ -4,7 +4,8 @@ from motions import T_PARENT_CHILD, child_of, disturbed, wandering_poses
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.solvers import dnl, dnlo, registry
+from hand_eye_calib.solvers import dnl, dnlo
+from hand_eye_calib.solvers.registry import Method
 
 
 def brute_force_objective(costs, threshold, floor):
@@ -62,7 +63,7 @@ def test_many_pairs_are_sampled_for_the_search_only():
 
 
 def test_leaving_pairs_out_agrees_with_solving_without_them(jumpy_pairs):
-    method = registry.Method("dnlo", min_inlier_fraction=0.3)
+    method = Method("dnlo", min_inlier_fraction=0.3)
     solution = method.solve(jumpy_pairs)
     left_out = np.arange(len(jumpy_pairs))[None] // 20 == np.arange(4)[:, None]
     answers = method.solve_without(jumpy_pairs, solution, left_out)
@@ -74,8 +75,8 @@ def test_leaving_pairs_out_agrees_with_solving_without_them(jumpy_pairs):
 
 @pytest.mark.parametrize("method", ["dnl", "dnlo"])
 def test_ipopt_and_the_fast_backend_agree(method, jumpy_pairs):
-    fast = registry.solve(method, jumpy_pairs, min_inlier_fraction=0.3)
-    ipopt = registry.solve(method, jumpy_pairs, min_inlier_fraction=0.3, backend="ipopt")
+    fast = Method(method, min_inlier_fraction=0.3).solve(jumpy_pairs)
+    ipopt = Method(method, min_inlier_fraction=0.3, backend="ipopt").solve(jumpy_pairs)
     assert fast.objective <= ipopt.objective * (1 + 1e-9)
     assert ipopt.iterations > 0
     if abs(fast.objective - ipopt.objective) < 1e-6 * ipopt.objective:
@@ -86,7 +87,7 @@ def test_ipopt_solves_the_noise_free_case():
     parent = wandering_poses(40)
     pairs = motion_pairs(parent, child_of(parent), "B3")
     for method in ("dnl", "dnlo"):
-        solution = registry.solve(method, pairs, backend="ipopt")
+        solution = Method(method, backend="ipopt").solve(pairs)
         assert se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD) == pytest.approx(
             np.zeros(6), abs=1e-6
         )

@@ -5,12 +5,14 @@ import inspect
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, wandering_poses
+from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, prior_fields
 from hand_eye_calib.engine.offline import offline_config
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.methods import BACKENDS, METHODS
+from hand_eye_calib.solvers.registry import Method
 
 PRIOR_FIELDS = {f"prior_{axis}" for axis in (*AXIS_UNITS, "transform")}
 
@@ -96,3 +98,38 @@ class TestPrior:
     def test_what_says_too_little_is_refused(self, prior, message):
         with pytest.raises(ConfigError, match=message):
             hec.calibrate(*streams(), prior=prior)
+
+
+class TestMethods:
+    def test_every_record_has_its_solver(self):
+        with_reference = {name for name, record in METHODS.items() if record.uses_reference}
+        assert {Method(name).name for name in with_reference} == with_reference
+        for name in set(METHODS) - with_reference:
+            with pytest.raises(ConfigError, match=f"method '{name}' is unknown"):
+                Method(name)
+
+    @pytest.mark.parametrize("name", METHODS)
+    def test_outliers_are_rejected_where_the_record_says_so(self, name):
+        """A jump in the child's stream leaves the answers of those methods alone."""
+        parent, child = streams(120)
+        poses = child.poses.copy()
+        poses[60:, :3, 3] += [1.0, -0.7, 0.4]
+        jumped = hec.Trajectory(child.stamps_ns, poses)
+        result = hec.calibrate(parent, jumped, method=name, reference="B1")
+        error_m = np.linalg.norm((result.T_parent_child - T_PARENT_CHILD)[:3, 3])
+        if METHODS[name].rejects_outliers:
+            assert error_m < 1e-4
+            assert result.n_inliers < result.n_pairs
+        else:
+            assert error_m > 1e-3
+            assert result.n_inliers == result.n_pairs
+
+    @pytest.mark.parametrize("name", METHODS)
+    def test_backends_are_those_of_the_record(self, name):
+        parent, child = streams(30)
+        for backend in BACKENDS:
+            if backend in METHODS[name].backends:
+                hec.calibrate(parent, child, method=name, reference="B1", backend=backend)
+            else:
+                with pytest.raises(ConfigError, match=f"method {name} has no {backend} backend"):
+                    hec.calibrate(parent, child, method=name, reference="B1", backend=backend)

@@ -26,6 +26,7 @@ from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.report.report import render
 from hand_eye_calib.simulation.drive import simulate_drive
@@ -300,8 +301,9 @@ def test_tracks_of_perfect_odometry_coincide():
 
 def test_long_drives_are_thinned(monkeypatch):
     snapshot, calibration = simulated(poses=400, reference="B10")
-    monkeypatch.setattr(evidence, "_MANY_TIMES", {"dnlo": 50})
-    monkeypatch.setattr(evidence, "_FEW_TIMES", {"dnlo": 100, "adaptive": 60})
+    for name, many, few in (("dnlo", 50, 100), ("adaptive", 60, 60)):
+        smaller = dict(most_poses_of_many=many, most_poses_of_few=few)
+        monkeypatch.setitem(METHODS, name, dataclasses.replace(METHODS[name], **smaller))
     monkeypatch.setattr(evidence, "_MOST_POSES_OF_OTHERS", 100)
     found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic)
     assert max(one.calibration.n_poses for one in found.convergence[:-1]) <= 50
