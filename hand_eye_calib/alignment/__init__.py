@@ -1,1 +1,1 @@
-"""How the two streams relate before a solve: time offset and scale."""
+"""Clock offset and scale of the child's stream, found before a method can solve."""

@@ -1,63 +1,65 @@
-"""The offset between two clocks, from how fast both streams turn.
+"""Coarse clock offset between two streams, from the correlation of their angular rates.
 
-However two sensors are mounted on a rigid body, they turn through the same angle in the same time.
-The offset that brings the two angular speeds into step is therefore the offset of the clocks: no
-extrinsic is needed, and neither a common world, a common scale nor the right quaternion order
-(reordering or inverting quaternions leaves the angles alone).
+Two sensors on one rigid body rotate through the same angle in the same time, however they are
+mounted. The offset that aligns their angular rates is therefore the clock offset. This needs no
+extrinsic, no common world, no common scale and no particular quaternion order: reordered or
+inverted quaternions have the same angles.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
 
 # Angles are taken over windows of this many sampling steps, so that the noise of single poses does
-# not drown the motion.
+# not hide the motion.
 _WINDOW_STEPS = 3
-_SHORTEST_WINDOW_S = 0.2
-_SHORTEST_STEP_S, _LONGEST_STEP_S = 0.02, 1.0
-_MOST_SAMPLES = 200_000
+_MIN_WINDOW_S = 0.2
+_MIN_STEP_S, _MAX_STEP_S = 0.02, 1.0
+_MAX_SAMPLES = 200_000
 
-# Turning faster than in all but this share of the windows is clipped: jumps of a stream are no
-# motion.
+# Angular rates above those of all but this share of the windows are clipped: jumps of a stream are
+# not motion.
 _CLIPPED_SHARE = 0.03
 
-# Offsets are considered where at least this share of the shorter stream, and this long, overlaps.
-_LEAST_OVERLAP_SHARE, _LEAST_OVERLAP_S = 0.25, 5.0
+# Offsets are considered if at least this share of the shorter stream, and this long, overlaps.
+_MIN_OVERLAP_SHARE, _MIN_OVERLAP_S = 0.25, 5.0
 
-# Another offset is a rival only beyond this distance: next to the peak the correlation is high by
-# itself.
+# Another offset is a rival only beyond this distance: close to the peak the correlation is high
+# anyway.
 _PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS = 2.0, 5.0
 
-# Streams turning together are 5 to 12 times better correlated at their offset than at any other,
-# streams that have nothing to do with each other at most 1.3 times (measured on sixteen real
-# recordings).
+# Streams of one body are 5 to 12 times better correlated at their offset than at any other,
+# unrelated streams at most 1.3 times (measured on sixteen real recordings).
 DISTINCT = 2.0
 CORRELATED = 0.5
 
-# Variation of the turning rate (rad/s) below which there is nothing to compare.
-LEAST_VARIATION = 0.01
+# Smallest standard deviation of the angular rate (rad/s) that can be correlated.
+MIN_VARIATION = 0.01
 
 _ALMOST_ONE = 1 - 1e-9
 
 
 @dataclass(frozen=True)
 class Correlation:
-    """Where the turning of two streams agrees best.
+    """Best correlation of the angular rates of two streams, over all clock offsets.
 
     Attributes
     ----------
     offset_s : float
-        Seconds to add to the child's stamps; fine to about a tenth of a sampling step.
+        Seconds to add to the child's stamps; accurate to about a tenth of a sampling step.
     correlation : float
-        Correlation coefficient of the turning rates there.
+        Correlation coefficient of the angular rates at that offset.
     distinctness : float
-        How many times more significant that is than the best elsewhere.
+        Ratio of its significance to that of the best rival.
     overlap_s : float
-        How long both streams run together at that offset.
+        Time that both streams have in common at that offset.
     variation : float
-        Standard deviation of the turning rate of the stream that varies less, rad/s.
+        Standard deviation of the angular rate, of the stream that varies less, rad/s.
     """
 
     offset_s: float
@@ -67,104 +69,123 @@ class Correlation:
     variation: float
 
     @property
-    def is_clear(self):
-        """Whether this is evidence enough to believe the offset."""
+    def is_clear(self) -> bool:
+        """Whether the evidence suffices to trust the offset."""
         return (
             self.correlation >= CORRELATED
             and self.distinctness >= DISTINCT
-            and self.variation >= LEAST_VARIATION
+            and self.variation >= MIN_VARIATION
         )
 
-    def doubt(self):
-        """What is wrong with the evidence, in words; empty where nothing is."""
-        if self.variation < LEAST_VARIATION:
-            return "the streams hardly turn, or turn at a constant rate"
+    def doubt(self) -> str:
+        """What is wrong with the evidence, in words; empty if nothing is."""
+        if self.variation < MIN_VARIATION:
+            return "the streams hardly rotate, or rotate at a constant rate"
         if self.correlation < CORRELATED:
-            return f"their turning is correlated by {self.correlation:.2f} at best ({CORRELATED} is needed)"
+            return (
+                f"their angular rates are correlated by {self.correlation:.2f} at best "
+                f"({CORRELATED} is needed)"
+            )
         if self.distinctness < DISTINCT:
-            return f"the best offset is only {self.distinctness:.1f} times better than the next ({DISTINCT:g} is needed)"
+            return (
+                f"the best offset is only {self.distinctness:.1f} times better than the next "
+                f"({DISTINCT:g} is needed)"
+            )
         return ""
 
 
 NO_CORRELATION = Correlation(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def correlate_turning(parent, child, max_gap_s=0.5):
-    """Find the clock offset at which two streams turn together, over all offsets.
+@dataclass(frozen=True)
+class AngularRates:
+    """Angular rates of a stream, sampled at equal steps.
+
+    Attributes
+    ----------
+    start_ns : int
+        Stamp of the first window's start.
+    step_s : float
+        From one window's start to the next.
+    values : (M,) array
+        rad/s; NaN for windows that touch a gap.
+    """
+
+    start_ns: int
+    step_s: float
+    values: FloatArray
+
+    @property
+    def covered_s(self) -> float:
+        """Seconds without the gaps."""
+        return float(np.isfinite(self.values).sum() * self.step_s)
+
+
+def correlate_rates(
+    parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
+) -> Correlation:
+    """Find the clock offset at which the angular rates of two streams agree best.
 
     Parameters
     ----------
     parent, child : Trajectory
         Their time ranges need not overlap.
     max_gap_s : float
-        Windows that touch a longer gap between poses are left out.
+        Windows that touch a longer gap between poses are left out, in seconds.
 
     Returns
     -------
     Correlation
-        Without any evidence where a stream is too short; see :attr:`Correlation.is_clear`.
+        Without any evidence if a stream is too short; see :attr:`Correlation.is_clear`.
 
     Notes
     -----
     Correlation coefficients at all offsets at once by fast Fourier transforms with masks for gaps
     and ends (Padfield, *Masked object registration in the Fourier domain*, IEEE Transactions on
     Image Processing, 2012). Offsets are compared by the significance of their coefficient (Fisher's
-    z), so that a short overlap needs a better agreement than a long one.
+    z), so that a short overlap needs a higher coefficient than a long one.
     """
     if min(len(parent), len(child)) < 4:
         return NO_CORRELATION
-    step_s = float(
-        np.clip(max(_interval_s(parent), _interval_s(child)), _SHORTEST_STEP_S, _LONGEST_STEP_S)
-    )
-    step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MOST_SAMPLES)
-    window_s = max(_WINDOW_STEPS * step_s, _SHORTEST_WINDOW_S)
-    start_parent, rate_parent = turning_rates(parent, window_s, step_s, max_gap_s)
-    start_child, rate_child = turning_rates(child, window_s, step_s, max_gap_s)
-    if (
-        min(np.isfinite(rate_parent).sum(), np.isfinite(rate_child).sum()) * step_s
-        < _LEAST_OVERLAP_S
-    ):
+    step_s = float(np.clip(max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S))
+    step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES)
+    window_s = max(_WINDOW_STEPS * step_s, _MIN_WINDOW_S)
+    of_parent = angular_rates(parent, window_s, step_s, max_gap_s)
+    of_child = angular_rates(child, window_s, step_s, max_gap_s)
+    if min(of_parent.covered_s, of_child.covered_s) < _MIN_OVERLAP_S:
         return NO_CORRELATION
-    variation = min(float(np.nanstd(rate)) for rate in (rate_parent, rate_child))
+    return _best_correlation(of_parent, of_child, window_s)
+
+
+def _best_correlation(parent: AngularRates, child: AngularRates, window_s: float) -> Correlation:
+    step_s = parent.step_s
     lags, coefficients, overlaps = _masked_correlation(
-        _compressed(rate_parent), _compressed(rate_child)
+        _compressed(parent.values), _compressed(child.values)
     )
     durations = overlaps * step_s
-    enough = durations >= max(
-        _LEAST_OVERLAP_SHARE * min(len(rate_parent), len(rate_child)) * step_s, _LEAST_OVERLAP_S
-    )
+    shorter_s = min(len(parent.values), len(child.values)) * step_s
+    enough = durations >= max(_MIN_OVERLAP_SHARE * shorter_s, _MIN_OVERLAP_S)
     # About one independent sample a second; three degrees of freedom go into the coefficient.
-    significance = np.where(
-        enough,
-        np.arctanh(np.clip(coefficients, -_ALMOST_ONE, _ALMOST_ONE))
-        * np.sqrt(np.maximum(durations - 3, 0)),
-        -np.inf,
-    )
+    fisher_z = np.arctanh(np.clip(coefficients, -_ALMOST_ONE, _ALMOST_ONE))
+    significance = np.where(enough, fisher_z * np.sqrt(np.maximum(durations - 3, 0)), -np.inf)
     best = int(np.argmax(significance))
-    elsewhere = np.abs(lags - lags[best]) * step_s > max(
-        _PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s
-    )
+    peak_s = max(_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s)
+    elsewhere = np.abs(lags - lags[best]) * step_s > peak_s
     rival = max(float(np.max(significance, where=elsewhere, initial=0.0)), 1.0)
-    offset_s = (int(start_parent) - int(start_child)) * 1e-9 + (
-        lags[best] + _vertex(lags, coefficients, best)
-    ) * step_s
+    lag = lags[best] + _vertex(lags, coefficients, best)
     return Correlation(
-        float(offset_s),
-        float(coefficients[best]),
-        float(significance[best] / rival),
-        float(durations[best]),
-        variation,
+        offset_s=float((parent.start_ns - child.start_ns) * 1e-9 + lag * step_s),
+        correlation=float(coefficients[best]),
+        distinctness=float(significance[best] / rival),
+        overlap_s=float(durations[best]),
+        variation=min(float(np.nanstd(rate.values)) for rate in (parent, child)),
     )
 
 
-def _interval_s(trajectory):
-    return float(np.median(np.diff(trajectory.stamps_ns))) * 1e-9
-
-
-def turning_rates(trajectory, window_s, step_s, max_gap_s):
-    """Start stamp and angular speeds (M,), rad/s, over windows that start every ``step_s``; nan
-    where a window touches a gap.
-    """
+def angular_rates(
+    trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float
+) -> AngularRates:
+    """Angular rates over windows of ``window_s`` seconds that start every ``step_s`` seconds."""
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
     starts_ns = stamps_ns[0] + np.round(np.arange(n_windows) * step_s * 1e9).astype(np.int64)
@@ -175,29 +196,25 @@ def turning_rates(trajectory, window_s, step_s, max_gap_s):
     first = np.searchsorted(stamps_ns, starts_ns, side="right") - 1
     last = np.minimum(np.searchsorted(stamps_ns, ends_ns), len(stamps_ns) - 1)
     rates[gaps_before[last] > gaps_before[first]] = np.nan
-    return stamps_ns[0], rates
+    return AngularRates(int(stamps_ns[0]), step_s, rates)
 
 
-def _compressed(rates):
-    """Rates with jumps clipped and large values compressed, about their mean."""
+def _compressed(rates: FloatArray) -> FloatArray:
+    """Rates with jumps clipped and large values compressed, less their mean."""
     roots = np.sqrt(rates)
     roots = np.minimum(roots, np.nanquantile(roots, 1 - _CLIPPED_SHARE))
     return roots - np.nanmean(roots)
 
 
-def _masked_correlation(first, second):
-    """Lags, correlation coefficients and numbers of common samples; first[i + lag] is compared with
-    second[i], nans are left out.
+def _masked_correlation(
+    first: FloatArray, second: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Lags, correlation coefficients and counts of common samples: first[i + lag] against
+    second[i], NaNs left out.
     """
     size = 1 << (len(first) + len(second) - 1).bit_length()
-
-    def spectra(signal):
-        mask = np.isfinite(signal)
-        filled = np.where(mask, signal, 0.0)
-        return [np.fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]
-
-    one_a, a, aa = spectra(first)
-    one_b, b, bb = (np.conj(part) for part in spectra(second))
+    one_a, a, aa = _spectra(first, size)
+    one_b, b, bb = (np.conj(part) for part in _spectra(second, size))
     count = np.round(np.fft.irfft(one_a * one_b, size))
     divisor = np.maximum(count, 1.0)
     sum_a, sum_b = np.fft.irfft(a * one_b, size), np.fft.irfft(one_a * b, size)
@@ -214,10 +231,17 @@ def _masked_correlation(first, second):
     return np.where(lags < len(first), lags, lags - size), coefficients, count
 
 
-def _vertex(lags, coefficients, best):
+def _spectra(signal: FloatArray, size: int) -> list[np.ndarray]:
+    """Spectra of the mask of finite samples, of the samples and of their squares."""
+    mask = np.isfinite(signal)
+    filled = np.where(mask, signal, 0.0)
+    return [np.fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]
+
+
+def _vertex(lags: IntArray, coefficients: FloatArray, best: int) -> float:
     """Distance, in lags, from the best lag to the vertex of the parabola through it and its
     neighbours.
     """
     below, top, above = (float(coefficients[(best + step) % len(lags)]) for step in (-1, 0, 1))
-    bend = below - 2 * top + above
-    return 0.0 if bend >= 0 else float(np.clip(0.5 * (below - above) / bend, -0.5, 0.5))
+    curvature = below - 2 * top + above
+    return 0.0 if curvature >= 0 else float(np.clip(0.5 * (below - above) / curvature, -0.5, 0.5))

@@ -22,14 +22,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.alignment.alignment import estimate_scale, indices_after, refine_time_offset
 from hand_eye_calib.alignment.angular_rates import (
-    LEAST_VARIATION,
+    MIN_VARIATION,
     NO_CORRELATION,
     Correlation,
-    correlate_turning,
+    correlate_rates,
 )
+from hand_eye_calib.alignment.motions import pairs_over
+from hand_eye_calib.alignment.scale import estimate_scale
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
+from hand_eye_calib.alignment.time_offset import refine_time_offset
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.checks.stream_checks import (
     check_stamps,
@@ -40,7 +42,6 @@ from hand_eye_calib.checks.stream_checks import (
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import pairs_between
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.solvers.separable import align_rotation_vectors
 
@@ -138,7 +139,7 @@ def check_streams(parent, child, time_offset_s=0.0, scale=1.0, max_gap_s=0.5):
     if any(finding.severity is Severity.ERROR for finding in findings):
         return _agreement(findings, NO_CORRELATION)
     child = child.shifted(time_offset_s).scaled(scale)
-    correlation = correlate_turning(parent, child, max_gap_s)
+    correlation = correlate_rates(parent, child, max_gap_s)
     aligned = child.shifted(correlation.offset_s) if correlation.is_clear else child
     frozen = [
         _frozen(name, share)
@@ -366,12 +367,12 @@ def _judge(hypothesis, parent, child, max_gap_s, lag_s, most=_PAIRS, start=None)
 
 def _pairs(parent, child, max_gap_s, lag_s, most=_PAIRS):
     pose_pairs = synchronise(parent, child, max_gap_s)
-    i, j = indices_after(pose_pairs.stamps_ns, lag_s, most)
-    if len(i) < _FEWEST_PAIRS:
+    pairs = pairs_over(pose_pairs, lag_s, most)
+    if len(pairs) < _FEWEST_PAIRS:
         raise NotEnoughDataError(
-            f"the streams have only {len(i)} motions over {lag_s:g} s in common"
+            f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
         )
-    return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i, j)
+    return pairs
 
 
 def _agreed_rotation(parent, child, max_gap_s, lag_s):
@@ -473,7 +474,7 @@ def _frozen(stream, share):
 
 
 def _not_together(correlation):
-    if correlation.variation < LEAST_VARIATION:
+    if correlation.variation < MIN_VARIATION:
         return _finding(
             "no_turning", "both", Severity.ERROR, Confidence.LIKELY,
             "the streams hardly turn, or at a constant rate, so that neither clock nor extrinsic can be checked",
@@ -591,13 +592,10 @@ def _excitation(pose_pairs, fit):
     """A note where nearly all turning is about one axis, and how much the parent turned about each
     of its axes.
     """
-    spans = (indices_after(pose_pairs.stamps_ns, lag_s, _PAIRS) for lag_s in _LAGS_S)
-    i, j = next(
-        span for span in spans if len(span[0]) >= _FEWEST_PAIRS
-    )  # one there is: the fit is over it
-    rotation = pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i, j).Ts_parenti_parentj[
-        :, :3, :3
-    ]
+    motions = (pairs_over(pose_pairs, lag_s, _PAIRS) for lag_s in _LAGS_S)
+    # One of them there is: the fit is over it.
+    pairs = next(pairs for pairs in motions if len(pairs) >= _FEWEST_PAIRS)
+    rotation = pairs.Ts_parenti_parentj[:, :3, :3]
     vectors = se3.rotation_log(rotation)
     turned = dict(zip("xyz", np.sqrt((vectors**2).mean(axis=0)).tolist(), strict=True))
     moved = rotation - np.eye(3)

@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.alignment.alignment import TimeOffset, estimate_time_offset
 from hand_eye_calib.alignment.angular_rates import Correlation
 from hand_eye_calib.alignment.similarity import SimilarityFit
+from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.checks.agreement import check_streams
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import turning_rates
+from hand_eye_calib.alignment.angular_rates import angular_rates
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.errors import HandEyeCalibError
@@ -208,16 +208,15 @@ def see_streams(parent, child, max_gap_s):
     """The StreamsSeen of two trajectories on one clock, in one unit of length."""
     start_ns = min(parent.stamps_ns[0], child.stamps_ns[0])
     step_s = max(
-        _interval_s(parent),
-        _interval_s(child),
+        parent.interval_s,
+        child.interval_s,
         max(parent.duration_s, child.duration_s) / _MOST_RATES,
     )
     rates, spans = [], []
     for stream in (parent, child):
-        first_ns, rate = turning_rates(
-            stream, max(3 * step_s, _SHORTEST_WINDOW_S), step_s, max_gap_s
-        )
-        rates.append(((first_ns - start_ns) * 1e-9 + np.arange(len(rate)) * step_s, rate))
+        found = angular_rates(stream, max(3 * step_s, _SHORTEST_WINDOW_S), step_s, max_gap_s)
+        steps = np.arange(len(found.values)) * step_s
+        rates.append(((found.start_ns - start_ns) * 1e-9 + steps, found.values))
         gaps = np.flatnonzero(np.diff(stream.stamps_ns) > max_gap_s * 1e9)
         edges = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
         spans.append((edges.reshape(-1, 2) - start_ns) * 1e-9)
@@ -379,10 +378,6 @@ def _streams(calibration, config, pose_pairs, streams):
         for poses in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
     )
     return see_streams(parent, child, config.max_gap)
-
-
-def _interval_s(trajectory):
-    return float(np.median(np.diff(trajectory.stamps_ns))) * 1e-9
 
 
 def _compared_motions(pose_pairs):

@@ -111,6 +111,11 @@ class Trajectory:
         """Seconds from first to last pose; 0 for fewer than two."""
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) > 1 else 0.0
 
+    @property
+    def interval_s(self) -> float:
+        """Median time between two poses in seconds, of at least two poses."""
+        return float(np.median(np.diff(self.stamps_ns))) * 1e-9
+
     def shifted(self, offset_s):
         """The same poses with ``offset_s`` seconds added to every stamp."""
         shifted = copy.copy(self)  # poses and order have been checked

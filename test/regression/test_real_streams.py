@@ -5,7 +5,7 @@ import pytest
 import real_data
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.alignment.alignment import estimate_time_offset
+from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.checks.agreement import check_streams
 from hand_eye_calib.checks.stream_checks import tidy

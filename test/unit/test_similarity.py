@@ -15,7 +15,7 @@ from motions import (
     wandering_poses,
 )
 
-from hand_eye_calib.alignment.alignment import estimate_scale
+from hand_eye_calib.alignment.scale import estimate_scale
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
@@ -40,7 +40,7 @@ def pose_pairs(parent, child):
 def test_noise_free_scale_is_exact(scale, poses):
     found = estimate_scale(pose_pairs(*streams(scale=scale, poses=poses)))
     assert found.value == pytest.approx(scale, rel=1e-5)
-    assert found.is_explained
+    assert found.fit.explains_translation
 
 
 def test_most_pairs_decide_whatever_the_others_say():
@@ -93,7 +93,7 @@ def test_uncertainty_of_the_scale_enters_that_of_the_extrinsic():
 def test_a_scale_that_explains_nothing_is_refused():
     parent, _ = streams(seed=1)
     _, other = streams(seed=9)
-    with pytest.raises(NotEnoughDataError, match="scale cannot be estimated: even with one"):
+    with pytest.raises(NotEnoughDataError, match="scale cannot be estimated: even with a scale"):
         calibrate(parent, other, reference="B10", scale="estimate")
     assert calibrate(parent, other, reference="B10", scale="auto").scale == 1.0
 

@@ -9,7 +9,7 @@ import pytest
 from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
 from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
 
-from hand_eye_calib.alignment.alignment import estimate_time_offset
+from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.checks.agreement import check_streams
 from hand_eye_calib.checks.findings import Severity
 from hand_eye_calib.checks.stream_checks import (

@@ -16,8 +16,8 @@ from motions import (
     wandering_poses,
 )
 
-from hand_eye_calib.alignment.alignment import estimate_time_offset
-from hand_eye_calib.alignment.angular_rates import correlate_turning
+from hand_eye_calib.alignment.angular_rates import correlate_rates
+from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine import calibrator as engine
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -98,15 +98,15 @@ def test_planar_motion_and_an_unknown_scale_do_no_harm():
     assert estimate_time_offset(parent, child.scaled(0.3)).seconds == pytest.approx(0.75, abs=0.005)
 
 
-def test_turning_does_not_depend_on_conventions():
+def test_angular_rates_do_not_depend_on_conventions():
     parent, child = drive(shift_s=8.0)
-    plain = correlate_turning(parent, child).offset_s
+    plain = correlate_rates(parent, child).offset_s
     inverse = dataclasses.replace(child, poses=se3.inverse(child.poses))
     reordered = Trajectory.from_quat_xyzw(
         child.stamps_ns, child.poses[:, :3, 3], np.roll(se3.to_quat_xyzw(child.poses), 1, axis=1)
     )
     for stream in (inverse, reordered):
-        assert correlate_turning(parent, stream).offset_s == pytest.approx(plain, abs=1e-6)
+        assert correlate_rates(parent, stream).offset_s == pytest.approx(plain, abs=1e-6)
 
 
 class TestWeakEvidenceIsRefused:
@@ -122,7 +122,7 @@ class TestWeakEvidenceIsRefused:
         poses = np.tile(np.eye(4), (300, 1, 1))
         poses[:, 0, 3] = np.linspace(0, 50, 300)
         straight = as_trajectory(poses)
-        with pytest.raises(NotEnoughDataError, match="hardly turn"):
+        with pytest.raises(NotEnoughDataError, match="hardly rotate"):
             estimate_time_offset(straight, straight)
 
     def test_motion_that_is_too_short(self):

@@ -1,0 +1,90 @@
+"""The scale: factor from the child's unit of length to the parent's."""
+
+from dataclasses import dataclass
+
+from hand_eye_calib.alignment.motions import pairs_over
+from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
+from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+# Motions over these times (s) are compared; the lag with the smallest relative standard deviation
+# wins. Long motions show the scale best.
+_LAGS_S = (3.0, 1.0, 8.0)
+_MIN_PAIRS = 20
+
+# A scale differs from 1 if it is off by more than _MIN_DIFFERENCE and by _MIN_SIGMAS standard
+# deviations, and if the fit leaves less than _MAX_UNEXPLAINED_TO_DIFFER of the motion unexplained:
+# jumps in most of the motions could imitate a scale.
+_MIN_DIFFERENCE, _MIN_SIGMAS, _MAX_UNEXPLAINED_TO_DIFFER = 0.01, 5.0, 0.1
+
+
+@dataclass(frozen=True)
+class Scale:
+    """An estimated scale.
+
+    Attributes
+    ----------
+    value : float
+        Factor from the child's lengths to the parent's.
+    sigma : float
+        Standard deviation.
+    fit : SimilarityFit
+        The fit it comes from.
+    """
+
+    value: float
+    sigma: float
+    fit: SimilarityFit
+
+    @property
+    def differs(self) -> bool:
+        """Whether the lengths of the two streams differ significantly, and by enough to matter."""
+        significant = abs(self.value - 1.0) > max(_MIN_DIFFERENCE, _MIN_SIGMAS * self.sigma)
+        return significant and self.fit.unexplained_translation < _MAX_UNEXPLAINED_TO_DIFFER
+
+    @property
+    def relative_error(self) -> float:
+        """Relative standard deviation, plus the unexplained share if the fit does not hold."""
+        penalty = 0.0 if self.fit.explains_translation else self.fit.unexplained_translation
+        return self.sigma / self.value + penalty
+
+
+def estimate_scale(pose_pairs: PosePairs, start: SimilarityFit | None = None) -> Scale:
+    """Estimate the factor from the child's unit of length to the parent's.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    start : SimilarityFit, optional
+        Fit of the same streams to start at; a start is searched for without one.
+
+    Returns
+    -------
+    Scale
+
+    Raises
+    ------
+    NotEnoughDataError
+        If there are too few poses.
+    """
+    scales: list[Scale] = []
+    fit = start
+    for lag_s in _LAGS_S:
+        pairs = pairs_over(pose_pairs, lag_s)
+        if len(pairs) < _MIN_PAIRS:
+            continue
+        fit = fit_similarity(pairs, start=fit)
+        scales.append(Scale(fit.scale, fit.scale_sigma, fit))
+    if not scales:
+        raise NotEnoughDataError(
+            f"the scale cannot be estimated from {len(pose_pairs)} pose pairs: fewer than "
+            f"{_MIN_PAIRS} of them are {min(_LAGS_S):g} s apart; record longer, or give scale"
+        )
+    return min(scales, key=lambda scale: scale.relative_error)
+
+
+def child_scaled(pose_pairs: PosePairs, factor: float) -> PosePairs:
+    """The same poses with the child's translations times ``factor``."""
+    Ts_cw_c = pose_pairs.Ts_cw_c.copy()
+    Ts_cw_c[:, :3, 3] *= factor
+    return PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, Ts_cw_c)

@@ -1,0 +1,160 @@
+"""The clock offset: seconds to add to the child's stamps to get the parent's clock."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
+from hand_eye_calib.alignment.motions import pairs_over
+from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.leaps import find_leap
+from hand_eye_calib.pairing.synchronise import synchronise
+
+# Motions over these times (s) are compared; the lag with the smallest standard deviation wins.
+# Short motions show the offset best.
+_LAGS_S = (1.0, 0.3, 3.0)
+_MIN_PAIRS = 20
+
+# Time on either side of a stamp (s) over which the child's velocity is taken. One interval of the
+# child's stream if that is longer.
+_VELOCITY_SPAN_S = 0.05
+
+_MAX_ROUNDS, _SETTLED_S = 4, 2e-5
+
+# Most that the fine offset may differ from the coarse one: seconds, or intervals of the slower
+# stream if those are longer.
+_FINE_RANGE_S, _FINE_RANGE_INTERVALS = 0.25, 2.0
+
+
+@dataclass(frozen=True)
+class TimeOffset:
+    """An estimated clock offset.
+
+    Attributes
+    ----------
+    seconds : float
+        Seconds to add to the child's stamps.
+    sigma_s : float
+        Standard deviation.
+    correlation : Correlation
+        Correlation of the angular rates that gave the coarse offset.
+    fit : SimilarityFit or None
+        The fit that gave the fine offset; None if no fit held.
+    """
+
+    seconds: float
+    sigma_s: float
+    correlation: Correlation
+    fit: SimilarityFit | None
+
+
+def estimate_time_offset(
+    parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
+) -> TimeOffset:
+    """Estimate the offset of the child's clock: coarse from the angular rates, then fine together
+    with X and the scale.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+        Their time ranges need not overlap.
+    max_gap_s : float
+        Longest time between two poses that interpolation may bridge, in seconds.
+
+    Returns
+    -------
+    TimeOffset
+
+    Raises
+    ------
+    NotEnoughDataError
+        If the evidence is weak; the message says why.
+    InputError
+        If a stream's stamps leap by days.
+    """
+    for name, stream in (("parent", parent), ("child", child)):
+        if leap := find_leap(stream.stamps_ns):
+            raise InputError(f"the {name} stream's {leap.what()}; {leap.advice()}")
+    correlation = correlate_rates(parent, child, max_gap_s)
+    if not correlation.is_clear:
+        raise NotEnoughDataError(
+            f"the time offset cannot be estimated: {correlation.doubt()}; "
+            "drive more varied turns, or give time_offset in seconds"
+        )
+    return refine_time_offset(parent, child, correlation, max_gap_s)
+
+
+def refine_time_offset(
+    parent: Trajectory,
+    child: Trajectory,
+    correlation: Correlation,
+    max_gap_s: float,
+    start: SimilarityFit | None = None,
+) -> TimeOffset:
+    """Refine a coarse offset.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+    correlation : Correlation
+        Has the coarse offset.
+    max_gap_s : float
+    start : SimilarityFit, optional
+        Fit of the same streams to start at; a start is searched for without one.
+
+    Returns
+    -------
+    TimeOffset
+        The coarse offset with a wide sigma if no fit explains the motion.
+    """
+    reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s))
+    best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation, None), start
+    for lag_s in _LAGS_S:
+        offset_s, fit = _fine_offset(parent, child, correlation.offset_s, lag_s, max_gap_s, fit)
+        if fit is None:
+            continue
+        holds = fit.explains_translation and abs(offset_s - correlation.offset_s) <= reach_s
+        if holds and fit.offset_sigma_s < best.sigma_s:
+            best = TimeOffset(float(offset_s), fit.offset_sigma_s, correlation, fit)
+    return best
+
+
+def _fine_offset(
+    parent: Trajectory,
+    child: Trajectory,
+    offset_s: float,
+    lag_s: float,
+    max_gap_s: float,
+    fit: SimilarityFit | None,
+) -> tuple[float, SimilarityFit | None]:
+    """Offset and fit over motions of ``lag_s``; no fit if there are too few."""
+    span_s = max(_VELOCITY_SPAN_S, child.interval_s)
+    for _ in range(_MAX_ROUNDS):
+        shifted = child.shifted(offset_s)
+        pose_pairs = synchronise(parent, shifted, max_gap_s)
+        pairs = pairs_over(pose_pairs, lag_s)
+        if len(pairs) < _MIN_PAIRS:
+            return offset_s, None
+        twists = _twists(shifted, pose_pairs.stamps_ns[np.r_[pairs.i, pairs.j]], span_s)
+        twists_i, twists_j = np.split(twists, 2)
+        fit = fit_similarity(pairs, twists_i, twists_j, start=fit)
+        offset_s += fit.offset_s
+        if abs(fit.offset_s) < _SETTLED_S:
+            break
+    return offset_s, fit
+
+
+def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> FloatArray:
+    """Velocities (K, 6) of the sensor in its own frame, over ``span_s`` on either side of a stamp
+    and less at the ends of the trajectory.
+    """
+    span_ns = round(span_s * 1e9)
+    first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
+    before, after = (np.clip(stamps_ns + sign * span_ns, first_ns, last_ns) for sign in (-1, 1))
+    steps = se3.log(se3.inverse(trajectory.at(before)) @ trajectory.at(after))
+    return steps / ((after - before) * 1e-9)[:, None]
