@@ -247,7 +247,7 @@ def _match_runs(dataset, level, runs, results):
         published = np.array([row.T_parent_child for row in results["park", "B1"]])
         ours = np.array(
             [
-                park.solve(motion_pairs(parent.poses, child.poses)).T_parent_child
+                park.solve(motion_pairs(parent.poses, child.poses, "B1")).T_parent_child
                 for _, parent, child, _ in runs
             ]
         )

@@ -37,7 +37,7 @@ from hand_eye_calib.adaptive.noise import (
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.solvers import dnlo
+from hand_eye_calib.solvers.registry import Method
 
 # Robust start: DNLO over this reference sees through jumps, and does not need the noise levels.
 _START_REFERENCE = "B3"
@@ -229,9 +229,11 @@ def _start(poses, kept, nuisance, spikes=(), centres=CENTRES):
     """Robust first answer from some of the poses, and what it says about jumps and the centre of
     the rotation noise.
     """
-    T = dnlo.solve(
-        motion_pairs(poses.Ts_pw_p[kept], poses.Ts_cw_c[kept], _START_REFERENCE)
-    ).T_parent_child
+    T = (
+        Method("dnlo")
+        .solve(motion_pairs(poses.Ts_pw_p[kept], poses.Ts_cw_c[kept], _START_REFERENCE))
+        .T_parent_child
+    )
     increments = poses.increments(kept, centres[0])
     increments = [increments.about(centre) for centre in centres]
     sizes = [

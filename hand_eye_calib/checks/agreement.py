@@ -39,6 +39,7 @@ from hand_eye_calib.checks.stream_checks import (
     coarse_poses,
     frozen_share,
 )
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -115,7 +116,7 @@ class Agreement:
         return all(finding.severity is Severity.NOTE for finding in self.findings)
 
 
-def check_streams(parent, child, time_offset_s=0.0, scale=1.0, max_gap_s=0.5):
+def check_streams(parent, child, time_offset_s=0.0, scale=1.0, max_gap_s=CalibratorConfig.max_gap):
     """Check two streams before believing them.
 
     Parameters

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.leaps import find_leap
@@ -110,7 +111,7 @@ def tidy(stamps_ns, translations, quats_xyzw, stream, **frames):
     ), findings
 
 
-def check_stream(trajectory, stream, max_gap_s=0.5):
+def check_stream(trajectory, stream, max_gap_s=CalibratorConfig.max_gap):
     """Findings about one stream: too short, a leap in time, gaps, jumps.
 
     Parameters

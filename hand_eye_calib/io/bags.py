@@ -26,6 +26,7 @@ from rosbags.rosbag2.reader import zstd
 from rosbags.rosbag2.storage_mcap import decompress
 from rosbags.typesys import Stores, get_typestore
 
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -398,14 +399,14 @@ class PoseBag:
 
     # ---- poses
 
-    def poses(self, parent, child, max_gap_s=0.5):
+    def poses(self, parent, child, max_gap_s=CalibratorConfig.max_gap):
         """Iterate over the poses of both streams, StampedPose by StampedPose; as :meth:`blocks`
         otherwise.
         """
         for block in self.blocks(parent, child, max_gap_s):
             yield from block.rows()
 
-    def blocks(self, parent, child, max_gap_s=0.5):
+    def blocks(self, parent, child, max_gap_s=CalibratorConfig.max_gap):
         """Iterate over the poses of both streams in the order of the bag's time, many at once.
 
         A path's poses are those of its newest message, and before its first stamp those of older

@@ -39,7 +39,7 @@ class MotionPairs:
         )
 
 
-def motion_pairs(Ts_pw_p, Ts_cw_c, reference="B1"):
+def motion_pairs(Ts_pw_p, Ts_cw_c, reference):
     """Relative motions of two synchronised trajectories (Välimäki et al. 2023, eqs 1-2).
 
     Parameters

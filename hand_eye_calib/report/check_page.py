@@ -1,12 +1,13 @@
 """``check.html``: what the stream checks found, and what they saw."""
 
 from hand_eye_calib.checks.findings import Severity
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import see_streams
 from hand_eye_calib.report.report import environment, said_of_streams
 from hand_eye_calib.report.report_figures import draw_streams
 
 
-def render_check(parent, child, agreement, findings, inputs, max_gap_s=0.5):
+def render_check(parent, child, agreement, findings, inputs, max_gap_s=CalibratorConfig.max_gap):
     """The page as HTML.
 
     Parameters

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.simulation.options import NoiseConfig
 
 JUMP_VARIANCE = 0.02
 
@@ -38,7 +39,7 @@ def add_noise(Ts_pw_p, Ts_cw_c, noise, rng):
     return Ts_pw_p, Ts_cw_c
 
 
-def add_gaussian(Ts_world_sensor, level, rng, rotation_per_metre=2.0):
+def add_gaussian(Ts_world_sensor, level, rng, rotation_per_metre=NoiseConfig.rotation_per_metre):
     """Independent errors of every pose, in the sensor's frame.
 
     Parameters

@@ -56,7 +56,7 @@ _SETTLED, _CONVERGED = 1e-4, 1e-9
 _NEVER = 1e100
 
 
-def solve(pairs, threshold=0.01, min_inlier_fraction=0.5):
+def solve(pairs, threshold, min_inlier_fraction):
     """Minimise ``sum alpha e + (1 - alpha) c`` over X and the weights alpha.
 
     Parameters
@@ -78,7 +78,7 @@ def solve(pairs, threshold=0.01, min_inlier_fraction=0.5):
     return _finish(pairs, T_found, threshold, min_inlier_fraction * len(pairs))
 
 
-def solve_without(pairs, solution, left_out, threshold=0.01, min_inlier_fraction=0.5):
+def solve_without(pairs, solution, left_out, threshold, min_inlier_fraction):
     """Answers when some pairs are left out, for resampling.
 
     A few pairs less may tip the choice of the inliers, and the answer with it: the search starts at

@@ -38,7 +38,7 @@ def solve_dnl(pairs):
     return _solution(solver, T_parent_child, objective, np.ones(len(pairs)))
 
 
-def solve_dnlo(pairs, threshold=0.01, min_inlier_fraction=0.5):
+def solve_dnlo(pairs, threshold, min_inlier_fraction):
     """Minimise eq. (5) from the identity with all weights 1; see
     :func:`hand_eye_calib.solvers.dnlo.solve`.
     """

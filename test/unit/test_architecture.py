@@ -1,11 +1,16 @@
 """Imports go one way, and the heavy or ROS-bound libraries stay in their rooms."""
 
 import ast
+import dataclasses
+import inspect
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from hand_eye_calib.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.simulation.options import NoiseConfig
 
 PACKAGE = "hand_eye_calib"
 SOURCE = Path(__file__).resolve().parents[2] / PACKAGE
@@ -195,3 +200,55 @@ def test_importing_loads_nothing_heavy(code):
         [sys.executable, "-c", check], capture_output=True, text=True, cwd=SOURCE.parent
     )
     assert (done.returncode, done.stdout.split()) == (0, []), done.stderr
+
+
+def repeated_defaults(package_root):
+    """Parameters and fields outside the option classes that write the default of an option again;
+    nothing (0, "", False) is no choice and may stand anywhere.
+    """
+    defaults = {}
+    for options in (CalibratorConfig, NodeConfig, NoiseConfig):
+        for field in dataclasses.fields(options):
+            defaults |= {field.name: field.default, f"{field.name}_s": field.default}
+    homes = {inspect.getsourcefile(options) for options in (CalibratorConfig, NoiseConfig)}
+    found = []
+    for path in sorted(package_root.rglob("*.py")):
+        if str(path) in homes:
+            continue
+        for name, default, line in _written_defaults(path):
+            if default and defaults.get(name) == default:
+                found.append(f"{path.relative_to(package_root)}:{line}: {name} = {default!r}")
+    return found
+
+
+def _written_defaults(path):
+    """(name, value, line) of every parameter and annotated field with a literal as its default."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        pairs = []
+        if isinstance(node, ast.FunctionDef):
+            taken = node.args.posonlyargs + node.args.args
+            pairs = [*zip(reversed(taken), reversed(node.args.defaults), strict=False)]
+            pairs += zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)
+            pairs = [(taken.arg, default) for taken, default in pairs]
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            pairs = [(node.target.id, node.value)]
+        for name, default in pairs:
+            if isinstance(default, ast.Constant):
+                yield name, default.value, default.lineno
+
+
+def test_defaults_of_options_stand_in_one_place():
+    assert repeated_defaults(SOURCE) == []
+
+
+def test_a_repeated_default_is_caught(tmp_path):
+    (tmp_path / "late.py").write_text(
+        "def a(x, max_gap_s=0.5, time_offset_s=0.0): ...\n"
+        "def b(*, backend='fast', threshold=0.02): ...\n"
+        "class C:\n    min_inlier_fraction: float = 0.5\n"
+    )
+    assert repeated_defaults(tmp_path) == [
+        "late.py:1: max_gap_s = 0.5",
+        "late.py:2: backend = 'fast'",
+        "late.py:4: min_inlier_fraction = 0.5",
+    ]

@@ -50,7 +50,7 @@ def test_outliers_are_rejected_and_reported(jumpy_pairs):
 
 
 def test_the_same_pairs_give_the_same_answer(jumpy_pairs):
-    first, second = dnlo.solve(jumpy_pairs), dnlo.solve(jumpy_pairs)
+    first, second = (Method("dnlo").solve(jumpy_pairs) for _ in range(2))
     assert np.array_equal(first.T_parent_child, second.T_parent_child)
 
 
@@ -58,7 +58,7 @@ def test_many_pairs_are_sampled_for_the_search_only():
     parent = wandering_poses(1500)
     child = disturbed(child_of(parent), 1, 0.001, 0.001)
     child[700:, :3, 3] += 5.0
-    solution = dnlo.solve(motion_pairs(parent, child, "B2"))
+    solution = Method("dnlo").solve(motion_pairs(parent, child, "B2"))
     np.testing.assert_allclose(solution.T_parent_child, T_PARENT_CHILD, atol=2e-3)
 
 

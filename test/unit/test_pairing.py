@@ -60,15 +60,15 @@ def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
     near = wandering_poses(20)
     far = near.copy()
     far[:, :3, 3] += np.array([456_789.0, 4_567_890.0, 120.0])
-    near_motion = motion_pairs(near, near).Ts_parenti_parentj
+    near_motion = motion_pairs(near, near, "B1").Ts_parenti_parentj
     np.testing.assert_allclose(
-        motion_pairs(far, far).Ts_parenti_parentj, near_motion, atol=4e-9
+        motion_pairs(far, far, "B1").Ts_parenti_parentj, near_motion, atol=4e-9
     )  # 1 ulp of 4.5e6 is 9e-10
 
 
 def test_different_numbers_of_poses_are_refused():
     with pytest.raises(InputError, match="found 3 and 4"):
-        motion_pairs(wandering_poses(3), wandering_poses(4))
+        motion_pairs(wandering_poses(3), wandering_poses(4), "B1")
 
 
 def test_the_slower_stream_gives_the_stamps():
