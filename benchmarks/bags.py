@@ -40,7 +40,8 @@ import resource, sys, time
 from hand_eye_calib.cli.main import main
 start = time.perf_counter()
 code = main(["replay", *sys.argv[1:], "--json"])
-print(code, time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, file=sys.stderr)
+peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+print(code, time.perf_counter() - start, peak_mb, file=sys.stderr)
 """
 
 
@@ -129,9 +130,16 @@ def compare(folder, count, console):
 def images(folder, gigabytes, console):
     """Replay a bag that is nearly all images; whether it took too much memory."""
     image = TYPESTORE.types[IMAGE](
-        header=TYPESTORE.types["std_msgs/msg/Header"](TYPESTORE.types["builtin_interfaces/msg/Time"](0, 0), "camera"),
-        height=1080, width=1920, encoding="rgb8", is_bigendian=0, step=5760, data=np.zeros(1920 * 1080 * 3, dtype=np.uint8),
-    )  # fmt: skip
+        header=TYPESTORE.types["std_msgs/msg/Header"](
+            TYPESTORE.types["builtin_interfaces/msg/Time"](0, 0), "camera"
+        ),
+        height=1080,
+        width=1920,
+        encoding="rgb8",
+        is_bigendian=0,
+        step=5760,
+        data=np.zeros(1920 * 1080 * 3, dtype=np.uint8),
+    )
     raw = bytes(TYPESTORE.serialize_cdr(image, IMAGE))
     n_images, count = int(gigabytes * 1e9 / len(raw)) + 1, 20_000
     path = folder / "images"
@@ -155,7 +163,8 @@ def images(folder, gigabytes, console):
     )
     code, seconds, megabytes = done.stderr.split()[-3:]
     console.print(
-        f"replay of {size:.2f} GB with {n_images} images: exit code {code}, {float(seconds):.1f} s, peak memory {float(megabytes):.0f} MB"
+        f"replay of {size:.2f} GB with {n_images} images: exit code {code}, "
+        f"{float(seconds):.1f} s, peak memory {float(megabytes):.0f} MB"
     )
     return float(megabytes) > TOLERATED_MB
 

@@ -1,6 +1,7 @@
 """One row of results per (case, method, reference): ours, the published one, whether they agree."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -152,7 +153,7 @@ def solve_cell(source, cell):
     """List of Row of a cell, by run and reference."""
     return [
         _solve(case, cell.method, reference)
-        for case in source.cases(cell.dataset, cell.level)
+        for case in _cases(source, cell.dataset, cell.level)
         for reference in REFERENCES
     ]
 
@@ -170,6 +171,12 @@ def in_m_and_deg(errors):
 def published_name(method):
     """Name of a method in the published results."""
     return "ali" if method == ALI_AS_PUBLISHED else method
+
+
+# A process solves the methods of one level in turn.
+@lru_cache(maxsize=1)
+def _cases(source, dataset, level):
+    return source.cases(dataset, level)
 
 
 def _solve(case, method, reference):

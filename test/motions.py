@@ -9,7 +9,7 @@ T_PARENT_CHILD = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
 
 
 def wandering_poses(n_poses, seed=0, step_m=0.1, step_rad=0.08):
-    """(N, 4, 4) poses of a random walk in all six degrees of freedom, smooth over about ten poses."""
+    """(N, 4, 4) poses of a random walk in six degrees of freedom, smooth over about ten poses."""
     random = np.random.default_rng(seed)
     kernel = np.ones(10) / np.sqrt(10)
     steps = np.apply_along_axis(

@@ -164,7 +164,7 @@ def all_recordings():
 
 
 def asl_rows(folder, name):
-    """Rows (N, 8) of a file as they are: ``t x y z qx qy qz qw``, duplicates and disorder included."""
+    """Rows (N, 8) of a file as they are: ``t x y z qx qy qz qw``, repeated and unsorted too."""
     return np.loadtxt(data_folder() / folder / f"{name}.csv", delimiter=",")
 
 

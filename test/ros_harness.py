@@ -1,4 +1,4 @@
-"""The node in a process of its own, and the process of the test as the other end of the middleware."""
+"""The node in a process of its own; the test's process is the other end of the middleware."""
 
 import itertools
 import os

@@ -46,7 +46,7 @@ class Drive:
 
 
 def drives(sizes):
-    """Where the two drives of published lengths come from, and a Drive for every number of pairs."""
+    """Source of the two drives of published lengths, and a Drive for every number of pairs."""
     found = {n_pairs: simulated_drive(n_pairs + 5) for n_pairs in sizes}
     published = _published()
     return "published" if published else "simulated", {

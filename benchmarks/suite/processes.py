@@ -29,14 +29,16 @@ from suite.data import simulated_drive
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers.registry import Method
 def peak():  # the maximum that resource tells includes this process's parent
-    return next(int(line.split()[1]) * 1024 for line in open("/proc/self/status") if line.startswith("VmHWM"))
+    lines = open("/proc/self/status")
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
 size, part = int(sys.argv[1]), 10_000
 A, B = np.empty((2, size, 4, 4))
 drive = simulated_drive(part + 5)
 before = peak()
 for first in range(0, size, part):
     pairs = drive.pairs[: min(part, size - first)]
-    A[first : first + part], B[first : first + part] = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
+    A[first : first + part] = pairs.Ts_parenti_parentj
+    B[first : first + part] = pairs.Ts_childi_childj
 Method("dnlo").solve(MotionPairs(A, B, np.arange(size), np.arange(5, size + 5)))
 print(before, peak(), A.nbytes + B.nbytes)
 """

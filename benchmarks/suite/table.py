@@ -66,7 +66,7 @@ def show(found):
 
 
 def write(found, page, note):
-    """Put tables, and a note before them, into a Markdown page in place of those of an earlier run."""
+    """Replace the tables of an earlier run in a Markdown page, with a note before them."""
     before, _, rest = page.read_text(encoding="utf-8").partition(_BEGIN)
     _, _, after = rest.partition(_END)
     parts = [_BEGIN, note]
@@ -94,7 +94,8 @@ def _growth(source, rows):
     for row in rows:
         cells.setdefault(row.name, {})[row.size] = _cell(row)
     return Table(
-        f"Processor time by number of motion pairs ({REFERENCE}; {SHORT} and {LONG:,} {source}, others simulated)",
+        f"Processor time by number of motion pairs ({REFERENCE}; {SHORT} and {LONG:,} "
+        f"{source}, others simulated)",
         [f"{size:,}" for size in sizes],
         [[name, *(found.get(size, "") for size in sizes)] for name, found in cells.items()],
     )
@@ -123,6 +124,9 @@ def _side_by_side(title, rows):
 def _others(rows, memory):
     lines = [[row.name, f"{row.size:,}" if row.size else "", _cell(row)] for row in rows]
     for size, (before, peak, data) in memory.items():
-        sizes = f"{peak / 1e6:.0f} MB, {before / 1e6:.0f} before and {data / 1e6:.0f} for the pairs among it"
+        sizes = (
+            f"{peak / 1e6:.0f} MB, {before / 1e6:.0f} before and {data / 1e6:.0f} for the "
+            "pairs among it"
+        )
         lines.append(["peak memory of dnlo fast", f"{size:,}", sizes])
     return Table("Processes, bags, messages", ["size", "measured"], lines)

@@ -249,10 +249,18 @@ def degenerate_motions(kind, seed):
 @pytest.mark.parametrize(
     "kind",
     [
-        "no motion", "translation", "straight line", "rotation about one axis", "plane", "rotation on the spot", "half turns",
-        "one pair", "two pairs", "hardly any",
+        "no motion",
+        "translation",
+        "straight line",
+        "rotation about one axis",
+        "plane",
+        "rotation on the spot",
+        "half turns",
+        "one pair",
+        "two pairs",
+        "hardly any",
     ],
-)  # fmt: skip
+)
 @settings(max_examples=8)
 @given(
     seed=seeds,

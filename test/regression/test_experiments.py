@@ -1,4 +1,4 @@
-"""One command gives the article's tables and figures from the published trajectories, and says what
+"""One command gives the paper's tables and figures from the published trajectories, and says what
 differs.
 """
 
@@ -6,13 +6,13 @@ import csv
 import json
 
 import pytest
-from published_data import data_folder
+from published_data import FALSE_MINIMA_OF_DNL, data_folder
 
 from reproduction.command import main
 from reproduction.published import METHODS
 from reproduction.tables import PRINTED
 
-# Four methods in every simulated and every KITTI case, and Ali: as published where simulated.
+# Four methods in every simulated and every KITTI case; Ali as published in the simulated cases.
 ROWS_OF_FOUR_METHODS, ROWS_OF_ONE = 17_376, 4_344
 
 
@@ -79,7 +79,16 @@ def test_everything_from_one_command(tmp_path, capsys):
     # What differs must be explained, and our objectives must not be above the published answers'.
     reasons = {why for item in four for why in item["differing"]}
     assert not reasons & {"unexplained", "our objective is higher"}
-    assert agreement["ali_as_published"]["agreeing"] >= 0.995 * (ROWS_OF_ONE - 12)
+    differing = {}
+    for line in read(tmp_path / "rows.csv"):
+        if line["agrees"] == "False":
+            differing.setdefault(line["method"], []).append(line)
+    assert not {"park", "taylor", "ali_as_published"} & set(differing)
+    assert {(line["case"], line["reference"]) for line in differing["dnl"]} <= FALSE_MINIMA_OF_DNL
+    for line in differing["dnl"]:
+        assert float(line["objective"]) < 0.1 * float(line["objective_at_published"]), line["case"]
+    # The last of 500 steps of an iteration that never settles may depend on rounding.
+    assert all("does not settle" in line["why"] for line in differing.get("zhuang", ()))
     assert agreement["ali"]["agreeing"] >= 12
     objective = agreement["dnlo"]["objective"]
     assert sum(objective.values()) == ROWS_OF_ONE

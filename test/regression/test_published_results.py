@@ -1,33 +1,23 @@
 """The methods give the published results of Välimäki et al. 2023, row by row.
 
-A row agrees where each of its four errors is within 1e-3 relative or 1e-6 (m, deg) absolute of the
-published one. dnlo, whose published answers depend on the optimiser's build, is held to its
-objective elsewhere.
+A row agrees if each of its four errors is within 1e-3 relative or 1e-6 (m, deg) absolute of the
+published one. These are samples: test_experiments.py solves every published row. dnlo, whose
+published answers depend on the optimiser's build, is compared by its objective there.
 """
 
 from dataclasses import astuple
 
 import numpy as np
 import pytest
-from published_data import kitti_long, kitti_short, simulated
+from published_data import FALSE_MINIMA_OF_DNL, kitti_long, kitti_short, simulated
 
 from hand_eye_calib.assessment.metrics import errors
 from hand_eye_calib.solvers import ali, dnl, park, taylor, zhuang
 from reproduction import ali_as_published
-from reproduction.published import REFERENCES, SIMULATED
+from reproduction.published import REFERENCES
 
 KITTI_SOLVERS = {"park": park, "taylor": taylor, "zhuang": zhuang, "dnl": dnl, "ali": ali}
 SIMULATION_SOLVERS = KITTI_SOLVERS | {"ali": ali_as_published}
-N_SIMULATED_ROWS = 19 * 38 * 6
-
-# Ipopt ended in a false minimum, with a rotation 170 to 178 deg off and a cost at least ten times
-# ours.
-FALSE_MINIMA_OF_DNL = {
-    ("outliers/6/run_48", "A"),
-    ("outliers/8/run_48", "A"),
-    ("outliers/10/run_6", "A"),
-    ("mixture/run_48", "A"),
-}
 
 
 def in_m_and_deg(metrics):
@@ -66,23 +56,10 @@ def sample():
     ]
 
 
-@pytest.fixture(scope="module")
-def everything():
-    return simulated(SIMULATED)
-
-
 @pytest.mark.parametrize("method", SIMULATION_SOLVERS)
 def test_sampled_simulated_rows_agree(sample, method):
     n_rows, disagreeing = compare(sample, method, SIMULATION_SOLVERS[method])
     assert n_rows == (3 * 38 + 19) * 6
-    check_disagreeing(method, n_rows, disagreeing)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", SIMULATION_SOLVERS)
-def test_all_simulated_rows_agree(everything, method):
-    n_rows, disagreeing = compare(everything, method, SIMULATION_SOLVERS[method])
-    assert n_rows == N_SIMULATED_ROWS
     check_disagreeing(method, n_rows, disagreeing)
 
 
@@ -138,7 +115,7 @@ def test_zhuang_knows_that_the_published_answer_is_no_minimum(
 
 
 def test_proper_ali_is_far_nearer_to_the_truth_than_the_published_one():
-    """Noise 0.01, B1: what the article reports for Ali is the unnormalised quaternion's error."""
+    """Noise 0.01, B1: the paper's figures for Ali are those of an unnormalised quaternion."""
     cases = simulated(["noise"], [0.01])
     ours = [
         errors(

@@ -104,7 +104,10 @@ def test_demo_prints_both_directions_and_replaces_an_earlier_demo(tmp_path, doma
 
 
 def test_demo_without_ros_says_what_to_install(tmp_path):
-    program = "import sys; sys.modules['rclpy'] = None; from hand_eye_calib.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    program = (
+        "import sys; sys.modules['rclpy'] = None; from hand_eye_calib.cli.main import main; "
+        "sys.exit(main(sys.argv[1:]))"
+    )
     done = run("-c", program, "demo", "--out", tmp_path / "out")
     assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
     assert "rclpy is missing" in done.stderr

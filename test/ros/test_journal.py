@@ -97,7 +97,8 @@ def test_resume_without_a_directory_is_one_line_and_code_1(start_node):
     assert node.wait() == 1
     assert (
         node.log
-        == "calibrator: journal resume needs output_directory: that is where the session to resume is\n"
+        == "calibrator: journal resume needs output_directory: that is where the session to "
+        "resume is\n"
     )
 
 
@@ -198,7 +199,10 @@ def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):
     peer.trigger("solve")
     second = start_node(*QUIET, *into(used))
     assert second.wait() == 1
-    line = f"output_directory {used} is in use by another calibrator (process {first.process.pid}): stop that one, or choose another"
+    line = (
+        f"output_directory {used} is in use by another calibrator (process "
+        f"{first.process.pid}): stop that one, or choose another"
+    )
     assert second.log == f"calibrator: {line} directory\n"
     first.process.kill()
     first.wait()

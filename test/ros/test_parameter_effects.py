@@ -175,7 +175,8 @@ def test_tf_at_the_start_without_its_messages_is_one_line_and_code_1(start_node)
     node = start_node("-p publish_tf:=true")
     assert node.wait() == 1
     assert node.log.startswith(
-        "calibrator: publish_tf needs the message package tf2_msgs, which is not installed: install "
+        "calibrator: publish_tf needs the message package tf2_msgs, which is not "
+        "installed: install "
     )
     assert node.log.count("\n") == 1
 

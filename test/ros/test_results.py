@@ -1,4 +1,4 @@
-"""What the node publishes, over the real middleware, from poses with a known or published answer."""
+"""What the node publishes, over the real middleware, for poses with a known or published answer."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,8 @@ def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, pee
     node = start_node()
     peer.publisher(String, "parent_odom")
     node.wait_for_log(
-        "/parent_odom has type std_msgs/msg/String; expected nav_msgs/msg/Odometry, geometry_msgs/msg/PoseStamped"
+        "/parent_odom has type std_msgs/msg/String; expected nav_msgs/msg/Odometry, "
+        "geometry_msgs/msg/PoseStamped"
     )
 
 

@@ -174,7 +174,7 @@ def test_the_derivative_by_time_is_what_a_lag_does():
 
 
 def disturbed_about_origin(poses, seed, sigma_m, sigma_rad):
-    """Poses of a camera that sees a target: what is disturbed is the target in the camera's frame."""
+    """Poses of a camera that sees a target: the errors are of the target in the camera's frame."""
     return se3.inverse(disturbed(se3.inverse(poses), seed, sigma_m, sigma_rad))
 
 

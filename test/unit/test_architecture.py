@@ -15,8 +15,8 @@ from hand_eye_calib.simulation.options import NoiseConfig
 PACKAGE = "hand_eye_calib"
 SOURCE = Path(__file__).resolve().parents[2] / PACKAGE
 
-# A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the public
-# Python API. In the engine each room sees only rooms before it.
+# A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
+# public Python API. In the engine each room sees only rooms before it.
 GROUND = {"errors", "config", "methods", "arrays"}
 ENGINE = {
     "errors": set(),
@@ -44,8 +44,20 @@ ALLOWED = ENGINE | {
 }
 
 # Where a library that is heavy, optional or bound to ROS may be imported.
-ROS_LIBRARIES = ("rclpy", "nav_msgs", "geometry_msgs", "std_srvs", "std_msgs", "diagnostic_msgs", "tf2_msgs", "tf2_ros",
-                 "rcl_interfaces", "builtin_interfaces", "rosidl_runtime_py", "rosgraph_msgs")  # fmt: skip
+ROS_LIBRARIES = (
+    "rclpy",
+    "nav_msgs",
+    "geometry_msgs",
+    "std_srvs",
+    "std_msgs",
+    "diagnostic_msgs",
+    "tf2_msgs",
+    "tf2_ros",
+    "rcl_interfaces",
+    "builtin_interfaces",
+    "rosidl_runtime_py",
+    "rosgraph_msgs",
+)
 CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "rosbags": "io/bags.py",
     "casadi": "solvers/ipopt.py",

@@ -117,7 +117,8 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
     assert_same_motion(backwards, PARENT.stamps_ns, se3.inverse(PARENT.poses @ MOUNT))
     with pytest.raises(
         InputError,
-        match=r"transform lidar:rear does not move: all of its transforms are static; it has base:lidar \(static\), base:rear \(static\), map:odom",
+        match=r"transform lidar:rear does not move: all of its transforms are static; it has "
+        r"base:lidar \(static\), base:rear \(static\), map:odom",
     ):
         hec.read_trajectory(path, tf="lidar:rear")
 
@@ -526,7 +527,10 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_warned_about(tmp_path):
         for bag_ns, stamp_ns, matrix in zip(PARENT.stamps_ns, stamps_ns, PARENT.poses, strict=True)
     ]
     path = write_messages(tmp_path / "bag", messages)
-    expected = r"/a: 1 of 120 stamps jump away and back against the bag's own time \(first message 31, .*by 64 s\); their poses were left out"
+    expected = (
+        r"/a: 1 of 120 stamps jump away and back against the bag's own time \(first message "
+        r"31, .*by 64 s\); their poses were left out"
+    )
     with pytest.warns(UserWarning, match=expected):
         trajectory = hec.read_trajectory(path, topic="/a")
     assert_same_motion(

@@ -131,7 +131,8 @@ def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
         (("/odom", "/camera/pose"), "no topic /odom in "),
         (
             ("/lidar/odom", "/log"),
-            r"topic /log of .* is of type std_msgs/msg/String; accepted are nav_msgs/msg/Odometry, ",
+            r"topic /log of .* is of type std_msgs/msg/String; accepted are "
+            r"nav_msgs/msg/Odometry, ",
         ),
         (("/lidar/odom", "/lidar/odom"), "parent and child topic are both /lidar/odom"),
     ],
@@ -143,7 +144,8 @@ def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, me
     ):
         bag.select_topics(*named)
     listing = (
-        "The bag has /camera/pose (geometry_msgs/msg/PoseStamped, 30 messages), /lidar/odom (nav_msgs/msg/Odometry, 40 messages), "
+        "The bag has /camera/pose (geometry_msgs/msg/PoseStamped, 30 messages), "
+        "/lidar/odom (nav_msgs/msg/Odometry, 40 messages), "
         "/log (std_msgs/msg/String, 1 messages)"
     )
     assert listing in str(caught.value)
@@ -209,7 +211,8 @@ def test_an_mcap_cut_off_gives_what_came_before(tmp_path, compression, share):
     assert 0.9 * share - 0.2 * (compression == "zstd") < len(recovered) / len(whole) < share + 0.1
     assert recovered == whole[: len(recovered)]
     assert re.search(
-        rf"recovered are {len(recovered)} messages covering [0-9.]+ s, from the first \d+% of its \d+ bytes",
+        rf"recovered are {len(recovered)} messages covering [0-9.]+ s, from the first "
+        r"\d+% of its \d+ bytes",
         warning,
     )
 
@@ -235,7 +238,9 @@ def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):
     with McapFile(storage_file(path), None) as mcap:
         offsets = [chunk.offset for chunk in mcap._chunks]
     assert len(offsets) > 2
-    for offset in offsets:  # 9 bytes of record header, three times 8 of times and size, 4 of checksum, 4 of no compression, 8 of size
+    # 9 bytes of record header, 3 x 8 of times and size, 4 of checksum, 4 of no compression, 8 of
+    # size.
+    for offset in offsets:
         size = int.from_bytes(data[offset + 25 : offset + 33], "little")
         data[offset + 33 : offset + 37] = zlib.crc32(
             data[offset + 49 : offset + 49 + size]
@@ -340,10 +345,16 @@ def test_qos_that_differs_between_metadata_and_storage_hides_no_message(new_bag,
     before = read(path)
     metadata = yaml.safe_load((path / "metadata.yaml").read_text())
     qos = {
-        "history": "keep_last", "depth": 5, "reliability": "reliable", "durability": "volatile", "liveliness": "automatic",
-        "deadline": {"sec": 0, "nsec": 0}, "lifespan": {"sec": 0, "nsec": 0}, "liveliness_lease_duration": {"sec": 0, "nsec": 0},
+        "history": "keep_last",
+        "depth": 5,
+        "reliability": "reliable",
+        "durability": "volatile",
+        "liveliness": "automatic",
+        "deadline": {"sec": 0, "nsec": 0},
+        "lifespan": {"sec": 0, "nsec": 0},
+        "liveliness_lease_duration": {"sec": 0, "nsec": 0},
         "avoid_ros_namespace_conventions": False,
-    }  # fmt: skip
+    }
     for topic in metadata["rosbag2_bagfile_information"]["topics_with_message_count"]:
         topic["topic_metadata"]["offered_qos_profiles"] = [qos]
     (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))

@@ -24,7 +24,7 @@ IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 def drive(n_poses=200, seed=0):
-    """Parent at 10 Hz, child at 50 Hz, 13 ms apart; smooth enough that interpolation costs little."""
+    """Parent at 10 Hz, child at 50 Hz, 13 ms apart; smooth, so that interpolation costs little."""
     from hand_eye_calib.geometry import se3
 
     coarse = wandering_poses(n_poses, seed)

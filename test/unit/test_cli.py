@@ -90,7 +90,7 @@ def run(capsys):
 
 @pytest.fixture
 def refused(run):
-    """Runs a command that must end in one line on stderr and nothing on stdout; returns that line."""
+    """Run a command that must end in one line on stderr, nothing on stdout; returns the line."""
 
     def call(*arguments, code=1):
         found, out, err = run(*arguments)
@@ -151,7 +151,8 @@ def test_topics_may_be_left_out_where_there_are_only_two(run, new_bag):
     code, out, err = run("replay", new_bag(), "--json")
     assert code == 0
     assert err == (
-        f"hand_eye_calib: note: parent is {CHILD_TOPIC}, child is {PARENT_TOPIC}; --parent-topic and --child-topic say otherwise\n"
+        f"hand_eye_calib: note: parent is {CHILD_TOPIC}, child is {PARENT_TOPIC}; "
+        "--parent-topic and --child-topic say otherwise\n"
     )
     np.testing.assert_allclose(json.loads(out)["T_child_parent"]["matrix"], TRUTH, atol=1e-6)
 
@@ -185,8 +186,11 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
         from_files["T_parent_child"]["matrix"], from_bag["T_parent_child"]["matrix"], atol=1e-12
     )
     assert from_files["inputs"]["child"] == {
-        "file": str(files[1]), "poses": 120, "first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000,
-    }  # fmt: skip
+        "file": str(files[1]),
+        "poses": 120,
+        "first_stamp_ns": START_NS,
+        "last_stamp_ns": START_NS + 11_900_000_000,
+    }
     inputs = (from_files.pop("inputs"), from_bag.pop("inputs"))
     # two files are used whole, a stream is bounded
     bounds = [options.pop("max_pairs") for options in (inputs[0]["options"], inputs[1]["options"])]
@@ -358,7 +362,8 @@ def test_quaternion_that_is_not_of_unit_length(refused, new_bag, monkeypatch):
     [
         (
             "",
-            f"{CHILD_TOPIC}, message 1, stamp 1700000000.000000000: the child stream's sensor frame is empty",
+            f"{CHILD_TOPIC}, message 1, stamp 1700000000.000000000: the child stream's "
+            "sensor frame is empty",
         ),
         ("lidar", "both streams name 'lidar' as their sensor frame"),
     ],
@@ -489,7 +494,8 @@ def config_file(tmp_path):
         "{method: dnl, threshold: 1e-3, keyframe.min_interval: 1}",
         "{method: dnl, threshold: 0.001, keyframe: {min_interval: 1.0}}",
         "/**: {ros__parameters: {method: dnl, threshold: 0.001, keyframe: {min_interval: 1.0}}}",
-        "calibrator: {ros__parameters: {method: dnl, threshold: 0.001, keyframe.min_interval: 1.0}}",
+        "calibrator: {ros__parameters: {method: dnl, threshold: 0.001, "
+        "keyframe.min_interval: 1.0}}",
         "/**: {ros__parameters: {method: dnlo, threshold: 0.001}}\n"
         "robot: {calibrator: {ros__parameters: {method: dnl, keyframe.min_interval: 1.0}}}\n"
         "/camera_driver: {ros__parameters: {exposure: 3}}",
@@ -559,8 +565,10 @@ def test_top_level_help_lists_all_commands_and_imports_none(run):
     assert code == 0
     assert all(re.search(rf"^ +{name}\b", out, flags=re.MULTILINE) for name in cli.COMMANDS)
     check = (
-        "import sys; from hand_eye_calib.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
-        "print([name for name in sys.modules if name in ('numpy', 'scipy', 'yaml')], file=sys.stderr)"
+        "import sys; from hand_eye_calib.cli.main import main\n"
+        "try: main(['--help'])\nexcept SystemExit: pass\n"
+        "print([name for name in sys.modules if name in ('numpy', 'scipy', 'yaml')], "
+        "file=sys.stderr)"
     )
     done = subprocess.run(
         [sys.executable, "-c", check], capture_output=True, text=True, cwd=ROOT, check=True
@@ -639,9 +647,13 @@ def test_a_configuration_that_the_engine_refuses_is_wrong_usage(refused, new_bag
 
 def start(*arguments, **options):
     return subprocess.Popen(
-        [sys.executable, "-m", "hand_eye_calib", *map(str, arguments)], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True, **options,
-    )  # fmt: skip
+        [sys.executable, "-m", "hand_eye_calib", *map(str, arguments)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
 
 
 def test_process_exit_codes_and_streams(new_bag, tmp_path):
@@ -682,9 +694,13 @@ def test_a_reader_that_goes_away_is_no_error(run, new_bag, tmp_path):
     readable, writable = os.pipe()
     os.close(readable)
     done = subprocess.run(
-        [sys.executable, "-m", "hand_eye_calib", "info", str(tmp_path)], cwd=ROOT, stdout=writable, stderr=subprocess.PIPE,
-        text=True, check=False,
-    )  # fmt: skip
+        [sys.executable, "-m", "hand_eye_calib", "info", str(tmp_path)],
+        cwd=ROOT,
+        stdout=writable,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
     os.close(writable)
     assert (done.returncode, done.stderr) == (141, "")
 

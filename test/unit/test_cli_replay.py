@@ -140,7 +140,8 @@ def test_a_bag_cut_in_half_gives_what_came_before_and_a_warning(run, bag):
     assert code in (0, 3)
     (warning,) = [text for text in json.loads(out)["warnings"] if "recovered" in text]
     assert re.search(
-        r"the file ends at byte \d+, in the middle of a .*; recovered are \d+ messages covering [\d.]+ s",
+        r"the file ends at byte \d+, in the middle of a .*; recovered are \d+ messages "
+        r"covering [\d.]+ s",
         warning,
     )
     assert f"hand_eye_calib: note: {warning}\n" in err
@@ -156,7 +157,8 @@ def test_absurd_positions_end_in_one_line(run, bag, tmp_path, monkeypatch):
     code, out, err = run(tmp_path / "bad", *STREAMS)
     assert (code, out) == (1, "")
     assert re.search(
-        r"error: /b, message 8, stamp 1700000000\.700000000: position \(1e\+150, .* is more than 1e\+08 m from the origin",
+        r"error: /b, message 8, stamp 1700000000\.700000000: position \(1e\+150, .* is "
+        r"more than 1e\+08 m from the origin",
         err,
     )
 
@@ -185,9 +187,14 @@ def test_list_shows_topics_types_counts_rates_durations_and_frames(run, tmp_path
     assert document["duration_s"] == pytest.approx(9.9)
     first = document["topics"][0]
     assert first == {
-        "name": "/a", "type": ODOMETRY, "count": 100, "rate_hz": pytest.approx(10), "duration_s": pytest.approx(9.9),
-        "frames": ["map:lidar"], "is_usable": True,
-    }  # fmt: skip
+        "name": "/a",
+        "type": ODOMETRY,
+        "count": 100,
+        "rate_hz": pytest.approx(10),
+        "duration_s": pytest.approx(9.9),
+        "frames": ["map:lidar"],
+        "is_usable": True,
+    }
 
 
 # ---- convergence
@@ -210,9 +217,10 @@ def test_every_estimates_on_the_way_and_over_everything_in_the_end(run, bag):
         matrix(out), matrix(run(bag, *STREAMS, "--json", "--reference", "B5")[1])
     )
     lines = [line for line in err.splitlines() if "note: after " in line]
-    assert [re.search(r"after (\d) s: x .* m, roll .* deg, (\d+) poses, ok", line).groups() for line in lines] == [
-        ("2", "20"), ("4", "40"), ("6", "60"), ("8", "80")
-    ]  # fmt: skip
+    assert [
+        re.search(r"after (\d) s: x .* m, roll .* deg, (\d+) poses, ok", line).groups()
+        for line in lines
+    ] == [("2", "20"), ("4", "40"), ("6", "60"), ("8", "80")]
 
 
 def test_every_says_why_there_is_no_estimate_yet(run, bag):
@@ -240,8 +248,12 @@ def fleet(tmp_path):
         "options": {"reference": "B5"},
         "parent_topic": "/a",
         "child_topic": "/b",
-        "bags": ["bags/drive*", {"bag": "absent", "name": "gone"}, {"bag": ["bags/drive0"], "name": "again", "options": {"reference": "B1"}}],
-    }  # fmt: skip
+        "bags": [
+            "bags/drive*",
+            {"bag": "absent", "name": "gone"},
+            {"bag": ["bags/drive0"], "name": "again", "options": {"reference": "B1"}},
+        ],
+    }
     path = tmp_path / "fleet.yaml"
     path.write_text(yaml.safe_dump(document))
     return path
@@ -377,7 +389,8 @@ def test_a_batch_file_that_cannot_be_read(run, tmp_path):
 def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
     path = tmp_path / "fleet.yaml"
     path.write_text(
-        "{parent_tf: 'odom:lidar', options: {method: dnl}, bags: [a, {bag: b/a, parent_topic: /p, options: {reference: A}}]}"
+        "{parent_tf: 'odom:lidar', options: {method: dnl}, bags: [a, {bag: b/a, "
+        "parent_topic: /p, options: {reference: A}}]}"
     )
     first, second = batch.read_batch(
         path, {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"}

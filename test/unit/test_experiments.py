@@ -40,8 +40,18 @@ CELLS = [
 ]
 
 A_ROW = Row(
-    "noise", 0.002, "run_01", "dnl", "B1", (0.01, 0.5, 0.02, 0.3), 1.0, True, tuple(np.eye(4).ravel()), (0.01, 0.5, 0.02, 0.3), 1.0
-)  # fmt: skip
+    "noise",
+    0.002,
+    "run_01",
+    "dnl",
+    "B1",
+    (0.01, 0.5, 0.02, 0.3),
+    1.0,
+    True,
+    tuple(np.eye(4).ravel()),
+    (0.01, 0.5, 0.02, 0.3),
+    1.0,
+)
 
 
 @pytest.fixture(autouse=True)

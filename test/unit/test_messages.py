@@ -93,7 +93,7 @@ def assert_fields(fields, pose, message_type):
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @given(pose=poses)
 def test_a_pose(encoding, message_type, pose):
-    """Any length of the frames' names moves what follows: alignment is where a reader goes wrong."""
+    """The length of the frames' names shifts what follows: alignment is where readers go wrong."""
     assert_fields(
         unpack_pose(*_order(encoded(encoding, message_type, pose), message_type)),
         pose,

@@ -69,7 +69,7 @@ def run(command, **options):
 
 
 def clean_environment(**extra):
-    """The environment without what a parent process's ROS wheels or another work space put there."""
+    """The environment without what a parent's ROS wheels or another workspace put there."""
     dropped = {
         "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
         "LD_LIBRARY_PATH",

@@ -25,7 +25,7 @@ def pairs_of(Ts_parenti_parentj, Ts_childi_childj):
 
 
 def random_pairs(noise=0.0, n_poses=25, seed=0):
-    """Motions of up to a metre and 0.8 rad per axis, with noise (m and rad) on both sensors' poses."""
+    """Motions of up to 1 m and 0.8 rad per axis, with noise (m and rad) on both sensors' poses."""
     random = np.random.default_rng(seed)
     poses = [np.eye(4)]
     for step in random.uniform(
@@ -303,6 +303,7 @@ def test_reader_refuses_results_without_their_trajectories(data_folder):
     )
     with pytest.raises(
         InputError,
-        match=r"trajectories of mixture do not go with the published results: expected 38 runs \(found 0\)",
+        match=r"trajectories of mixture do not go with the published results: expected 38 runs "
+        r"\(found 0\)",
     ):
         published.load_simulated(data_folder, ["mixture"])

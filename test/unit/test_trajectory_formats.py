@@ -81,7 +81,10 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
 
 
 def test_euroc_is_nanoseconds_with_the_scalar_first(file):
-    header = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1]"
+    header = (
+        "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
+        "q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1]"
+    )
     lines = [f"{row}, 0.5" for row in rows(TRAJECTORY.stamps_ns, "wxyz", ", ")]
     assert_is_the_trajectory(hec.read_trajectory(file([header, *lines]), "euroc"))
     assert_is_the_trajectory(hec.read_trajectory(file([header, *lines]), "csv"))
@@ -97,18 +100,27 @@ def test_euroc_is_nanoseconds_with_the_scalar_first(file):
         ("t,x,y,z,qx,qy,qz,qw", "xyzw", ","),
         ("timestamp; tx; ty; tz; qw; qx; qy; qz", "wxyz", ";"),
         ("# time px py pz q_w q_x q_y q_z", "wxyz", " "),
-        ("time,.pose.pose.position.x,.pose.pose.position.y,.pose.pose.position.z,.pose.pose.orientation.x,.pose.pose.orientation.y,"
-         ".pose.pose.orientation.z,.pose.pose.orientation.w", "xyzw", ","),
+        (
+            "time,.pose.pose.position.x,.pose.pose.position.y,.pose.pose.position.z,"
+            ".pose.pose.orientation.x,.pose.pose.orientation.y,.pose.pose.orientation.z,"
+            ".pose.pose.orientation.w",
+            "xyzw",
+            ",",
+        ),
         ("Stamp [ns],Pos_X [m],Pos_Y [m],Pos_Z [m],rot_w,rot_x,rot_y,rot_z", "wxyz", ","),
     ],
-)  # fmt: skip
+)
 def test_csv_finds_its_columns_by_their_names(file, header, order, separator):
     path = file([header, *rows(TRAJECTORY.stamps_ns, order, separator)])
     assert_is_the_trajectory(hec.read_trajectory(path, "csv"))
 
 
 def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
-    header = 'time, .header.stamp.secs, .header.stamp.nsecs, .child, .p.position.x, .p.position.y, .p.position.z, .p.orientation.x, .p.orientation.y, .p.orientation.z, .p.orientation.w, .covariance'  # fmt: skip
+    header = (
+        "time, .header.stamp.secs, .header.stamp.nsecs, .child, .p.position.x, .p.position.y, "
+        ".p.position.z, .p.orientation.x, .p.orientation.y, .p.orientation.z, "
+        ".p.orientation.w, .covariance"
+    )
     lines = [
         ", ".join(
             [
@@ -176,7 +188,8 @@ def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, uni
     if unit != "s":
         with pytest.raises(
             InputError,
-            match=r"unit of the timestamps is unclear; read as \w+, the poses are .* s apart; name it with stamp_unit",
+            match=r"unit of the timestamps is unclear; read as \w+, the poses are .* s apart; "
+            r"name it with stamp_unit",
         ):
             hec.read_trajectory(file(rows(relative, separator=" ")), "tum")
 
@@ -187,12 +200,14 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
     path = file(["t,x,y,z,qx,qy,qz,qw", *(lines[index] for index in order)])
     with pytest.raises(
         InputError,
-        match=r"line 12: timestamps must increase, .*; 4 such lines; sort .* repair \(--repair-stamps\)",
+        match=r"line 12: timestamps must increase, .*; 4 such lines; sort .* repair "
+        r"\(--repair-stamps\)",
     ):
         hec.read_trajectory(path, "csv")
     with pytest.warns(
         UserWarning,
-        match="stamps went back at 3 of 32 poses, which were sorted; dropped 2 whose stamp was there already",
+        match="stamps went back at 3 of 32 poses, which were sorted; dropped 2 whose stamp was "
+        "there already",
     ):
         assert_is_the_trajectory(hec.read_trajectory(path, "csv", repair=True))
 
@@ -254,8 +269,8 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
     out, err = capsys.readouterr()
     assert code == 0
     assert (
-        "stamps went back at 1 of 31 poses, which were sorted; dropped 1 whose stamp was there already"
-        in err
+        "stamps went back at 1 of 31 poses, which were sorted; dropped 1 whose stamp was "
+        "there already" in err
     )
     document = json.loads(out)
     np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
