@@ -1,4 +1,4 @@
-"""The README says what the program does: its tables and commands are compared with the code."""
+"""README and docs say what the program does: their commands, tables and links are tested."""
 
 import argparse
 import dataclasses
@@ -7,14 +7,20 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from hand_eye_calib.cli.main import COMMANDS
+from hand_eye_calib.cli.main import COMMANDS, main
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
 
-README = Path(__file__).resolve().parents[2] / "README.md"
-TEXT = README.read_text(encoding="utf-8")
+ROOT = Path(__file__).resolve().parents[2]
+README, NODE_PAGE = ROOT / "README.md", ROOT / "docs" / "node.md"
+PAGES = {
+    page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
+    for page in (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md")))
+}
 HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
+FEWEST_WORDS, MOST_WORDS = 700, 900
 
 
 def parameter_table(config):
@@ -43,7 +49,7 @@ def default(field):
 
 
 def escaped(cell):
-    """Without what Markdown would take for a column or a tag."""
+    """Escape what Markdown would take for a column or a tag."""
     return cell.replace("|", "\\|").replace("<", "&lt;")
 
 
@@ -56,7 +62,11 @@ def allowed(field):
     words = [f"`{word}`" for word in meta["words"]]
     if meta["minimum"] is not None and meta["maximum"] is not None:
         return " or ".join([*words, f"{meta['minimum']:g} to {meta['maximum']:g}"])
-    return " or ".join(words) or "any name" if meta["pattern"] is None else "see meaning"
+    if words:
+        return " or ".join(words)
+    if meta["parse"] or meta["pattern"]:
+        return "see meaning"
+    return "any path" if field.name.endswith("_directory") else "any name"
 
 
 def meaning(meta):
@@ -67,11 +77,11 @@ def meaning(meta):
 def test_parameter_table_is_that_of_the_code(config):
     table = parameter_table(config)
     hint = "PYTHONPATH=. python test/unit/test_readme.py writes it"
-    assert table in TEXT, f"README.md must have this table for {config.__name__}; {hint}:\n{table}"
+    assert table in PAGES["docs/node.md"], f"docs/node.md must have this table; {hint}:\n{table}"
 
 
 def test_parameter_tables_have_no_other_rows():
-    documented = re.findall(r"^\| `([a-z_.]+)` \| `[^|]*` \|", TEXT, re.MULTILINE)
+    documented = re.findall(r"^\| `([a-z_.]+)` \| `[^|]*` \|", PAGES["docs/node.md"], re.MULTILINE)
     assert documented == [
         option_name(field)
         for config in (CalibratorConfig, NodeConfig)
@@ -79,10 +89,22 @@ def test_parameter_tables_have_no_other_rows():
     ]
 
 
-def commands():
-    """Every command of ours in the README's shell blocks, as (subcommand, arguments)."""
-    blocks = re.findall(r"```bash\n(.*?)```", TEXT, re.DOTALL)
-    for line in "\n".join(blocks).replace("\\\n", " ").splitlines():
+def test_readme_is_short():
+    assert FEWEST_WORDS <= len(PAGES["README.md"].split()) <= MOST_WORDS
+
+
+def shell_lines(text):
+    """Lines of the shell blocks, and commands in running text that have no placeholder."""
+    blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
+    yield from "\n".join(blocks).replace("\\\n", " ").splitlines()
+    for command in re.findall(r"`((?:ros2 run )?hand_eye_calib [^`]*)`", text):
+        if not re.search(r"[A-Z]{3}|\.\.\.| --version", command):
+            yield command
+
+
+def commands(text):
+    """Every command of ours on a page, as (subcommand, arguments)."""
+    for line in shell_lines(text):
         words = shlex.split(line, comments=True)
         while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
             words = words[1:]
@@ -97,11 +119,14 @@ def commands():
         yield tuple(words)
 
 
-def test_readme_has_commands_to_check():
-    assert {words[0] for words in commands()} >= {"replay", "calibrate", "calibrator", "info"}
+def test_pages_have_commands_to_check():
+    assert {words[0] for words in commands(PAGES["README.md"])} >= {"replay", "calibrator"}
+    assert {words[0] for words in commands(PAGES["docs/cli.md"])} == set(COMMANDS) - {"calibrator"}
 
 
-@pytest.mark.parametrize("words", sorted(set(commands())), ids=" ".join)
+@pytest.mark.parametrize(
+    "words", sorted({found for text in PAGES.values() for found in commands(text)}), ids=" ".join
+)
 def test_command_parses(words):
     name, *arguments = words
     assert name in COMMANDS
@@ -109,30 +134,93 @@ def test_command_parses(words):
     importlib.import_module(f"hand_eye_calib.cli.{name}").add_arguments(parser)
     if name == "calibrator":
         assert arguments[:1] in ([], ["--ros-args"])
-    else:
+    elif arguments:
         parser.parse_args(arguments)
 
 
-@pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#:]+)\)", TEXT))))
-def test_relative_link_leads_somewhere(target):
-    assert (README.parent / target).exists()
+def test_every_command_has_its_line():
+    table = re.findall(r"^\| `([a-z]+)[` ]", PAGES["docs/cli.md"], re.MULTILINE)
+    assert sorted(table) == sorted(COMMANDS)
 
 
-def test_make_targets_exist():
-    makefile = (README.parent / "Makefile").read_text(encoding="utf-8")
-    mentioned = set(
-        re.findall(
-            r"`?make ([a-z-]+)`?",
-            "\n".join(re.findall(r"`[^`]+`|```bash\n.*?```", TEXT, re.DOTALL)),
+@pytest.mark.parametrize("page", PAGES)
+def test_launch_arguments_exist(page):
+    launch_file = (ROOT / "launch" / "calibrator.launch.py").read_text(encoding="utf-8")
+    lines = [line for line in PAGES[page].splitlines() if line.startswith("ros2 launch")]
+    names = {name for line in lines for name in re.findall(r"(\w+):=", line)}
+    assert {name for name in names if f'"{name}"' not in launch_file} == set()
+
+
+def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "--out", "drives", "--seed", "3"]) == 0
+    for sensor, name in ((1, "lidar"), (2, "camera")):
+        (tmp_path / f"{name}.tum").write_bytes(
+            (tmp_path / "drives" / "run_01" / f"T_S{sensor}_W{sensor}.txt").read_bytes()
         )
-    )
-    targets = set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
-    assert mentioned
-    assert mentioned <= targets
+    (block,) = re.findall(r"```python\n(.*?)```", PAGES["README.md"], re.DOTALL)
+    names = {}
+    exec(compile(block, "README.md", "exec"), names)
+    result = names["result"]
+    assert result.T_parent_child.shape == (4, 4)
+    assert result.covariance.shape == (6, 6)
+    truth = names["hec"].read_trajectory("drives/run_01/T_S2_S1.txt").poses[0]
+    np.testing.assert_allclose(result.T_parent_child, truth, atol=1e-6)
+    assert (tmp_path / "result" / "extrinsic.yaml").exists()
+
+
+def anchors(text):
+    """Names that links to headings of a page have on GitHub."""
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def links():
+    for page, text in PAGES.items():
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            if not re.match(r"[a-z]+:", target):
+                yield page, target
+
+
+@pytest.mark.parametrize(("page", "target"), sorted(set(links())))
+def test_relative_link_leads_somewhere(page, target):
+    path, _, anchor = target.partition("#")
+    found = (ROOT / page).parent / path if path else ROOT / page
+    assert found.exists()
+    if anchor:
+        assert anchor in anchors(found.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_make_targets_exist(page):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    code = "\n".join(re.findall(r"`[^`\n]+`|```bash\n.*?```", PAGES[page], re.DOTALL))
+    mentioned = set(re.findall(r"(?:^|`)make ([a-z-]+)", code, re.MULTILINE))
+    assert mentioned <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
+
+
+# Words that stand for something else here, and the field's word for it.
+UNWANTED = {
+    "waiting room": "buffer",
+    "latecomer": "late arrival",
+    "let go": "dropped",
+    "lets go": "drops",
+    "hang together": "",
+    "what is said of": "",
+    "none that two": "",
+    "for the sake of": "",
+    "nuisance": "systematic error",
+}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_use_the_glossary(page):
+    text = " ".join(PAGES[page].lower().split())
+    assert [phrase for phrase in UNWANTED if phrase in text] == []
 
 
 def with_tables_of_the_code(text):
-    """The README with both parameter tables as they must be."""
+    """The page with both parameter tables as they must be."""
     tables = iter([parameter_table(CalibratorConfig), parameter_table(NodeConfig)])
     return re.sub(
         r"^\| Name \| Default \|.*\n(\|.*\n)*",
@@ -143,4 +231,4 @@ def with_tables_of_the_code(text):
 
 
 if __name__ == "__main__":
-    README.write_text(with_tables_of_the_code(TEXT), encoding="utf-8")
+    NODE_PAGE.write_text(with_tables_of_the_code(PAGES["docs/node.md"]), encoding="utf-8")
