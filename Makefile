@@ -5,6 +5,7 @@
 #   make lint          style and types
 #   make coverage      the test suite with the lines it leaves out
 #   make paper DATA=x  every figure and table of the paper from its published data in folder x, into reproduced/
+#   make coverage-study DATA=x  errors over the least possible and what the sigmas hold, on simulated and real recordings
 #   make bench         benchmarks against the baseline; about two minutes (BENCH_ARGS=--full: four)
 #   make bench-node    load, soak and crashes of the node, measured; about four minutes
 #   make clean         remove everything the above made
@@ -13,6 +14,7 @@ PYTHON ?= python3
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 PAPER_ARGS ?=
+STUDY_ARGS ?=
 DATA ?=
 DEMO_ARGS ?= --out demo_output
 
@@ -20,7 +22,7 @@ VENV := .venv
 OLDEST := .venv-oldest
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help demo test test-oldest coverage paper bench bench-node lint format clean
+.PHONY: help demo test test-oldest coverage coverage-study paper bench bench-node lint format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -29,8 +31,8 @@ demo: $(VENV)/.ready-demo
 	$(VENV)/bin/hand_eye_calib demo $(DEMO_ARGS)
 
 # One thread per process: small matrices gain nothing from more, and the last digit does not depend on the number of cores.
-test test-oldest coverage paper: export OMP_NUM_THREADS := 1
-test test-oldest coverage paper: export OPENBLAS_NUM_THREADS := 1
+test test-oldest coverage coverage-study paper: export OMP_NUM_THREADS := 1
+test test-oldest coverage coverage-study paper: export OPENBLAS_NUM_THREADS := 1
 
 test: $(VENV)/.ready-test
 	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
@@ -43,6 +45,9 @@ coverage: $(VENV)/.ready-test
 
 paper: $(VENV)/.ready-test
 	$(VENV)/bin/python -m reproduction all $(if $(DATA),--data-folder $(DATA)) $(PAPER_ARGS)
+
+coverage-study: $(VENV)/.ready-test
+	$(VENV)/bin/python -m reproduction.coverage --page docs/coverage.md $(if $(DATA),--data-folder $(DATA)) $(STUDY_ARGS)
 
 bench: $(VENV)/.ready-bench
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py $(BENCH_ARGS)

@@ -1,0 +1,287 @@
+"""Simulated recordings of many kinds, each with its Cramer-Rao bound."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from reproduction.coverage import motions
+from reproduction.coverage.bound import Side, cramer_rao_bound
+from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, Tail, draw, sigmas
+
+_START_NS = 1_700_000_000_000_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingClass:
+    """How the recordings of a class are made.
+
+    Attributes
+    ----------
+    motion : callable
+        ``motion(rng, duration_s)`` gives a Motion.
+    duration_s, rate_hz : float
+    parent, child : SensorErrors
+    lever_m : float
+        Length of the extrinsic's translation; its direction is drawn.
+    bound_from : str
+        What the bound rests on.
+    """
+
+    motion: Callable[[np.random.Generator, float], motions.Motion]
+    duration_s: float
+    rate_hz: float
+    parent: SensorErrors
+    child: SensorErrors
+    lever_m: float = 0.4
+    bound_from: str = "Gaussian noise, exact"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulated:
+    """One recording of a class, with the truth.
+
+    Attributes
+    ----------
+    parent, child : Trajectory
+        As measured.
+    T_parent_child : (4, 4) array
+        The truth.
+    sides : (Side, Side)
+        True poses and drawn errors of both sensors.
+    dt : float
+        Time between poses, s.
+    """
+
+    parent: Trajectory
+    child: Trajectory
+    T_parent_child: FloatArray
+    sides: tuple[Side, Side]
+    dt: float
+
+    def bound(self) -> FloatArray:
+        """Cramer-Rao bound (6, 6) of xi in ``X Exp(xi)``, (rho, phi), child frame, under the true
+        noise. The instants of jumps and bursts count as known.
+        """
+        return cramer_rao_bound(self.sides, self.sides[1].Ts, self.dt)
+
+
+def simulate(kind: RecordingClass, seed: int | tuple[int, ...]) -> Simulated:
+    """One recording; the same seed gives the same."""
+    motion_rng, mount_rng, parent_rng, child_rng = np.random.default_rng(seed).spawn(4)
+    dt = 1.0 / kind.rate_hz
+    times_s: FloatArray = dt * np.arange(round(kind.duration_s * kind.rate_hz), dtype=np.float64)
+    motion = kind.motion(motion_rng, kind.duration_s)
+    X = _mount(mount_rng, kind.lever_m)
+    Ts, twists = motion.at(times_s), motion.twists(times_s)
+    to_child = se3.adjoint(se3.inverse(X))
+    parent = draw(kind.parent, Ts, twists, dt, parent_rng)
+    child = draw(kind.child, Ts @ X, twists @ to_child.T, dt, child_rng)
+    stamps_ns = _START_NS + np.round(times_s * 1e9).astype(np.int64)
+    child_poses = se3.inverse(_world(mount_rng)) @ child.poses
+    return Simulated(
+        parent=Trajectory(stamps_ns, parent.poses, "parent", "parent_odom"),
+        child=Trajectory(stamps_ns, child_poses, "child", "child_odom"),
+        T_parent_child=X,
+        sides=(
+            Side(kind.parent, parent, Ts, to_child),
+            Side(kind.child, child, Ts @ X, -np.eye(6)),
+        ),
+        dt=dt,
+    )
+
+
+def make(name: str, seed: int) -> Simulated:
+    """The recording of a class by this seed."""
+    return simulate(CLASSES[name], (seed, sorted(CLASSES).index(name)))
+
+
+def _mount(rng: np.random.Generator, lever_m: float) -> FloatArray:
+    """Any rotation, and a translation of this length, mostly level."""
+    direction = rng.standard_normal(3) * [1.0, 1.0, 0.5]
+    rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    return se3.from_rotation_translation(rotation, lever_m * direction / np.linalg.norm(direction))
+
+
+def _world(rng: np.random.Generator) -> FloatArray:
+    rotation = Rotation.from_euler("ZYX", rng.uniform(-1.0, 1.0, 3)).as_matrix()
+    return se3.from_rotation_translation(rotation, rng.uniform(-2.0, 2.0, 3))
+
+
+def _slow(
+    errors: SensorErrors, tau_s: float, metres: float, degrees: float, in_world: bool = False
+) -> SensorErrors:
+    part = GaussMarkov(tau_s, sigmas(metres, degrees), in_world)
+    return replace(errors, slow=(*errors.slow, part))
+
+
+def _white(metres: float, degrees: float) -> SensorErrors:
+    return SensorErrors(white=sigmas(metres, degrees))
+
+
+def _slam(tau_s: float, metres: float, degrees: float) -> SensorErrors:
+    return _slow(_white(0.008, 0.03), tau_s, metres, degrees, in_world=True)
+
+
+_MOCAP = _white(0.0005, 0.05)
+_STEADY = _white(0.0004, 0.03)
+_HAND = _white(0.003, 0.2)
+_INS = _slow(_white(0.003, 0.01), 25.0, 0.12, 0.05, in_world=True)
+_LIDAR_ODOMETRY = replace(_white(0.01, 0.03), walk_by_metre=sigmas(0.006, 0.012))
+_VIO = replace(_white(0.0008, 0.03), walk=sigmas(0.004, 0.06))
+_FLICKER = tuple(GaussMarkov(tau, sigmas(0.002, 0.12)) for tau in (0.1, 0.4, 1.6, 6.4, 25.6))
+
+_Kind = Callable[..., RecordingClass]
+
+
+def _recorded_with(
+    motion: Callable[[np.random.Generator, float], motions.Motion], lever_m: float
+) -> _Kind:
+    """``kind(duration_s, rate_hz, parent, child, **more)`` of a motion."""
+
+    def kind(
+        duration_s: float, rate_hz: float, parent: SensorErrors, child: SensorErrors, **more: object
+    ) -> RecordingClass:
+        given = {"lever_m": lever_m, **more}
+        return RecordingClass(
+            motion=motion, duration_s=duration_s, rate_hz=rate_hz, parent=parent, child=child,
+            **given,  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    return kind
+
+
+_hand = _recorded_with(motions.hand_held, 0.4)
+_car = _recorded_with(motions.car, 1.5)
+_agv = _recorded_with(motions.agv, 0.8)
+_flat_agv = _recorded_with(motions.flat_agv, 0.8)
+_drone = _recorded_with(motions.drone, 0.3)
+_arm = _recorded_with(motions.arm, 0.15)
+
+CLASSES = {
+    "hand_white": _hand(60.0, 20.0, _HAND, _white(0.004, 0.3)),
+    "hand_vio_walk": _hand(90.0, 20.0, _MOCAP, _VIO),
+    "hand_gm_1s": _hand(
+        100.0, 20.0, _white(0.001, 0.08), _slow(_white(0.001, 0.08), 1.0, 0.005, 0.3)
+    ),
+    "hand_gm_03s_white": _hand(
+        80.0, 20.0, _slow(_HAND, 0.3, 0.003, 0.2), _slow(_HAND, 0.3, 0.006, 0.4)
+    ),
+    "hand_flicker": _hand(80.0, 15.0, _MOCAP, replace(_white(0.001, 0.06), slow=_FLICKER)),
+    "car_ins_lidar": _car(240.0, 10.0, _INS, _LIDAR_ODOMETRY),
+    "car_vo_scale": _car(
+        240.0,
+        10.0,
+        _INS,
+        replace(_white(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01), scale=(0.01, 40.0)),
+        lever_m=1.2,
+    ),
+    "car_jitter": _car(
+        180.0,
+        10.0,
+        replace(_INS, jitter_s=0.001),
+        replace(_LIDAR_ODOMETRY, jitter_s=0.004),
+        lever_m=1.0,
+    ),
+    "car_lever": _car(
+        200.0,
+        10.0,
+        replace(_white(0.01, 0.08), walk=sigmas(0.01, 0.01)),
+        replace(_white(0.01, 0.08), walk_by_metre=sigmas(0.004, 0.008)),
+        lever_m=5.0,
+    ),
+    "car_two_slams": _car(250.0, 10.0, _slam(12.0, 0.05, 0.08), _slam(8.0, 0.08, 0.12)),
+    "agv_ramps": _agv(
+        240.0,
+        10.0,
+        replace(_white(0.001, 0.01), walk_by_metre=sigmas(0.004, 0.05)),
+        _slow(_white(0.004, 0.04), 3.0, 0.01, 0.06, in_world=True),
+    ),
+    "agv_long": _agv(
+        1200.0,
+        2.5,
+        replace(_white(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05)),
+        _slow(_white(0.005, 0.05), 20.0, 0.015, 0.08, in_world=True),
+    ),
+    "drone_gnss_vio": _drone(
+        150.0, 20.0, _slow(_white(0.004, 0.05), 15.0, 0.15, 0.2, in_world=True), _VIO, lever_m=0.2
+    ),
+    "drone_rotation_1deg": _drone(
+        100.0, 20.0, _white(0.002, 1.0), replace(_white(0.003, 0.3), walk=sigmas(0.002, 0.02))
+    ),
+    "arm_target": _arm(
+        150.0,
+        10.0,
+        _slow(_white(0.0001, 0.005), 5.0, 0.0003, 0.02),
+        _slow(
+            SensorErrors(
+                white=sigmas(np.array([0.0008, 0.0008, 0.003]), np.array([0.3, 0.3, 0.06]))
+            ),
+            1.0,
+            0.0005,
+            0.06,
+        ),
+    ),
+    "hand_t3": _hand(
+        60.0,
+        20.0,
+        _STEADY,
+        replace(_white(0.003, 0.2), tail=Tail("student", factor=3.0)),
+        bound_from="Fisher information of the multivariate t",
+    ),
+    "hand_spikes": _hand(
+        60.0,
+        20.0,
+        _STEADY,
+        replace(_white(0.003, 0.2), tail=Tail("spikes", 0.05, 20.0)),
+        bound_from="Fisher information of the mixture",
+    ),
+    "hand_bursts": _hand(
+        90.0,
+        20.0,
+        replace(_STEADY, walk=sigmas(0.001, 0.02)),
+        replace(_white(0.002, 0.15), tail=Tail("bursts", 0.15, 10.0)),
+        bound_from="Gaussian noise, instants of bursts known",
+    ),
+    "drone_anisotropic": _drone(
+        120.0,
+        20.0,
+        SensorErrors(white=sigmas(np.array([0.002, 0.002, 0.012]), np.array([0.3, 0.1, 0.1]))),
+        SensorErrors(
+            white=sigmas(np.array([0.015, 0.003, 0.003]), np.array([0.1, 0.1, 0.5])),
+            walk=sigmas(np.array([0.004, 0.001, 0.001]), np.array([0.01, 0.01, 0.04])),
+        ),
+    ),
+    "hand_mixture_30s": _hand(
+        30.0,
+        30.0,
+        _white(0.001, 0.08),
+        _slow(
+            replace(_white(0.002, 0.1), walk=sigmas(0.003, 0.05), jumps_per_s=0.2), 2.0, 0.002, 0.1
+        ),
+        bound_from="Gaussian noise, instants of jumps known",
+    ),
+    "drone_two_vios": _drone(
+        140.0,
+        15.0,
+        _VIO,
+        replace(_white(0.001, 0.04), walk=sigmas(0.006, 0.05), scale=(0.005, 20.0)),
+        lever_m=0.1,
+    ),
+    "flat_agv": _flat_agv(
+        200.0,
+        10.0,
+        replace(_white(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05)),
+        replace(_white(0.005, 0.05), walk_by_metre=sigmas(0.003, 0.03)),
+        bound_from="none: z is unobservable and must be refused",
+    ),
+}
+
+# Motions that do not reveal all six degrees of freedom: the answer must say so.
+REFUSED = ("flat_agv",)

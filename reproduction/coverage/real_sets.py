@@ -1,0 +1,289 @@
+"""Real recordings whose answer is known, or that can be calibrated more than once.
+
+They lie in folders of their own beside the published data of Välimäki et al. 2023. A set whose
+folder is absent is left out, and the page says so.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files import read_trajectory, read_trajectory_file
+from reproduction.kitti_truth import RECTIFIED
+from reproduction.recordings import Recording
+
+_ASL_COLUMNS, _ZXL19_COLUMNS = "t,x,y,z,qx,qy,qz,qw", "t,x,y,z,qw,qx,qy,qz"
+
+# A user who knows neither clock nor scale.
+_FOUND = {"time_offset": "estimate", "scale": "auto"}
+_CLOCK_FOUND = {"time_offset": "estimate"}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A known answer.
+
+    Attributes
+    ----------
+    T_parent_child : (4, 4) array
+    sigmas : (6,) array
+        How well it is known, m along and rad about the axes of the parent sensor; infinite where
+        it is not.
+    """
+
+    T_parent_child: FloatArray
+    sigmas: FloatArray
+
+    @classmethod
+    def within(cls, T_parent_child: FloatArray, metres: object, degrees: object) -> Truth:
+        """Known to so many metres and degrees, one number or one per axis."""
+        parts = [np.full(3, 1.0) * metres, np.radians(np.full(3, 1.0) * degrees)]
+        return cls(T_parent_child, np.concatenate(parts))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rig:
+    """Recordings of one rig.
+
+    Attributes
+    ----------
+    name : str
+    recordings : dict
+        Name to Recording.
+    options : dict
+        What a user would give.
+    truth : Truth, optional
+    is_cut : bool
+        Whether halves and thirds of each recording are repeats, too.
+    """
+
+    name: str
+    recordings: Mapping[str, Recording]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    truth: Truth | None = None
+    is_cut: bool = True
+
+
+def real_rigs(folder: Path) -> tuple[list[Rig], list[str]]:
+    """The rigs whose files are there, and the names of the folders that are not.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Holds ``valimaki2023``, ``euroc_vio`` and the other sets.
+    """
+    present = [name for name in _LOADERS if (folder / name).is_dir()]
+    rigs = [rig for name in present for rig in _LOADERS[name](folder / name)]
+    return rigs, [name for name in _LOADERS if name not in present]
+
+
+# Good to about 0.15 deg and 10 mm, as the flights say of it among themselves.
+_EUROC = Truth.within(
+    np.array(
+        [
+            [0.0148655, -0.9998809, 0.0041403, -0.0216401],
+            [0.9995572, 0.0149672, 0.0257155, -0.0646770],
+            [-0.0257744, 0.0037562, 0.9996607, 0.0098107],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    ),
+    0.010,
+    0.15,
+)
+
+
+def _euroc(folder: Path) -> list[Rig]:
+    def recordings(kind: str) -> dict[str, Recording]:
+        return {
+            flight: Recording(
+                read_trajectory(folder / f"vio_{kind}_{flight}.tum"),
+                read_trajectory(folder / f"cam0_truth_{flight}.tum"),
+            )
+            for flight in ("mh_03", "mh_05", "v2_01")
+        }
+
+    return [
+        Rig(name=f"euroc_{kind}", recordings=recordings(kind), truth=_EUROC)
+        for kind in ("stereo", "mono")
+    ]
+
+
+_SIMPLE_KITTI = Truth.within(
+    se3.from_quat_xyzw((0.8, -0.3, 0.5), (0.333307, -0.063488, 0.753055, 0.563723)), 0.0, 0.0
+)
+
+
+def _simple_kitti(folder: Path) -> list[Rig]:
+    recordings = {
+        drive: Recording(
+            read_trajectory(folder / f"odometry_{drive}.tum"),
+            read_trajectory(folder / f"truth_{drive}.tum"),
+        )
+        for drive in ("05", "07")
+    }
+    return [Rig(name="simple_kitti", recordings=recordings, truth=_SIMPLE_KITTI)]
+
+
+def _kitti(folder: Path) -> list[Rig]:
+    camera = "KeyFrameTrajectory_TUM_Format.txt"
+    short, long = (
+        folder / "kitti_tests" / f"{day}_drive_0027" for day in ("2011_09_30", "2011_10_03")
+    )
+    files = {
+        "kitti_short": (short / "LIDAR_HDL64E/traj_HDL_aft_opt.csv", short / "cam01" / camera),
+        "kitti_long": (long / "cam01" / camera, long / "cam23" / camera),
+    }
+    # The rectified calibration is what the SLAM saw: the published files differ from it by their
+    # own rectification, 0.03 and 0.45 deg.
+    return [
+        Rig(
+            name=name,
+            recordings={"whole": Recording(*map(read_trajectory, pair))},
+            options=_FOUND,
+            truth=Truth.within(RECTIFIED[name], 0.0, 0.0),
+        )
+        for name, pair in files.items()
+    ]
+
+
+_YAW = Rotation.from_euler("z", -90.78, degrees=True).as_matrix()
+_ZXL19 = Truth.within(
+    se3.from_rotation_translation(_YAW, [0.002, 0.367, 0.0]),
+    np.array([0.018, 0.022, np.inf]),
+    np.array([np.inf, np.inf, 0.23]),
+)
+
+
+def _zxl19(folder: Path) -> list[Rig]:
+    def recordings(child: str) -> dict[str, Recording]:
+        return {
+            f"bag{bag}": Recording(
+                *(_read(folder / f"bag{bag}/{s}_FCPE.mat", _ZXL19_COLUMNS) for s in ("INS", child))
+            )
+            for bag in (1, 2, 3)
+        }
+
+    # The road is flat: heights are a matter for a tape measure.
+    lidar = {**_FOUND, "prior": {"z": (0.0, 0.3)}}
+    camera = {"time_offset": "estimate", "scale": "estimate", "prior": {"z": (-0.3, 0.3)}}
+    return [
+        Rig(
+            name="zxl19_lidar",
+            recordings=recordings("LO"),
+            options=lidar,
+            truth=_ZXL19,
+            is_cut=False,
+        ),
+        Rig(name="zxl19_camera", recordings=recordings("VO"), options=camera, is_cut=False),
+    ]
+
+
+_DEVICES = {
+    "caligula": "CALIGULA_2017-04-06-18-21-33",
+    "mars": "MARS_2017-04-06-18-23-37",
+    "nero": "NERO_2017-04-06-18-25-25",
+}
+
+# Three devices on one rig, pairwise: the answers of a cycle must close.
+CYCLE = ("tango_caligula_mars", "tango_mars_nero", "tango_nero_caligula")
+
+
+def _tango(folder: Path) -> list[Rig]:
+    devices = {name: _read(folder / f"{file}.csv", _ASL_COLUMNS) for name, file in _DEVICES.items()}
+    return [
+        Rig(
+            name=name,
+            recordings={"whole": Recording(devices[parent], devices[child])},
+            options=_FOUND,
+        )
+        for name, (parent, child) in ((name, name.split("_")[1:]) for name in CYCLE)
+    ]
+
+
+# Of four drives of the same pair of sensors: the middle of their range, and half of it.
+_PRIMESENSE = Truth.within(
+    se3.from_rotation_translation(np.eye(3), [0.066, 0.0415, 0.032]),
+    np.array([0.002, 0.0015, 0.002]),
+    np.inf,
+)
+_ARM = Truth.within(
+    se3.from_rotation_translation(np.eye(3), [0.0025, -0.016, 0.001]),
+    np.array([0.0015, 0.0005, 0.0005]),
+    np.inf,
+)
+
+
+def _primesense(folder: Path) -> list[Rig]:
+    stem = "2017-04-09-18-13-10"
+    names = (f"{stem}_vicon_prime_sense", f"{stem}_W_camera_rgb_image_raw")
+    recording = Recording(*(_read(folder / f"{name}.csv", _ASL_COLUMNS) for name in names))
+    return [_single("primesense", recording, _PRIMESENSE)]
+
+
+def _robot_arm(folder: Path) -> list[Rig]:
+    stem = "robot_arm_complete_bag_color_and_ir"
+    names = (f"{stem}_base_link_sr300_hinge", f"{stem}_target_ir")
+    recording = Recording(*(_read(folder / f"{name}.csv", _ASL_COLUMNS) for name in names))
+    return [_single("robot_arm", recording, _ARM)]
+
+
+def _single(name: str, recording: Recording, truth: Truth) -> Rig:
+    return Rig(name=name, recordings={"whole": recording}, options=_CLOCK_FOUND, truth=truth)
+
+
+_BOREAS = Truth.within(
+    se3.from_rotation_translation(
+        Rotation.from_euler("xyz", [-180.0, 0.0, 46.67], degrees=True).as_matrix(), [0.0, 0.0, 0.21]
+    ),
+    0.0,
+    0.005,
+)
+
+
+def _boreas(folder: Path) -> list[Rig]:
+    drive = folder / "boreas-2021-08-05-13-34"
+    recording = Recording(
+        _boreas_poses(drive / "lidar_poses.csv", 1_000), _boreas_poses(drive / "radar_poses.csv", 1)
+    )
+    return [replace(_single("boreas", recording, _BOREAS), options={}, is_cut=False)]
+
+
+def _boreas_poses(path: Path, unit_ns: int) -> Trajectory:
+    """Poses of one INS; its attitude angles are rotations of the frame, hence the signs."""
+    with open(path, encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+
+    def columns(*names: str) -> FloatArray:
+        return np.array([[float(row[name]) for name in names] for row in rows])
+
+    rotations = Rotation.from_euler("XYZ", -columns("roll", "pitch", "heading")).as_matrix()
+    return Trajectory(
+        np.array([int(row["GPSTime"]) * unit_ns for row in rows]),
+        se3.from_rotation_translation(rotations, columns("easting", "northing", "altitude")),
+    )
+
+
+def _read(path: Path, columns: str) -> Trajectory:
+    return read_trajectory_file(path, "csv", columns=columns, repair=True)[0]
+
+
+_LOADERS: dict[str, Callable[[Path], list[Rig]]] = {
+    "valimaki2023": _kitti,
+    "simple_kitti": _simple_kitti,
+    "euroc_vio": _euroc,
+    "zxl19": _zxl19,
+    "asl_tango_easy": _tango,
+    "asl_primesense": _primesense,
+    "asl_robot_arm": _robot_arm,
+    "boreas": _boreas,
+}

@@ -1,0 +1,224 @@
+"""Answers of the calibration, held against what is known."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.assessment.metrics import deviation
+from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.engine.offline import calibrate
+from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from reproduction.coverage import classes
+from reproduction.coverage.measures import COVERAGE, Row
+from reproduction.coverage.real_sets import CYCLE, Rig, Truth
+from reproduction.recordings import PARTS, Recording
+from reproduction.repeats import spread_and_sigma
+
+# Half the width of an interval, in standard deviations.
+_REACH = float(norm.isf((1.0 - COVERAGE) / 2.0))
+
+_KNOWN = (DofVerdict.OBSERVED, DofVerdict.WEAK)
+
+METHODS = {
+    "auto": {"method": "auto"},
+    "adaptive": {"method": "adaptive"},
+    "dnlo": {"method": "dnlo", "reference": "auto"},
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A calibration, None if it failed, and the processor time (s) that it took."""
+
+    calibration: Calibration | None
+    seconds: float
+
+
+def answer(parent: Trajectory, child: Trajectory, options: Mapping[str, Any]) -> Answer:
+    """Calibrate, and take the time."""
+    start = time.process_time()
+    try:
+        calibration = calibrate(parent, child, **options)
+    except HandEyeCalibError:
+        calibration = None
+    return Answer(calibration, time.process_time() - start)
+
+
+def class_row(name: str, method: str, seeds: int) -> Row:
+    """Errors over the bound, NEES and coverage of a simulated class."""
+    cases: dict[str, dict[str, float]] = {}
+    seconds = []
+    for seed in range(seeds):
+        recording = classes.make(name, seed)
+        found = answer(recording.parent, recording.child, METHODS[method])
+        seconds.append(found.seconds)
+        for kind, value in _class_case(name, recording, found.calibration).items():
+            cases.setdefault(kind, {})[f"{seed}"] = value
+    return Row("simulated", name, method, cases, float(np.median(seconds)))
+
+
+def _class_case(
+    name: str, recording: classes.Simulated, found: Calibration | None
+) -> dict[str, float]:
+    refused = found is not None and found.status is SolveStatus.UNOBSERVABLE
+    if name in classes.REFUSED:
+        return {"refused": float(refused)}
+    if found is None:
+        return {"answered": 0.0}
+    xi = se3.log(se3.inverse(found.T_parent_child) @ recording.T_parent_child)
+    bound = recording.bound()
+    case = {
+        "answered": float(found.status is SolveStatus.OK),
+        "bound": _squared(xi, bound),
+        "bound_t": _squared(xi[:3], bound[:3, :3]),
+        "bound_r": _squared(xi[3:], bound[3:, 3:]),
+        "mm": 1e3 * float(np.linalg.norm(xi[:3])),
+        "deg": float(np.degrees(np.linalg.norm(xi[3:]))),
+    }
+    if not np.isfinite(found.covariance).all():
+        return case
+    within = np.abs(xi) < _REACH * np.sqrt(np.diag(found.covariance))
+    return case | {"nees": _squared(xi, found.covariance), "covers": float(within.mean())}
+
+
+def _squared(xi: FloatArray, covariance: FloatArray) -> float:
+    return float(xi @ np.linalg.solve(covariance, xi))
+
+
+def truth_row(rig: Rig, name: str, method: str) -> Row:
+    """Error of a real recording against the known answer, over the axes that both know."""
+    recording = rig.recordings[name]
+    found = answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
+    row_name = f"{rig.name} {name}".removesuffix(" whole")
+    cases = {"answered": {"": 0.0}}
+    if found.calibration is not None and rig.truth is not None:
+        cases = _truth_cases(found.calibration, rig.truth)
+    return Row("known answer", row_name, method, cases, found.seconds)
+
+
+def _truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]]:
+    known = np.isfinite(truth.sigmas) & _knows(found)
+    error = deviation(found.T_parent_child, truth.T_parent_child)
+    # A rotation whose axis is not known to the truth has no small rotation vector.
+    if not np.isfinite(truth.sigmas[3:]).all():
+        error[3:] = _angle_differences(found.T_parent_child, truth.T_parent_child)
+    sigmas = np.where(known, found.sigmas, 1.0)
+    apart = np.where(known, np.abs(error), 0.0)
+    of_truth = np.where(known, truth.sigmas, 0.0)
+    cases = {
+        "answered": {"": 1.0},
+        "mm": {"": 1e3 * float(np.linalg.norm(apart[:3]))},
+        "mm_truth": {"": 1e3 * float(np.linalg.norm(of_truth[:3]))},
+        "deg_truth": {"": float(np.degrees(np.linalg.norm(of_truth[3:])))},
+        "z": {"": float(np.max(apart / sigmas))},
+        "covers": _by_axis(apart < _REACH * sigmas, known),
+        "covers_truth": _by_axis(apart < _REACH * np.hypot(sigmas, of_truth), known),
+    }
+    if known[3:].any():
+        cases["deg"] = {"": float(np.degrees(np.linalg.norm(apart[3:])))}
+    return cases
+
+
+def _angle_differences(T: FloatArray, T_truth: FloatArray) -> FloatArray:
+    """Differences (3,) of roll, pitch and yaw, rad."""
+    angles = se3.rotation_to_rpy(T[:3, :3]) - se3.rotation_to_rpy(T_truth[:3, :3])
+    return (angles + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def _knows(found: Calibration) -> BoolArray:
+    return np.array([dof.verdict in _KNOWN for dof in found.observability])
+
+
+def _by_axis(values: BoolArray, known: BoolArray) -> dict[str, float]:
+    return {axis: float(values[k]) for k, axis in enumerate(AXES) if known[k]}
+
+
+def scatter_row(rig: Rig, method: str) -> Row:
+    """Scatter between the recordings of a rig over their stated sigmas."""
+    found = [
+        answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
+        for recording in rig.recordings.values()
+    ]
+    cases = _scatter_cases([one.calibration for one in found])
+    seconds = float(np.median([one.seconds for one in found]))
+    return Row("rig", rig.name, method, {"scatter": cases} if cases else {}, seconds)
+
+
+def parts_row(rig: Rig, name: str, method: str) -> Row:
+    """Scatter between halves and between thirds of a recording over their stated sigmas."""
+    recording, options = rig.recordings[name], {**rig.options, **METHODS[method]}
+    row_name = f"{rig.name} {name}".removesuffix(" whole")
+    whole = answer(recording.parent, recording.child, options)
+    cases: dict[str, float] = {}
+    if whole.calibration is not None:
+        for count, label in PARTS.items():
+            parts = recording.parts(count, whole.calibration.time_offset_s)
+            answers = [_part_answer(part, options) for part in parts]
+            cases |= {f"{label} {key}": value for key, value in _scatter_cases(answers).items()}
+    return Row("parts", row_name, method, {"scatter": cases} if cases else {}, whole.seconds)
+
+
+def _part_answer(part: Recording, options: Mapping[str, Any]) -> Calibration | None:
+    return answer(part.parent, part.child, options).calibration
+
+
+def _scatter_cases(answers: list[Calibration | None]) -> dict[str, float]:
+    """Squared scatter over stated variance of each axis, once per degree of freedom."""
+    good = [one for one in answers if one is not None]
+    if len(good) < len(answers) or len(good) < 2:
+        return {}
+    spread, stated, known = spread_and_sigma(good)
+    return {
+        f"{axis}/{freedom}": float(spread[k] / stated[k])
+        for k, axis in enumerate(AXES)
+        if known[k]
+        for freedom in range(len(good) - 1)
+    }
+
+
+def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
+    """How far three pairwise answers miss closing, and that over their stated covariances."""
+    found = []
+    for name in CYCLE:
+        rig = rigs[name]
+        recording = rig.recordings["whole"]
+        found.append(answer(recording.parent, recording.child, {**rig.options, **METHODS[method]}))
+    good = [one.calibration for one in found if one.calibration is not None]
+    seconds = float(np.median([one.seconds for one in found]))
+    if len(good) < len(found):
+        return Row("cycle", "tango", method, {"answered": {"": 0.0}}, seconds)
+    xi, covariance = misclosure(good)
+    cases = {
+        "answered": 1.0,
+        "mm": 1e3 * float(np.linalg.norm(xi[:3])),
+        "deg": float(np.degrees(np.linalg.norm(xi[3:]))),
+        "chi2": _squared(xi, covariance),
+    }
+    return Row("cycle", "tango", method, {k: {"": v} for k, v in cases.items()}, seconds)
+
+
+def misclosure(answers: list[Calibration]) -> tuple[FloatArray, FloatArray]:
+    """Error (6,) of a closed chain of answers, first parent to last child, with its covariance
+    (6, 6), both in the frame of the last child. Scales are those of the parents in turn.
+    """
+    closed, covariance, scale = np.eye(4), np.zeros((6, 6)), 1.0
+    for one in answers:
+        T = one.T_parent_child.copy()
+        T[:3, 3] *= scale
+        stretch = np.repeat([scale, 1.0], 3)
+        moved = se3.adjoint(se3.inverse(T))
+        covariance = moved @ covariance @ moved.T
+        covariance += one.covariance * np.outer(stretch, stretch)
+        closed = closed @ T
+        scale *= one.scale
+    return se3.log(closed), covariance

@@ -1,0 +1,247 @@
+"""Errors of a sensor's poses: what kinds there are, and draws of them.
+
+Errors act on the right, in the sensor's own frame: ``T_measured = T_true Exp(error)``. A sensor has
+white errors, Gauss-Markov errors fixed to its body or to its world, and errors of its increments
+(random walk, jumps, a drifting scale).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.geometry import se3
+
+
+def sigmas(metres: float | FloatArray, degrees: float | FloatArray) -> FloatArray:
+    """Standard deviations (6,) of (rho, phi), in m and rad."""
+    return np.concatenate([np.full(3, 1.0) * metres, np.radians(np.full(3, 1.0) * degrees)])
+
+
+def _no_error() -> FloatArray:
+    return np.zeros(6)
+
+
+@dataclass(frozen=True)
+class GaussMarkov:
+    """A stationary first-order process: correlation time tau_s, standard deviations (6,)."""
+
+    tau_s: float
+    sigma: FloatArray
+    in_world: bool = False
+
+
+@dataclass(frozen=True)
+class Tail:
+    """Factors on the standard deviation of the white errors, drawn for each pose.
+
+    Attributes
+    ----------
+    kind : str
+        ``student``: multivariate t with ``factor`` degrees of freedom. ``spikes``: a share of the
+        poses is worse by a factor. ``bursts``: the same in stretches of 1 s.
+    share, factor : float
+    """
+
+    kind: str
+    share: float = 0.0
+    factor: float = 1.0
+
+    def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
+        """Factors (N,)."""
+        if self.kind == "student":
+            return np.sqrt(self.factor / rng.chisquare(self.factor, count))
+        if self.kind == "spikes":
+            return np.where(rng.random(count) < self.share, self.factor, 1.0)
+        return np.where(_bursts(rng, count, self.share, 1.0 / dt), self.factor, 1.0)
+
+    def information(self) -> float:
+        """Fisher information of the location of a 6-dimensional error, over that of the Gaussian
+        core. Bursts last long enough to be seen: there each pose's factor counts as known.
+        """
+        if self.kind == "student":
+            return (self.factor + 6.0) / (self.factor + 8.0)
+        if self.kind == "spikes":
+            return mixture_information(self.share, self.factor)
+        return 1.0
+
+
+def _bursts(rng: np.random.Generator, count: int, share: float, length: float) -> BoolArray:
+    """Whether each pose (N,) lies in a burst; bursts last ``length`` poses on average."""
+    inside, flags = False, np.empty(count, dtype=bool)
+    leave, enter = 1.0 / length, share / (1.0 - share) / length
+    for i, draw in enumerate(rng.random(count)):
+        inside = bool(draw >= leave if inside else draw < enter)
+        flags[i] = inside
+    return flags
+
+
+def mixture_information(share: float, factor: float, dimensions: int = 6) -> float:
+    """Fisher information of the location of (1 - share) N(0, I) + share N(0, factor^2 I), per
+    dimension, by an integral over the radius.
+    """
+    r = np.linspace(1e-6, 8.0 * factor + 8.0, 400_000)
+    core = (1.0 - share) * np.exp(-0.5 * r**2)
+    wide = share * factor**-dimensions * np.exp(-0.5 * (r / factor) ** 2)
+    density, slope = core + wide, r * (core + wide / factor**2)
+    seen = density > 1e-300
+    weight = r[seen] ** (dimensions - 1)
+    total = np.sum(weight * density[seen])
+    found = np.sum(weight * slope[seen] ** 2 / density[seen])
+    return float(found / total / dimensions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorErrors:
+    """What a sensor gets wrong.
+
+    Attributes
+    ----------
+    white : (6,) array
+        Standard deviations of each pose.
+    walk, walk_by_metre : (6,) arrays
+        Standard deviations of the summed increments after 1 s, and after 1 m.
+    slow : tuple of GaussMarkov
+    scale : (float, float), optional
+        Standard deviation and correlation time (s) of a drifting scale.
+    jitter_s : float
+        Standard deviation of the stamps.
+    tail : Tail, optional
+        Of the white errors.
+    jumps_per_s : float
+    jump : (6,) array
+        Standard deviations of a jump.
+    """
+
+    white: FloatArray
+    walk: FloatArray = field(default_factory=_no_error)
+    walk_by_metre: FloatArray = field(default_factory=_no_error)
+    slow: tuple[GaussMarkov, ...] = ()
+    scale: tuple[float, float] | None = None
+    jitter_s: float = 0.0
+    tail: Tail | None = None
+    jumps_per_s: float = 0.0
+    jump: FloatArray = field(default_factory=lambda: sigmas(0.1, 0.5))
+
+
+@dataclass(frozen=True)
+class DrawnErrors:
+    """A sensor's poses with one draw of its errors, and what the bound takes as known.
+
+    Attributes
+    ----------
+    poses : (N, 4, 4) array
+        As measured.
+    white : (N, 6, 6) array
+        Inverse Fisher information of the white errors: their covariance if they are Gaussian.
+    walk : (N-1, 6, 6) array
+        Covariances of the increments' white errors, jumps included.
+    """
+
+    poses: FloatArray
+    white: FloatArray
+    walk: FloatArray
+
+
+def draw(
+    errors: SensorErrors, Ts: FloatArray, twists: FloatArray, dt: float, rng: np.random.Generator
+) -> DrawnErrors:
+    """Measure the poses of a sensor once.
+
+    Parameters
+    ----------
+    errors : SensorErrors
+    Ts : (N, 4, 4) array
+        True poses.
+    twists : (N, 6) array
+        True twists in the sensor's frame, m/s and rad/s.
+    dt : float
+        Time between poses, s.
+    rng : numpy.random.Generator
+    """
+    jump_rng, walk_rng, scale_rng, tail_rng, white_rng, slow_rng = rng.spawn(6)
+    steps = se3.inverse(Ts[:-1]) @ Ts[1:]
+    variances = _walk_variances(errors, steps, dt, jump_rng)
+    increments = np.sqrt(variances) * walk_rng.standard_normal((len(steps), 6))
+    increments += _scale_errors(errors, steps, dt, scale_rng)
+    white, covariances = _white(errors, twists, dt, tail_rng, white_rng)
+    for part in errors.slow:
+        white = white + _slow(part, Ts, dt, slow_rng)
+    poses = _integrated(Ts[0], steps @ se3.exp(increments)) @ se3.exp(white)
+    return DrawnErrors(poses, covariances, variances[:, :, None] * np.eye(6))
+
+
+def _white(
+    errors: SensorErrors,
+    twists: FloatArray,
+    dt: float,
+    tail_rng: np.random.Generator,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """White errors (N, 6) and their inverse Fisher information (N, 6, 6)."""
+    factors, known = np.ones(len(twists)), np.ones(len(twists))
+    if errors.tail is not None:
+        factors = errors.tail.draw(tail_rng, len(twists), dt)
+        known = factors**2 if errors.tail.kind == "bursts" else known / errors.tail.information()
+    drawn = factors[:, None] * errors.white * rng.standard_normal((len(twists), 6))
+    drawn += errors.jitter_s * twists * rng.standard_normal((len(twists), 1))
+    covariances = known[:, None, None] * np.diag(errors.white**2)
+    return drawn, covariances + errors.jitter_s**2 * twists[:, :, None] * twists[:, None, :]
+
+
+def _walk_variances(
+    errors: SensorErrors, steps: FloatArray, dt: float, rng: np.random.Generator
+) -> FloatArray:
+    """Variances (N-1, 6) of the increments' white errors."""
+    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
+    jumped = rng.random(len(steps)) < errors.jumps_per_s * dt
+    by_metre = errors.walk_by_metre**2 * lengths[:, None]
+    return errors.walk**2 * dt + by_metre + jumped[:, None] * errors.jump**2
+
+
+def _scale_errors(
+    errors: SensorErrors, steps: FloatArray, dt: float, rng: np.random.Generator
+) -> FloatArray:
+    """Errors (N-1, 6) of the increments that a drifting scale makes."""
+    if errors.scale is None:
+        return np.zeros((len(steps), 6))
+    sigma, tau_s = errors.scale
+    return scale_columns(steps) * (sigma * _markov(len(steps), 1, np.exp(-dt / tau_s), rng))
+
+
+def scale_columns(steps: FloatArray) -> FloatArray:
+    """Errors (N-1, 6) of increments (N-1, 4, 4) per unit of relative scale."""
+    rho = np.einsum("nji,nj->ni", steps[:, :3, :3], steps[:, :3, 3])
+    return np.concatenate([rho, np.zeros_like(rho)], axis=1)
+
+
+def _integrated(start: FloatArray, steps: FloatArray) -> FloatArray:
+    poses = np.empty((len(steps) + 1, 4, 4))
+    poses[0] = start
+    for i, step in enumerate(steps):
+        poses[i + 1] = poses[i] @ step
+    return poses
+
+
+def _markov(count: int, columns: int, phi: float, rng: np.random.Generator) -> FloatArray:
+    """Stationary first-order processes (N, columns) of variance 1."""
+    values = rng.standard_normal((count, columns))
+    values[1:] *= np.sqrt(1.0 - phi**2)
+    for i in range(1, count):
+        values[i] += phi * values[i - 1]
+    return values
+
+
+def _slow(part: GaussMarkov, Ts: FloatArray, dt: float, rng: np.random.Generator) -> FloatArray:
+    values = part.sigma * _markov(len(Ts), 6, np.exp(-dt / part.tau_s), rng)
+    return np.einsum("nij,nj->ni", directions(part, Ts), values)
+
+
+def directions(part: GaussMarkov, Ts: FloatArray) -> FloatArray:
+    """Matrices (N, 6, 6) from a process to errors in the sensor's frame."""
+    matrices = np.tile(np.eye(6), (len(Ts), 1, 1))
+    if part.in_world:
+        matrices[:, :3, :3] = matrices[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2)
+    return matrices

@@ -1,0 +1,83 @@
+"""All rows of the study, on several processes, and where they are kept."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from hand_eye_calib.errors import InputError
+from reproduction.coverage.classes import CLASSES
+from reproduction.coverage.measures import POOLED, Row, pooled
+from reproduction.coverage.real_sets import CYCLE, Rig
+from reproduction.coverage.scores import class_row, cycle_row, parts_row, scatter_row, truth_row
+from reproduction.runner import in_parallel
+
+HERE = Path(__file__).parent
+BASELINE, VERSION_0_1 = HERE / "baseline.json", HERE / "version_0_1.json"
+
+# Digits that are kept of a case: more than noise, less than rounding.
+_DIGITS = 5
+
+
+def measure(rigs: Sequence[Rig], methods: Sequence[str], seeds: int, jobs: int) -> list[Row]:
+    """Rows of every class, rig and cycle for every method, then the pooled ones."""
+    tasks = [task for method in methods for task in _tasks(rigs, method, seeds)]
+    rows = in_parallel(_measured, tasks, jobs)
+    together = [
+        pooled(table, name, method, rows) for method in methods for table, name in POOLED.items()
+    ]
+    return [row for row in rows + together if row.cases]
+
+
+def _tasks(rigs: Sequence[Rig], method: str, seeds: int) -> list[tuple[object, ...]]:
+    tasks: list[tuple[object, ...]] = [(class_row, name, method, seeds) for name in CLASSES]
+    for rig in rigs:
+        names = list(rig.recordings)
+        if rig.truth is not None:
+            tasks += [(truth_row, rig, name, method) for name in names]
+        if len(names) > 1:
+            tasks.append((scatter_row, rig, method))
+        if rig.is_cut:
+            tasks += [(parts_row, rig, name, method) for name in names]
+    by_name = {rig.name: rig for rig in rigs}
+    if set(CYCLE) <= set(by_name):
+        tasks.append((cycle_row, {name: by_name[name] for name in CYCLE}, method))
+    return tasks
+
+
+def _measured(function, *arguments) -> Row:  # type: ignore[no-untyped-def]
+    return function(*arguments)
+
+
+def save(rows: Iterable[Row], path: Path) -> None:
+    """Keep the rows, one per line."""
+    lines = [json.dumps(_document(row), allow_nan=False) for row in rows]
+    path.write_text('{"rows": [\n' + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
+
+
+def _document(row: Row) -> dict[str, object]:
+    cases = {
+        kind: {key: float(f"{value:.{_DIGITS}g}") for key, value in found.items()}
+        for kind, found in row.cases.items()
+    }
+    return {"table": row.table, "name": row.name, "method": row.method, "seconds": round(row.seconds, 4),
+            "cases": cases}  # fmt: skip
+
+
+def load(path: Path) -> dict[str, Row]:
+    """Kept rows by their keys.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    try:
+        documents = json.loads(path.read_text(encoding="utf-8"))["rows"]
+        rows = [Row(**document) for document in documents]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"cannot read the rows in {path}: {error}; store new ones with --update-baseline"
+        ) from None
+    return {row.key: row for row in rows}

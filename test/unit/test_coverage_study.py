@@ -1,0 +1,279 @@
+"""The coverage study: its yardstick is right, and a worsened row fails."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from published_data import data_folder
+
+from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.geometry import se3
+from reproduction.coverage import __main__ as command
+from reproduction.coverage import classes, measures, motions, study
+from reproduction.coverage.bound import ideal_estimate
+from reproduction.coverage.measures import Row, pooled, worsened
+from reproduction.coverage.page import page
+from reproduction.coverage.real_sets import CYCLE, real_rigs
+from reproduction.coverage.scores import misclosure
+from reproduction.coverage.sensor_errors import (
+    GaussMarkov,
+    SensorErrors,
+    Tail,
+    mixture_information,
+    sigmas,
+)
+
+# White, walk, scale and slow errors fixed to body and world: every term of the state space.
+SMALL = classes.RecordingClass(
+    motion=motions.hand_held,
+    duration_s=12.0,
+    rate_hz=10.0,
+    parent=SensorErrors(
+        white=sigmas(0.0005, 0.02), slow=(GaussMarkov(2.0, sigmas(0.002, 0.05), in_world=True),)
+    ),
+    child=SensorErrors(
+        white=sigmas(0.0005, 0.02),
+        walk=sigmas(0.001, 0.02),
+        slow=(GaussMarkov(0.5, sigmas(0.001, 0.05)),),
+        scale=(0.01, 5.0),
+    ),
+)
+
+
+def shown(recording):
+    """z of the bound's state space: increments' errors at the truth, summed up."""
+    X = recording.T_parent_child
+    A, B = (
+        se3.inverse(stream.poses[:-1]) @ stream.poses[1:]
+        for stream in (recording.parent, recording.child)
+    )
+    errors = se3.log(se3.inverse(B) @ se3.inverse(X) @ A @ X)
+    true = recording.sides[1].Ts
+    back = se3.adjoint(se3.inverse(se3.inverse(true[:-1]) @ true[1:]))
+    z = np.zeros((len(true), 6))
+    for i, error in enumerate(errors):
+        z[i + 1] = back[i] @ z[i] + error
+    return z
+
+
+def test_ideal_weighted_estimator_scatters_by_the_bound():
+    squared = []
+    for seed in range(40):
+        recording = classes.simulate(SMALL, seed)
+        xi = ideal_estimate(recording.sides, recording.sides[1].Ts, recording.dt, shown(recording))
+        squared.append(xi @ np.linalg.solve(recording.bound(), xi))
+    # The mean of chi-squared with 6 degrees of freedom over 40 draws: 6 +/- 0.55.
+    assert 4.4 < np.mean(squared) < 7.6
+
+
+@pytest.mark.parametrize("term", ["walk", "slow", "scale", "white"])
+def test_a_wrong_noise_level_would_show(term):
+    recording = classes.simulate(SMALL, 0)
+    parent, child = recording.sides
+    worse = {
+        "walk": dataclasses.replace(
+            child, drawn=dataclasses.replace(child.drawn, walk=9 * child.drawn.walk)
+        ),
+        "white": dataclasses.replace(
+            child, drawn=dataclasses.replace(child.drawn, white=9 * child.drawn.white)
+        ),
+        "slow": dataclasses.replace(
+            child,
+            errors=dataclasses.replace(SMALL.child, slow=(GaussMarkov(0.5, sigmas(0.003, 0.15)),)),
+        ),
+        "scale": dataclasses.replace(
+            child, errors=dataclasses.replace(SMALL.child, scale=(0.1, 5.0))
+        ),
+    }[term]
+    more = dataclasses.replace(recording, sides=(parent, worse)).bound()
+    gain = np.linalg.eigvals(np.linalg.solve(recording.bound(), more)).real
+    assert gain.min() > 1.0 - 1e-6
+    assert gain.max() > 1.02
+
+
+def test_information_of_heavy_tails():
+    assert mixture_information(0.0, 10.0) == pytest.approx(1.0, abs=1e-6)
+    # Spikes far out are seen for what they are, and lost.
+    assert mixture_information(0.1, 100.0) == pytest.approx(0.9, abs=0.01)
+    assert Tail("student", factor=1e6).information() == pytest.approx(1.0, abs=1e-5)
+    scores = []
+    rng = np.random.default_rng(0)
+    for factor in Tail("student", factor=3.0).draw(rng, 20_000, 0.1):
+        x = factor * rng.standard_normal(6)
+        scores.append(9.0 * x[0] / (3.0 + x @ x))
+    assert np.mean(np.square(scores)) == pytest.approx(
+        Tail("student", factor=3.0).information(), rel=0.05
+    )
+
+
+def test_recordings_of_a_class_repeat_and_differ():
+    first, again, other = (classes.make("hand_white", seed) for seed in (1, 1, 2))
+    assert np.array_equal(first.child.poses, again.child.poses)
+    assert not np.allclose(first.T_parent_child, other.T_parent_child)
+    exact = dataclasses.replace(SMALL, parent=_nearly_none(), child=_nearly_none())
+    recording = classes.simulate(exact, 0)
+    X, parent, child = recording.T_parent_child, recording.parent.poses, recording.child.poses
+    A, B = (se3.inverse(poses[0]) @ poses[-1] for poses in (parent, child))
+    np.testing.assert_allclose(A @ X, X @ B, atol=1e-6)
+
+
+def _nearly_none():
+    return SensorErrors(white=sigmas(1e-9, 1e-9))
+
+
+def row(values, kind="bound", name="hand_white"):
+    cases = {f"{seed}": value for seed, value in enumerate(values)}
+    return Row("simulated", name, "dnlo", {kind: cases, "answered": dict.fromkeys(cases, 1.0)})
+
+
+HONEST = np.random.default_rng(0).chisquare(6, 12)
+
+
+@pytest.mark.parametrize(
+    ("now", "is_worse"),
+    [
+        (HONEST, False),
+        (0.5 * HONEST, False),
+        (1.04 * HONEST, False),
+        (1.5 * HONEST, True),
+        # One bad draw among twelve is noise.
+        (np.r_[9.0 * HONEST[0], HONEST[1:]], False),
+        # Fewer seeds are compared with the same ones.
+        (2.0 * HONEST[:5], True),
+    ],
+)
+def test_a_row_gets_worse_beyond_its_noise(now, is_worse):
+    before = row(HONEST)
+    assert bool(worsened([row(now)], {before.key: before})) == is_worse
+
+
+@pytest.mark.parametrize(
+    ("kind", "before", "now"),
+    [
+        ("covers", [0.9] * 8, [0.7] * 8),
+        ("covers", [0.9] * 8, [1.0] * 8),
+        ("nees", [5.3] * 8, [9.0] * 8),
+        ("nees", [5.3] * 8, [1.0] * 8),
+        ("scatter", [1.0] * 8, [4.0] * 8),
+        ("mm", [10.0], [12.0]),
+        ("refused", [1.0] * 8, [1.0] * 7 + [0.0]),
+    ],
+)
+def test_every_kind_of_measure_can_get_worse(kind, before, now):
+    was = row(before, kind)
+    found = worsened([row(now, kind)], {was.key: was})
+    if kind == "refused":
+        # One of eight: not beyond the noise of the cases, but all of them would be.
+        found = worsened([row([0.0] * 8, kind)], {was.key: was})
+    assert [one.kind for one in found] == [kind]
+    assert measures.KINDS[kind].title in str(found[0])
+
+
+def test_pooled_error_is_the_geometric_mean_over_the_classes():
+    rows = [row(4.0 * HONEST, name="a"), row(HONEST, name="b")]
+    together = pooled("simulated", "all", "dnlo", rows)
+    assert together.value("bound") == pytest.approx(
+        np.sqrt(rows[0].value("bound") * rows[1].value("bound"))
+    )
+    assert rows[0].value("bound") == pytest.approx(2.0 * rows[1].value("bound"))
+
+
+def test_command_fails_on_a_worsened_row_only(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(study, "BASELINE", tmp_path / "baseline.json")
+    monkeypatch.delenv("HAND_EYE_CALIB_DATA", raising=False)
+
+    def measured(factor):
+        return lambda *_: [row(factor * HONEST)]
+
+    monkeypatch.setattr(study, "measure", measured(1.0))
+    assert command.main(["--update-baseline"]) == 0
+    assert command.main([]) == 0
+    monkeypatch.setattr(study, "measure", measured(2.0))
+    capsys.readouterr()
+    assert command.main(["--page", str(tmp_path / "page.md")]) == 1
+    out, err = capsys.readouterr()
+    assert "worse: dnlo, simulated: hand_white: error / bound" in err
+    assert (tmp_path / "page.md").read_text() + "\n" == out
+    assert command.main(["--methods", "none"]) == 2
+    (tmp_path / "baseline.json").unlink()
+    assert command.main([]) == 1
+
+
+def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
+    rng = np.random.default_rng(0)
+    T_ab, T_bc = se3.exp(rng.normal(0.0, 0.5, (2, 6)))
+    T_ca = se3.inverse(T_ab @ T_bc)
+    # The child's lengths times its scale are the parent's metres.
+    scales = (0.5, 4.0, 0.5)
+    T_bc[:3, 3] /= 0.5
+    T_ca[:3, 3] /= 0.5 * 4.0
+    covariances = [np.diag(variances) for variances in rng.uniform(1e-6, 1e-4, (3, 6))]
+    answers = [
+        _calibration(T, covariance, scale)
+        for T, covariance, scale in zip((T_ab, T_bc, T_ca), covariances, scales, strict=True)
+    ]
+    xi, covariance = misclosure(answers)
+    np.testing.assert_allclose(xi, 0.0, atol=1e-12)
+    off = se3.exp(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]))
+    xi, _ = misclosure([*answers[:2], _calibration(T_ca @ off, covariances[2], 0.5)])
+    assert xi[2] == pytest.approx(0.02)
+    draws = []
+    for _ in range(400):
+        errors = [rng.multivariate_normal(np.zeros(6), c) for c in covariances]
+        moved = [
+            dataclasses.replace(one, T_parent_child=one.T_parent_child @ se3.exp(error))
+            for one, error in zip(answers, errors, strict=True)
+        ]
+        xi, _ = misclosure(moved)
+        draws.append(xi @ np.linalg.solve(covariance, xi))
+    assert np.mean(draws) == pytest.approx(6.0, abs=0.6)
+
+
+def _calibration(T_parent_child, covariance, scale):
+    return Calibration(
+        T_parent_child=T_parent_child,
+        covariance=covariance,
+        status=SolveStatus.OK,
+        observability=(),
+        objective=0.0,
+        method="dnlo",
+        reference="B1",
+        backend="fast",
+        n_poses=2,
+        n_pairs=1,
+        n_inliers=1,
+        scale=scale,
+    )
+
+
+def test_one_class_from_end_to_end(monkeypatch):
+    monkeypatch.setattr(study, "CLASSES", ("hand_white", "flat_agv"))
+    rows = study.measure([], ["dnlo"], 2, 1)
+    found = {one.name: one for one in rows}
+    assert 0.3 < found["hand_white"].value("bound") < 3.0
+    assert found["flat_agv"].value("refused") == 1.0
+    assert set(found["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
+    assert "| hand_white | dnlo |" in page(rows, {}, ["a folder"], 2)
+
+
+def test_rows_survive_the_file(tmp_path):
+    rows = [row(HONEST), row([0.5, 1.0], "covers", "car_lever")]
+    study.save(rows, tmp_path / "rows.json")
+    kept = study.load(tmp_path / "rows.json")
+    assert set(kept) == {one.key for one in rows}
+    assert kept[rows[0].key].value("bound") == pytest.approx(rows[0].value("bound"), rel=1e-4)
+
+
+def test_absent_folders_are_named(tmp_path):
+    rigs, absent = real_rigs(tmp_path)
+    assert rigs == []
+    assert "euroc_vio" in absent
+
+
+def test_every_real_set_can_be_read():
+    rigs, absent = real_rigs(data_folder())
+    assert absent == []
+    assert set(CYCLE) < {rig.name for rig in rigs}
+    for rig in rigs:
+        for recording in rig.recordings.values():
+            assert min(len(recording.parent), len(recording.child)) > 100
