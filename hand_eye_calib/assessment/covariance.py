@@ -169,21 +169,14 @@ def model_covariance(pairs, solution):
     """
     weights = solution.weights
     n_effective = max(float(weights.sum()) - 3.0, 1.0)
-    rotation, translation = solution.T_parent_child[:3, :3], solution.T_parent_child[:3, 3]
-    rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
-    translation_b = pairs.Ts_childi_childj[:, :3, 3]
-    moved = rotation_a - np.eye(3)
-
-    residual_t = (
-        moved @ translation + pairs.Ts_parenti_parentj[:, :3, 3] - translation_b @ rotation.T
-    )
-    residual_r = se3.rotation_log(
-        np.swapaxes(rotation_a @ rotation, 1, 2) @ (rotation @ rotation_b)
-    )  # child axes at j
+    residual_t, residual_r = pairs.residuals(solution.T_parent_child)
     variance_t = (weights @ (residual_t**2).sum(axis=1)) / (3 * n_effective)
     cov_r = np.einsum("k,ki,kj->ij", weights, residual_r, residual_r) / n_effective
     variance_r = np.trace(cov_r) / 3
 
+    rotation = solution.T_parent_child[:3, :3]
+    rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
+    translation_b, moved = pairs.Ts_childi_childj[:, :3, 3], rotation_a - np.eye(3)
     jacobian_t = np.concatenate([moved @ rotation, rotation @ se3.skew(translation_b)], axis=2)
     information_t = np.einsum("k,kai,kaj->ij", weights, jacobian_t, jacobian_t)
     jacobian_r = np.swapaxes(rotation_b, 1, 2) - np.eye(3)

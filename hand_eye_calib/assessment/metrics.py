@@ -37,9 +37,6 @@ def errors(pairs, T_parent_child, truth_T_parent_child):
 def relative_errors(pairs, T_parent_child):
     """Mean relative errors e_rt and e_rR (eqs 6 and 7).
 
-    The translation residual is ``R_A t + t_A - R t_B - t``; the article prints its last term with
-    the opposite sign, its published numbers have this one.
-
     Parameters
     ----------
     pairs : MotionPairs
@@ -51,11 +48,11 @@ def relative_errors(pairs, T_parent_child):
     e_rt, e_rR : float
         In m and rad.
     """
-    via_parent = pairs.Ts_parenti_parentj @ T_parent_child
-    via_child = T_parent_child @ pairs.Ts_childi_childj
-    translation = np.linalg.norm((via_parent - via_child)[:, :3, 3], axis=1)
-    rotation = _angle_between(via_child[:, :3, :3], via_parent[:, :3, :3])
-    return float(translation.mean()), float(rotation.mean())
+    translation, rotation = pairs.residuals(T_parent_child)
+    return (
+        float(np.linalg.norm(translation, axis=1).mean()),
+        float(np.linalg.norm(rotation, axis=1).mean()),
+    )
 
 
 def absolute_errors(T_parent_child, truth_T_parent_child):
@@ -63,9 +60,8 @@ def absolute_errors(T_parent_child, truth_T_parent_child):
     true one.
     """
     translation = np.linalg.norm(truth_T_parent_child[:3, 3] - T_parent_child[:3, 3])
-    return float(translation), float(
-        _angle_between(T_parent_child[:3, :3], truth_T_parent_child[:3, :3])
-    )
+    rotation = se3.rotation_angle(T_parent_child[:3, :3].T @ truth_T_parent_child[:3, :3])
+    return float(translation), float(rotation)
 
 
 def deviation(T_parent_child, T_reference):
@@ -74,7 +70,3 @@ def deviation(T_parent_child, T_reference):
     """
     rotation = se3.rotation_log(T_parent_child[:3, :3] @ T_reference[:3, :3].T)
     return np.r_[T_parent_child[:3, 3] - T_reference[:3, 3], rotation]
-
-
-def _angle_between(first, second):
-    return se3.rotation_angle(np.swapaxes(first, -1, -2) @ second)

@@ -382,9 +382,10 @@ def _agreed_rotation(parent, child, max_gap_s, lag_s):
     """
     pairs = _pairs(parent, child, max_gap_s, lag_s)
     rotation = align_rotation_vectors(pairs)
-    rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
-    errors = se3.rotation_angle(np.swapaxes(rotation_a @ rotation, 1, 2) @ (rotation @ rotation_b))
-    agree = np.median(errors) < 2 * HOLDS * np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2))
+    T_rotation = se3.from_rotation_translation(rotation, np.zeros(3))
+    errors = np.linalg.norm(pairs.rotation_residuals(T_rotation), axis=1)
+    angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
+    agree = np.median(errors) < 2 * HOLDS * np.sqrt(np.mean(angles**2))
     return rotation if agree else None
 
 
