@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 
 
 @dataclass(frozen=True)
@@ -26,15 +28,17 @@ class Errors:
     e_aR: float
 
 
-def errors(pairs, T_parent_child, truth_T_parent_child):
-    """All four metrics of a calibration; see :func:`relative_errors` and :func:`absolute_errors`."""
+def errors(
+    pairs: MotionPairs, T_parent_child: FloatArray, truth_T_parent_child: FloatArray
+) -> Errors:
+    """All four metrics of a calibration."""
     return Errors(
         *relative_errors(pairs, T_parent_child),
         *absolute_errors(T_parent_child, truth_T_parent_child),
     )
 
 
-def relative_errors(pairs, T_parent_child):
+def relative_errors(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[float, float]:
     """Mean relative errors e_rt and e_rR (eqs 6 and 7).
 
     Parameters
@@ -55,7 +59,9 @@ def relative_errors(pairs, T_parent_child):
     )
 
 
-def absolute_errors(T_parent_child, truth_T_parent_child):
+def absolute_errors(
+    T_parent_child: FloatArray, truth_T_parent_child: FloatArray
+) -> tuple[float, float]:
     """Absolute errors e_at and e_aR (eqs 8 and 9), in m and rad, of a transform (4, 4) against the
     true one.
     """
@@ -64,8 +70,8 @@ def absolute_errors(T_parent_child, truth_T_parent_child):
     return float(translation), float(rotation)
 
 
-def deviation(T_parent_child, T_reference):
-    """How far one answer is from another: (6,) array, m along and rad about the axes of the parent
+def deviation(T_parent_child: FloatArray, T_reference: FloatArray) -> FloatArray:
+    """Deviation (6,) of a transform from another, along (m) and about (rad) the axes of the parent
     sensor's frame.
     """
     rotation = se3.rotation_log(T_parent_child[:3, :3] @ T_reference[:3, :3].T)

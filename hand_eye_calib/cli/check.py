@@ -34,9 +34,9 @@ def add_arguments(parser):
 
 def run(arguments):
     """Print what was found; returns 1 where something is wrong with the streams, otherwise 0."""
-    from hand_eye_calib.checks.agreement import check_streams
+    from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import Severity
-    from hand_eye_calib.checks.stream_checks import summarise
+    from hand_eye_calib.checks.streams import summarise
     from hand_eye_calib.engine.calibrator import ESTIMATE
 
     if len(arguments.inputs) > 2:
@@ -74,23 +74,18 @@ def run(arguments):
 
 
 def _read_files(arguments):
-    from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+    from hand_eye_calib.checks.findings import repaired_file
 
     arguments.parent, arguments.child = arguments.inputs
     arguments.repair_stamps = True
     trajectories, notes = read_files(arguments)
-    return trajectories, [
-        Finding(
-            "disorder", "both", Severity.NOTE, Confidence.CERTAIN, text, "repair the file's source"
-        )
-        for text in notes
-    ]
+    return trajectories, [repaired_file(text) for text in notes]
 
 
 def _read_bag(arguments):
     import numpy as np
 
-    from hand_eye_calib.checks.stream_checks import tidy
+    from hand_eye_calib.checks.streams import tidy
     from hand_eye_calib.io.bags import PoseBag
 
     columns = {stream: ([], [], []) for stream in STREAMS}
@@ -123,7 +118,7 @@ def _document(streams, findings, agreement):
             "time_offset_s": agreement.correlation.offset_s,
             "correlation": agreement.correlation.correlation,
             "distinctness": agreement.correlation.distinctness,
-            "rms_rad_in_3_s": agreement.turned_rad,
+            "rms_rad_in_3_s": agreement.rms_rotation,
         },
         "findings": [finding.to_dict() for finding in findings],
     }
@@ -138,11 +133,11 @@ def _text(streams, findings, agreement):
     for name, summary in streams.items():
         lines.append(
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} {summary.longest_interval_s:10.3f} s "
-            f"{summary.way_m:8.1f} m {math.degrees(summary.turned_rad):6.0f} deg"
+            f"{summary.path_m:8.1f} m {math.degrees(summary.rotation_rad):6.0f} deg"
         )
-    if agreement.turned_rad:
+    if agreement.rms_rotation:
         turned = "  ".join(
-            f"{axis} {math.degrees(angle):.2f}" for axis, angle in agreement.turned_rad.items()
+            f"{axis} {math.degrees(angle):.2f}" for axis, angle in agreement.rms_rotation.items()
         )
         lines.append(
             f"The parent turns about its axes, in 3 s and root mean square:  {turned}  deg"
