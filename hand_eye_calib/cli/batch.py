@@ -1,5 +1,5 @@
-"""``replay --batch FILE``: many bags, on all cores or on a Dask cluster; what is done already is
-not done again.
+"""``replay --batch FILE``: many recordings, on all cores or on a Dask cluster. What is done already
+is not done again.
 
 The file is YAML: a list of bags, or a mapping with the list under ``bags`` and, beside it, what
 holds for all of them::
@@ -10,54 +10,65 @@ holds for all of them::
     bags:
       - monday/*                           # paths are relative to this file
       - bag: [tuesday/drive_0, tuesday/drive_1]
-        name: tuesday                      # of its folder in --out; the bag's own name where left
-        out child_topic: /camera/slam options: {reference: B10}
+        name: tuesday                      # of its folder in --out; by default the bag's own name
+        child_topic: /camera/slam
+        options: {reference: B10}
 
-What is said of a bag goes before what holds for all, and that before the command line.
+What is given for a bag goes before what holds for all, and that before the command line.
 """
 
+import argparse
 import hashlib
 import json
 import multiprocessing
 import os
 import signal
 import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from glob import glob
 from pathlib import Path
+from typing import Any
 
-from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.cli.console import note, with_progress
 from hand_eye_calib.cli.findings import with_findings
-from hand_eye_calib.cli.options import options_from, read_yaml
+from hand_eye_calib.cli.listing import print_table
+from hand_eye_calib.cli.options import Options, options_from, read_yaml
 from hand_eye_calib.cli.replaying import fingerprints, replay
 from hand_eye_calib.cli.reporting import REPORT, can_draw, rendered, save_page, with_consistency
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
+from hand_eye_calib.report.words import with_sigma
 
 _SOURCES = ("parent_topic", "child_topic", "parent_tf", "child_tf")
 _KEYS = ("bag", "name", "options", *_SOURCES)
 _STATE = "batch.json"
 _SUMMARY = "summary.json"
 
+_HEADINGS = ("x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg", "poses", "warnings")
 
-@dataclass(frozen=True)
+# What came of a task, in plain values.
+Outcome = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """One bag to calibrate from, in plain values: it travels to other processes and machines."""
 
     name: str
-    bags: tuple
-    options: dict = field(default_factory=dict)
-    sources: dict = field(default_factory=dict)
+    bags: tuple[str, ...]
+    options: Options = field(default_factory=dict)
+    sources: dict[str, str] = field(default_factory=dict)
     with_fingerprints: bool = False
     with_report: bool = False
 
-    def key(self):
-        """Changes where the task, the bag or its options change, so that an older result is not
-        taken for this one's.
+    def key(self) -> str:
+        """Digest of the task, its options and its bags, so that no older result is taken for this
+        one's.
         """
         state = [
             [file, os.path.getsize(file), os.stat(file).st_mtime_ns]
@@ -69,71 +80,81 @@ class Task:
         ).hexdigest()
 
 
-def run_batch(arguments):
+def run_batch(arguments: argparse.Namespace) -> int:
     """Calibrate from all bags of the file; returns the exit code.
 
     Raises
     ------
     HandEyeCalibError
-        Where the file cannot be used; a bag that fails is a row in the result.
+        If the file cannot be used; a bag that fails is a row in the result.
     """
-    defaults = {
-        name: str(getattr(arguments, name))
-        for name in ("parent_topic", "child_topic")
-        if getattr(arguments, name)
-    }
-    defaults |= {
-        name: ":".join(getattr(arguments, name))
-        for name in ("parent_tf", "child_tf")
-        if getattr(arguments, name)
-    }
-    with_report = bool(arguments.out) and can_draw(REPORT)
+    out: Path | None = arguments.out
     tasks = read_batch(
-        arguments.batch, options_from(arguments), defaults, bool(arguments.out), with_report
+        arguments.batch,
+        options_from(arguments),
+        _sources_from(arguments),
+        with_fingerprints=bool(out),
+        with_report=bool(out) and can_draw(REPORT),
     )
-    documents = {task.name: _stored(task, arguments.out) for task in tasks} if arguments.out else {}
-    waiting = [task for task in tasks if not documents.get(task.name)]
-    if len(waiting) < len(tasks):
-        note(
-            f"{len(tasks) - len(waiting)} of {len(tasks)} bags are done already; their results are in {arguments.out}"
-        )
-    run = (
-        _on_dask(arguments.dask) if arguments.dask else _on_cores(arguments.jobs or os.cpu_count())
-    )
-    with run as outcomes:
-        for task, document in with_progress(outcomes(waiting), len(waiting), "calibrating"):
+    documents = _stored_outcomes(tasks, out) if out else {}
+    waiting = [task for task in tasks if task.name not in documents]
+    if documents:
+        note(f"{len(documents)} of {len(tasks)} bags are done already; their results are in {out}")
+    on_dask = arguments.dask
+    workers = _on_dask(on_dask) if on_dask else _on_cores(arguments.jobs or os.cpu_count())
+    with workers as outcomes:
+        shown = with_progress(outcomes(waiting), len(waiting), "calibrating")
+        for task, document in shown:
             page = document.pop("page", None)
             documents[task.name] = document
-            if arguments.out:
-                _store(task, document, page, arguments.out)
-    rows = [documents[task.name] for task in tasks]
-    summary = {
-        "batch": str(arguments.batch),
-        "results": rows,
-        "failures": [row["name"] for row in rows if row["error"]],
+            if out:
+                _store(task, document, page, out)
+    return _finish([documents[task.name] for task in tasks], arguments)
+
+
+def _sources_from(arguments: argparse.Namespace) -> dict[str, str]:
+    """Topics and frames that the command line gives for all bags."""
+    given = {name: getattr(arguments, name) for name in _SOURCES}
+    return {
+        name: value if isinstance(value, str) else ":".join(value)
+        for name, value in given.items()
+        if value
     }
+
+
+def _finish(rows: Sequence[Outcome], arguments: argparse.Namespace) -> int:
+    """Write and print the summary; returns the exit code."""
+    failures = [row["name"] for row in rows if row["error"]]
+    summary = {"batch": str(arguments.batch), "results": list(rows), "failures": failures}
     if arguments.out:
         _write(arguments.out / _SUMMARY, summary)
     if arguments.json:
         print(json.dumps(summary, indent=2, allow_nan=False))
     else:
-        _print_table(rows)
+        _print_results(rows)
     for row in rows:
         if row["error"]:
             note(f"{row['name']} failed: {row['error']}")
-    if summary["failures"]:
+    if failures:
         return 1
     return 3 if any(row["calibration"]["status"] != "ok" for row in rows) else 0
 
 
-def read_batch(path, options, sources, with_fingerprints=False, with_report=False):
+def read_batch(
+    path: Path,
+    options: Options,
+    sources: Mapping[str, str],
+    *,
+    with_fingerprints: bool = False,
+    with_report: bool = False,
+) -> list[Task]:
     """The tasks of a batch file.
 
     Parameters
     ----------
     path : pathlib.Path
     options, sources : dict
-        What holds where the file says nothing else.
+        What holds if the file says nothing else.
     with_fingerprints : bool
         Whether the results shall say which bytes were read.
     with_report : bool
@@ -146,43 +167,32 @@ def read_batch(path, options, sources, with_fingerprints=False, with_report=Fals
     Raises
     ------
     InputError
-        Where the file cannot be read.
+        If the file cannot be read.
     ConfigError
-        Where it says something that cannot be.
+        If it says something that cannot be.
     """
     document = read_yaml(path)
     if isinstance(document, list):
         document = {"bags": document}
-    if (
-        not isinstance(document, dict)
-        or not isinstance(document.get("bags"), list)
-        or not document["bags"]
-    ):
+    bags = document.get("bags") if isinstance(document, dict) else None
+    if not isinstance(bags, list) or not bags:
         raise ConfigError(f"{path}: expected a list of bags, or a mapping with one under 'bags'")
     common = {name: value for name, value in document.items() if name != "bags"}
-    defaults = _merged({"options": options} | sources, _checked(path, common, "beside 'bags'"))
-    tasks = []
-    for number, entry in enumerate(document["bags"], start=1):
-        entry = _checked(
-            path, entry if isinstance(entry, dict) else {"bag": entry}, f"entry {number}"
-        )
+    given = {"options": options} | dict(sources)
+    defaults = _merged(given, _checked(path, common, "beside 'bags'"))
+    wanted = {"with_fingerprints": with_fingerprints, "with_report": with_report}
+    tasks: list[Task] = []
+    for number, entry in enumerate(bags, start=1):
+        where = f"entry {number}"
+        entry = _checked(path, entry if isinstance(entry, dict) else {"bag": entry}, where)
         merged = _merged(defaults, entry)
-        for bags in _expanded(path, entry, number):
-            tasks.append(
-                _task(
-                    path,
-                    number,
-                    bags,
-                    merged,
-                    {task.name for task in tasks},
-                    with_fingerprints,
-                    with_report,
-                )
-            )
+        for paths in _expanded(path, entry, where):
+            taken = {task.name for task in tasks}
+            tasks.append(_task(f"{path}, {where}", paths, merged, taken, wanted))
     return tasks
 
 
-def _checked(path, entry, where):
+def _checked(path: Path, entry: dict[str, Any], where: str) -> dict[str, Any]:
     unknown = [str(name) for name in entry if name not in _KEYS]
     if unknown:
         raise ConfigError(
@@ -193,32 +203,38 @@ def _checked(path, entry, where):
     return entry
 
 
-def _merged(base, over):
-    """``over`` before ``base``; the topic of a stream replaces its frames and the other way round."""
-    merged = {name: value for name, value in base.items() if _other(name) not in over} | over
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """``over`` before ``base``; the topic of a stream replaces its frames, and the reverse."""
+    merged = {name: value for name, value in base.items() if _other(name) not in over} | dict(over)
     return merged | {"options": base.get("options", {}) | over.get("options", {})}
 
 
-def _other(name):
+def _other(name: str) -> str | None:
     stream, _, kind = name.partition("_")
     return {"topic": f"{stream}_tf", "tf": f"{stream}_topic"}.get(kind)
 
 
-def _expanded(path, entry, number):
-    """Lists of the bags of each drive: one drive, or several where a pattern stands for many."""
+def _expanded(path: Path, entry: Mapping[str, Any], where: str) -> list[list[str]]:
+    """Bags of each recording: one recording, or several if a pattern stands for many."""
     bags = entry.get("bag")
     named = bags if isinstance(bags, list) else [bags]
     if not named or not all(isinstance(bag, str) and bag for bag in named):
         raise ConfigError(
-            f"{path}, entry {number}: expected a bag's path or a list of paths; got {bags!r}"
+            f"{path}, {where}: expected a bag's path or a list of paths; got {bags!r}"
         )
-    places = [str(path.parent / bag) for bag in named]
+    places = [str(path.parent / str(bag)) for bag in named]
     if len(places) > 1 or glob(places[0]) in ([], places):
         return [places]
     return [[place] for place in sorted(glob(places[0]))]
 
 
-def _task(path, number, bags, entry, taken, *extras):
+def _task(
+    where: str,
+    bags: Sequence[str],
+    entry: Mapping[str, Any],
+    taken: set[str],
+    wanted: Mapping[str, bool],
+) -> Task:
     from hand_eye_calib.io.transforms import TfSource
 
     try:
@@ -227,7 +243,7 @@ def _task(path, number, bags, entry, taken, *extras):
             if name in entry:
                 TfSource.parse(str(entry[name]))
     except ConfigError as error:
-        raise ConfigError(f"{path}, entry {number}: {error}") from None
+        raise ConfigError(f"{where}: {error}") from None
     base = name = str(entry.get("name") or Path(bags[0]).stem).replace("/", "_")
     while name in taken:
         name = (
@@ -236,61 +252,70 @@ def _task(path, number, bags, entry, taken, *extras):
             else name + "_"
         )
     sources = {source: str(entry[source]) for source in _SOURCES if source in entry}
-    return Task(name, tuple(bags), entry["options"], sources, *extras)
+    return Task(
+        name=name, bags=tuple(bags), options=dict(entry["options"]), sources=sources, **wanted
+    )
 
 
-def work(task):
-    """Do a task; what goes wrong becomes part of the outcome, in plain values, for the others shall
-    go on.
+def work(task: Task) -> Outcome:
+    """Do a task; what goes wrong becomes part of the outcome, so that the others go on.
 
     Returns
     -------
     dict
         ``name``, ``bags``, ``calibration`` (Calibration.to_dict or None), ``findings`` of the
-        stream checks, ``inputs``, ``error`` (text or None), the ``page`` of the report where the
+        stream checks, ``inputs``, ``error`` (text or None), the ``page`` of the report if the
         task wants one, and a ``traceback`` for errors that are defects of the program.
     """
-    from hand_eye_calib.io.transforms import TfSource
-
     outcome = _failed(task, None)
-    frames = {stream: task.sources.get(f"{stream}_tf") for stream in ("parent", "child")}
-    sources = [
-        task.sources.get(f"{stream}_topic") or (text and TfSource.parse(text))
-        for stream, text in frames.items()
-    ]
     try:
-        replayed = replay(
-            list(task.bags), *sources, CalibratorConfig.from_options(task.options), quiet=True
-        )
-        if task.with_fingerprints:
-            replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
-        snapshot = replayed.calibrator.snapshot()
-        calibration, findings = with_findings(replayed.calibration, snapshot)
-        calibration, evidence = with_consistency(calibration, snapshot)
-        if task.with_report:
-            outcome["page"] = rendered(
-                calibration, evidence, snapshot.config, replayed.inputs, findings
-            )
+        return outcome | _calibrated(task)
     except HandEyeCalibError as error:
         return outcome | {"error": str(error)}
     except Exception as error:
         text = " ".join(f"unexpected {type(error).__name__}: {error}".split())
         return outcome | {"error": text, "traceback": traceback.format_exc()}
-    outcome |= {
+
+
+def _calibrated(task: Task) -> Outcome:
+    """What a task adds to its outcome if nothing goes wrong."""
+    config = CalibratorConfig.from_options(task.options)
+    sources = (_source(task, "parent"), _source(task, "child"))
+    replayed = replay(list(task.bags), *sources, config=config, quiet=True)
+    if task.with_fingerprints:
+        replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
+    snapshot = replayed.calibrator.snapshot()
+    calibration, findings = with_findings(replayed.calibration, snapshot)
+    calibration, evidence = with_consistency(calibration, snapshot)
+    found: Outcome = {
         "calibration": calibration.to_dict(),
         "findings": findings,
         "inputs": replayed.inputs,
     }
-    if calibration.status.value == "not_converged":
-        outcome["error"] = "the solver did not converge"
-    return outcome
+    if calibration.status is SolveStatus.NOT_CONVERGED:
+        found["error"] = "the solver did not converge"
+    if task.with_report:
+        found["page"] = rendered(calibration, evidence, snapshot.config, replayed.inputs, findings)
+    return found
+
+
+def _source(task: Task, stream: str) -> Any:
+    """Topic, pair of frames or nothing."""
+    from hand_eye_calib.io.transforms import TfSource
+
+    if frames := task.sources.get(f"{stream}_tf"):
+        return TfSource.parse(frames)
+    return task.sources.get(f"{stream}_topic")
 
 
 # ---- where the work is done
 
+# Does tasks, and yields each with its outcome.
+_Worker = Callable[[Sequence[Task]], Iterable[tuple[Task, Outcome]]]
+
 
 @contextmanager
-def _on_cores(jobs):
+def _on_cores(jobs: int | None) -> Iterator[_Worker]:
     """Processes of this machine, spawned: forking a program with threads is not safe."""
     # One thread each: the matrices are small, and all cores are taken already.
     threads = os.environ.get("OMP_NUM_THREADS")
@@ -299,19 +324,15 @@ def _on_cores(jobs):
         jobs, multiprocessing.get_context("spawn"), initializer=_ignore_interrupts
     )
 
-    def outcomes(tasks):
+    def outcomes(tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
         futures = {executor.submit(work, task): task for task in tasks}
         for future in as_completed(futures):
             task = futures[future]
             try:
                 yield task, future.result()
             except BrokenProcessPool:
-                yield (
-                    task,
-                    _failed(
-                        task, "a worker process died, perhaps for want of memory; try --jobs 1"
-                    ),
-                )
+                reason = "a worker process died, perhaps for lack of memory; try --jobs 1"
+                yield task, _failed(task, reason)
 
     try:
         yield outcomes
@@ -327,14 +348,15 @@ def _on_cores(jobs):
 
 
 @contextmanager
-def _on_dask(address):
+def _on_dask(address: str) -> Iterator[_Worker]:
     """Workers of a Dask cluster, which must see the bags under the same paths."""
     try:
         from dask.distributed import Client
         from dask.distributed import as_completed as as_completed_on_dask
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
-            f"--dask needs the package dask.distributed ({error.name} is missing): pip install 'hand_eye_calib[cluster]'"
+            f"--dask needs the package dask.distributed ({error.name} is missing): "
+            "pip install 'hand_eye_calib[cluster]'"
         ) from None
     try:
         client = Client(address, timeout="10s")
@@ -343,23 +365,22 @@ def _on_dask(address):
             f"no Dask scheduler at {address}: {' '.join(str(error).split())}"
         ) from None
 
-    def outcomes(tasks):
+    def outcomes(tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
         futures = {client.submit(work, task, pure=False): task for task in tasks}
         for future in as_completed_on_dask(futures):
             task = futures[future]
             error = future.exception()
-            yield (
-                task,
-                _failed(task, f"the cluster lost it: {' '.join(str(error).split())}")
-                if error
-                else future.result(),
-            )
+            if error:
+                reason = f"the cluster lost it: {' '.join(str(error).split())}"
+                yield task, _failed(task, reason)
+            else:
+                yield task, future.result()
 
     with client:
         yield outcomes
 
 
-def _failed(task, reason):
+def _failed(task: Task, reason: str | None) -> Outcome:
     return {
         "name": task.name,
         "bags": list(task.bags),
@@ -370,7 +391,7 @@ def _failed(task, reason):
     }
 
 
-def _ignore_interrupts():
+def _ignore_interrupts() -> None:
     """Ctrl-C is for the process that waits for the workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -378,13 +399,19 @@ def _ignore_interrupts():
 # ---- results on disk
 
 
-def _files(bag):
+def _files(bag: str) -> list[str]:
     path = Path(bag)
     return sorted(map(str, path.iterdir())) if path.is_dir() else [bag] if path.exists() else []
 
 
-def _stored(task, directory):
-    """The outcome of an earlier run; None where there is none, it failed, or something has changed
+def _stored_outcomes(tasks: Sequence[Task], directory: Path) -> dict[str, Outcome]:
+    """Outcomes of an earlier run, by the tasks' names."""
+    stored = {task.name: _stored(task, directory) for task in tasks}
+    return {name: outcome for name, outcome in stored.items() if outcome}
+
+
+def _stored(task: Task, directory: Path) -> Outcome | None:
+    """The outcome of an earlier run; None if there is none, it failed, or something has changed
     since.
     """
     try:
@@ -396,7 +423,7 @@ def _stored(task, directory):
     return None
 
 
-def _store(task, outcome, page, directory):
+def _store(task: Task, outcome: Outcome, page: str | None, directory: Path) -> None:
     from hand_eye_calib.io.results import save_result
 
     if outcome["calibration"]:
@@ -408,7 +435,7 @@ def _store(task, outcome, page, directory):
     _write(directory / task.name / _STATE, {"key": task.key(), "outcome": outcome})
 
 
-def _write(path, document):
+def _write(path: Path, document: Any) -> None:
     from hand_eye_calib.io.results import replace_file
 
     try:
@@ -420,44 +447,34 @@ def _write(path, document):
         ) from None
 
 
-def _print_table(rows):
+def _print_results(rows: Sequence[Outcome]) -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(box=box.SIMPLE, pad_edge=False)
-    for heading in (
-        "bag",
-        "status",
-        "x m",
-        "y m",
-        "z m",
-        "roll deg",
-        "pitch deg",
-        "yaw deg",
-        "poses",
-        "warnings",
-    ):
-        table.add_column(heading, justify="left" if heading in ("bag", "status") else "right")
+    table.add_column("bag")
+    table.add_column("status")
+    for heading in _HEADINGS:
+        table.add_column(heading, justify="right")
     for row in rows:
-        calibration = row["calibration"]
-        if row["error"] or not calibration:
-            table.add_row(row["name"], "failed", *[""] * 8)
-            continue
-        transform = calibration["T_parent_child"]
-        numbers = [f"{value:.4f}" for value in transform["translation"]] + [
-            f"{value:.3f}" for value in transform["rpy_deg"]
-        ]
-        table.add_row(
-            row["name"],
-            calibration["status"],
-            *numbers,
-            str(calibration["n_poses"]),
-            str(len(calibration["warnings"])),
-        )
-    console = Console(highlight=False, markup=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, markup=False, width=240)
-    console.print(table)
-    failed = [row for row in rows if row["error"]]
-    print(f"{len(rows) - len(failed)} of {len(rows)} bags calibrated, {len(failed)} failed")
+        table.add_row(row["name"], *_cells(row))
+    print_table(table)
+    failed = sum(bool(row["error"]) for row in rows)
+    print(f"{len(rows) - failed} of {len(rows)} bags calibrated, {failed} failed")
+
+
+def _cells(row: Outcome) -> list[str]:
+    """Status, numbers with their standard deviations, counts."""
+    calibration = row["calibration"]
+    if row["error"] or not calibration:
+        return ["failed", *[""] * len(_HEADINGS)]
+    transform = calibration["T_parent_child"]
+    lengths = zip(transform["translation"], transform["sigma_translation"], strict=True)
+    angles = zip(transform["rpy_deg"], transform["sigma_rpy_deg"], strict=True)
+    return [
+        calibration["status"],
+        *(with_sigma(value, sigma, 3) for value, sigma in lengths),
+        *(with_sigma(value, sigma, 2) for value, sigma in angles),
+        str(calibration["n_poses"]),
+        str(len(calibration["warnings"])),
+    ]

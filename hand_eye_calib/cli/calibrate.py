@@ -1,23 +1,51 @@
 """``calibrate PARENT CHILD``: two trajectory files."""
 
+import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.options import add_config_arguments, add_output_arguments, options_from
+from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
 
+if TYPE_CHECKING:
+    from hand_eye_calib.geometry.trajectory import Trajectory
+
 STREAMS = ("parent", "child")
-_FILE_OPTIONS = {
-    "format": dict(choices=TRAJECTORY_FORMATS, help="tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; csv: columns by "
-                   "the names in the header, or with --columns. Default: tum"),
-    "columns": dict(metavar="NAMES", help="names of the columns of a csv file without a header: t,x,y,z,qw,qx,qy,qz in their order"),
-    "times": dict(metavar="FILE", type=Path, help="stamps of the poses of a kitti file, one a line"),
-    "stamp_unit": dict(choices=tuple(STAMP_UNITS), help="unit of the stamps. Default: recognised from their size"),
-}  # fmt: skip
+
+EXAMPLES = """\
+examples:
+  hand_eye_calib calibrate lidar.txt camera.txt --out result
+  hand_eye_calib calibrate gnss.csv slam.txt --parent-format csv --time-offset estimate
+  hand_eye_calib calibrate lidar.txt mono.txt --scale estimate --prior z=1.85+/-0.02"""
+
+_FORMATS = (
+    "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; csv: columns "
+    "by the names in the header, or with --columns. Default: tum"
+)
+_FILE_OPTIONS: dict[str, dict[str, Any]] = {
+    "format": {"choices": TRAJECTORY_FORMATS, "help": _FORMATS},
+    "columns": {
+        "metavar": "NAMES",
+        "help": "names of the columns of a csv file without a header, in their order: "
+        "t,x,y,z,qw,qx,qy,qz",
+    },
+    "times": {
+        "metavar": "FILE",
+        "type": Path,
+        "help": "stamps of the poses of a kitti file, one per line",
+    },
+    "stamp_unit": {
+        "choices": tuple(STAMP_UNITS),
+        "help": "unit of the stamps. Default: recognised from their size",
+    },
+}
 
 
-def add_arguments(parser):
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = EXAMPLES
     parser.add_argument("parent", metavar="PARENT", help="trajectory of the parent sensor")
     parser.add_argument("child", metavar="CHILD", help="trajectory of the child sensor")
     add_file_arguments(parser)
@@ -25,30 +53,27 @@ def add_arguments(parser):
     add_output_arguments(parser)
 
 
-def add_file_arguments(parser):
+def add_file_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how trajectory files are to be read: for both, and for each."""
     group = parser.add_argument_group(
-        "trajectory files", "each also as --parent-... and --child-... for one of the two"
+        "trajectory files", "each also as --parent-... and --child-... for one of the two files"
     )
     for name, settings in _FILE_OPTIONS.items():
         group.add_argument(f"--{name.replace('_', '-')}", dest=name, **settings)
         for stream in STREAMS:
-            kind = {key: value for key, value in settings.items() if key != "help"} | {
-                "help": f"the same for {stream.upper()} alone"
-            }
-            group.add_argument(
-                f"--{stream}-{name.replace('_', '-')}", dest=f"{stream}_{name}", **kind
-            )
+            of_one = settings | {"help": f"the same for {stream.upper()} only"}
+            option = f"--{stream}-{name.replace('_', '-')}"
+            advanced(group.add_argument(option, dest=f"{stream}_{name}", **of_one))
     group.add_argument(
         "--repair-stamps",
         action="store_true",
-        help="sort poses that are out of order and drop those with a stamp that is there already, instead of refusing the file",
+        help="sort poses that are out of order and drop repeated stamps, instead of refusing the "
+        "file",
     )
 
 
-def read_files(arguments):
-    """The trajectories of both files, by stream, as :func:`add_file_arguments` says they are to be
-    read.
+def read_files(arguments: argparse.Namespace) -> tuple[dict[str, "Trajectory"], list[str]]:
+    """Read both files as the options of :func:`add_file_arguments` say.
 
     Returns
     -------
@@ -60,39 +85,50 @@ def read_files(arguments):
     Raises
     ------
     HandEyeCalibError
-        Where a file cannot be read.
+        If a file cannot be read.
     """
     from hand_eye_calib.io.trajectory_files import read_trajectory_file
 
-    trajectories, notes = {}, []
+    trajectories: dict[str, Trajectory] = {}
+    notes: list[str] = []
     for stream in STREAMS:
-        given = {
-            name: getattr(arguments, f"{stream}_{name}") or getattr(arguments, name)
-            for name in _FILE_OPTIONS
-        }
-        file_format = given.pop("format") or "tum"
-        # A setting for both files is for those of them that are of its format.
-        for name, belongs_to in (("columns", "csv"), ("times", "kitti")):
-            if (
-                file_format != belongs_to
-                and not getattr(arguments, f"{stream}_{name}")
-                and _is_of_other(arguments, stream, belongs_to)
-            ):
-                given[name] = None
+        settings = _settings_of(arguments, stream)
         trajectories[stream], repaired = read_trajectory_file(
-            getattr(arguments, stream), file_format, repair=arguments.repair_stamps, **given
+            getattr(arguments, stream),
+            settings.pop("format"),
+            repair=arguments.repair_stamps,
+            **settings,
         )
         notes += repaired
     return trajectories, notes
 
 
-def _is_of_other(arguments, stream, file_format):
-    """Whether the other file is of this format."""
+def _settings_of(arguments: argparse.Namespace, stream: str) -> dict[str, Any]:
+    """How to read the file of a stream: its own options before those for both."""
+    given = {
+        name: getattr(arguments, f"{stream}_{name}") or getattr(arguments, name)
+        for name in _FILE_OPTIONS
+    }
+    given["format"] = given["format"] or "tum"
+    # An option for both files is meant for those of them that have its format.
+    for name, belongs_to in (("columns", "csv"), ("times", "kitti")):
+        is_own = bool(getattr(arguments, f"{stream}_{name}"))
+        if (
+            given["format"] != belongs_to
+            and not is_own
+            and _is_other(arguments, stream, belongs_to)
+        ):
+            given[name] = None
+    return given
+
+
+def _is_other(arguments: argparse.Namespace, stream: str, file_format: str) -> bool:
+    """Whether the other file has this format."""
     other = STREAMS[1 - STREAMS.index(stream)]
     return (getattr(arguments, f"{other}_format") or arguments.format) == file_format
 
 
-def run(arguments):
+def run(arguments: argparse.Namespace) -> int:
     """Calibrate from files; returns the exit code."""
     from hand_eye_calib.cli.findings import with_findings
     from hand_eye_calib.cli.present import deliver
@@ -106,25 +142,25 @@ def run(arguments):
     snapshot = whole_snapshot(config, **trajectories)
     with waiting_for("solving"):
         calibration = snapshot.estimate()
-    with waiting_for("checking"):
+    with waiting_for("checking the streams"):
         calibration, findings = with_findings(calibration, snapshot)
-    inputs = {"options": config.to_options()}
+    inputs: dict[str, Any] = {"options": config.to_options()}
     for stream in STREAMS:
         inputs[stream] = {"file": str(getattr(arguments, stream)), **_extent(trajectories[stream])}
     if arguments.out:
         from hand_eye_calib.cli.replaying import fingerprints
 
-        files = [getattr(arguments, stream) for stream in STREAMS]
-        files += [
-            times
-            for times in (arguments.times, arguments.parent_times, arguments.child_times)
-            if times
-        ]
-        inputs["files"] = fingerprints(files)
+        inputs["files"] = fingerprints(_files(arguments))
     return deliver(calibration, arguments, inputs, snapshot, findings=findings)
 
 
-def _extent(trajectory):
+def _files(arguments: argparse.Namespace) -> list[Path]:
+    """All files that were read."""
+    times = (arguments.times, arguments.parent_times, arguments.child_times)
+    return [Path(arguments.parent), Path(arguments.child), *filter(None, times)]
+
+
+def _extent(trajectory: "Trajectory") -> dict[str, int]:
     return {
         "poses": len(trajectory),
         "first_stamp_ns": int(trajectory.stamps_ns[0]),

@@ -1,19 +1,36 @@
-"""``check BAG`` or ``check PARENT CHILD``: look at both streams before believing them."""
+"""``check BAG`` or ``check PARENT CHILD``: check both pose streams before any solve."""
 
+import argparse
 import json
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.calibrate import add_file_arguments, read_files
+from hand_eye_calib.cli.calibrate import STREAMS, add_file_arguments, read_files
 from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
 from hand_eye_calib.cli.options import add_config_arguments, add_json_argument, config_from
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.report.words import printable
 
-STREAMS = ("parent", "child")
+if TYPE_CHECKING:
+    from hand_eye_calib.checks.agreement import Agreement
+    from hand_eye_calib.checks.findings import Finding
+    from hand_eye_calib.checks.stream_checks import StreamSummary
+    from hand_eye_calib.geometry.trajectory import Trajectory
+
+EXAMPLES = """\
+examples:
+  hand_eye_calib check my_bag
+  hand_eye_calib check my_bag --parent-topic /lidar/odometry --child-topic /vio --out checked
+  hand_eye_calib check lidar.txt camera.txt"""
+
+_HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rotation")
 
 
-def add_arguments(parser):
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = EXAMPLES
     parser.add_argument(
         "inputs", metavar="BAG | PARENT CHILD", nargs="+", help="a bag, or two trajectory files"
     )
@@ -27,75 +44,79 @@ def add_arguments(parser):
         "--out",
         metavar="DIR",
         type=Path,
-        help="write check.html into this directory: the findings, and a picture of both streams",
+        help="write check.html into this directory: the findings, and figures of both streams",
     )
     add_json_argument(parser)
 
 
-def run(arguments):
-    """Print what was found; returns 1 where something is wrong with the streams, otherwise 0."""
-    from hand_eye_calib.checks.check import check_streams
+def run(arguments: argparse.Namespace) -> int:
+    """Print what was found; returns 1 if something is wrong with the streams, otherwise 0."""
+    from hand_eye_calib.checks.agreement import check_streams
     from hand_eye_calib.checks.findings import Severity
-    from hand_eye_calib.checks.streams import summarise
-    from hand_eye_calib.engine.calibrator import ESTIMATE
+    from hand_eye_calib.checks.stream_checks import summarise
 
     if len(arguments.inputs) > 2:
         raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.inputs)}")
     config = config_from(arguments)
-    trajectories, findings = (
-        _read_bag(arguments) if len(arguments.inputs) == 1 else _read_files(arguments)
+    trajectories, sources, findings = (_read_bag if len(arguments.inputs) == 1 else _read_files)(
+        arguments
     )
     parent, child = (trajectories[stream] for stream in STREAMS)
     # What is to be estimated is not known yet: the checks say what it is.
-    offset_s = 0.0 if config.time_offset == ESTIMATE else config.time_offset
+    offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
     scale = config.scale if isinstance(config.scale, float) else 1.0
-    with waiting_for("checking"):
+    with waiting_for("checking the streams"):
         agreement = check_streams(parent, child, offset_s, scale, config.max_gap)
     findings = [*agreement.findings, *findings]
-    streams = {
-        name: summarise(trajectory)
-        for name, trajectory in trajectories.items()
-        if len(trajectory) > 1
-    }
+    streams = {name: summarise(one) for name, one in trajectories.items() if len(one) > 1}
     if arguments.json:
-        print(json.dumps(_document(streams, findings, agreement), indent=2, allow_nan=False))
+        document = _document(sources, streams, findings, agreement)
+        print(json.dumps(document, indent=2, allow_nan=False))
     else:
-        print(_text(streams, findings, agreement))
+        print(_text(sources, streams, findings, agreement))
     if arguments.out:
         from hand_eye_calib.cli.reporting import write_check
 
         corrected = child.shifted(offset_s).scaled(scale)
-        write_check(
-            arguments.out, parent, corrected, agreement, findings, arguments.inputs, config.max_gap
-        )
+        named = [f"{stream}: {source}" for stream, source in sources.items()]
+        write_check(arguments.out, parent, corrected, agreement, findings, named, config.max_gap)
     if all(finding.severity is Severity.NOTE for finding in findings):
         return 0
     return fail(f"{findings[0].what}; {findings[0].advice}", 1)
 
 
-def _read_files(arguments):
-    from hand_eye_calib.checks.findings import repaired_file
+_Read = tuple[dict[str, "Trajectory"], dict[str, str], "list[Finding]"]
+
+
+def _read_files(arguments: argparse.Namespace) -> _Read:
+    from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 
     arguments.parent, arguments.child = arguments.inputs
     arguments.repair_stamps = True
     trajectories, notes = read_files(arguments)
-    return trajectories, [repaired_file(text) for text in notes]
+    advice = "repair the file's source"
+    findings = [
+        Finding("disorder", "both", Severity.NOTE, Confidence.CERTAIN, text, advice)
+        for text in notes
+    ]
+    return trajectories, dict(zip(STREAMS, arguments.inputs, strict=True)), findings
 
 
-def _read_bag(arguments):
+def _read_bag(arguments: argparse.Namespace) -> _Read:
     import numpy as np
 
-    from hand_eye_calib.checks.streams import tidy
+    from hand_eye_calib.checks.stream_checks import tidy
     from hand_eye_calib.io.bags import PoseBag
 
-    columns = {stream: ([], [], []) for stream in STREAMS}
+    columns: dict[str, tuple[list[Any], list[Any], list[Any]]] = {
+        stream: ([], [], []) for stream in STREAMS
+    }
     with PoseBag(arguments.inputs[0]) as bag:
         sources = bag.select_topics(arguments.parent_topic, arguments.child_topic)
         poses = bag.poses(*sources)
         for pose in with_progress(poses, bag.expected(*sources), f"reading {bag}"):
-            for column, value in zip(
-                columns[pose.stream], (pose.stamp_ns, pose.position, pose.quat_xyzw), strict=True
-            ):
+            values = (pose.stamp_ns, pose.position, pose.quat_xyzw)
+            for column, value in zip(columns[pose.stream], values, strict=True):
                 column.append(value)
         for text in bag.warnings:
             note(text)
@@ -108,38 +129,50 @@ def _read_bag(arguments):
             stream,
         )
         findings += found
-    return trajectories, findings
+    return trajectories, dict(zip(STREAMS, map(str, sources), strict=True)), findings
 
 
-def _document(streams, findings, agreement):
+def _document(
+    sources: Mapping[str, str],
+    streams: "Mapping[str, StreamSummary]",
+    findings: "Sequence[Finding]",
+    agreement: "Agreement",
+) -> dict[str, Any]:
     return {
-        "streams": {name: vars(summary) for name, summary in streams.items()},
+        "streams": {
+            name: {"source": sources[name], **vars(summary)} for name, summary in streams.items()
+        },
         "turning": {
             "time_offset_s": agreement.correlation.offset_s,
             "correlation": agreement.correlation.correlation,
             "distinctness": agreement.correlation.distinctness,
-            "rms_rad_in_3_s": agreement.rms_rotation,
+            "rms_rad_in_3_s": agreement.turned_rad,
         },
         "findings": [finding.to_dict() for finding in findings],
     }
 
 
-def _text(streams, findings, agreement):
+def _text(
+    sources: Mapping[str, str],
+    streams: "Mapping[str, StreamSummary]",
+    findings: "Sequence[Finding]",
+    agreement: "Agreement",
+) -> str:
     from hand_eye_calib.cli.findings import table
 
-    lines = [
-        f"{'':<8} {'poses':>8} {'seconds':>9} {'per s':>7} {'longest gap':>12} {'way':>10} {'turned':>10}"
-    ]
+    lines = [f"{stream} is {printable(source)}" for stream, source in sources.items()]
+    lines.append("{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS))
     for name, summary in streams.items():
         lines.append(
-            f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} {summary.longest_interval_s:10.3f} s "
-            f"{summary.path_m:8.1f} m {math.degrees(summary.rotation_rad):6.0f} deg"
+            f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} "
+            f"{summary.longest_interval_s:10.3f} s {summary.way_m:10.1f} m "
+            f"{math.degrees(summary.turned_rad):6.0f} deg"
         )
-    if agreement.rms_rotation:
+    if agreement.turned_rad:
         turned = "  ".join(
-            f"{axis} {math.degrees(angle):.2f}" for axis, angle in agreement.rms_rotation.items()
+            f"{axis} {math.degrees(angle):.2f}" for axis, angle in agreement.turned_rad.items()
         )
         lines.append(
-            f"The parent turns about its axes, in 3 s and root mean square:  {turned}  deg"
+            f"Rotation of the parent in 3 s about its axes, root mean square: {turned} deg"
         )
     return "\n".join([*lines, "", table(findings)])

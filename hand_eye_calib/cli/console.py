@@ -1,76 +1,108 @@
-"""What commands say beside their result: notes, errors and progress, all on stderr."""
+"""What commands print beside their result: notes, errors and progress, all on stderr."""
 
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeVar
+
+from hand_eye_calib.cli.spelling import as_typed
+from hand_eye_calib.report.words import printable
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+_Item = TypeVar("_Item")
 
 _SILENT_S = 2.0
 _REDRAW_S = 0.2
 _CLEAR_LINE = "\r\033[K"
 
 
-def note(text):
-    """Say something that is good to know."""
-    print(f"hand_eye_calib: note: {text}", file=sys.stderr)
+def note(text: object) -> None:
+    """Print something that is good to know, in one line."""
+    print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
 
 
-def fail(error, code):
-    """Say in one line what went wrong; returns ``code``."""
-    print(f"hand_eye_calib: error: {error}", file=sys.stderr)
+def fail(error: object, code: int) -> int:
+    """Print in one line what went wrong; returns ``code``."""
+    print(f"hand_eye_calib: error: {printable(as_typed(str(error)))}", file=sys.stderr)
     return code
 
 
 @contextmanager
-def waiting_for(what):
-    """On a terminal, show what is being done for as long as it lasts."""
-    is_terminal = sys.stderr.isatty()
-    if is_terminal:
-        print(f"{what} ...", end="", file=sys.stderr, flush=True)
+def waiting_for(what: str) -> Iterator[None]:
+    """On a terminal, show what is being done for as long as it lasts; after two seconds, how long
+    it has taken.
+    """
+    if not sys.stderr.isatty():
+        yield
+        return
+    print(f"{what} ...", end="", file=sys.stderr, flush=True)
+    done = threading.Event()
+    clock = threading.Thread(target=_show_seconds, args=(what, done), daemon=True)
+    clock.start()
     try:
         yield
     finally:
-        if is_terminal:
-            print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
+        done.set()
+        clock.join()
+        print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
 
 
-def with_progress(items, total, doing, size=lambda item: 1):
-    """Pass on ``items``; on a terminal, once that has taken two seconds, show how far, how fast and
-    how long still.
+def _show_seconds(what: str, done: threading.Event) -> None:
+    started = time.monotonic()
+    wait_s = _SILENT_S
+    while not done.wait(wait_s):
+        seconds = time.monotonic() - started
+        print(f"\r{what} ... {seconds:.0f} s", end="", file=sys.stderr, flush=True)
+        wait_s = 1.0
+
+
+def with_progress(
+    items: Iterable[_Item],
+    total: int | None,
+    doing: str,
+    size: Callable[[_Item], int] = lambda item: 1,
+) -> Iterator[_Item]:
+    """Pass on ``items``. On a terminal, from two seconds on, show how much is done, at what rate,
+    and the time left.
 
     Parameters
     ----------
     items : iterable
     total : int or None
-        How many there are, as far as one knows.
+        Sum of their sizes, if it is known.
     doing : str
     size : callable
-        For how many an item counts.
+        What an item adds to what is done.
     """
     if not sys.stderr.isatty():
         yield from items
         return
-    started = redraw_at = time.monotonic()
-    redraw_at += _SILENT_S
-    progress, done = None, 0
+    started = time.monotonic()
+    redraw_at = started + _SILENT_S
+    shown: Progress | None = None
+    done = 0
     try:
         for item in items:
             if (now := time.monotonic()) >= redraw_at:
-                if progress is None:
-                    progress = _progress_bar()
-                    progress.start()
-                    task = progress.add_task(doing, total=total, rate="")
-                progress.update(
-                    task, completed=done, rate=f"{done / max(now - started, 1e-9):,.0f}/s"
-                )
+                if shown is None:
+                    shown = _progress_bar()
+                    shown.start()
+                    task = shown.add_task(doing, total=total, rate="")
+                rate = f"{done / max(now - started, 1e-9):,.0f}/s"
+                shown.update(task, completed=done, rate=rate)
                 redraw_at = now + _REDRAW_S
             yield item
             done += size(item)
     finally:
-        if progress is not None:
-            progress.stop()
+        if shown is not None:
+            shown.stop()
 
 
-def _progress_bar():
+def _progress_bar() -> "Progress":
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -80,7 +112,12 @@ def _progress_bar():
         TimeRemainingColumn,
     )
 
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
-    )  # fmt: skip
-    return Progress(*columns, console=Console(stderr=True), transient=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )

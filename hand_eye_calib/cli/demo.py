@@ -1,7 +1,8 @@
-"""``demo``: one simulated drive, calibrated from its bag and by the live node, compared with the
-truth.
+"""``demo``: calibrate one simulated recording from its bag and with the live node, and compare with
+the truth.
 """
 
+import argparse
 import dataclasses
 import json
 import math
@@ -10,86 +11,116 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import fail, note
+from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 
+if TYPE_CHECKING:
+    from hand_eye_calib.arrays import FloatArray
+    from hand_eye_calib.calibration import Calibration
+    from hand_eye_calib.engine.calibrator import Calibrator
+    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.ros.player import Player
+    from hand_eye_calib.simulation.drive import SimulatedDrive
+
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 
 # A minute of driving with good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, a
-# handful of SLAM corrections of decimetres.
+# few SLAM corrections of decimetres.
 DRIVE = dataclasses.replace(HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera")
 NOISE = NoiseConfig(gaussian=0.002, rotation_per_metre=0.5, outliers=0.005, drift=0.002)
 
 PLAY_SPEED = 20.0
-# The same messages through the same engine: what is left is the way through a quaternion.
+# The same messages go through the same engine: only the conversion to quaternions differs.
 AGREEMENT = 1e-9
 
 _STOP_S = 10.0
 
 
-def add_arguments(parser):
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = "examples:\n  hand_eye_calib demo\n  hand_eye_calib demo --seed 7 --out demo_7"
     parser.add_argument(
         "--out",
         metavar="DIR",
         type=Path,
         default=Path("demo_output"),
-        help="directory for the bag, the node's log and report.html; those of an earlier demo are replaced. Default: demo_output",
+        help="directory for the bag, the node's log and report.html; those of an earlier demo are "
+        "replaced. Default: demo_output",
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="another seed, another drive. Default: 0"
+        "--seed", type=int, default=0, help="another seed gives another recording. Default: 0"
     )
     add_json_argument(parser)
 
 
-def run(arguments):
+def run(arguments: argparse.Namespace) -> int:
     """Run the demo; returns the exit code."""
     from hand_eye_calib.cli.present import EXIT_CODES
-    from hand_eye_calib.cli.reporting import with_consistency, write_report
     from hand_eye_calib.simulation.drive import simulate_drive
 
-    Player = _import_player()
+    player = _import_player()
     if arguments.seed < 0:
         raise InputError(f"--seed must not be negative; got {arguments.seed}")
-    drive = simulate_drive(arguments.seed, DRIVE, NOISE)
-    bag_path = _write_bag(arguments.out, drive)
-    note(f"simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
-    calibrator = _replay(bag_path)
-    offline = calibrator.estimate()
-    note(f"replayed it offline; playing it to the live node at {PLAY_SPEED:g} times the speed")
-    live = _play(Player, bag_path, arguments.out / "node.log", offline.stamp_ns)
+    with waiting_for("simulating"):
+        drive = simulate_drive(arguments.seed, DRIVE, NOISE)
+        bag_path = _write_bag(arguments.out, drive)
+    note(f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
+    with waiting_for("replaying the bag"):
+        calibrator = _replay(bag_path)
+        offline = calibrator.estimate()
+    note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
+    with waiting_for("playing"):
+        live = _play(player, bag_path, arguments.out / "node.log", offline.stamp_ns)
+    note("3/4 calibrated live; cross-checks and report follow")
     document = _document(drive, bag_path, offline, live)
     print(json.dumps(document, indent=2, allow_nan=False) if arguments.json else _text(document))
-    inputs = {"bag": str(bag_path)} | {stream: {"topic": topic} for stream, topic in TOPICS.items()}
-    snapshot = calibrator.snapshot()
-    write_report(arguments.out, *with_consistency(offline, snapshot), snapshot.config, inputs)
+    sys.stdout.flush()
+    _write_report(arguments.out, bag_path, calibrator, offline)
+    note(f"4/4 done; everything is in {arguments.out}")
     if max(document["agreement"].values()) > AGREEMENT:
         return fail(
-            f"offline and online differ by more than {AGREEMENT}: {document['agreement']}; the same messages must give the same",
+            f"offline and online differ by more than {AGREEMENT}: {document['agreement']}; "
+            "the same messages must give the same",
             1,
         )
     return EXIT_CODES[offline.status]
 
 
-def _import_player():
+def _write_report(
+    out: Path, bag_path: Path, calibrator: "Calibrator", offline: "Calibration"
+) -> None:
+    from hand_eye_calib.cli.reporting import with_consistency, write_report
+
+    inputs: dict[str, Any] = {"bag": str(bag_path)}
+    inputs |= {stream: {"topic": topic} for stream, topic in TOPICS.items()}
+    snapshot = calibrator.snapshot()
+    with waiting_for("cross-checks with other methods and halves of the recording"):
+        calibration, evidence = with_consistency(offline, snapshot)
+    write_report(out, calibration, evidence, snapshot.config, inputs)
+
+
+def _import_player() -> "type[Player]":
     try:
         from hand_eye_calib.ros.player import Player
     except ModuleNotFoundError as error:
-        if error.name.partition(".")[0] == "hand_eye_calib":
+        if (error.name or "").partition(".")[0] == "hand_eye_calib":
             raise
         raise MissingDependencyError(
-            f"the demo runs the live node and needs ROS 2's Python packages ({error.name} is missing): source the setup file of a "
-            "ROS 2 installation, or pip install 'hand_eye_calib[ros]'"
+            f"the demo runs the live node and needs ROS 2's Python packages ({error.name} is "
+            "missing): source the setup file of a ROS 2 installation, or "
+            "pip install 'hand_eye_calib[ros]'"
         ) from None
     return Player
 
 
-def _write_bag(out, drive):
+def _write_bag(out: Path, drive: "SimulatedDrive") -> Path:
     from hand_eye_calib.io.bags import write_bag
 
     path = out / "demo_bag"
@@ -98,7 +129,8 @@ def _write_bag(out, drive):
             shutil.rmtree(path)
     except OSError as error:
         raise InputError(
-            f"cannot replace {path}: {error.strerror}; remove it or choose another directory with --out"
+            f"cannot replace {path}: {error.strerror}; remove it or choose another directory with "
+            "--out"
         ) from None
     streams = {
         TOPICS["parent"]: (drive.parent, "nav_msgs/msg/Odometry"),
@@ -108,13 +140,13 @@ def _write_bag(out, drive):
     return path
 
 
-def _opened(bag_path):
+def _opened(bag_path: Path) -> "PoseBag":
     from hand_eye_calib.io.bags import PoseBag
 
     return PoseBag(bag_path)
 
 
-def _replay(bag_path):
+def _replay(bag_path: Path) -> "Calibrator":
     from hand_eye_calib.cli.replaying import feed
     from hand_eye_calib.engine.calibrator import Calibrator
 
@@ -124,25 +156,27 @@ def _replay(bag_path):
     return calibrator
 
 
-def _play(Player, bag_path, log_path, stamp_ns):
-    _keep_to_ourselves()
-    with _node(log_path) as check, Player(TOPICS, check) as player, _opened(bag_path) as bag:
+def _play(player_type: "type[Player]", bag_path: Path, log_path: Path, stamp_ns: int) -> Any:
+    _stay_on_this_machine()
+    with (
+        _node(log_path) as check,
+        player_type(TOPICS, check) as player,
+        _opened(bag_path) as bag,
+    ):
         player.play(bag.poses(*TOPICS.values()), PLAY_SPEED)
         return player.wait_for_extrinsic(stamp_ns)
 
 
-def _keep_to_ourselves():
-    """No robot on the network shall receive simulated odometry; an explicit ROS_DOMAIN_ID is
-    respected.
-    """
+def _stay_on_this_machine() -> None:
+    """Keep simulated odometry away from robots on the network."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    # Above 101 the ports run into those that Linux gives to clients.
+    # From 102 on the ports overlap with those that Linux gives to clients.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 
 
 @contextmanager
-def _node(log_path):
-    """The node in a process of its own; yields a function that raises where it has ended."""
+def _node(log_path: Path) -> Iterator[Callable[[], None]]:
+    """Run the node in a process of its own; yields a function that raises if it has ended."""
     command = [
         sys.executable,
         "-m",
@@ -154,13 +188,13 @@ def _node(log_path):
     ]
     for stream, topic in TOPICS.items():
         command += ["-r", f"{stream}_odom:={topic}"]
-        # Played this fast, best effort might lose messages, and this demo compares results of the
-        # same ones.
+        # At this speed best effort might lose messages, and the results of the same messages are
+        # compared.
         command += ["-p", f"qos_overrides.{topic}.subscription.reliability:=reliable"]
     with log_path.open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
-    def check():
+    def check() -> None:
         if process.poll() is not None:
             raise HandEyeCalibError(
                 f"the node ended with exit code {process.returncode}; see {log_path}"
@@ -177,11 +211,14 @@ def _node(log_path):
             process.wait()
 
 
-def _document(drive, bag_path, offline, live):
+def _document(
+    drive: "SimulatedDrive", bag_path: Path, offline: "Calibration", live: Any
+) -> dict[str, Any]:
     frames = {"parent_frame": offline.parent_frame, "child_frame": offline.child_frame}
     if (live.parent_frame, live.child_frame) != (offline.parent_frame, offline.child_frame):
         raise HandEyeCalibError(
-            f"the node's result is of {live.child_frame} in {live.parent_frame}, the replay's of {frames}"
+            f"the node's result is of {live.child_frame} in {live.parent_frame}, the replay's of "
+            f"{frames}"
         )
     difference_m, difference_rad = _errors(live.T_parent_child, offline.T_parent_child)
     return {
@@ -198,14 +235,14 @@ def _document(drive, bag_path, offline, live):
     }
 
 
-def _estimate(T_parent_child, truth):
+def _estimate(T_parent_child: "FloatArray", truth: "FloatArray") -> dict[str, Any]:
     error_m, error_rad = _errors(T_parent_child, truth)
     return _both_directions(T_parent_child) | {
         "error": {"translation_m": error_m, "rotation_rad": error_rad}
     }
 
 
-def _both_directions(T_parent_child):
+def _both_directions(T_parent_child: "FloatArray") -> dict[str, Any]:
     from hand_eye_calib.geometry import se3
 
     return {
@@ -214,49 +251,45 @@ def _both_directions(T_parent_child):
     }
 
 
-def _errors(T_parent_child, truth):
+def _errors(T_parent_child: "FloatArray", truth: "FloatArray") -> tuple[float, float]:
     """Distance between the translations (m) and angle between the rotations (rad)."""
     from hand_eye_calib.geometry import se3
 
-    return math.dist(T_parent_child[:3, 3], truth[:3, 3]), float(
-        se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3])
-    )
+    angle = se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3])
+    return math.dist(T_parent_child[:3, 3], truth[:3, 3]), float(angle)
 
 
-def _text(document):
-    parent, child, agreement = (
-        document["parent_frame"],
-        document["child_frame"],
-        document["agreement"],
-    )
-    rows = {"truth": "truth", "offline": "replay of the bag", "online": "live node"}
+_ROWS = {"truth": "truth", "offline": "replay of the bag", "online": "live node"}
+
+
+def _text(document: Mapping[str, Any]) -> str:
+    parent, child = document["parent_frame"], document["child_frame"]
     lines = []
-    for direction, source, target in (
-        ("T_parent_child", child, parent),
-        ("T_child_parent", parent, child),
-    ):
+    directions = (("T_parent_child", child, parent), ("T_child_parent", parent, child))
+    for direction, source, target in directions:
         lines.append(
-            f"{f'Pose of {source} in {target}':<26}         x         y         z  m      roll     pitch       yaw  deg"
+            f"{f'Pose of {source} in {target}':<26}         x         y         z  m"
+            "      roll     pitch       yaw  deg"
         )
-        lines += [f"  {title:<24}{_row(document[key][direction])}" for key, title in rows.items()]
+        lines += [f"  {title:<24}{_row(document[key][direction])}" for key, title in _ROWS.items()]
     lines.append(f"Error of the pose of {child} in {parent}")
     for key in ("offline", "online"):
         error = document[key]["error"]
+        degrees = math.degrees(error["rotation_rad"])
         lines.append(
-            f"  {rows[key]:<24}{1e3 * error['translation_m']:10.2f} mm {math.degrees(error['rotation_rad']):10.4f} deg"
+            f"  {_ROWS[key]:<24}{1e3 * error['translation_m']:10.2f} mm {degrees:10.4f} deg"
         )
+    agreement = document["agreement"]
     lines.append(
-        f"Offline and online differ by {agreement['translation_m']:.1e} m and {math.degrees(agreement['rotation_rad']):.1e} deg"
+        f"Offline and online differ by {agreement['translation_m']:.1e} m and "
+        f"{math.degrees(agreement['rotation_rad']):.1e} deg"
     )
     return "\n".join(lines)
 
 
-def _row(matrix):
+def _row(matrix: Sequence[Sequence[float]]) -> str:
     from hand_eye_calib.geometry import se3
 
     angles = se3.rotation_to_rpy([row[:3] for row in matrix[:3]])
-    return (
-        "".join(f"{row[3]:10.4f}" for row in matrix[:3])
-        + "   "
-        + "".join(f"{math.degrees(a):10.3f}" for a in angles)
-    )
+    position = "".join(f"{row[3]:10.4f}" for row in matrix[:3])
+    return position + "   " + "".join(f"{math.degrees(angle):10.3f}" for angle in angles)

@@ -1,17 +1,26 @@
-"""The stream checks beside a calibration, and as a table."""
+"""The findings of the stream checks: beside a calibration, and as a table."""
 
 import dataclasses
 import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.cli.options import flag
+from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.cli.spelling import as_typed, flag
+from hand_eye_calib.report.words import printable
+
+if TYPE_CHECKING:
+    from hand_eye_calib.engine.calibrator import Snapshot
 
 _MARKS = {Severity.ERROR: "ERROR", Severity.WARNING: "WARNING", Severity.NOTE: "note"}
 _WIDTH = 100
 
 
-def with_findings(calibration, snapshot):
-    """A calibration whose warnings hold what is wrong with its streams, and all findings as plain
+def with_findings(
+    calibration: Calibration, snapshot: "Snapshot"
+) -> tuple[Calibration, list[dict[str, Any]]]:
+    """A calibration whose warnings include those of the stream checks, and all findings as plain
     values.
 
     Parameters
@@ -21,26 +30,29 @@ def with_findings(calibration, snapshot):
         The poses it comes from.
     """
     findings = snapshot.check(calibration).findings
-    grave = [str(finding) for finding in findings if finding.severity is not Severity.NOTE]
-    calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *grave))
+    serious = [str(finding) for finding in findings if finding.severity is not Severity.NOTE]
+    calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *serious))
     return calibration, [finding.to_dict() for finding in findings]
 
 
-def table(findings):
-    """Findings as text for a terminal, the gravest first."""
+def table(findings: Sequence[Finding]) -> str:
+    """Findings as text for a terminal, in their order."""
     if not findings:
         return "No findings: nothing speaks against calibrating with these streams."
     lines = []
     for finding in findings:
-        head = f"{_MARKS[finding.severity]:<8} {finding.code:<17} {finding.stream:<7} {finding.confidence.value:<9} "
-        body = textwrap.wrap(finding.what, _WIDTH - 4) + textwrap.wrap(
-            f"-> {finding.advice}{_typed(finding)}", _WIDTH - 4
-        )
-        lines += [head.rstrip(), *(f"    {line}" for line in body)]
+        head = f"{_MARKS[finding.severity]:<8} {finding.code:<17} {finding.stream:<7} "
+        advice = f"-> {finding.advice}{_typed_options(finding)}"
+        body = [*_wrapped(finding.what), *_wrapped(advice)]
+        lines += [head + finding.confidence.value, *(f"    {line}" for line in body)]
     return "\n".join(lines)
 
 
-def _typed(finding):
-    """The options as they are typed."""
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(printable(as_typed(text)), _WIDTH - 4, break_on_hyphens=False)
+
+
+def _typed_options(finding: Finding) -> str:
+    """The options that help, as they are typed."""
     typed = [f"--{flag(name)} {value}" for name, value in finding.options]
     return f": {' '.join(typed)}" if typed else ""

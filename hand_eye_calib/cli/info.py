@@ -1,18 +1,21 @@
 """``info RESULT``: show a saved calibration."""
 
+import argparse
+
 from hand_eye_calib.cli.options import add_json_argument
 
 
-def add_arguments(parser):
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json"
     parser.add_argument(
         "result", metavar="RESULT", help="extrinsic.yaml, or the directory that holds it"
     )
     add_json_argument(parser)
 
 
-def run(arguments):
-    """Print a saved calibration; returns the exit code, 0 whatever the calibration is worth."""
+def run(arguments: argparse.Namespace) -> int:
+    """Print a saved calibration; returns the exit code, 0 whatever the calibration's status."""
     from hand_eye_calib.cli.present import as_json, as_text
     from hand_eye_calib.io.results import load_result
 

@@ -1,36 +1,43 @@
 """``replay BAG --list``: what is in a bag."""
 
 import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, waiting_for
+from hand_eye_calib.report.words import printable
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
-def list_bag(paths, as_json):
+def list_bag(paths: Sequence[Path], as_json: bool) -> int:
     """Print the topics of a bag; returns the exit code.
 
     Parameters
     ----------
     paths : list of path-like
-        One bag, or several of one drive.
+        One bag, or several parts of one recording.
     as_json : bool
         One JSON document instead of a table.
 
     Raises
     ------
     InputError
-        Where the bag cannot be read.
+        If the bag cannot be read.
     """
     from hand_eye_calib.io.bags import PoseBag
 
     with PoseBag(*paths) as bag:
         with waiting_for(f"reading {bag}"):
             topics = bag.describe()
-        duration_s = (bag.end_ns - bag.start_ns) * 1e-9 if bag.start_ns is not None else 0.0
+        has_messages = bag.start_ns is not None and bag.end_ns is not None
         document = {
             "bag": str(bag),
             "start_ns": bag.start_ns,
             "end_ns": bag.end_ns,
-            "duration_s": duration_s,
+            "duration_s": (bag.end_ns - bag.start_ns) * 1e-9 if has_messages else 0.0,
             "topics": [topic._asdict() for topic in topics],
             "warnings": bag.warnings,
         }
@@ -39,45 +46,50 @@ def list_bag(paths, as_json):
     if as_json:
         print(json.dumps(document, indent=2))
     else:
-        _print_table(document, topics)
+        _print_topics(document, topics)
     return 0
 
 
-def _print_table(document, topics):
+def _print_topics(document: dict[str, Any], topics: Sequence[Any]) -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
     if not topics:
         print(f"{document['bag']} has no topics")
         return
-    table = Table(
-        title=f"{document['bag']}, {document['duration_s']:.1f} s",
-        box=box.SIMPLE,
-        title_justify="left",
-        pad_edge=False,
-    )
-    for heading, justify in (("topic", "left"), ("type", "left"), ("count", "right"), ("rate", "right"), ("duration", "right"),
-                             ("frames", "left")):  # fmt: skip
-        table.add_column(heading, justify=justify, overflow="fold")
+    title = f"{document['bag']}, {document['duration_s']:.1f} s"
+    table = Table(title=title, box=box.SIMPLE, title_justify="left", pad_edge=False)
+    for heading in ("topic", "type"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("count", "rate", "duration"):
+        table.add_column(heading, justify="right", overflow="fold")
+    table.add_column("frames", overflow="fold")
     for topic in topics:
-        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
-        duration = "" if topic.duration_s is None else f"{topic.duration_s:.1f} s"
-        cells = [
-            topic.name,
-            topic.type or "several types",
-            str(topic.count),
-            rate,
-            duration,
-            "\n".join(topic.frames),
-        ]
-        table.add_row(*cells, style="bold" if topic.is_usable else None)
-    # Whoever reads through a pipe wants whole lines, not those of a terminal of eighty columns.
+        table.add_row(*_cells(topic), style="bold" if topic.is_usable else None)
+    print_table(table)
+    if any(topic.is_usable for topic in topics):
+        print(
+            "Poses: --parent-topic and --child-topic take the topics in bold, --parent-tf and "
+            "--child-tf frames of /tf: odom:lidar"
+        )
+
+
+def _cells(topic: Any) -> list[str]:
+    return [
+        printable(topic.name),
+        topic.type or "several types",
+        str(topic.count),
+        "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz",
+        "" if topic.duration_s is None else f"{topic.duration_s:.1f} s",
+        "\n".join(printable(frame) for frame in topic.frames),
+    ]
+
+
+def print_table(table: "Table") -> None:
+    """Print a table; through a pipe with whole lines, not those of a terminal of 80 columns."""
+    from rich.console import Console
+
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
         console = Console(highlight=False, markup=False, width=240)
     console.print(table)
-    if any(topic.is_usable for topic in topics):
-        print(
-            "Poses: --parent-topic and --child-topic take the topics in bold, --parent-tf and --child-tf frames of /tf: odom:lidar"
-        )

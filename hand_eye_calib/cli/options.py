@@ -1,136 +1,179 @@
-"""Command-line options made from the option dataclasses, and the configuration file that may stand
-for them.
+"""Command-line options made from the option dataclasses, and the configuration file that sets the
+same options by name.
 """
 
 import argparse
 import dataclasses
 import re
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from hand_eye_calib.cli.console import note
-from hand_eye_calib.config import CalibratorConfig, NodeConfig, check_value, option_name
+from hand_eye_calib.cli.parser import advanced
+from hand_eye_calib.cli.spelling import OPTION_FIELDS, did_you_mean, flag
+from hand_eye_calib.config import (
+    REFERENCE_PATTERN,
+    CalibratorConfig,
+    NodeConfig,
+    check_value,
+    option_name,
+)
 from hand_eye_calib.errors import ConfigError, InputError
 
-_FIELDS = {option_name(field): field for field in dataclasses.fields(CalibratorConfig)}
+Options = dict[str, Any]
+
 _NODE_OPTIONS = {option_name(field) for field in dataclasses.fields(NodeConfig)}
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 _NODE_NAMES = ("calibrator", "**", "*")
-_PREFIX = "option "
+_DEST = "option "
 _PRIOR = "prior."
 
+# What most people set; the other options are shown by --help-all.
+_COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
 
-def add_config_arguments(parser):
+# What stands for a regular expression in messages.
+_IN_WORDS = {REFERENCE_PATTERN: "auto, A, B<n> such as B5, or C<n> such as C20"}
+
+
+def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--config`` and an option for every field of CalibratorConfig."""
     # argparse takes -1e-3, -90deg+/-2deg and the like for options otherwise.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
-    group.add_argument(
-        "--config",
-        metavar="FILE",
-        type=Path,
-        help="YAML file with these options by name, or a ROS parameter file",
+    for name in _COMMON:
+        _add_option(group, name)
+    _add_prior_and_config(group)
+    for name in OPTION_FIELDS:
+        if name not in _COMMON:
+            advanced(_add_option(group, name))
+
+
+def _add_option(group: argparse._ArgumentGroup, name: str) -> argparse.Action:
+    field = OPTION_FIELDS[name]
+    meta = field.metadata
+    unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
+    default = "" if field.default == "" else f" Default: {field.default}."
+    return group.add_argument(
+        f"--{flag(name)}",
+        dest=_DEST + name,
+        default=argparse.SUPPRESS,
+        type=_argument_type(field),
+        metavar=_metavar(name, meta),
+        help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
     )
-    for name, field in _FIELDS.items():
-        meta = field.metadata
-        unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
-        default = "" if field.default == "" else f" Default: {field.default}."
-        group.add_argument(
-            f"--{flag(name)}",
-            dest=_PREFIX + name,
-            default=argparse.SUPPRESS,
-            type=_argument_type(field),
-            metavar=_metavar(name, meta),
-            help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
-        )
-    axes = ", ".join(name.removeprefix(_PRIOR) for name in _FIELDS if name.startswith(_PRIOR))
+
+
+def _add_prior_and_config(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--prior",
         metavar="AXIS=VALUE+/-SIGMA",
         action="append",
         type=_prior_argument,
         default=argparse.SUPPRESS,
-        help=f"the same as --prior-AXIS VALUE+/-SIGMA, for one of {axes}; may be repeated",
+        help="what is known of an axis beforehand, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; "
+        f"AXIS is one of {_axes()}; may be repeated",
+    )
+    group.add_argument(
+        "--config",
+        metavar="FILE",
+        type=Path,
+        help="YAML file with these options by name, or a ROS parameter file",
     )
 
 
-def add_output_arguments(parser):
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out`` and ``--json``."""
     group = parser.add_argument_group("output")
     group.add_argument(
         "--out",
         metavar="DIR",
         type=Path,
-        help="save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro and static_transform.launch.py",
+        help="save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
+        "static_transform.launch.py and report.html",
     )
     add_json_argument(group)
 
 
-def add_json_argument(parser):
+def add_json_argument(parser: argparse._ActionsContainer) -> None:
     """Add ``--json``."""
     parser.add_argument(
         "--json", action="store_true", help="print one JSON document on stdout instead of text"
     )
 
 
-def flag(name):
-    """An option's name as it is typed, without the leading dashes."""
-    return name.replace(".", "-").replace("_", "-")
-
-
-def options_from(arguments):
+def options_from(arguments: argparse.Namespace) -> Options:
     """The options that were set, by their public names: the command line before the file.
 
     Raises
     ------
     ConfigError
-        Where the file sets something that does not exist or cannot be.
+        If the file sets something that does not exist or cannot be.
     InputError
-        Where the file cannot be read.
+        If the file cannot be read.
     """
     options = _read_config(arguments.config) if arguments.config else {}
     options |= dict(getattr(arguments, "prior", ()))
     return options | {
-        name.removeprefix(_PREFIX): value
+        name.removeprefix(_DEST): value
         for name, value in vars(arguments).items()
-        if name.startswith(_PREFIX)
+        if name.startswith(_DEST)
     }
 
 
-def config_from(arguments):
+def config_from(arguments: argparse.Namespace) -> CalibratorConfig:
     """The CalibratorConfig that was asked for: :func:`options_from` before the defaults."""
     return CalibratorConfig.from_options(options_from(arguments))
 
 
-def _prior_argument(text):
+def _axes() -> str:
+    return ", ".join(name.removeprefix(_PRIOR) for name in OPTION_FIELDS if _PRIOR in name)
+
+
+def _prior_argument(text: str) -> tuple[str, Any]:
     axis, equals, value = text.partition("=")
-    if not equals or _PRIOR + axis not in _FIELDS:
-        axes = ", ".join(name.removeprefix(_PRIOR) for name in _FIELDS if name.startswith(_PRIOR))
+    if not equals or _PRIOR + axis not in OPTION_FIELDS:
         raise argparse.ArgumentTypeError(
-            f"expected AXIS=VALUE+/-SIGMA with AXIS one of {axes}; got {text!r}"
+            f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_axes()}; got {text!r}"
         )
     try:
-        return _PRIOR + axis, check_value(_FIELDS[_PRIOR + axis], value)
+        return _PRIOR + axis, check_value(OPTION_FIELDS[_PRIOR + axis], value)
     except ConfigError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def _metavar(name, meta):
+def _metavar(name: str, meta: Mapping[str, Any]) -> str:
     if meta["choices"]:
         return "{" + ",".join(meta["choices"]) + "}"
     return "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
 
 
-def _argument_type(field):
-    def parse(text):
+def _argument_type(field: dataclasses.Field[Any]) -> Callable[[str], Any]:
+    def parse(text: str) -> Any:
         try:
-            return check_value(field, _from_text(field, text))
+            return _value(field, text)
         except ConfigError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
+            message = str(error).removeprefix(f"{option_name(field)} ")
+            raise argparse.ArgumentTypeError(message) from None
 
     return parse
 
 
-def _from_text(field, text):
+def _value(field: dataclasses.Field[Any], value: Any) -> Any:
+    """The value of an option, from text or as YAML has it; the error of a misspelt one says what it
+    may have been.
+    """
+    try:
+        return check_value(field, _from_text(field, value) if isinstance(value, str) else value)
+    except ConfigError as error:
+        meta, text = field.metadata, str(error)
+        if meta["pattern"] in _IN_WORDS:
+            text = text.replace(f"match {meta['pattern']}", f"be {_IN_WORDS[meta['pattern']]}")
+        words = (*(meta["choices"] or ()), *meta["words"])
+        raise ConfigError(text + did_you_mean(str(value), words)) from None
+
+
+def _from_text(field: dataclasses.Field[Any], text: str) -> Any:
     """Numbers arrive as text; what is none is left for check_value to complain about."""
     kind = type(field.default)
     try:
@@ -139,13 +182,13 @@ def _from_text(field, text):
         return text
 
 
-def read_yaml(path):
+def read_yaml(path: Path) -> Any:
     """What a YAML file holds.
 
     Raises
     ------
     InputError
-        Where it cannot be read, or is not YAML.
+        If it cannot be read, or is not YAML.
     """
     import yaml
 
@@ -157,7 +200,7 @@ def read_yaml(path):
         raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
 
 
-def _read_config(path):
+def _read_config(path: Path) -> Options:
     document = read_yaml(path)
     if document is None:
         return {}
@@ -167,28 +210,31 @@ def _read_config(path):
         )
     options, ignored = {}, []
     for name, value in _flatten(_parameters(path, document)).items():
-        if name in _FIELDS:
-            options[name] = _checked(path, _FIELDS[name], value)
+        if name in OPTION_FIELDS:
+            options[name] = _checked(path, name, value)
         elif name in _NODE_OPTIONS or name.partition(".")[0] in _ROS_OPTIONS:
-            ignored.append(name)
+            ignored.append(repr(name))
         else:
+            known = sorted(OPTION_FIELDS)
             raise ConfigError(
-                f"{path}: unknown option {name!r}; known are {', '.join(sorted(_FIELDS))}"
+                f"{path}: unknown option {name!r}{did_you_mean(name, known)}; "
+                f"known are {', '.join(map(repr, known))}"
             )
     if ignored:
         note(f"{path}: only the node uses {', '.join(ignored)}; ignored here")
     return options
 
 
-def _checked(path, field, value):
+def _checked(path: Path, name: str, value: Any) -> Any:
     try:
-        return check_value(field, _from_text(field, value) if isinstance(value, str) else value)
+        return _value(OPTION_FIELDS[name], value)
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+        # In quotes it keeps the spelling of the file.
+        raise ConfigError(f"{path}: {str(error).replace(name, repr(name), 1)}") from None
 
 
-def _parameters(path, document):
-    """Of a ROS parameter file what is meant for the node ``calibrator``, of any other all."""
+def _parameters(path: Path, document: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Of a ROS parameter file what is meant for the node ``calibrator``, of any other file all."""
     sections = dict(_ros_sections(document))
     if not sections:
         return document
@@ -199,12 +245,15 @@ def _parameters(path, document):
     ]
     if not ours:
         raise ConfigError(
-            f"{path}: no parameters for a node named calibrator; found some for {', '.join(sections)}"
+            f"{path}: no parameters for a node named calibrator; found some for "
+            f"{', '.join(sections)}"
         )
     return {name: value for parameters in ours for name, value in _flatten(parameters).items()}
 
 
-def _ros_sections(mapping, node=""):
+def _ros_sections(
+    mapping: Mapping[str, Any], node: str = ""
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
     for name, value in mapping.items():
         if name == "ros__parameters":
             yield node, value or {}
@@ -212,13 +261,12 @@ def _ros_sections(mapping, node=""):
             yield from _ros_sections(value, f"{node}/{str(name).strip('/')}")
 
 
-def _flatten(mapping, prefix=""):
+def _flatten(mapping: Mapping[str, Any], prefix: str = "") -> Options:
     """Nested mappings to dotted names."""
-    flat = {}
+    flat: Options = {}
     for name, value in mapping.items():
-        flat |= (
-            _flatten(value, f"{prefix}{name}.")
-            if isinstance(value, dict)
-            else {f"{prefix}{name}": value}
-        )
+        if isinstance(value, dict):
+            flat |= _flatten(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
     return flat

@@ -1,21 +1,46 @@
 """A calibration on the screen: as text for people, as JSON for programs, and as an exit code."""
 
+import argparse
 import json
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hand_eye_calib.calibration import DofVerdict, SolveStatus
+from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.cli.reporting import with_consistency, write_report
+from hand_eye_calib.cli.spelling import as_typed
+from hand_eye_calib.report.words import given_or_estimated, listing, printable, with_sigma
+
+if TYPE_CHECKING:
+    from hand_eye_calib.engine.calibrator import Snapshot
 
 EXIT_CODES = {SolveStatus.OK: 0, SolveStatus.NOT_CONVERGED: 1, SolveStatus.UNOBSERVABLE: 3}
 
 _ROTATIONS = ("roll", "pitch", "yaw")
+_ROTATION_VECTOR = ("rx", "ry", "rz")
+_VERDICTS = {
+    DofVerdict.OBSERVED: "observed",
+    DofVerdict.WEAK: "weak",
+    DofVerdict.PRIOR: "mostly from the prior",
+    DofVerdict.UNOBSERVABLE: "unobservable",
+}
+_SCATTER = {
+    "of_methods": "other methods and references",
+    "of_halves": "the two halves of the recording",
+}
 
 
-def deliver(calibration, arguments, inputs, snapshot=None, **more):
-    """Print a calibration, save it where ``--out`` asks for that, and return the exit code.
+def deliver(
+    calibration: Calibration,
+    arguments: argparse.Namespace,
+    inputs: dict[str, Any],
+    snapshot: "Snapshot | None" = None,
+    **more: Any,
+) -> int:
+    """Print a calibration, save it if ``--out`` asks for that, and return the exit code.
 
     Parameters
     ----------
@@ -26,128 +51,148 @@ def deliver(calibration, arguments, inputs, snapshot=None, **more):
         Where the data came from, in plain values: part of the JSON document and of the saved file's
         provenance.
     snapshot : Snapshot, optional
-        The poses and options that gave it: with them, ``--out`` also asks other methods and writes
-        the report.
+        The poses and options that gave it. With them, ``--out`` also runs the cross-checks and
+        writes the report.
     **more
         What else the JSON document holds.
     """
     evidence = None
     if arguments.out:
-        from hand_eye_calib.io.results import save_result
+        from hand_eye_calib.io.results import keep_earlier_results, save_result
 
         if snapshot is not None:
-            with waiting_for("asking other methods and the drive's halves"):
+            with waiting_for("cross-checks with other methods and halves of the recording"):
                 calibration, evidence = with_consistency(calibration, snapshot)
+        keep_earlier_results(arguments.out)
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
     print(as_json(calibration, inputs=inputs, **more) if arguments.json else as_text(calibration))
-    if evidence is not None:
-        write_report(
-            arguments.out, calibration, evidence, snapshot.config, inputs, more.get("findings", ())
-        )
+    if evidence is not None and snapshot is not None:
+        findings = more.get("findings", ())
+        write_report(arguments.out, calibration, evidence, snapshot.config, inputs, findings)
     if calibration.status is SolveStatus.NOT_CONVERGED:
         fail("the solver did not converge; do not use this result, record more varied motion", 1)
     return EXIT_CODES[calibration.status]
 
 
-def as_json(calibration, **more):
+def as_json(calibration: Calibration, **more: Any) -> str:
     """One JSON document: Calibration.to_dict() and ``more``."""
     return json.dumps(calibration.to_dict() | more, indent=2, allow_nan=False)
 
 
-def as_text(calibration):
+def as_text(calibration: Calibration) -> str:
     """Everything a person needs to see, in several lines."""
-    parent, child = calibration.parent_frame, calibration.child_frame
+    parent, child = (
+        printable(frame) for frame in (calibration.parent_frame, calibration.child_frame)
+    )
     document = calibration.to_dict()
     lines = [
-        f"Pose of {child} (child) in {parent} (parent)",
-        *_transform_lines(document["T_parent_child"]),
-        f"Pose of {parent} (parent) in {child} (child)",
-        *_transform_lines(document["T_child_parent"]),
-        f"One standard deviation of the pose of {child}, along and about the axes of {parent}",
-        *(_observability_line(dof) for dof in calibration.observability),
-        *_consistency_lines(calibration.consistency),
-        f"Solved with {calibration.method} ({calibration.backend}) on reference {calibration.reference}: "
-        f"{calibration.n_inliers} of {calibration.n_pairs} motion pairs are inliers, from {calibration.n_poses} poses; "
-        f"objective {calibration.objective:.6g}",
-        *([f"  reference {calibration.reference_reason}"] if calibration.reference_reason else []),
-        *(f"  {line}" for line in (calibration.noise or {}).get("in_words", ())),
-        f"  time offset {_with_sigma(calibration.time_offset_s, calibration.time_offset_sigma_s, 4)} s, "
-        f"scale {_with_sigma(calibration.scale, calibration.scale_sigma, 4)}",
         f"Status: {_status(calibration)}",
-        *(f"Warning: {warning}" for warning in calibration.warnings),
-        "To publish it:",
-        f"  {static_transform_command(calibration)}",
+        *(f"Warning: {as_typed(warning)}" for warning in calibration.warnings),
+        f"Pose of {child} (child) in {parent} (parent): maps coordinates of {child} into {parent}",
+        *_transform_lines(document["T_parent_child"]),
+        f"Pose of {parent} (parent) in {child} (child): maps coordinates of {parent} into {child}",
+        *_transform_lines(document["T_child_parent"]),
+        f"Along and about the axes of {parent}: {_observability(calibration)}",
+        *_scatter_lines(calibration.consistency),
+        *_solution_lines(calibration),
+        *_publishing_lines(calibration),
     ]
-    return "\n".join(lines)
+    return "\n".join(printable(line) for line in lines)
 
 
-def convergence_line(entry):
-    """One line of what ``replay --every`` found on the way: an entry of its history."""
+def convergence_line(entry: Mapping[str, Any]) -> str:
+    """An entry of the history that ``replay --every`` makes, in one line."""
     calibration, at = entry["calibration"], f"after {entry['bag_time_s']:g} s:"
     if calibration is None:
         return f"{at} no estimate yet, {entry['reason']}"
     transform = calibration["T_parent_child"]
-    values = [
-        f"{name} {value:.3f}" for name, value in zip("xyz", transform["translation"], strict=True)
-    ]
-    values += [
-        f"{name} {value:.2f}" for name, value in zip(_ROTATIONS, transform["rpy_deg"], strict=True)
-    ]
-    return f"{at} {' '.join(values[:3])} m, {' '.join(values[3:])} deg, {calibration['n_poses']} poses, {calibration['status']}"
+    position = _values("xyz", transform["translation"], 3)
+    angles = _values(_ROTATIONS, transform["rpy_deg"], 2)
+    poses, status = calibration["n_poses"], calibration["status"]
+    return f"{at} {position} m, {angles} deg, {poses} poses, {status}"
 
 
-def _transform_lines(transform):
-    return [
-        f"  {transform['maps']}",
-        "  translation " + _row(("x", "y", "z"), transform["translation"]) + "  m",
-        "  quaternion  " + _row(("x", "y", "z", "w"), transform["quat_xyzw"]),
-        "  rotation    "
-        + _row(_ROTATIONS, transform["rpy_deg"], digits=4)
-        + "  deg, about fixed axes",
-    ]
-
-
-def _row(names, values, digits=6):
-    return "  ".join(
-        f"{name} {value:{digits + 6}.{digits}f}" for name, value in zip(names, values, strict=True)
+def _values(names: tuple[str, ...] | str, values: list[float], decimals: int) -> str:
+    return " ".join(
+        f"{name} {value:.{decimals}f}" for name, value in zip(names, values, strict=True)
     )
 
 
-def _with_sigma(value, sigma, digits):
-    """A number that was given as it is, one that was estimated with its standard deviation."""
-    return f"{value:.{digits}f} +/- {sigma:.{digits}f}" if sigma else f"{value:g}"
+def _transform_lines(transform: Mapping[str, Any]) -> Iterator[str]:
+    """A row for each number that is printed, with one standard deviation."""
+    sigmas_m = transform["sigma_translation"]
+    for name, value, sigma in zip("xyz", transform["translation"], sigmas_m, strict=True):
+        yield f"  {name:<6} {with_sigma(value, sigma, 3):>24} m"
+    names, kind, note_on = _ROTATIONS, "rpy", ""
+    if "rotation_vector_deg" in transform:
+        names, kind = _ROTATION_VECTOR, "rotation_vector"
+        note_on = "  rotation vector: pitch is near +/-90 deg, where roll and yaw mean nothing"
+        yield note_on
+    angles, sigmas = transform[f"{kind}_deg"], transform[f"sigma_{kind}_deg"]
+    for name, value, sigma in zip(names, angles, sigmas, strict=True):
+        yield f"  {name:<6} {with_sigma(value, sigma, 2):>24} deg"
+    yield f"  quaternion {_values(('x', 'y', 'z', 'w'), transform['quat_xyzw'], 6)}"
 
 
-def _observability_line(dof):
-    is_rotation = dof.name in _ROTATIONS
-    if dof.verdict is DofVerdict.UNOBSERVABLE or not np.isfinite(dof.sigma):
-        return f"  {dof.name:<6}          -      {dof.verdict.value}"
-    sigma, unit = (np.degrees(dof.sigma), "deg") if is_rotation else (dof.sigma, "m")
-    return f"  {dof.name:<6} {sigma:10.4f} {unit:<4} {dof.verdict.value}"
+def _observability(calibration: Calibration) -> str:
+    """Axes by verdict: ``x, y and yaw observed; z unobservable``."""
+    texts = []
+    for verdict, words in _VERDICTS.items():
+        names = [dof.name for dof in calibration.observability if dof.verdict is verdict]
+        if names:
+            texts.append(f"{listing(names)} {words}")
+    return "; ".join(texts)
 
 
-def _consistency_lines(consistency):
-    """The same as other methods and references, and the drive's halves, suggest it."""
-    titles = {
-        "of_methods": "Other methods and references suggest",
-        "of_halves": "The two halves of the drive suggest",
-    }
-    for kind, title in titles.items() if consistency else ():
+def _scatter_lines(consistency: Mapping[str, Mapping[str, Any]] | None) -> Iterator[str]:
+    """How far other answers to the same question scatter about the result."""
+    for kind, title in _SCATTER.items() if consistency else ():
         told = [
-            f"{axis} {np.degrees(row[kind]):.3f} deg"
+            f"{axis} {np.degrees(row[kind]):.2g} deg"
             if axis in _ROTATIONS
-            else f"{axis} {row[kind]:.4f} m"
-            for axis, row in consistency.items()
+            else f"{axis} {row[kind]:.2g} m"
+            for axis, row in (consistency or {}).items()
             if row[kind] is not None
         ]
         if told:
-            yield f"  {title}: {', '.join(told)}"
+            yield f"Scatter of {title} (one standard deviation): {', '.join(told)}"
 
 
-def _status(calibration):
+def _solution_lines(calibration: Calibration) -> Iterator[str]:
+    yield (
+        f"Solved with {calibration.method} ({calibration.backend}) on reference "
+        f"{calibration.reference}: {calibration.n_inliers} of {calibration.n_pairs} motion pairs "
+        f"are inliers, from {calibration.n_poses} poses; objective {calibration.objective:.6g}"
+    )
+    if calibration.reference_reason:
+        yield f"  reference {calibration.reference_reason}"
+    for line in (calibration.noise or {}).get("in_words", ()):
+        yield f"  {line}"
+    offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
+    scale = (calibration.scale, calibration.scale_sigma)
+    yield (
+        f"  time offset {given_or_estimated(*offset, 's')}; scale {given_or_estimated(*scale, '')}"
+    )
+
+
+def _publishing_lines(calibration: Calibration) -> Iterator[str]:
+    """The command that publishes the result, if it is one to use."""
+    if calibration.status is SolveStatus.OK:
+        yield "To publish it:"
+        yield f"  {static_transform_command(calibration)}"
+    elif unknown := calibration.unobservable():
+        yield (
+            f"No command to publish it, because {listing(unknown)} "
+            f"{'is' if len(unknown) == 1 else 'are'} unknown. Record motion with rotations about "
+            f"other axes, or measure by hand and give --prior {unknown[0]}=VALUE+/-SIGMA"
+        )
+
+
+def _status(calibration: Calibration) -> str:
     if calibration.status is SolveStatus.UNOBSERVABLE:
-        names = ", ".join(calibration.unobservable())
-        return f"unobservable: this motion does not reveal {names}; do not use their values"
+        names = calibration.unobservable()
+        values = "its value" if len(names) == 1 else "their values"
+        return f"unobservable: this motion does not determine {listing(names)}; do not use {values}"
     if calibration.status is SolveStatus.NOT_CONVERGED:
         return "not converged: do not use this result"
     return calibration.status.value

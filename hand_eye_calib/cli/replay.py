@@ -3,70 +3,98 @@
 import argparse
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import waiting_for
 from hand_eye_calib.cli.options import add_config_arguments, add_output_arguments, config_from
+from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.errors import ConfigError
+
+if TYPE_CHECKING:
+    from hand_eye_calib.io.transforms import TfSource
+
+EXAMPLES = """\
+examples:
+  hand_eye_calib replay my_bag --list
+  hand_eye_calib replay my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
+  hand_eye_calib replay my_bag --parent-tf odom:lidar --child-topic /vio --out result
+  hand_eye_calib replay monday_1.mcap monday_2.mcap --time-offset estimate --every 5s"""
 
 _UNITS_S = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0}
 
 
-def add_arguments(parser):
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = EXAMPLES
     parser.add_argument(
         "bags",
         metavar="BAG",
         nargs="*",
         type=Path,
-        help="rosbag2 directory, .mcap or .db3 file of one, or rosbag1 .bag file; several are the parts of one drive",
+        help="rosbag2 directory, .mcap or .db3 file of one, or rosbag1 .bag file; several are the "
+        "parts of one recording",
     )
-    for stream in ("parent", "child"):
-        source = parser.add_mutually_exclusive_group()
-        source.add_argument(
-            f"--{stream}-topic",
-            metavar="TOPIC",
-            help=f"poses of the {stream} sensor: Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Path",
-        )
-        source.add_argument(
-            f"--{stream}-tf",
-            metavar="WORLD:SENSOR",
-            type=_tf_source,
-            help=f"poses of the {stream} sensor from /tf and /tf_static: its frame, and the fixed one, such as odom:lidar",
-        )
+    _add_stream_arguments(parser)
     parser.add_argument(
         "--list",
         action="store_true",
-        help="show what is in the bag - topics, types, counts, rates, frames - and end",
+        help="show the bag's topics with types, counts, rates and frames, and exit",
     )
     parser.add_argument(
         "--every",
         metavar="DURATION",
         type=_duration_s,
-        help="estimate every so much bag time as well, such as 5s, and show how the estimate converges",
+        help="also estimate after every such period of bag time, for example 5s, and print how the "
+        "estimate converges",
     )
-    batch = parser.add_argument_group("many bags")
-    batch.add_argument(
-        "--batch",
-        metavar="FILE",
-        type=Path,
-        help="YAML file with a list of bags, each with options of its own",
-    )
-    batch.add_argument(
-        "--jobs",
-        metavar="N",
-        type=_positive,
-        help="processes that work on it. Default: one for each core",
-    )
-    batch.add_argument(
-        "--dask",
-        metavar="ADDRESS",
-        help="work on it on a Dask cluster instead: address of its scheduler, tcp://...",
-    )
+    _add_batch_arguments(parser)
     add_config_arguments(parser)
     add_output_arguments(parser)
 
 
-def run(arguments):
+def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("pose streams", "may be left out if the bag has only two")
+    for stream in ("parent", "child"):
+        source = group.add_mutually_exclusive_group()
+        source.add_argument(
+            f"--{stream}-topic",
+            metavar="TOPIC",
+            help=f"poses of the {stream} sensor: Odometry, PoseStamped, PoseWithCovarianceStamped, "
+            "TransformStamped or Path",
+        )
+        source.add_argument(
+            f"--{stream}-tf",
+            metavar="WORLD:SENSOR",
+            type=_tf_source,
+            help=f"poses of the {stream} sensor from /tf and /tf_static: the fixed frame and the "
+            "sensor's, such as odom:lidar",
+        )
+
+
+def _add_batch_arguments(parser: argparse.ArgumentParser) -> None:
+    batch = parser.add_argument_group("many recordings")
+    batch.add_argument(
+        "--batch",
+        metavar="FILE",
+        type=Path,
+        help="YAML file with a list of bags, each with its own options",
+    )
+    jobs = batch.add_argument(
+        "--jobs",
+        metavar="N",
+        type=_positive,
+        help="number of worker processes. Default: one for each core",
+    )
+    dask = batch.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="use a Dask cluster instead: address of its scheduler, tcp://...",
+    )
+    advanced(jobs)
+    advanced(dask)
+
+
+def run(arguments: argparse.Namespace) -> int:
     """Calibrate from a bag; returns the exit code."""
     _check_usage(arguments)
     if arguments.batch:
@@ -93,12 +121,12 @@ def run(arguments):
         replayed.inputs["files"] = fingerprints(replayed.files)
     more = {"convergence": replayed.convergence} if arguments.every else {}
     snapshot = replayed.calibrator.snapshot()
-    with waiting_for("checking"):
+    with waiting_for("checking the streams"):
         calibration, findings = with_findings(replayed.calibration, snapshot)
     return deliver(calibration, arguments, replayed.inputs, snapshot, findings=findings, **more)
 
 
-def _check_usage(arguments):
+def _check_usage(arguments: argparse.Namespace) -> None:
     if arguments.batch and (arguments.bags or arguments.list or arguments.every):
         raise ConfigError(
             "--batch names its bags in its file: no BAG, --list or --every goes with it"
@@ -109,7 +137,7 @@ def _check_usage(arguments):
         raise ConfigError("the following arguments are required: BAG, or --batch FILE")
 
 
-def _tf_source(text):
+def _tf_source(text: str) -> "TfSource":
     from hand_eye_calib.io.transforms import TfSource
 
     try:
@@ -118,7 +146,7 @@ def _tf_source(text):
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def _duration_s(text):
+def _duration_s(text: str) -> float:
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*(s|ms|min|)", text)
     if not match or not float(match[1]):
         raise argparse.ArgumentTypeError(
@@ -127,7 +155,7 @@ def _duration_s(text):
     return float(match[1]) * _UNITS_S[match[2]]
 
 
-def _positive(text):
+def _positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
     return int(text)

@@ -1,19 +1,41 @@
-"""A bag's poses, fed to the engine in the order they were recorded."""
+"""Feed the poses of a bag to the engine in the order they were recorded."""
 
 import dataclasses
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from itertools import chain, islice, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.console import note, waiting_for, with_progress
 from hand_eye_calib.cli.present import convergence_line
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 
+if TYPE_CHECKING:
+    from hand_eye_calib.io.bags import PoseBag, PoseBlock
+    from hand_eye_calib.io.transforms import TfSource
+
+_STREAMS = ("parent", "child")
 _NS_PER_S = 1_000_000_000
+
+
+class _Output(NamedTuple):
+    """How a replay says what it does."""
+
+    note: Callable[[str], None]
+    with_progress: Callable[..., Iterable[Any]]
+    waiting_for: Callable[[str], AbstractContextManager[None]]
+
+
+_LOUD = _Output(note, with_progress, waiting_for)
+_SILENT = _Output(lambda text: None, lambda items, *_: items, lambda what: nullcontext())
 
 
 @dataclass
@@ -27,33 +49,40 @@ class Replayed:
         Where the data came from, in plain values.
     files : list of pathlib.Path
         The files that were read.
-    convergence : list of dict
-        Estimates on the way, in plain values.
     calibrator : Calibrator
         The engine, with all poses.
+    convergence : list of dict
+        Estimates on the way, in plain values.
     """
 
     calibration: Calibration
-    inputs: dict
-    files: list
-    convergence: list = field(default_factory=list)
-    calibrator: Calibrator | None = None
+    inputs: dict[str, Any]
+    files: list[Path]
+    calibrator: Calibrator
+    convergence: list[dict[str, Any]] = field(default_factory=list)
 
 
-def replay(paths, parent, child, config, every_s=None, quiet=False):
-    """Calibrate from one bag, or from several of one drive.
+def replay(
+    paths: Sequence[Path | str],
+    parent: "str | TfSource | None",
+    child: "str | TfSource | None",
+    config: CalibratorConfig,
+    every_s: float | None = None,
+    quiet: bool = False,
+) -> Replayed:
+    """Calibrate from one bag, or from the parts of one recording.
 
     Parameters
     ----------
     paths : list of path-like
     parent, child : str, TfSource or None
-        Topic or pair of frames; chosen where the bag leaves no choice.
+        Topic or pair of frames; None if the bag leaves no choice.
     config : CalibratorConfig
     every_s : float, optional
         Bag time between estimates on the way.
     quiet : bool
-        Say nothing on stderr; what there is to say of the data is among the calibration's warnings
-        anyway.
+        Print nothing on stderr; what there is to say of the data is among the calibration's
+        warnings too.
 
     Returns
     -------
@@ -62,49 +91,64 @@ def replay(paths, parent, child, config, every_s=None, quiet=False):
     Raises
     ------
     HandEyeCalibError
-        Where bag or poses cannot be used, or there are too few.
+        If bag or poses cannot be used, or there are too few.
     """
     from hand_eye_calib.io.bags import PoseBag
 
-    say, shown, waited_for = _silence if quiet else (note, with_progress, waiting_for)
+    output = _SILENT if quiet else _LOUD
     calibrator = Calibrator(config)
+    convergence = Convergence(calibrator, every_s) if every_s else None
     with PoseBag(*paths) as bag:
-        sources = dict(zip(("parent", "child"), bag.select_topics(parent, child), strict=True))
+        sources = dict(zip(_STREAMS, bag.select_topics(parent, child), strict=True))
         if not (parent and child):
-            say(
-                f"parent is {sources['parent']}, child is {sources['child']}; --parent-topic and --child-topic say otherwise"
+            output.note(
+                f"parent is {sources['parent']}, child is {sources['child']}; to change that, give "
+                "--parent-topic and --child-topic"
             )
-        blocks = bag.blocks(*sources.values(), config.max_gap)
-        with waited_for(f"opening {bag}"):
-            blocks = _started(blocks)
-        expected = bag.expected(*sources.values())
-        convergence = Convergence(calibrator, every_s) if every_s else None
-        found = feed(
-            calibrator, shown(blocks, expected, f"reading {bag}", len), sources, convergence
-        )
-        found += bag.n_left_out
-        warnings = bag.warnings
+        warnings = _read(bag, sources, calibrator, convergence, output)
         files = bag.files()
-    if expected is not None and found != expected:
-        warnings.append(
-            f"{bag} says it has {expected} messages on these topics, but {found} could be read; it may be damaged"
-        )
     for text in warnings:
-        say(text)
-    with waited_for("solving"):
+        output.note(text)
+    with output.waiting_for("solving"):
         calibration = calibrator.estimate()
     calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *warnings))
-    inputs = {"bag": str(bag), "options": calibrator.config.to_options()}
-    inputs |= {
-        stream: {"topic": str(source), **_counts(calibrator.statistics(stream))}
-        for stream, source in sources.items()
-    }
-    return Replayed(
-        calibration, inputs, files, convergence.history if convergence else [], calibrator
-    )
+    inputs: dict[str, Any] = {"bag": str(bag), "options": calibrator.config.to_options()}
+    for stream, source in sources.items():
+        inputs[stream] = {"topic": str(source), **_counts(calibrator.statistics(stream))}
+    history = convergence.history if convergence else []
+    return Replayed(calibration, inputs, files, calibrator, history)
 
 
-def feed(calibrator, blocks, topics, convergence=None):
+def _read(
+    bag: "PoseBag",
+    sources: Mapping[str, Any],
+    calibrator: Calibrator,
+    convergence: "Convergence | None",
+    output: _Output,
+) -> list[str]:
+    """Give all poses of a bag to the engine; returns what there is to say of the bag."""
+    parent, child = (sources[stream] for stream in _STREAMS)
+    blocks = bag.blocks(parent, child, calibrator.config.max_gap)
+    with output.waiting_for(f"opening {bag}"):
+        blocks = _started(blocks)
+    expected = bag.expected(parent, child)
+    shown = output.with_progress(blocks, expected, f"reading {bag}", len)
+    found = feed(calibrator, shown, sources, convergence) + bag.n_left_out
+    warnings = list(bag.warnings)
+    if expected is not None and found != expected:
+        warnings.append(
+            f"{bag} says it has {expected} messages on these topics, but {found} could be read; it "
+            "may be damaged"
+        )
+    return warnings
+
+
+def feed(
+    calibrator: Calibrator,
+    blocks: "Iterable[PoseBlock]",
+    topics: Mapping[str, Any],
+    convergence: "Convergence | None" = None,
+) -> int:
     """Give every pose to the engine.
 
     Parameters
@@ -114,7 +158,7 @@ def feed(calibrator, blocks, topics, convergence=None):
     topics : mapping
         "parent" and "child" to the names of their topics, for messages.
     convergence : Convergence, optional
-        Told of every pose's bag time.
+        Told the bag time of every pose.
 
     Returns
     -------
@@ -124,45 +168,60 @@ def feed(calibrator, blocks, topics, convergence=None):
     Raises
     ------
     InputError
-        At the first message that cannot be used, naming topic, message and stamp.
+        At the first message that cannot be used, with topic, message number and stamp.
     """
-    count, frames = 0, {(stream, None) for stream in topics}
+    # A message without a frame name changes nothing.
+    frames: set[tuple[str, str | None]] = {(stream, None) for stream in topics}
+    count = 0
     for block in blocks:
         count += len(block)
-        new_frames = {}
-        for row, pair in enumerate(
-            zip(block.streams.tolist(), block.sensor_frames.tolist(), strict=True)
-        ):
-            if pair not in frames:
-                new_frames.setdefault(pair, row)
-        cuts = {
-            0,
-            len(block),
-            *new_frames.values(),
-            *(convergence.cuts(block.bag_ns) if convergence else ()),
-        }
-        for first, last in pairwise(sorted(cuts)):
+        for first, last in pairwise(_cuts(block, frames, convergence)):
             part = block[first:last]
             if convergence is not None:
                 convergence.reached(int(part.bag_ns[0]))
             try:
-                if (pair := (part.streams[0], part.sensor_frames[0])) not in frames:
-                    calibrator.set_frame(*pair)
-                    frames.add(pair)
-                calibrator.add_poses(
-                    part.streams, part.stamps_ns, part.poses[:, :3], part.poses[:, 3:]
-                )
+                _add(calibrator, part, frames)
             except InputError as error:
-                row = getattr(error, "index", 0)
-                seconds, nanoseconds = divmod(int(part.stamps_ns[row]), _NS_PER_S)
-                raise InputError(
-                    f"{topics[part.streams[row]]}, message {part.numbers[row]}, stamp {seconds}.{nanoseconds:09d}: {error}"
-                ) from error
+                raise InputError(f"{_place(part, topics, error)}: {error}") from error
     return count
 
 
+def _cuts(
+    block: "PoseBlock",
+    frames: set[tuple[str, str | None]],
+    convergence: "Convergence | None",
+) -> list[int]:
+    """Rows at which a block is cut, first and last included: where a frame name appears for the
+    first time, or an estimate is due.
+    """
+    first_rows: dict[tuple[str, str | None], int] = {}
+    named = zip(block.streams.tolist(), block.sensor_frames.tolist(), strict=True)
+    for row, pair in enumerate(named):
+        if pair not in frames:
+            first_rows.setdefault(pair, row)
+    due = convergence.cuts(block.bag_ns) if convergence else []
+    return sorted({0, len(block), *first_rows.values(), *due})
+
+
+def _add(calibrator: Calibrator, part: "PoseBlock", frames: set[tuple[str, str | None]]) -> None:
+    """Add poses; the first of them may name a frame that is new."""
+    pair = (part.streams[0], part.sensor_frames[0])
+    if pair not in frames:
+        calibrator.set_frame(*pair)
+        frames.add(pair)
+    calibrator.add_poses(part.streams, part.stamps_ns, part.poses[:, :3], part.poses[:, 3:])
+
+
+def _place(part: "PoseBlock", topics: Mapping[str, Any], error: InputError) -> str:
+    """Topic, message number and stamp of the message that was refused."""
+    row = getattr(error, "index", 0)
+    seconds, nanoseconds = divmod(int(part.stamps_ns[row]), _NS_PER_S)
+    topic = topics[part.streams[row]]
+    return f"{topic}, message {part.numbers[row]}, stamp {seconds}.{nanoseconds:09d}"
+
+
 class Convergence:
-    """Estimates on the way, every so much bag time.
+    """Estimates on the way, one in each period of bag time.
 
     Parameters
     ----------
@@ -176,20 +235,19 @@ class Convergence:
         there was none.
     """
 
-    def __init__(self, calibrator, every_s):
-        self.history = []
+    def __init__(self, calibrator: Calibrator, every_s: float) -> None:
+        self.history: list[dict[str, Any]] = []
         self._calibrator, self._every_ns = calibrator, round(every_s * _NS_PER_S)
-        self._first_ns = self._next_ns = None
+        self._first_ns: int | None = None
+        self._next_ns = 0
 
-    def cuts(self, bag_ns):
-        """Where in an array of bag times another period may begin."""
+    def cuts(self, bag_ns: IntArray) -> list[int]:
+        """Indices in an array of bag times at which another period may begin."""
         first_ns = bag_ns[0] if self._first_ns is None else self._first_ns
         return (np.flatnonzero(np.diff((bag_ns - first_ns) // self._every_ns)) + 1).tolist()
 
-    def reached(self, bag_ns):
-        """Estimate where another period has passed; call it before the message of that time is
-        added.
-        """
+    def reached(self, bag_ns: int) -> None:
+        """Estimate if another period has passed; to be called before that message is added."""
         if self._first_ns is None:
             self._first_ns, self._next_ns = bag_ns, bag_ns + self._every_ns
         if bag_ns < self._next_ns:
@@ -199,33 +257,27 @@ class Convergence:
         self.history.append({"bag_time_s": periods * self._every_ns / _NS_PER_S} | self._estimate())
         note(convergence_line(self.history[-1]))
 
-    def _estimate(self):
+    def _estimate(self) -> dict[str, Any]:
         try:
             return {"calibration": self._calibrator.estimate().to_dict()}
         except NotEnoughDataError as error:
             return {"calibration": None, "reason": str(error)}
 
 
-def fingerprints(files, quiet=False):
+def fingerprints(files: Sequence[Path], quiet: bool = False) -> list[dict[str, Any]]:
     """Name, size and SHA-256 of the files that were read."""
     from hand_eye_calib.io.results import fingerprint
 
-    return [
-        fingerprint(file)
-        for file in (files if quiet else with_progress(files, len(files), "hashing"))
-    ]
+    output = _SILENT if quiet else _LOUD
+    return [fingerprint(file) for file in output.with_progress(files, len(files), "hashing")]
 
 
-def _started(blocks):
-    """The same, after what a bag has to do before the first of them."""
+def _started(blocks: Iterator[Any]) -> Iterator[Any]:
+    """The same blocks, after what a bag has to do before the first of them."""
     return chain(list(islice(blocks, 1)), blocks)
 
 
-# In place of note, with_progress and waiting_for.
-_silence = (lambda text: None, lambda items, *_: items, lambda what: nullcontext())
-
-
-def _counts(statistics):
+def _counts(statistics: Any) -> dict[str, Any]:
     return {
         "messages": statistics.received,
         "refused_duplicate": statistics.refused_duplicate,

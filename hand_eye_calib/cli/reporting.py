@@ -1,75 +1,97 @@
-"""What ``--out`` adds to a calibration: other answers to the same question, ``report.html``; and
-``check.html`` of the command ``check``.
+"""What ``--out`` adds to a calibration: cross-checks and ``report.html``; and ``check.html`` of the
+command ``check``.
 """
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.cross_check import consistency
 from hand_eye_calib.engine.estimation import estimate_extrinsic
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.methods import METHODS
 
+if TYPE_CHECKING:
+    from hand_eye_calib.engine.calibrator import Snapshot
+    from hand_eye_calib.engine.evidence import Evidence
+
 REPORT, CHECK = "report.html", "check.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 
 
-def with_consistency(calibration, snapshot):
-    """A calibration with how far other methods, other references and the drive's halves lie from
-    it; and the Evidence for a report.
+def with_consistency(
+    calibration: Calibration, snapshot: "Snapshot"
+) -> "tuple[Calibration, Evidence]":
+    """Cross-check a calibration with other methods, other references and the two halves of the
+    recording.
 
     Parameters
     ----------
     calibration : Calibration
     snapshot : Snapshot
         The poses and options that gave it.
+
+    Returns
+    -------
+    calibration : Calibration
+        With the cross-checks' scatter and warnings.
+    evidence : Evidence
+        For a report.
     """
     from hand_eye_calib.engine.evidence import gather
 
-    # The clock is settled; estimating it again would cost time.
+    # The time offset is settled; estimating it again would cost time.
     config = dataclasses.replace(snapshot.config, time_offset=calibration.time_offset_s)
     pose_pairs = dataclasses.replace(snapshot, config=config).pose_pairs()
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True))
     evidence = gather(calibration, snapshot.config, pose_pairs, estimate_extrinsic, streams)
-    others, halves = (
-        [one.calibration for one in answers] for answers in (evidence.comparison, evidence.halves)
-    )
-    # Where there are jumps, methods that use every pair disagree for a reason that says nothing
-    # about the result.
+    others = [one.calibration for one in evidence.comparison]
+    halves = [one.calibration for one in evidence.halves]
+    # If there are jumps, methods that use every pair disagree for a reason that says nothing about
+    # the result.
     robust = [other for other in others if METHODS[other.method].rejects_outliers]
     found = consistency(calibration, robust, halves)
     warnings = (*calibration.warnings, *found.warnings())
-    return dataclasses.replace(
-        calibration, consistency=found.to_dict(), warnings=warnings
-    ), evidence
+    checked = dataclasses.replace(calibration, consistency=found.to_dict(), warnings=warnings)
+    return checked, evidence
 
 
-def write_report(directory, *arguments):
-    """Write the report; without the libraries that it takes, say so and go on.
+def write_report(
+    directory: Path,
+    calibration: Calibration,
+    evidence: "Evidence",
+    config: CalibratorConfig,
+    inputs: Mapping[str, Any],
+    findings: Sequence[Mapping[str, Any]] = (),
+) -> None:
+    """Write the report into a directory; if a library for it is missing, say so and go on.
 
     Parameters
     ----------
     directory : path-like
-        One that exists.
-    *arguments
+    calibration, evidence, config, inputs, findings
         Those of :func:`rendered`.
 
     Raises
     ------
     InputError
-        Where it cannot be written.
+        If it cannot be written.
     """
     if can_draw(REPORT):
         with waiting_for("writing the report"):
-            path = save_page(Path(directory) / REPORT, rendered(*arguments))
+            page = rendered(calibration, evidence, config, inputs, findings)
+            path = save_page(Path(directory) / REPORT, page)
         note(f"wrote {path}")
 
 
-def write_check(directory, *arguments):
-    """Write the page of the stream checks into a directory, which is made; without the libraries,
-    say so and go on.
+def write_check(directory: Path, *arguments: Any) -> None:
+    """Write the page of the stream checks into a directory; if a library for it is missing, say so
+    and go on.
 
     Parameters
     ----------
@@ -80,21 +102,22 @@ def write_check(directory, *arguments):
     Raises
     ------
     InputError
-        Where it cannot be written.
+        If it cannot be written.
     """
     if can_draw(CHECK):
         from hand_eye_calib.report.check_page import render_check
 
-        path = save_page(Path(directory) / CHECK, render_check(*arguments))
+        with waiting_for("writing the page"):
+            path = save_page(Path(directory) / CHECK, render_check(*arguments))
         note(f"wrote {path}")
 
 
-def can_draw(file_name):
-    """Whether the libraries for pages are there; says which is missing."""
+def can_draw(file_name: str) -> bool:
+    """Whether the libraries for pages are installed; prints which one is missing."""
     try:
         import hand_eye_calib.report.report  # noqa: F401
     except ModuleNotFoundError as error:
-        library = error.name.partition(".")[0]
+        library = (error.name or "").partition(".")[0]
         if library not in _OPTIONAL:
             raise
         note(f"no {file_name}: {library} is missing; pip install {library}")
@@ -102,7 +125,13 @@ def can_draw(file_name):
     return True
 
 
-def rendered(calibration, evidence, config, inputs, findings=()):
+def rendered(
+    calibration: Calibration,
+    evidence: "Evidence",
+    config: CalibratorConfig,
+    inputs: Mapping[str, Any],
+    findings: Sequence[Mapping[str, Any]] = (),
+) -> str:
     """The report as HTML.
 
     Parameters
@@ -122,21 +151,26 @@ def rendered(calibration, evidence, config, inputs, findings=()):
     """
     from hand_eye_calib.report.report import render
 
-    command = static_transform_command(calibration)
+    is_usable = calibration.status is SolveStatus.OK
+    command = static_transform_command(calibration) if is_usable else ""
     return render(calibration, config, evidence, inputs=inputs, findings=findings, command=command)
 
 
-def save_page(path, text):
-    """Write a page, in a directory that is made where it is missing; returns its path.
+def save_page(path: Path, text: str) -> Path:
+    """Write a page in one step, into a directory that is made if it is missing; returns its path.
+
+    A link at that path is replaced, not followed.
 
     Raises
     ------
     InputError
-        Where it cannot be written.
+        If it cannot be written.
     """
+    from hand_eye_calib.io.results import replace_file
+
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        replace_file(path, text)
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or path}: {error.strerror}; choose another directory"

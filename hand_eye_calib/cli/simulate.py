@@ -1,13 +1,24 @@
-"""``simulate``: drives with known truth, as trajectory files and bags."""
+"""``simulate``: recordings with known truth, as trajectory files and bags."""
 
 import argparse
 import dataclasses
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from hand_eye_calib.cli.console import with_progress
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.simulation.options import HILLY_DRIVE, MIXTURE, PUBLISHED_DRIVE, NoiseConfig
+from hand_eye_calib.simulation.options import (
+    HILLY_DRIVE,
+    MIXTURE,
+    PUBLISHED_DRIVE,
+    DriveConfig,
+    NoiseConfig,
+)
+
+if TYPE_CHECKING:
+    from hand_eye_calib.simulation.drive import SimulatedDrive
 
 # The layout of the published simulations: sensor 1 is the parent.
 PARENT_FILE, CHILD_FILE, TRUTH_FILE = "T_S1_W1.txt", "T_S2_W2.txt", "T_S2_S1.txt"
@@ -15,18 +26,23 @@ PARENT_TOPIC, CHILD_TOPIC = "/parent/odometry", "/child/odometry"
 
 _DRIVES = {"published": PUBLISHED_DRIVE, "hilly": HILLY_DRIVE}
 _NOISE_OPTIONS = {"noise": "gaussian", "outliers": "outliers", "drift": "drift"}
-_FILES = f"""\
-DIR/run_01, run_02, ... are laid out as the published simulations of Valimaki et al. 2023, in TUM format:
+_EPILOG = f"""\
+examples:
+  hand_eye_calib simulate --out simulated --drive hilly --mixture --bag mcap
+  hand_eye_calib simulate --out repeats --runs 20 --noise 0.002
+
+DIR/run_01, run_02, ... have the layout of the simulations published with Valimaki et al. 2023, in
+TUM format:
   {PARENT_FILE}  trajectory of sensor 1, the parent, in its own world
   {CHILD_FILE}  trajectory of sensor 2, the child, in its own world
   {TRUTH_FILE}  the true extrinsic, one pose: the child sensor in the parent sensor's frame
   bag, bag.bag   with --bag: topics {PARENT_TOPIC} and {CHILD_TOPIC} (nav_msgs/msg/Odometry)"""
 
 
-def add_arguments(parser):
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _FILES
+    parser.epilog = _EPILOG
     parser.add_argument(
         "--out",
         metavar="DIR",
@@ -35,49 +51,62 @@ def add_arguments(parser):
         help="directory to make; it must be empty or not exist",
     )
     parser.add_argument(
-        "--runs", type=_positive, default=1, metavar="N", help="number of drives. Default: 1"
+        "--runs", type=_positive, default=1, metavar="N", help="number of recordings. Default: 1"
     )
     parser.add_argument(
         "--seed",
         type=_not_negative,
         default=0,
-        help="the same seed gives the same drives. Default: 0",
+        help="the same seed gives the same recordings. Default: 0",
     )
+    _add_motion_arguments(parser)
+    _add_noise_arguments(parser)
     parser.add_argument(
+        "--bag",
+        choices=("mcap", "sqlite3", "rosbag1"),
+        help="also write a bag of every recording, in this storage format",
+    )
+    add_json_argument(parser)
+
+
+def _add_motion_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("motion")
+    group.add_argument(
         "--drive",
         choices=tuple(_DRIVES),
         default="published",
-        help="published: 10 s at 0.5 m/s, both sensors at 10 Hz with equal stamps, as in the article. hilly: two minutes at 1.5 m/s, "
-        "10 and 20 Hz, no common stamps. Default: published",
+        help="published: 10 s at 0.5 m/s, both sensors at 10 Hz with equal stamps, as in the "
+        "paper. hilly: two minutes at 1.5 m/s, 10 and 20 Hz, no common stamps. Default: published",
     )
-    parser.add_argument(
+    group.add_argument(
         "--poses",
         type=int,
         metavar="N",
         help="poses of the parent sensor. Default: 100 (published), 1200 (hilly)",
     )
+
+
+def _add_noise_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("noise")
     fields = {field.name: field for field in dataclasses.fields(NoiseConfig)}
     for option, name in _NOISE_OPTIONS.items():
         meta = fields[name].metadata
         unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
-        parser.add_argument(
+        group.add_argument(
             f"--{option}",
             type=float,
             metavar=option.upper(),
             help=f"{meta['doc']}{unit} Default: 0.",
         )
-    parser.add_argument(
+    group.add_argument(
         "--mixture",
         action="store_true",
-        help=f"the article's mixture: --noise {MIXTURE.gaussian} --outliers {MIXTURE.outliers} --drift {MIXTURE.drift}, where not given",
+        help=f"the paper's mixture: --noise {MIXTURE.gaussian} --outliers {MIXTURE.outliers} "
+        f"--drift {MIXTURE.drift}; those that are given go before",
     )
-    parser.add_argument(
-        "--bag", choices=("mcap", "sqlite3", "rosbag1"), help="write a bag of every drive too"
-    )
-    add_json_argument(parser)
 
 
-def run(arguments):
+def run(arguments: argparse.Namespace) -> int:
     """Simulate and write; returns the exit code."""
     from hand_eye_calib.simulation.drive import simulate_drive
 
@@ -85,7 +114,8 @@ def run(arguments):
     _make_empty(arguments.out)
     digits = max(2, len(str(arguments.runs)))
     folders = [arguments.out / f"run_{number:0{digits}}" for number in range(1, arguments.runs + 1)]
-    for number, folder in enumerate(folders):
+    shown = with_progress(enumerate(folders), len(folders), "simulating")
+    for number, folder in shown:
         write_drive(folder, simulate_drive((arguments.seed, number), config, noise), arguments.bag)
     if arguments.json:
         settings = {
@@ -95,11 +125,12 @@ def run(arguments):
         }
         print(json.dumps({"runs": [str(folder) for folder in folders], **settings}, indent=2))
     else:
-        print(f"{len(folders)} drive{'s' * (len(folders) != 1)} written to {arguments.out}")
+        recordings = "recording" if len(folders) == 1 else "recordings"
+        print(f"{len(folders)} {recordings} written to {arguments.out}")
     return 0
 
 
-def write_drive(folder, drive, bag=None):
+def write_drive(folder: Path, drive: "SimulatedDrive", bag: str | None = None) -> None:
     """Write a SimulatedDrive into a new folder.
 
     Parameters
@@ -112,7 +143,7 @@ def write_drive(folder, drive, bag=None):
     Raises
     ------
     InputError
-        Where it cannot be written.
+        If it cannot be written.
     """
     from hand_eye_calib.geometry.trajectory import Trajectory
     from hand_eye_calib.io.trajectory_files import write_trajectory
@@ -120,9 +151,8 @@ def write_drive(folder, drive, bag=None):
     _make_empty(folder)
     write_trajectory(folder / PARENT_FILE, drive.parent)
     write_trajectory(folder / CHILD_FILE, drive.child)
-    write_trajectory(
-        folder / TRUTH_FILE, Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None])
-    )
+    truth = Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None])
+    write_trajectory(folder / TRUTH_FILE, truth)
     if bag:
         from hand_eye_calib.io.bags import write_bag
 
@@ -133,7 +163,7 @@ def write_drive(folder, drive, bag=None):
         write_bag(folder / ("bag.bag" if bag == "rosbag1" else "bag"), streams, bag)
 
 
-def _configs(arguments):
+def _configs(arguments: argparse.Namespace) -> tuple[DriveConfig, NoiseConfig]:
     config = _DRIVES[arguments.drive]
     if arguments.poses is not None:
         config = dataclasses.replace(config, poses=arguments.poses)
@@ -145,7 +175,7 @@ def _configs(arguments):
     return config, dataclasses.replace(MIXTURE if arguments.mixture else NoiseConfig(), **given)
 
 
-def _make_empty(folder):
+def _make_empty(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         occupied = any(folder.iterdir())
@@ -155,19 +185,20 @@ def _make_empty(folder):
         ) from None
     if occupied:
         raise InputError(
-            f"{folder} is not empty, and nothing in it is overwritten; remove it or choose another with --out"
+            f"{folder} is not empty, and nothing in it is overwritten; remove it or choose another "
+            "with --out"
         )
 
 
-def _positive(text):
+def _positive(text: str) -> int:
     return _at_least(1, text)
 
 
-def _not_negative(text):
+def _not_negative(text: str) -> int:
     return _at_least(0, text)
 
 
-def _at_least(minimum, text):
+def _at_least(minimum: int, text: str) -> int:
     if not text.isdecimal() or int(text) < minimum:
         raise argparse.ArgumentTypeError(
             f"expected a whole number of at least {minimum}, got {text!r}"

@@ -121,14 +121,19 @@ def with_pose(trajectory, index, **fields):
 def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag, storage):
     code, out, err = run("replay", new_bag(storage=storage), *TOPICS)
     assert (code, err) == (0, "")
-    assert "Pose of camera (child) in lidar (parent)\n  coordinates of camera into lidar\n" in out
-    assert "Pose of lidar (parent) in camera (child)\n  coordinates of lidar into camera\n" in out
-    rows = re.findall(r"translation x +(\S+) +y +(\S+) +z +(\S+)  m", out)
-    np.testing.assert_allclose(
-        np.array(rows, dtype=float), [TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]], atol=2e-6
+    assert out.startswith("Status: ok\n")
+    assert (
+        "Pose of camera (child) in lidar (parent): maps coordinates of camera into lidar\n" in out
     )
-    assert re.search(r"^  yaw +0\.\d+ deg +observed$", out, flags=re.MULTILINE)
-    assert "Status: ok\n" in out
+    assert (
+        "Pose of lidar (parent) in camera (child): maps coordinates of lidar into camera\n" in out
+    )
+    rows = re.findall(r"^  [xyz] +(\S+) \+/- \d\S* m$", out, flags=re.MULTILINE)
+    truth = np.concatenate([TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]])
+    np.testing.assert_allclose(np.array(rows, dtype=float), truth, atol=2e-6)
+    assert re.search(r"^  yaw +\S+ \+/- \d\S* deg$", out, flags=re.MULTILINE)
+    assert "axes of lidar: x, y, z, roll, pitch and yaw observed\n" in out
+    assert "To publish it:\n  ros2 run tf2_ros static_transform_publisher" in out
 
 
 def test_json_is_one_document_on_stdout(run, new_bag):
@@ -152,7 +157,7 @@ def test_topics_may_be_left_out_where_there_are_only_two(run, new_bag):
     assert code == 0
     assert err == (
         f"hand_eye_calib: note: parent is {CHILD_TOPIC}, child is {PARENT_TOPIC}; "
-        "--parent-topic and --child-topic say otherwise\n"
+        "to change that, give --parent-topic and --child-topic\n"
     )
     np.testing.assert_allclose(json.loads(out)["T_child_parent"]["matrix"], TRUTH, atol=1e-6)
 
@@ -227,10 +232,11 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
     parent, child = drive(planar=True)
     code, out, err = run("replay", new_bag(parent, child), *TOPICS)
     assert (code, err) == (3, "")
-    assert re.search(r"^  z +- +unobservable$", out, flags=re.MULTILINE)
-    assert re.search(
-        r"^Status: unobservable: this motion does not reveal .*\bz\b", out, flags=re.MULTILINE
-    )
+    assert re.search(r"^  z +unknown m$", out, flags=re.MULTILINE)
+    assert out.startswith("Status: unobservable: this motion does not determine z; do not use its")
+    assert "x, y, roll, pitch and yaw observed; z unobservable\n" in out
+    assert "static_transform_publisher" not in out
+    assert "give --prior z=VALUE+/-SIGMA" in out
 
 
 # ---- what is printed
@@ -259,7 +265,7 @@ def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_ba
         run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED, warnings=("look here",)
     )
     text = as_text(calibration)
-    assert "Status: not converged: do not use this result\nWarning: look here\n" in text
+    assert text.startswith("Status: not converged: do not use this result\nWarning: look here\n")
     assert all(dof.verdict is DofVerdict.OBSERVED for dof in calibration.observability)
     assert "unobservable" not in text
 
@@ -395,9 +401,9 @@ def test_results_that_cannot_be_saved(refused, new_bag, tmp_path):
 
 @pytest.mark.parametrize("command", ["replay", "calibrate"])
 def test_help_lists_every_option_with_its_default(run, command):
-    code, out, _ = run(command, "--help")
+    code, out, _ = run(command, "--help-all")
     assert code == 0
-    words = " ".join(out.split())
+    words = " ".join(out.partition("\nexamples:")[0].split())
     for field in dataclasses.fields(CalibratorConfig):
         name = f"--{option_name(field).replace('.', '-').replace('_', '-')}"
         entry = words[words.rindex(f" {name} ") :].replace("- ", "-")
@@ -447,26 +453,31 @@ def parsed(options):
         ([], "the following arguments are required: COMMAND"),
         (["fly"], "invalid choice: 'fly'"),
         (["replay"], "the following arguments are required: BAG"),
-        (["replay", "bag", "--methd", "dnl"], "unrecognized arguments: --methd dnl"),
-        (["replay", "bag", "--meth", "dnl"], "unrecognized arguments: --meth dnl"),
+        (["replay", "bag", "--methd", "dnl"], "unknown option --methd; did you mean --method?"),
+        (["replay", "bag", "--meth", "dnl"], "unknown option --meth; did you mean --method?"),
         (
             ["replay", "bag", "--method", "magic"],
-            "argument --method: method must be one of dnlo, dnl",
+            "argument --method: must be one of dnlo, dnl",
         ),
         (
             ["replay", "bag", "--threshold", "-1"],
-            "argument --threshold: threshold must be at least 1e-12 m^2; got -1.0",
+            "argument --threshold: must be at least 1e-12 m^2; got -1.0",
         ),
         (
             ["replay", "bag", "--threshold", "big"],
-            "argument --threshold: threshold must be of type float; got 'big'",
+            "argument --threshold: must be of type float; got 'big'",
         ),
         (
             ["replay", "bag", "--min-pairs", "3.5"],
-            "argument --min-pairs: min_pairs must be of type int; got '3.5'",
+            "argument --min-pairs: must be of type int; got '3.5'",
         ),
-        (["replay", "bag", "--scale", "0"], "argument --scale: scale must be at least"),
-        (["replay", "bag", "--reference", "D4"], "argument --reference: reference must match"),
+        (["replay", "bag", "--scale", "0"], "argument --scale: must be at least"),
+        (["replay", "bag", "--reference", "D4"], "--reference: must be auto, A, B<n> such as B5"),
+        (["replay", "bag", "--method", "dnlp"], "got 'dnlp'; did you mean dnl"),
+        (["replay", "bag", "--scale", "non"], "did you mean none?"),
+        (["calibrate", "--methd", "dnl", "a", "b"], "unknown option --methd; did you mean"),
+        (["calibrate", "a", "b", "c"], "unexpected argument 'c'"),
+        (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
     ],
 )
@@ -511,7 +522,7 @@ def test_config_file_plain_or_for_ros(config_file, text):
 
 def test_the_config_file_of_the_package_holds_the_defaults(capsys):
     assert parsed(["--config", str(ROOT / "config" / "calibrator.yaml")]) == CalibratorConfig()
-    assert "only the node uses solve_period" in capsys.readouterr().err
+    assert "only the node uses 'solve_period'" in capsys.readouterr().err
 
 
 def test_an_empty_config_file_changes_nothing(config_file):
@@ -525,21 +536,24 @@ def test_options_of_the_node_are_ignored_and_named(config_file, capsys):
     )
     assert config == CalibratorConfig(method="dnl")
     assert capsys.readouterr().err.endswith(
-        "only the node uses solve_period, use_sim_time; ignored here\n"
+        "only the node uses 'solve_period', 'use_sim_time'; ignored here\n"
     )
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; known are backend, child_frame"),
+        (
+            "{methd: dnl}",
+            r"config\.yaml: unknown option 'methd'; did you mean method\?; known are 'backend'",
+        ),
         (
             "/**: {ros__parameters: {keyframe: {minimum: 1}}}",
             r"config\.yaml: unknown option 'keyframe.minimum'",
         ),
-        ("{threshold: -1.0}", r"config\.yaml: threshold must be at least"),
-        ("{min_pairs: 12.5}", r"config\.yaml: min_pairs must be of type int; got 12.5"),
-        ("{method: 3}", r"config\.yaml: method must be of type str; got 3"),
+        ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
+        ("{min_pairs: 12.5}", r"config\.yaml: 'min_pairs' must be of type int; got 12.5"),
+        ("{method: 3}", r"config\.yaml: 'method' must be of type str; got 3"),
         ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
         (
             "/slam: {ros__parameters: {a: 1}}",
@@ -736,3 +750,57 @@ def test_progress_is_silent_at_first_and_shows_share_rate_and_time_left(monkeypa
     shown = terminal.getvalue()
     assert re.search(r"reading.*\b\d+%.*\d/s.*(\d:\d\d:\d\d|-:--:--)", shown), shown
     assert "\x1b[2K" in shown.rpartition("reading")[2]  # wiped out
+
+
+def test_messages_name_options_as_they_are_typed(capsys):
+    from hand_eye_calib.cli.console import fail, note
+
+    note("raise max_gap, or give prior.z; see 'max_gap' in /data/max_gap.txt and time_offset=3")
+    fail("keyframe.min_interval: no scale", 1)
+    assert capsys.readouterr().err == (
+        "hand_eye_calib: note: raise --max-gap, or give --prior-z; see 'max_gap' in "
+        "/data/max_gap.txt and time_offset=3\n"
+        "hand_eye_calib: error: --keyframe-min-interval: no scale\n"
+    )
+
+
+def test_control_characters_in_names_do_not_reach_the_terminal(run, new_bag, tmp_path, capsys):
+    from hand_eye_calib.cli.console import fail
+
+    hostile = "cam\x1b[2Jera\nStatus: ok"
+    text = as_text(some_calibration(run, new_bag, tmp_path, child_frame=hostile))
+    assert "\x1b" not in text
+    assert "cam\\x1b[2Jera\\nStatus: ok (child)" in text
+    fail(hostile, 1)
+    assert capsys.readouterr().err == "hand_eye_calib: error: cam\\x1b[2Jera\\nStatus: ok\n"
+
+
+def test_help_is_short_and_help_all_is_whole(run):
+    short, whole = run("replay", "--help")[1], run("replay", "--help-all")[1]
+    assert "--help-all" in short
+    assert "--method" in short
+    assert "--max-gap" not in short
+    assert "--max-gap" in whole
+    for text in (short, whole):
+        assert "\nexamples:\n  hand_eye_calib replay " in text
+    assert len(short.splitlines()) < 80
+
+
+def test_near_gimbal_lock_the_rotation_vector_is_printed(run, new_bag, tmp_path):
+    T = TRUTH.copy()
+    T[:3, :3] = se3.rotation_from_rpy(np.radians([20.0, 89.99, 70.0]))
+    text = as_text(
+        some_calibration(
+            run, new_bag, tmp_path, T_parent_child=T, covariance=np.diag([1e-4] * 3 + [1e-5] * 3)
+        )
+    )
+    assert "pitch is near +/-90 deg, where roll and yaw mean nothing" in text
+    assert re.search(r"^  rx +\S+ \+/- \S+ deg$", text, flags=re.MULTILINE)
+
+
+def test_an_earlier_result_is_kept(run, new_bag, tmp_path):
+    bag, out = new_bag(), tmp_path / "result"
+    for reference in ("B2", "B5"):
+        assert run("replay", bag, *TOPICS, "--out", out, "--reference", reference)[0] == 0
+    assert load_result(out).reference == "B5"
+    assert load_result(out / "previous").reference == "B2"
