@@ -1,10 +1,13 @@
-"""The result of a calibration: the extrinsic and everything one has to know to trust it."""
+"""The result of a calibration: the extrinsic, its covariance, and what to know before using it."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any, Self
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.printed_angles import (
@@ -15,16 +18,42 @@ from hand_eye_calib.geometry.printed_angles import (
     sigmas_translation,
 )
 
-# Of to_dict: a change that an older reader cannot understand raises the version.
+# Format and version of to_dict. A change that an older reader cannot understand raises the version.
 _FORMAT = "hand_eye_calib/extrinsic"
 _VERSION = 1
 
-# Where the motion leaves something unknown, a standard deviation above this (m) comes from that.
+# Attributes that to_dict holds as they are: those that every file has, and those added later.
+_PLAIN = (
+    "objective",
+    "method",
+    "reference",
+    "backend",
+    "n_poses",
+    "n_pairs",
+    "n_inliers",
+    "time_offset_s",
+    "scale",
+    "stamp_ns",
+    "parent_frame",
+    "child_frame",
+)
+_PLAIN_LATER = (
+    "time_offset_sigma_s",
+    "scale_sigma",
+    "reference_reason",
+    "noise",
+    "consistency",
+)
+
+# Motion pairs with more weight than this count as inliers.
+INLIER_WEIGHT = 0.5
+
+# With a direction unobservable, a larger standard deviation (m) of the inverse comes from that.
 _UNKNOWN_M = 0.9
 
 
 class SolveStatus(str, Enum):
-    """How a solve ended. Only OK is a result to use as it is."""
+    """How a solve ended. Only an OK result may be used as it is."""
 
     OK = "ok"
     UNOBSERVABLE = "unobservable"
@@ -32,7 +61,7 @@ class SolveStatus(str, Enum):
 
 
 class DofVerdict(str, Enum):
-    """What the motion says about one degree of freedom; PRIOR where a prior says (most of) it."""
+    """How well one degree of freedom is known; PRIOR if mostly or only from a prior."""
 
     OBSERVED = "observed"
     WEAK = "weak"
@@ -42,8 +71,8 @@ class DofVerdict(str, Enum):
 
 @dataclass(frozen=True)
 class DofObservability:
-    """Verdict on one degree of freedom of the child sensor's pose, along or about an axis of the
-    parent sensor's frame.
+    """Observability of one degree of freedom of the child sensor's pose, along or about an axis of
+    the parent sensor's frame.
 
     Attributes
     ----------
@@ -51,7 +80,7 @@ class DofObservability:
         x, y, z (translation) or roll, pitch, yaw (rotation about x, y, z).
     verdict : DofVerdict
     sigma : float
-        One standard deviation, in m or rad; ``inf`` where unobservable.
+        One standard deviation, in m or rad; ``inf`` if unobservable.
     """
 
     name: str
@@ -59,7 +88,52 @@ class DofObservability:
     sigma: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class Residuals:
+    """Residuals of K motion pairs at the result.
+
+    A pair of the adaptive estimator runs from one pose to the next.
+
+    Attributes
+    ----------
+    translation : (K, 3) array
+        Residuals of eq. (6) of Välimäki et al. 2023, m, in the axes of the parent sensor at the
+        start of each pair.
+    rotation : (K, 3) array
+        Rotation vectors of the residual rotations, whose angles are those of eq. (7), rad, in the
+        axes of the child sensor at the end of each pair.
+    weights : (K,) array
+        Weights of the pairs in the solution, 0 to 1.
+    start_ns, end_ns : (K,) int64 arrays
+        Stamps of both ends of each pair, parent clock.
+    """
+
+    translation: FloatArray
+    rotation: FloatArray
+    weights: FloatArray
+    start_ns: IntArray
+    end_ns: IntArray
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @property
+    def translation_m(self) -> FloatArray:
+        """Lengths (K,) of the translation residuals, m."""
+        return np.linalg.norm(self.translation, axis=1)
+
+    @property
+    def rotation_rad(self) -> FloatArray:
+        """Angles (K,) of the rotation residuals, rad."""
+        return np.linalg.norm(self.rotation, axis=1)
+
+    @property
+    def is_inlier(self) -> BoolArray:
+        """Whether (K,) each pair counts as an inlier."""
+        return self.weights > INLIER_WEIGHT
+
+
+@dataclass(frozen=True, kw_only=True)
 class Calibration:
     """An extrinsic with its quality.
 
@@ -74,37 +148,42 @@ class Calibration:
     status : SolveStatus
     observability : tuple of DofObservability
         x, y, z, roll, pitch, yaw in the parent sensor's frame.
+    T_method : (4, 4) array or None
+        The method's own answer, before directions that the motion does not reveal are set and
+        priors are added. None in a result read from a file that does not have it.
     objective : float
-        Value of the method's cost at the solution; for dnlo eq. (5), the outliers' share included.
+        Value of the method's cost at ``T_method``; for dnlo eq. (5), the outliers' share included.
     method, reference, backend : str
-        What was solved; ``reference`` is the one used, also where ``auto`` was asked for.
+        How it was solved; ``reference`` is the one that ``auto`` chose.
     n_poses, n_pairs, n_inliers : int
         Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
     time_offset_s, time_offset_sigma_s : float
-        Seconds added to the child's stamps, and one standard deviation: 0 where the offset was
-        given.
+        Seconds added to the child's stamps, and one standard deviation: 0 if the offset was given.
     scale, scale_sigma : float
-        Factor applied to the child's translations, and one standard deviation: 0 where the scale
-        was given.
+        Factor applied to the child's translations, and one standard deviation: 0 if the scale was
+        given.
     reference_reason : str
-        Why ``auto`` chose the reference; empty where it was given.
+        Why ``auto`` chose the reference; empty if it was given.
     noise : dict or None
-        What the adaptive estimator found out about the trajectories' noise; None with other
-        methods.
+        Noise of the trajectories as the adaptive estimator found it; None with other methods.
     consistency : dict or None
-        Per axis, how far other methods and references and the drive's halves lie from this answer
-        (:class:`~hand_eye_calib.engine.cross_check.Consistency`); None where they were not asked.
+        Per axis, how far the answers of other methods and references and of the two halves of the
+        recording lie from this one (:class:`~hand_eye_calib.engine.cross_check.Consistency`); None
+        without that cross-check.
     stamp_ns : int
         Stamp of the newest pose used, parent clock.
     parent_frame, child_frame : str
     warnings : tuple of str
         What a person should know before using the result.
+    motion_residuals : Residuals or None
+        Not part of files; see :meth:`residuals`.
     """
 
-    T_parent_child: np.ndarray
-    covariance: np.ndarray
+    T_parent_child: FloatArray
+    covariance: FloatArray
     status: SolveStatus
-    observability: tuple
+    observability: tuple[DofObservability, ...]
+    T_method: FloatArray | None = None
     objective: float
     method: str
     reference: str
@@ -117,41 +196,61 @@ class Calibration:
     scale: float = 1.0
     scale_sigma: float = 0.0
     reference_reason: str = ""
-    noise: dict | None = None
-    consistency: dict | None = None
+    noise: dict[str, Any] | None = None
+    consistency: dict[str, Any] | None = None
     stamp_ns: int = 0
     parent_frame: str = "parent"
     child_frame: str = "child"
-    warnings: tuple = field(default_factory=tuple)
+    warnings: tuple[str, ...] = ()
+    motion_residuals: Residuals | None = field(default=None, repr=False, compare=False)
 
     @property
-    def T_child_parent(self):
+    def T_child_parent(self) -> FloatArray:
         """(4, 4) array: pose of the parent sensor in the child sensor's frame."""
         return se3.inverse(self.T_parent_child)
 
     @property
-    def sigmas(self):
+    def sigmas(self) -> FloatArray:
         """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's
-        frame; infinite where unobservable.
+        frame; infinite if unobservable.
         """
         return np.array([dof.sigma for dof in self.observability])
 
     @property
-    def sigmas_rpy(self):
+    def sigmas_rpy(self) -> FloatArray:
         """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed; infinite
-        where one is unknown. Those of ``sigmas`` are of rotations about the parent's axes instead.
+        if one is unknown. Those of ``sigmas`` are of rotations about the parent's axes instead.
         """
         return sigmas_rpy(self.T_parent_child, self.covariance)
 
-    def unobservable(self):
-        """Names of the degrees of freedom the motion did not reveal."""
+    @property
+    def weights(self) -> FloatArray:
+        """(K,) array: weight of each motion pair in the solution, 0 to 1; see :meth:`residuals`."""
+        return self.residuals().weights
+
+    def residuals(self) -> Residuals:
+        """Residuals of the motion pairs that the result comes from, at ``T_parent_child``.
+
+        Raises
+        ------
+        InputError
+            If the result was read from a file: files do not have them.
+        """
+        if self.motion_residuals is None:
+            raise InputError(
+                "a result that was read from a file has no residuals; calibrate again to have them"
+            )
+        return self.motion_residuals
+
+    def unobservable(self) -> list[str]:
+        """Names of the degrees of freedom that the motion does not reveal."""
         return [dof.name for dof in self.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
 
-    def to_dict(self):
-        """Everything as plain numbers, strings, lists and mappings, ready for JSON or YAML
-        (infinite sigmas as None).
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but the residuals as plain numbers, strings, lists and mappings, ready for
+        JSON or YAML (infinite sigmas as None).
         """
-        return {
+        document: dict[str, Any] = {
             "format": _FORMAT,
             "version": _VERSION,
             "parent_frame": self.parent_frame,
@@ -175,25 +274,21 @@ class Calibration:
                 }
                 for dof in self.observability
             ],
-            "objective": float(self.objective),
-            "method": self.method,
-            "reference": self.reference,
-            "backend": self.backend,
-            "n_poses": self.n_poses,
-            "n_pairs": self.n_pairs,
-            "n_inliers": self.n_inliers,
-            "time_offset_s": self.time_offset_s,
-            "time_offset_sigma_s": self.time_offset_sigma_s,
-            "scale": self.scale,
-            "scale_sigma": self.scale_sigma,
-            "reference_reason": self.reference_reason,
-            "noise": self.noise,
-            "consistency": self.consistency,
-            "stamp_ns": self.stamp_ns,
-            "warnings": list(self.warnings),
         }
+        if self.T_method is not None:
+            document["T_method"] = {
+                "of": "T_parent_child as the method solved it: nothing set, no prior added",
+                "matrix": self.T_method.tolist(),
+            }
+        plain = {
+            name: getattr(self, name)
+            for name in self.__dataclass_fields__
+            if name in _PLAIN or name in _PLAIN_LATER
+        }
+        plain["objective"] = float(self.objective)
+        return document | plain | {"warnings": list(self.warnings)}
 
-    def _transform_dict(self):
+    def _transform_dict(self) -> dict[str, Any]:
         return _transform_dict(
             self.T_parent_child,
             self.parent_frame,
@@ -202,7 +297,7 @@ class Calibration:
             self.covariance,
         )
 
-    def _inverse_dict(self):
+    def _inverse_dict(self) -> dict[str, Any]:
         covariance = inverse_covariance(self.T_parent_child, self.covariance)
         sigmas_m = sigmas_translation(self.T_child_parent, covariance)
         if self.unobservable():
@@ -216,32 +311,27 @@ class Calibration:
         )
 
     @classmethod
-    def from_dict(cls, data):
-        """The calibration that :meth:`to_dict` described; what else ``data`` holds is left alone.
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Build from the mapping that :meth:`to_dict` gave; other keys are ignored.
 
         Raises
         ------
         InputError
-            Where ``data`` is no calibration, is of another version, or lacks something; the message
+            If ``data`` is no calibration, is of another version or lacks something; the message
             says what.
         """
-        found = (
-            (data.get("format"), data.get("version")) if isinstance(data, dict) else (None, None)
-        )
+        is_mapping = isinstance(data, Mapping)
+        found = (data.get("format"), data.get("version")) if is_mapping else (None, None)
         if found != (_FORMAT, _VERSION):
             raise InputError(
-                f"expected format {_FORMAT}, version {_VERSION}; found format {found[0]}, version {found[1]}"
+                f"expected format {_FORMAT}, version {_VERSION}; "
+                f"found format {found[0]}, version {found[1]}"
             )
-        plain = ("objective", "method", "reference", "backend", "n_poses", "n_pairs", "n_inliers", "time_offset_s", "scale",
-                 "stamp_ns", "parent_frame", "child_frame")  # fmt: skip
         try:
             return cls(
-                T_parent_child=np.array(data["T_parent_child"]["matrix"], dtype=float).reshape(
-                    4, 4
-                ),
-                covariance=np.array(
-                    [_infinite(row) for row in data["covariance"]["matrix"]], dtype=float
-                ).reshape(6, 6),
+                T_parent_child=_matrix(data["T_parent_child"], 4),
+                T_method=_matrix(data["T_method"], 4) if "T_method" in data else None,
+                covariance=_matrix(data["covariance"], 6),
                 status=SolveStatus(data["status"]),
                 observability=tuple(
                     DofObservability(
@@ -250,35 +340,43 @@ class Calibration:
                     for dof in data["observability"]
                 ),
                 warnings=tuple(data["warnings"]),
-                **{name: data[name] for name in plain},
-                # older files lack these
-                **{name: data.get(name, 0.0) for name in ("time_offset_sigma_s", "scale_sigma")},
-                reference_reason=data.get("reference_reason", ""),
-                noise=data.get("noise"),
-                consistency=data.get("consistency"),
+                **{name: data[name] for name in _PLAIN},
+                **{name: data[name] for name in _PLAIN_LATER if name in data},
             )
         except KeyError as error:
-            raise InputError(
-                f"the calibration lacks {error}; it is not as it was written"
-            ) from None
+            raise InputError(f"the calibration has no {error}: restore or repeat it") from None
         except (TypeError, ValueError) as error:
-            raise InputError(f"the calibration is not as it was written: {error}") from None
+            raise InputError(
+                f"the calibration was changed after it was written: {error}; restore or repeat it"
+            ) from None
 
 
-def _infinite(values):
+def _matrix(data: Mapping[str, Any], size: int) -> FloatArray:
+    """Square matrix of a document; None there is infinite."""
+    rows = [_infinite(row) for row in data["matrix"]]
+    return np.array(rows, dtype=float).reshape(size, size)
+
+
+def _infinite(values: Iterable[float | None]) -> list[float]:
     return [np.inf if value is None else float(value) for value in values]
 
 
-def _finite(value):
+def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _transform_dict(T_target_source, target, source, sigmas_m, covariance):
+def _transform_dict(
+    T_target_source: FloatArray,
+    target: str,
+    source: str,
+    sigmas_m: FloatArray,
+    covariance: FloatArray,
+) -> dict[str, Any]:
     """A transform in the notations people and programs use, with the standard deviation of each
     number that is printed (None for unknown).
     """
     rotation = T_target_source[:3, :3]
-    document = {
+    document: dict[str, Any] = {
         "maps": f"coordinates of {source} into {target}",
         "translation": T_target_source[:3, 3].tolist(),
         "sigma_translation": [_finite(value) for value in sigmas_m],
@@ -295,5 +393,5 @@ def _transform_dict(T_target_source, target, source, sigmas_m, covariance):
     return document
 
 
-def _degrees(values):
+def _degrees(values: FloatArray) -> list[float | None]:
     return [_finite(value) for value in np.degrees(values)]

@@ -1,59 +1,59 @@
 """How far an answer may be from the truth: a 6 x 6 covariance and a verdict per degree of freedom.
 
-Two estimates are made and the larger one holds, direction by direction:
+Two estimates are made. In each direction the larger one holds:
 
-- the model's: of the adaptive estimator its own; of other methods that of motion pairs with independent, equally large errors, carried
-  through the cost to first order;
-- the delete-a-block jackknife: the answer with each tenth of the drive left out in turn. It does not believe the noise model, and sees
-  what lasts for many pairs (drift, bad stretches), to which the model is blind.
+- The model's. The adaptive estimator has its own; for other methods it is that of motion pairs with
+  independent, equally large errors, propagated through the cost to first order.
+- The delete-a-block jackknife: the spread of the answers without each tenth of the recording. It
+  assumes no noise model and includes errors that last for many pairs, such as drift, which the
+  model misses.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.adaptive.estimator import solve_without
+from hand_eye_calib.adaptive.estimator import AdaptiveSolution, solve_without
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.assessment.lever_arm import HIDDEN_SHARE, ROUNDING_ANGLE, LeverArms
 from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.solvers.solution import Solution
+
+# (B, K) mask of the pairs to leave out to the answers (B, 4, 4) without them.
+SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
+
+# Blocks of the jackknife.
 
 _BLOCKS = 10
-_FEWEST_BLOCKS, _FEWEST_PAIRS_PER_BLOCK = 4, 3
+_MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 
-# Standard deviations that say "unknown" in the covariance: as far as sensors are apart on a large
-# machine. The unknown direction is never quite an axis of the parent sensor, and what is assumed of
-# it leaks into the other two; more than this would drown what is known of them. The verdicts carry
-# the plain statement.
+# Standard deviations that stand for "unknown" in the covariance: the distance between sensors on a
+# large machine. An unknown direction is never exactly an axis of the parent sensor, so that part of
+# its variance shows in the other axes; more than this would hide what is known of them. The
+# verdicts say what is unknown.
 UNKNOWN_TRANSLATION = 3.0
 UNKNOWN_ROTATION = np.pi
 UNKNOWN_SIGMAS = np.r_[np.full(3, UNKNOWN_TRANSLATION), np.full(3, UNKNOWN_ROTATION)]
 
-# A translation direction counts as observed when the rotations that reveal it have this many times
-# the power of the rotation errors themselves; below, noise alone would look like that motion.
-_LEAST_SIGNAL_TO_NOISE = 3.0
-
-# Nor does it where all rotation is about that direction but for this share (2 deg): odometries are
-# wrong by a per cent or two of the turn, and such errors last, so that the residuals do not show
-# them.
-_NEARLY_ONE_AXIS = 0.04
-
-# Rotation errors are never taken to be smaller than this (rad): rounding, not motion.
-_ROUNDING_ANGLE = 1e-6
-
-# Nor variances smaller than this (m^2 or rad^2).
+# Smallest variance (m^2 or rad^2) to divide by.
 _ROUNDING_VARIANCE = 1e-24
 
 # Information below this share of the largest is rounding.
 _RANK_TOLERANCE = 1e-12
 
-# Share of an axis that may lie in unknown directions before the axis itself counts as unobservable.
-_UNKNOWN_SHARE = 0.1
-
-# Beyond these an observed axis is called weak; beyond the last a rotation is not observed at all.
+# Standard deviations (m, rad) above which an observed axis is called weak, and a rotation
+# unobservable.
 WEAK_TRANSLATION = 0.05
-WEAK_ROTATION = np.radians(1.0)
-_LOST_ROTATION = 0.3
+WEAK_ROTATION = float(np.radians(1.0))
+_UNOBSERVABLE_ROTATION = 0.3
 
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
+AXES = TRANSLATIONS + ROTATIONS
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ class Assessment:
         x, y, z, roll, pitch, yaw in the parent sensor's frame.
     """
 
-    cov_parent_child_in_child: np.ndarray
-    observability: tuple
+    cov_parent_child_in_child: FloatArray
+    observability: tuple[DofObservability, ...]
 
 
-def assess(pairs, solution, solve_without):
+def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:
     """Covariance and observability of a solution.
 
     Parameters
@@ -95,7 +95,7 @@ def assess(pairs, solution, solve_without):
     return _combine(solution.T_parent_child, model, resampled, unknown)
 
 
-def assess_adaptive(pose_pairs, solution):
+def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assessment:
     """Covariance and observability of an answer of the adaptive estimator.
 
     Parameters
@@ -119,13 +119,11 @@ def assess_adaptive(pose_pairs, solution):
     return _combine(solution.T_parent_child, covariance, resampled, _basis(unseen))
 
 
-def _noise_driven_baselines(Ts_pw_p, solution):
-    """Directions (6,) of translation that rotations over no baseline lift out of the rotation
-    noise.
+def _noise_driven_baselines(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> list[FloatArray]:
+    """Directions (6,) of translation that the rotations do not reveal over any baseline.
 
-    The adaptive estimator weighs increments, each of which may well drown in noise; what counts is
-    the best that sums of them can do: long ones where the noise is white, short ones where it
-    drifts.
+    Each increment alone may be smaller than its noise; sums of increments decide: long ones if the
+    noise is white, short ones if it drifts.
     """
     longest = max(len(Ts_pw_p) // _BLOCKS, 1)
     baselines = sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True)
@@ -133,7 +131,9 @@ def _noise_driven_baselines(Ts_pw_p, solution):
     return min(found, key=len)
 
 
-def _noise_driven_over(baseline, rotation, solution):
+def _noise_driven_over(
+    baseline: int, rotation: FloatArray, solution: AdaptiveSolution
+) -> list[FloatArray]:
     motions = np.swapaxes(rotation[:-baseline], 1, 2) @ rotation[baseline:]
     # No baseline may run across a jump, unless all of them do.
     jumps_before = np.concatenate([[0], np.cumsum(solution.jumps)])
@@ -141,18 +141,23 @@ def _noise_driven_over(baseline, rotation, solution):
     if not weights.any():
         weights[:] = 1.0
     variance = 2 * solution.noise.rotation_white**2 + baseline * solution.noise.rotation_drift**2
-    moved = (motions - np.eye(3)) @ solution.T_parent_child[:3, :3]
-    return _noise_driven_translations(weights, moved, variance * np.eye(3))
+    chords = (motions - np.eye(3)) @ solution.T_parent_child[:3, :3]
+    return _hidden_translations(LeverArms.of(chords, weights), variance * np.eye(3))
 
 
-def _combine(T_parent_child, model, resampled, unknown):
+def _combine(
+    T_parent_child: FloatArray,
+    model: FloatArray,
+    resampled: FloatArray | None,
+    unknown: FloatArray,
+) -> Assessment:
     known = np.eye(6) - unknown @ unknown.T
     covariance = known @ larger_by_direction(model, resampled) @ known + _unknown_variance(unknown)
     return Assessment(covariance, _verdicts(T_parent_child[:3, :3], covariance, unknown))
 
 
-def model_covariance(pairs, solution):
-    """Covariance if the pairs' errors were independent and alike.
+def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """Covariance for independent, equally large errors of the pairs.
 
     The cost is ``|r_t|^2 + 2 |r_R|^2`` with the residual translation r_t and the residual rotation
     vector r_R. With their Jacobians J_t, J_R and the variances s_t^2, s_R^2 of the residuals, an
@@ -162,28 +167,20 @@ def model_covariance(pairs, solution):
     Returns
     -------
     covariance : (6, 6) array
-        Zero along directions that no pair says anything about.
+        Zero along directions without information.
     unknown : (6, U) array
-        Orthonormal basis of the directions that the motion does not reveal, or no better than noise
-        would.
+        Orthonormal basis of the directions that the motion does not reveal.
     """
     weights = solution.weights
     n_effective = max(float(weights.sum()) - 3.0, 1.0)
-    rotation, translation = solution.T_parent_child[:3, :3], solution.T_parent_child[:3, 3]
-    rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
-    translation_b = pairs.Ts_childi_childj[:, :3, 3]
-    moved = rotation_a - np.eye(3)
-
-    residual_t = (
-        moved @ translation + pairs.Ts_parenti_parentj[:, :3, 3] - translation_b @ rotation.T
-    )
-    residual_r = se3.rotation_log(
-        np.swapaxes(rotation_a @ rotation, 1, 2) @ (rotation @ rotation_b)
-    )  # child axes at j
+    residual_t, residual_r = pairs.residuals(solution.T_parent_child)
     variance_t = (weights @ (residual_t**2).sum(axis=1)) / (3 * n_effective)
     cov_r = np.einsum("k,ki,kj->ij", weights, residual_r, residual_r) / n_effective
     variance_r = np.trace(cov_r) / 3
 
+    rotation = solution.T_parent_child[:3, :3]
+    rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
+    translation_b, moved = pairs.Ts_childi_childj[:, :3, 3], rotation_a - np.eye(3)
     jacobian_t = np.concatenate([moved @ rotation, rotation @ se3.skew(translation_b)], axis=2)
     information_t = np.einsum("k,kai,kaj->ij", weights, jacobian_t, jacobian_t)
     jacobian_r = np.swapaxes(rotation_b, 1, 2) - np.eye(3)
@@ -192,63 +189,45 @@ def model_covariance(pairs, solution):
 
     hessian = information_t + 2 * information_r
     values, vectors = np.linalg.eigh(hessian)
-    seen = values > max(_RANK_TOLERANCE * values[-1], weights.sum() * _ROUNDING_ANGLE**2)
+    seen = values > max(_RANK_TOLERANCE * values[-1], weights.sum() * ROUNDING_ANGLE**2)
     inverse = (vectors * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)) @ vectors.T
     covariance = inverse @ (variance_t * information_t + 4 * variance_r * information_r) @ inverse
 
-    unseen = _noise_driven_translations(weights, moved @ rotation, cov_r) + list(
-        vectors[:, ~seen].T
-    )
-    return covariance, _basis(unseen)
+    hidden = _hidden_translations(LeverArms.of(moved @ rotation, weights), cov_r)
+    return covariance, _basis([*hidden, *vectors[:, ~seen].T])
 
 
-def _noise_driven_translations(weights, moved_in_child, cov_r):
-    """Directions (6,) of translation whose only evidence is rotation noise.
-
-    Noise e in a rotation moves a lever d by ``e x d``; its mean square is ``d' (tr(C) I - C) d``
-    with the covariance C of e.
-    """
-    signal = np.einsum("k,kai,kaj->ij", weights, moved_in_child, moved_in_child) / max(
-        float(weights.sum()), 1.0
-    )
-    noise = np.trace(cov_r) * np.eye(3) - cov_r + _ROUNDING_ANGLE**2 * np.eye(3)
-    powers, directions = np.linalg.eigh(signal)
-    drowned = [
-        direction
-        for power, direction in zip(powers, directions.T, strict=True)
-        if power
-        < max(
-            _LEAST_SIGNAL_TO_NOISE * (direction @ noise @ direction),
-            _NEARLY_ONE_AXIS**2 * powers[-1],
-        )
+def _hidden_translations(lever_arms: LeverArms, cov_rotation: FloatArray) -> list[FloatArray]:
+    """Directions (6,) of translation that the rotations do not reveal."""
+    return [
+        np.r_[direction, np.zeros(3)] for direction in lever_arms.hidden_directions(cov_rotation).T
     ]
-    return [np.r_[direction, np.zeros(3)] for direction in drowned]
 
 
-def _basis(directions):
-    """Orthonormal basis (6, U) of directions (6,) that may depend on each other: what is found in
-    two ways is unknown once.
-    """
+def _basis(directions: list[FloatArray]) -> FloatArray:
+    """Orthonormal basis (6, U) of directions (6,), which may be linearly dependent."""
     if not directions:
         return np.zeros((6, 0))
     left, sizes, _ = np.linalg.svd(np.array(directions).T, full_matrices=False)
     return left[:, sizes > 1e-6 * sizes[0]]
 
 
-def _unknown_variance(unknown):
+def _unknown_variance(unknown: FloatArray) -> FloatArray:
     scaled = UNKNOWN_SIGMAS[:, None] * unknown
     return scaled @ scaled.T
 
 
-def jackknife_covariance(n_pairs, T_parent_child, solve_without):
-    """Delete-a-block jackknife covariance (6, 6), or None where there are too few pairs for blocks.
+def jackknife_covariance(
+    n_pairs: int, T_parent_child: FloatArray, solve_without: SolveWithout
+) -> FloatArray | None:
+    """Delete-a-block jackknife covariance (6, 6), or None if there are too few pairs for blocks.
 
     ``(B - 1) / B * sum (xi_b - mean)(xi_b - mean)'`` over the B answers without a block (Efron,
     Tibshirani, *An introduction to the bootstrap*, 1993, eq. 11.5), with xi_b the tangent vector
     from the full answer.
     """
-    n_blocks = min(_BLOCKS, n_pairs // _FEWEST_PAIRS_PER_BLOCK)
-    if n_blocks < _FEWEST_BLOCKS:
+    n_blocks = min(_BLOCKS, n_pairs // _MIN_PAIRS_PER_BLOCK)
+    if n_blocks < _MIN_BLOCKS:
         return None
     block_of_pair = np.arange(n_pairs) * n_blocks // n_pairs
     left_out = block_of_pair[None, :] == np.arange(n_blocks)[:, None]
@@ -257,10 +236,8 @@ def jackknife_covariance(n_pairs, T_parent_child, solve_without):
     return (n_blocks - 1) / n_blocks * deviations.T @ deviations
 
 
-def larger_by_direction(first, second):
-    """The first covariance, lifted to the second in every direction where that is larger; second
-    may be None.
-    """
+def larger_by_direction(first: FloatArray, second: FloatArray | None) -> FloatArray:
+    """The first covariance, raised to the second in every direction in which that is larger."""
     if second is None:
         return first
     # In the coordinates where the first is the identity, the eigenvalues of the second are the
@@ -268,25 +245,28 @@ def larger_by_direction(first, second):
     variances, axes = np.linalg.eigh(first)
     root = axes * np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE))
     values, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, second).T))
-    lifted = root @ vectors
-    return (lifted * np.maximum(values, 1.0)) @ lifted.T
+    raised = root @ vectors
+    return (raised * np.maximum(values, 1.0)) @ raised.T
 
 
-def _verdicts(rotation_parent_child, covariance, unknown):
+def _verdicts(
+    rotation_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray
+) -> tuple[DofObservability, ...]:
     """Verdicts for the axes of the parent sensor's frame."""
     to_parent = np.kron(np.eye(2), rotation_parent_child)
     sigmas = np.sqrt(np.maximum(np.diag(to_parent @ covariance @ to_parent.T), 0.0))
     unknown_shares = ((to_parent @ unknown) ** 2).sum(axis=1)
     verdicts = []
-    for index, (name, sigma, share) in enumerate(zip(AXES, sigmas, unknown_shares, strict=True)):
-        turns = index >= 3
-        if share > _UNKNOWN_SHARE or (turns and sigma > _LOST_ROTATION):
+    for name, sigma, share in zip(AXES, sigmas.tolist(), unknown_shares, strict=True):
+        is_lost = name in ROTATIONS and sigma > _UNOBSERVABLE_ROTATION
+        if share > HIDDEN_SHARE or is_lost:
             verdicts.append(DofObservability(name, DofVerdict.UNOBSERVABLE, float("inf")))
         else:
-            weak = sigma > (WEAK_ROTATION if turns else WEAK_TRANSLATION)
-            verdicts.append(
-                DofObservability(
-                    name, DofVerdict.WEAK if weak else DofVerdict.OBSERVED, float(sigma)
-                )
-            )
+            verdicts.append(known_dof(name, sigma))
     return tuple(verdicts)
+
+
+def known_dof(axis: str, sigma: float) -> DofObservability:
+    """Observed or weak, by the standard deviation (m or rad)."""
+    is_weak = sigma > (WEAK_ROTATION if axis in ROTATIONS else WEAK_TRANSLATION)
+    return DofObservability(axis, DofVerdict.WEAK if is_weak else DofVerdict.OBSERVED, sigma)

@@ -1,33 +1,35 @@
-"""What a drive has shown so far, and in plain words what it has not: for a person who is still
-driving.
+"""How the parent sensor has moved, and in words what its motion does not show: hints for a person
+who is still recording.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.assessment.covariance import AXES, WEAK_ROTATION, WEAK_TRANSLATION
-from hand_eye_calib.calibration import DofVerdict
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.covariance import (
+    ROTATIONS,
+    TRANSLATIONS,
+    WEAK_ROTATION,
+    WEAK_TRANSLATION,
+)
+from hand_eye_calib.assessment.lever_arm import LeverArms
+from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.synchronise import PosePairs
 
-# Poses looked at, spread evenly over the session: enough to see turns, few enough to cost a few
-# milliseconds.
-_MOST_POSES = 500
+# Most poses that are looked at, evenly over the session: enough to see curves, and few enough to
+# cost a few milliseconds.
+_MAX_POSES = 500
 
-# A turn counts when so large a share of the motions has less of it: one outlier is not a turn.
-_QUANTILE = 95
+# The rotation about an axis is this percentile of all motions: one outlier is not a rotation.
+_PERCENTILE = 95
 
-# Less turning than this reveals nothing of a lever (rad).
-ENOUGH_TURNING = np.radians(5.0)
+# Smallest rotation (rad) that reveals anything of a lever arm.
+MIN_ROTATION = float(np.radians(5.0))
 
-# Two turning axes must differ: turning about all but one is less than this share of the turning
-# about that one.
-_ONE_AXIS_SHARE = 0.04
-
-# An axis is hidden when this share of it lies in the direction that shows least.
-_HIDDEN_SHARE = 0.1
-
-_TURNS = dict(zip("xyz", AXES[3:], strict=True))
+_ROTATION_ABOUT = dict(zip(TRANSLATIONS, ROTATIONS, strict=True))
 
 
 @dataclass(frozen=True)
@@ -38,29 +40,45 @@ class Excitation:
     ----------
     n_poses : int
         Synchronised pose pairs of the session.
-    turned : (3,) array
-        How far it has turned about x, y and z, rad: the largest over all spans of time of the 95th
-        percentile over the session.
-    gain : (3,) array
-        Root mean square of the displacement that an offset of 1 m along x, y and z causes, m: how
-        well that offset shows. 0 to 2.
-    worst : (3,) array
-        Unit vector of the offset that shows least.
-    worst_gain : float
-        Its gain.
+    rotation : (3,) array
+        Rotation about x, y and z, rad: the 95th percentile over the session, of the time span with
+        the most rotation.
+    lever_arms : LeverArms
+        How far the rotations move lever arms, over the time span with the most of it.
     distance : float
         Length of the path, m.
     """
 
     n_poses: int
-    turned: np.ndarray
-    gain: np.ndarray
-    worst: np.ndarray
-    worst_gain: float
+    rotation: FloatArray
+    lever_arms: LeverArms
     distance: float
 
+    @property
+    def gain(self) -> FloatArray:
+        """(3,) array: root mean square displacement of lever arms of 1 m along x, y and z, in m:
+        how well an offset shows. 0 to 2.
+        """
+        return np.sqrt(np.maximum(np.diag(self.lever_arms.information), 0.0))
 
-def excitation(pose_pairs):
+    @property
+    def worst(self) -> FloatArray:
+        """(3,) array: unit vector of the lever arm that the rotations move least."""
+        return self.lever_arms.directions[:, 0]
+
+    @property
+    def worst_gain(self) -> float:
+        """Gain of that lever arm."""
+        return float(np.sqrt(max(self.lever_arms.powers[0], 0.0)))
+
+    def hidden_axes(self) -> tuple[str, ...]:
+        """Axes x, y, z along which the motion cannot show the translation, whatever the noise."""
+        if self.rotation.max() < MIN_ROTATION:
+            return TRANSLATIONS
+        return self.lever_arms.hidden_axes()
+
+
+def excitation(pose_pairs: PosePairs) -> Excitation:
     """The Excitation in synchronised poses.
 
     Parameters
@@ -72,108 +90,96 @@ def excitation(pose_pairs):
     Excitation
     """
     n_poses = len(pose_pairs)
+    rotation, lever_arms = np.zeros(3), LeverArms.of(np.zeros((1, 3, 3)))
     if n_poses < 2:
-        return Excitation(n_poses, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0)
-    poses = pose_pairs.Ts_pw_p[
-        np.unique(np.linspace(0, n_poses - 1, min(n_poses, _MOST_POSES)).astype(int))
-    ]
-    turned, information = np.zeros(3), np.zeros((3, 3))
+        return Excitation(n_poses, rotation, lever_arms, 0.0)
+    rows = np.unique(np.linspace(0, n_poses - 1, min(n_poses, _MAX_POSES)).astype(int))
+    poses = pose_pairs.Ts_pw_p[rows]
     lag = 1
     while lag < len(poses):
         rotations = np.swapaxes(poses[:-lag, :3, :3], 1, 2) @ poses[lag:, :3, :3]
-        turned = np.maximum(
-            turned, np.percentile(np.abs(se3.rotation_log(rotations)), _QUANTILE, axis=0)
-        )
-        moved = rotations - np.eye(3)
-        at_lag = np.einsum("kai,kaj->ij", moved, moved) / len(moved)
-        if np.trace(at_lag) > np.trace(information):
-            information = at_lag
+        angles = np.abs(se3.rotation_log(rotations))
+        rotation = np.maximum(rotation, np.percentile(angles, _PERCENTILE, axis=0))
+        at_lag = LeverArms.of(rotations - np.eye(3))
+        if np.trace(at_lag.information) > np.trace(lever_arms.information):
+            lever_arms = at_lag
         lag *= 2
-    powers, directions = np.linalg.eigh(information)
-    gain = np.sqrt(np.maximum(np.diag(information), 0.0))
     distance = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    return Excitation(
-        n_poses, turned, gain, directions[:, 0], float(np.sqrt(max(powers[0], 0.0))), distance
-    )
+    return Excitation(n_poses, rotation, lever_arms, distance)
 
 
-def what_is_missing(seen, calibration=None):
-    """One sentence for the driver: what the motion so far does not show, and what to do about it.
+def what_is_missing(seen: Excitation, calibration: Calibration | None = None) -> str:
+    """What the motion so far does not show, and what to do about it, in one sentence.
 
     Parameters
     ----------
     seen : Excitation
         Of the parent sensor; x, y, z are its axes.
     calibration : Calibration, optional
-        The answer from those poses; its verdicts count where there is one.
+        The result from those poses. If there is one, its verdicts decide.
 
     Returns
     -------
     str
-        Empty where nothing is missing.
+        Empty if nothing is missing.
     """
-    hidden = calibration.unobservable() if calibration else _hidden(seen)
+    hidden = calibration.unobservable() if calibration else seen.hidden_axes()
     if not hidden:
         return _weak(calibration) if calibration else ""
-    if seen.turned.max() < ENOUGH_TURNING:
+    angles = dict(zip("xyz", seen.rotation.tolist(), strict=True))
+    most = max(angles.values())
+    if most < MIN_ROTATION:
         return (
-            f"hardly any turning so far (at most {_degrees(seen.turned.max())}): {_list(hidden)} not observable, "
-            "drive curves in both directions"
+            f"hardly any rotation so far (at most {_degrees(most)}): {_list(hidden)} not "
+            "observable, drive curves in both directions"
         )
-    fine = [
-        axis for axis, turned in zip("xyz", seen.turned, strict=True) if turned >= ENOUGH_TURNING
-    ]
-    small = [axis for axis in "xyz" if axis not in fine]
-    said = f"turning about {_list(fine)} is fine ({_list([_degrees(seen.turned['xyz'.index(axis)]) for axis in fine])})"
+    fine = [axis for axis, angle in angles.items() if angle >= MIN_ROTATION]
+    small = [axis for axis in angles if axis not in fine]
+    text = f"rotation about {_list(fine)} is fine ({_list([_degrees(angles[a]) for a in fine])})"
     if small:
-        most = max(seen.turned["xyz".index(axis)] for axis in small)
-        said += f"; {_list([_TURNS[axis] for axis in small])} under {_degrees(most, up=True)}"
-    return f"{said}: {_list([_called(name) for name in hidden])} not observable, {_advice(hidden, small)}"
+        below = _degrees(max(angles[axis] for axis in small), round_up=True)
+        text += f"; {_list([_ROTATION_ABOUT[axis] for axis in small])} under {below}"
+    names = _list([_described(name) for name in hidden])
+    return f"{text}: {names} not observable, {_advice(hidden, small)}"
 
 
-def _hidden(seen):
-    """What the motion cannot show, whatever the noise."""
-    if seen.turned.max() < ENOUGH_TURNING:
-        return list(AXES[:3])
-    if seen.worst_gain > _ONE_AXIS_SHARE * seen.gain.max():
-        return []
-    return [axis for axis, share in zip("xyz", seen.worst**2, strict=True) if share > _HIDDEN_SHARE]
+def _described(name: str) -> str:
+    if name == "z":
+        return "vertical offset (z)"
+    return f"offset {name}" if name in TRANSLATIONS else name
 
 
-def _called(name):
-    return {"z": "vertical offset (z)"}.get(name, f"offset {name}" if name in "xyz" else name)
-
-
-def _advice(hidden, small):
-    if not any(name in "xyz" for name in hidden):
-        return "turn about other axes as well"
+def _advice(hidden: Sequence[str], small: Sequence[str]) -> str:
+    if not any(name in TRANSLATIONS for name in hidden):
+        return "rotate about other axes as well"
     if len(small) >= 2:
         return "drive over a ramp or a kerb, or measure it by hand"
-    return "turn further about the other axes"
+    return "rotate further about the other axes"
 
 
-def _weak(calibration):
+def _weak(calibration: Calibration) -> str:
     weak = [dof for dof in calibration.observability if dof.verdict is DofVerdict.WEAK]
     if not weak:
         return ""
     limits = f"{WEAK_TRANSLATION * 100:g} cm or {np.degrees(WEAK_ROTATION):g} deg"
-    return f"{_list([_sigma(dof) for dof in weak])} still more uncertain than {limits}: go on driving, with more turns"
-
-
-def _sigma(dof):
     return (
-        f"{dof.name} (+/- {dof.sigma * 100:.0f} cm)"
-        if dof.name in "xyz"
-        else f"{dof.name} (+/- {np.degrees(dof.sigma):.1f} deg)"
+        f"{_list([_with_sigma(dof) for dof in weak])} still more uncertain than {limits}: "
+        "continue, with more curves"
     )
 
 
-def _degrees(angle, up=False):
-    degrees = np.degrees(angle)
-    if up:
-        degrees = max(np.ceil(degrees), 1.0)
-    return f"{degrees:.0f} deg" if degrees >= 10 or up else f"{degrees:.1f} deg"
+def _with_sigma(dof: DofObservability) -> str:
+    if dof.name in TRANSLATIONS:
+        return f"{dof.name} (+/- {dof.sigma * 100:.0f} cm)"
+    return f"{dof.name} (+/- {np.degrees(dof.sigma):.1f} deg)"
 
 
-def _list(words):
+def _degrees(angle: float, round_up: bool = False) -> str:
+    degrees = float(np.degrees(angle))
+    if round_up:
+        return f"{max(np.ceil(degrees), 1.0):.0f} deg"
+    return f"{degrees:.0f} deg" if degrees >= 10 else f"{degrees:.1f} deg"
+
+
+def _list(words: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

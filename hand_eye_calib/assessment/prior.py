@@ -1,49 +1,53 @@
-"""What a person knows beforehand, brought together with what the motion says.
+"""Fusion of the estimate from motion with a prior.
 
-An answer with its covariance is a measurement; a tape measure is another. Both are weighed by their
-covariances, whatever method the answer comes from. Along a direction that the motion does not
-reveal only the prior counts; where there is none, the child sensor is put level with the parent
-along it (zero, not the value that noise would give), and the direction stays unknown.
+The estimate and the prior are two measurements, weighted by their covariances, whatever the method.
+Along a direction that the motion does not reveal only the prior counts. Without a prior, the
+translation along it is set to zero instead of the value that noise would give, and the direction
+stays unknown.
 """
 
-import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import (
+    ROTATIONS,
+    TRANSLATIONS,
     UNKNOWN_ROTATION,
     UNKNOWN_SIGMAS,
     UNKNOWN_TRANSLATION,
-    WEAK_ROTATION,
-    WEAK_TRANSLATION,
     Assessment,
+    known_dof,
 )
 from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
 
-TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
+# Axis name to (value, standard deviation), in m and rad.
+Prior: TypeAlias = Mapping[str, tuple[float, float]]
 
-# A direction is unknown where its variance is this share of that of what is unknown, and an axis
-# known again below this share of the standard deviation.
+# A direction is unknown if its variance is at least this share of the variance that stands for
+# unknown. With a prior, an axis is known below this share of that standard deviation.
 _UNKNOWN_SHARE, _KNOWN_SHARE = 0.25, 0.1
 
-# A prior says most of it where it at least halves the variance.
-_PRIOR_SAYS_MOST = 0.5
+# An axis is mostly from the prior if the prior at least halves its variance.
+_MOSTLY_PRIOR = 0.5
 
 _MAX_STEPS, _STEP_TOLERANCE = 20, 1e-12
 _DIFFERENCE = 1e-6
 
-# Perfect data has no variance at all; what is divided by is never below this (m^2 or rad^2).
+# Smallest variance to divide by (m^2 or rad^2): noise-free data has none.
 _ROUNDING_VARIANCE = 1e-18
 
-# A prior this many standard deviations from what the motion says contradicts it.
-_CONTRADICTION = 4.0
+# A prior more than this many standard deviations from the estimate from motion contradicts it.
+_MAX_DISTANCE = 4.0
 
 
 @dataclass(frozen=True)
 class Fused:
-    """Motion and prior together.
+    """Estimate from motion and prior together.
 
     Attributes
     ----------
@@ -51,25 +55,25 @@ class Fused:
     assessment : Assessment
         Covariance and verdicts of both together.
     contradictions : dict
-        Axis names to the number of standard deviations between prior and motion, where there are
-        too many.
+        Axis name to the number of standard deviations between prior and motion, for the axes on
+        which they contradict each other.
     """
 
-    T_parent_child: np.ndarray
+    T_parent_child: FloatArray
     assessment: Assessment
-    contradictions: dict
+    contradictions: dict[str, float]
 
 
-def fuse(T_parent_child, assessment, prior):
-    """Weigh an answer against a prior, and settle what neither of them knows.
+def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fused:
+    """Fuse the estimate from motion with a prior, and set what neither of them knows.
 
     Parameters
     ----------
     T_parent_child : (4, 4) array
-        The answer from motion.
+        The estimate from motion.
     assessment : Assessment
-        Of that answer.
-    prior : dict
+        Of that estimate.
+    prior : mapping
         Axis name (x, y, z, roll, pitch, yaw; of the child sensor's pose in the parent sensor's
         frame, angles about fixed axes) to (value, sigma), in m and rad. May be empty.
 
@@ -96,21 +100,25 @@ def fuse(T_parent_child, assessment, prior):
             break
     if not prior:
         return Fused(T, assessment, {})
-    fused = Assessment(root @ np.linalg.inv(normal) @ root.T, ())
-    fused = dataclasses.replace(
-        fused, observability=_verdicts(T[:3, :3], fused, T_parent_child[:3, :3], assessment, prior)
+    posterior = root @ np.linalg.inv(normal) @ root.T
+    verdicts = _verdicts(
+        assessment.observability,
+        _sigmas_in_parent(T[:3, :3], posterior),
+        _sigmas_in_parent(T_parent_child[:3, :3], covariance),
+        prior,
     )
-    return Fused(T, fused, _contradictions(T_parent_child, covariance, prior))
+    contradictions = _contradictions(T_parent_child, covariance, prior)
+    return Fused(T, Assessment(posterior, verdicts), contradictions)
 
 
-def widened(assessment, rotation, spread):
-    """An assessment with more uncertainty, of something that the answer depends on.
+def widened(assessment: Assessment, rotation: FloatArray, spread: FloatArray) -> Assessment:
+    """An assessment with the covariance of something added that the estimate depends on.
 
     Parameters
     ----------
     assessment : Assessment
     rotation : (3, 3) array
-        Of the answer, T_parent_child.
+        Of the estimate, T_parent_child.
     spread : (6, 6) array
         Covariance to add, of (rho, phi) in the child sensor's frame.
 
@@ -120,40 +128,36 @@ def widened(assessment, rotation, spread):
     """
     if not spread.any():
         return assessment
-    wider = Assessment(assessment.cov_parent_child_in_child + spread, ())
-    added = _sigmas_in_parent(rotation, Assessment(spread, ()))
-    observability = [
+    added = _sigmas_in_parent(rotation, spread)
+    observability = tuple(
         dof
         if dof.verdict is DofVerdict.UNOBSERVABLE
-        else _known(dof.name, float(np.hypot(dof.sigma, more)))
+        else known_dof(dof.name, float(np.hypot(dof.sigma, more)))
         for dof, more in zip(assessment.observability, added, strict=True)
-    ]
-    return dataclasses.replace(wider, observability=tuple(observability))
+    )
+    return Assessment(assessment.cov_parent_child_in_child + spread, observability)
 
 
-def _known(axis, sigma):
-    weak = sigma > (WEAK_ROTATION if axis in ROTATIONS else WEAK_TRANSLATION)
-    return DofObservability(axis, DofVerdict.WEAK if weak else DofVerdict.OBSERVED, sigma)
-
-
-def _unknown_directions(covariance):
-    """Orthonormal basis (6, U) of the directions along which a covariance says "unknown"."""
+def _unknown_directions(covariance: FloatArray) -> FloatArray:
+    """Orthonormal basis (6, U) of the directions whose variance stands for unknown."""
     shares, vectors = np.linalg.eigh(covariance / np.outer(UNKNOWN_SIGMAS, UNKNOWN_SIGMAS))
     directions = UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE]
     return np.linalg.qr(directions)[0]
 
 
-def _whitened(T_parent_child, covariance, unknown):
-    """What makes deviations from the answer numbers of unit variance: known and unknown directions
-    differ by many powers of ten.
+def _whitened(
+    T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coordinates of unit variance: the variances of known and unknown directions differ by many
+    powers of ten.
 
     Returns
     -------
     root, inverse_root : (6, 6) arrays
-        Deviation from unit numbers, and back.
+        From these coordinates to deviations (rho, phi) from the estimate, and back.
     targets : (6,) array
-        Unit numbers of where the answer is put if nothing else is known: at the parent sensor's
-        origin along unknown translations.
+        Where the estimate is set without a prior, in these coordinates: zero translation along
+        unknown directions.
     """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
     known = vectors[:, values < 0.5]
@@ -171,14 +175,15 @@ def _whitened(T_parent_child, covariance, unknown):
     )
 
 
-def _difference(T_from, T_to):
+def _difference(T_from: FloatArray, T_to: FloatArray) -> FloatArray:
+    """Deviation (rho, phi) of one transform from another."""
     rotation = T_from[:3, :3].T
     return np.r_[
         rotation @ (T_to[:3, 3] - T_from[:3, 3]), se3.rotation_log(rotation @ T_to[:3, :3])
     ]
 
 
-def _prior_residuals(T, prior):
+def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
     """Weighted residuals (P,) of the prior and their derivatives (P, 6) by (rho, phi)."""
     residuals, jacobian = _weighted(T, prior), np.zeros((len(prior), 6))
     for column, step in enumerate(_DIFFERENCE * np.eye(6)):
@@ -191,13 +196,13 @@ def _prior_residuals(T, prior):
     return residuals, jacobian
 
 
-def _weighted(T, prior):
+def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
     errors = _errors(T, prior)
     return np.array([errors[axis] / sigma for axis, (_, sigma) in prior.items()])
 
 
-def _errors(T, prior):
-    """Axis name to the pose's value less the prior's."""
+def _errors(T: FloatArray, prior: Prior) -> dict[str, float]:
+    """Axis name to the value of the transform less that of the prior."""
     errors = {
         axis: value - prior[axis][0]
         for axis, value in zip(TRANSLATIONS, T[:3, 3], strict=True)
@@ -215,34 +220,38 @@ def _errors(T, prior):
     return errors
 
 
-def _contradictions(T_parent_child, covariance, prior):
-    if not prior:
-        return {}
+def _contradictions(
+    T_parent_child: FloatArray, covariance: FloatArray, prior: Prior
+) -> dict[str, float]:
     _, jacobian = _prior_residuals(T_parent_child, prior)
     distances = np.abs(_weighted(T_parent_child, prior)) / np.sqrt(
         1.0 + np.einsum("pi,ij,pj->p", jacobian, covariance, jacobian)
     )
-    return {axis: float(d) for axis, d in zip(prior, distances, strict=True) if d > _CONTRADICTION}
+    return {axis: float(d) for axis, d in zip(prior, distances, strict=True) if d > _MAX_DISTANCE}
 
 
-def _verdicts(rotation, fused, rotation_before, before, prior):
-    """Verdicts for the axes of the parent sensor's frame, with the prior counted in."""
-    sigmas, sigmas_before = (
-        _sigmas_in_parent(rotation, fused),
-        _sigmas_in_parent(rotation_before, before),
-    )
+def _verdicts(
+    before: tuple[DofObservability, ...],
+    sigmas: FloatArray,
+    sigmas_before: FloatArray,
+    prior: Prior,
+) -> tuple[DofObservability, ...]:
+    """Verdicts for the axes of the parent sensor's frame, with the prior, from those without."""
     verdicts = []
-    for dof, sigma, sigma_before in zip(before.observability, sigmas, sigmas_before, strict=True):
-        turns = dof.name in ROTATIONS
-        if sigma > _KNOWN_SHARE * (UNKNOWN_ROTATION if turns else UNKNOWN_TRANSLATION):
+    for dof, sigma, sigma_before in zip(
+        before, sigmas.tolist(), sigmas_before.tolist(), strict=True
+    ):
+        unknown = UNKNOWN_ROTATION if dof.name in ROTATIONS else UNKNOWN_TRANSLATION
+        if sigma > _KNOWN_SHARE * unknown:
             verdicts.append(DofObservability(dof.name, DofVerdict.UNOBSERVABLE, float("inf")))
-        elif dof.name in prior and sigma**2 < _PRIOR_SAYS_MOST * sigma_before**2:
-            verdicts.append(DofObservability(dof.name, DofVerdict.PRIOR, float(sigma)))
+        elif dof.name in prior and sigma**2 < _MOSTLY_PRIOR * sigma_before**2:
+            verdicts.append(DofObservability(dof.name, DofVerdict.PRIOR, sigma))
         else:
-            verdicts.append(_known(dof.name, float(sigma)))
+            verdicts.append(known_dof(dof.name, sigma))
     return tuple(verdicts)
 
 
-def _sigmas_in_parent(rotation, assessment):
+def _sigmas_in_parent(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Standard deviations (6,) along and about the parent's axes."""
     to_parent = np.kron(np.eye(2), rotation)
-    return np.sqrt(np.diag(to_parent @ assessment.cov_parent_child_in_child @ to_parent.T))
+    return np.sqrt(np.diag(to_parent @ covariance @ to_parent.T))

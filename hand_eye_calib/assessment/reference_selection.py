@@ -3,23 +3,26 @@ to the adaptive estimator's answer.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.adaptive.prediction import ReferencePredictor
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.solvers.registry import Method
 
 CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 
-# References whose predicted error is within this factor of the smallest are told apart by their
-# answers.
+# Among references with a predicted error within this factor of the smallest, their answers decide.
 _NEARLY_AS_GOOD = 1.3
 
-# Fewer poses say too little about the noise to choose by it.
-_FEWEST_POSES = 13
+# Fewest poses from which the noise can be estimated.
+_MIN_POSES = 13
 
 
 @dataclass(frozen=True)
@@ -30,38 +33,42 @@ class ReferenceChoice:
     ----------
     reference : str
     predicted_m : dict of str to float
-        Root mean square translation error in m that is expected of every candidate.
+        Candidate to its predicted root mean square translation error, m.
     alike : tuple of str
-        The candidates with nearly the smallest of these, among which their answers decided.
+        The candidates with nearly the smallest error, among which their answers decided.
     """
 
     reference: str
-    predicted_m: dict
-    alike: tuple = ()
+    predicted_m: dict[str, float]
+    alike: tuple[str, ...] = ()
 
-    def reason(self):
-        """One sentence for a person."""
-        worst = max(self.predicted_m, key=self.predicted_m.get)
+    def reason(self) -> str:
+        """The reason in one sentence."""
+        worst = max(self.predicted_m, key=lambda reference: self.predicted_m[reference])
         decided = (
             f"; of {', '.join(self.alike)} its answer is nearest to the adaptive estimator's"
             if len(self.alike) > 1
             else ""
         )
         return (
-            f"{self.reference} of {', '.join(self.predicted_m)}: from the noise of these trajectories a translation error of "
-            f"{self.predicted_m[self.reference]:.3g} m is expected with it, {self.predicted_m[worst]:.3g} m with {worst}{decided}"
+            f"{self.reference} of {', '.join(self.predicted_m)}: with the noise of these "
+            "trajectories its predicted translation error is "
+            f"{self.predicted_m[self.reference]:.3g} m, that of {worst} "
+            f"{self.predicted_m[worst]:.3g} m{decided}"
         )
 
 
-def select_reference(pose_pairs, method, candidates=CANDIDATES):
+def select_reference(
+    pose_pairs: PosePairs, method: Method, candidates: Sequence[str] = CANDIDATES
+) -> ReferenceChoice:
     """Choose the reference for a method.
 
     The residual cannot tell which reference is best (Välimäki et al. 2023, section 4.2). The noise
-    can: once the adaptive estimator has found how strong it is and how it wanders, the error of
-    every reference follows from it. Where several are expected to do about equally well, chance
-    decides which of them does best on these poses; the one whose answer is nearest to the adaptive
-    estimator's is the best guess: that estimator's own error is the smaller one and, being that of
-    the best linear estimator, independent of how far the others lie from it.
+    can: the adaptive estimator identifies its level and drift, and the expected error of every
+    reference follows from them. If several references have about the same expected error, chance
+    decides which of them does best on these poses. The best guess is then the one whose answer is
+    nearest to the adaptive estimator's: the error of that estimator is smaller and, as that of the
+    best linear estimator, uncorrelated with the distance of the other answers from it.
 
     Parameters
     ----------
@@ -76,12 +83,12 @@ def select_reference(pose_pairs, method, candidates=CANDIDATES):
     Raises
     ------
     NotEnoughDataError
-        Where there are too few poses to choose.
+        If there are too few poses to choose.
     """
-    if len(pose_pairs) < _FEWEST_POSES:
+    if len(pose_pairs) < _MIN_POSES:
         raise NotEnoughDataError(
-            f"reference auto needs at least {_FEWEST_POSES} synchronised poses, found {len(pose_pairs)}; "
-            "drive on, or name a reference"
+            f"reference auto needs at least {_MIN_POSES} synchronised poses, "
+            f"found {len(pose_pairs)}; drive on, or name a reference"
         )
     poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     solution = estimator.solve(*poses)
@@ -93,7 +100,7 @@ def select_reference(pose_pairs, method, candidates=CANDIDATES):
         if covariance is not None
     }
     if not predicted_m:
-        # Nothing to choose by: the motion leaves a direction open with every reference.
+        # No prediction: with every reference the motion leaves a direction unobservable.
         return ReferenceChoice("B1", {"B1": float("inf")})
     limit = _NEARLY_AS_GOOD * min(predicted_m.values())
     alike = tuple(reference for reference, expected in predicted_m.items() if expected <= limit)
@@ -102,13 +109,15 @@ def select_reference(pose_pairs, method, candidates=CANDIDATES):
     )
 
 
-def _nearest(pose_pairs, method, references, T_parent_child):
-    """The reference with which the method's translation is nearest to a given answer's."""
+def _nearest(
+    pose_pairs: PosePairs, method: Method, references: Sequence[str], T_parent_child: FloatArray
+) -> str:
+    """The reference with which the method's translation is nearest to that of a transform."""
     if len(references) == 1:
         return references[0]
     fast = dataclasses.replace(method, backend="fast")
 
-    def distance(reference):
+    def distance(reference: str) -> float:
         T = fast.solve(
             motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
         ).T_parent_child

@@ -1,1 +1,1 @@
-"""Checks that the two streams are believable before anything is solved."""
+"""Stream checks: whether the two streams are plausible, before anything is solved."""

@@ -1,11 +1,25 @@
-"""A finding: something about the input that a person should know."""
+"""Findings: what the stream checks tell a person, and the wording of each."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hand_eye_calib.alignment.angular_rates import Correlation
+    from hand_eye_calib.alignment.scale import Scale
+    from hand_eye_calib.alignment.time_offset import TimeOffset
+    from hand_eye_calib.arrays import FloatArray
+    from hand_eye_calib.pairing.leaps import Leap
 
 
 class Severity(str, Enum):
-    """How much a finding matters: good to know; will spoil the result; makes a result impossible."""
+    """How much a finding matters.
+
+    A note is good to know, a warning spoils the result, an error makes a result impossible.
+    """
 
     NOTE = "note"
     WARNING = "warning"
@@ -20,9 +34,9 @@ class Confidence(str, Enum):
     POSSIBLE = "possible"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Something about the input that a person should know.
+    """Something about the streams that a person should know.
 
     Attributes
     ----------
@@ -33,11 +47,11 @@ class Finding:
     severity : Severity
     confidence : Confidence
     what : str
-        What was found, with numbers.
+        What was found, with its values.
     advice : str
         What to do.
     options : tuple of (str, value)
-        Options that do it, by their public names; empty where none can.
+        Options that do it, by their public names; empty if none can.
     """
 
     code: str
@@ -46,9 +60,9 @@ class Finding:
     confidence: Confidence
     what: str
     advice: str
-    options: tuple = ()
+    options: tuple[tuple[str, Any], ...] = ()
 
-    def to_dict(self):
+    def to_dict(self) -> dict[str, Any]:
         """Everything as plain values."""
         return {
             "code": self.code,
@@ -60,5 +74,302 @@ class Finding:
             "options": dict(self.options),
         }
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"{self.what}; {self.advice}"
+
+
+def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """The findings by severity, errors first, otherwise in their order."""
+    order = list(Severity)
+    return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))
+
+
+# ------------------------------------------------------------- of one stream
+
+
+def _note(code: str, stream: str, what: str, advice: str) -> Finding:
+    return Finding(
+        code=code,
+        stream=stream,
+        severity=Severity.NOTE,
+        confidence=Confidence.CERTAIN,
+        what=what,
+        advice=advice,
+    )
+
+
+def _error(
+    code: str, stream: str, what: str, advice: str, confidence: Confidence = Confidence.CERTAIN
+) -> Finding:
+    return Finding(
+        code=code,
+        stream=stream,
+        severity=Severity.ERROR,
+        confidence=confidence,
+        what=what,
+        advice=advice,
+    )
+
+
+def duplicates(stream: str, n_repeated: int, n_poses: int) -> Finding:
+    """Poses repeat a stamp."""
+    return _note(
+        "duplicates",
+        stream,
+        f"{n_repeated} of {n_poses} {stream} poses repeat a stamp",
+        "the first of each is used",
+    )
+
+
+def disorder(stream: str, n_backwards: int) -> Finding:
+    """Stamps go back."""
+    return _note(
+        "disorder",
+        stream,
+        f"{n_backwards} {stream} stamps are earlier than the one before",
+        "poses are sorted by stamp",
+    )
+
+
+def repaired_file(what: str) -> Finding:
+    """A file had to be repaired while it was read."""
+    return _note("disorder", "both", what, "repair the file's source")
+
+
+def too_few_poses(stream: str, n_poses: int) -> Finding:
+    """A stream is too short to check."""
+    return _error(
+        "too_short",
+        stream,
+        f"the {stream} stream has {n_poses} poses",
+        "record longer, or check the topic",
+    )
+
+
+def leaping_stamps(stream: str, leap: Leap) -> Finding:
+    """Stamps lie days apart."""
+    return _error("leap", stream, f"the {stream} stream's {leap.what()}", leap.advice())
+
+
+def gaps(stream: str, n_gaps: int, longest_s: float, share: float) -> Finding:
+    """Poses are missing for a while."""
+    return _note(
+        "gaps",
+        stream,
+        f"the {stream} stream has {n_gaps} gaps of up to {longest_s:.2f} s ({share:.0%} of the "
+        "time)",
+        "nothing is paired across a gap; raise max_gap if the motion there is smooth",
+    )
+
+
+def jumps(stream: str, share: float) -> Finding:
+    """Poses jump."""
+    return Finding(
+        code="jumps",
+        stream=stream,
+        severity=Severity.WARNING,
+        confidence=Confidence.LIKELY,
+        what=f"{share:.1%} of the {stream} stream's steps are jumps: far from the motion before "
+        "and after",
+        advice="keep method dnlo or adaptive, which leave them out; better, repair the source",
+        options=(("method", "dnlo"),),
+    )
+
+
+def frozen(stream: str, share: float) -> Finding:
+    """A stream repeats its pose while the other sensor moves."""
+    return _error(
+        "frozen",
+        stream,
+        f"the {stream} stream repeats the same pose for {share:.0%} of the time while the other "
+        "sensor moves",
+        "find out why its source stopped, and cut that part out",
+    )
+
+
+def stamp_unit(stream: str, other: str, unit: str, factor: float) -> Finding:
+    """Stamps are in another unit than nanoseconds."""
+    return _error(
+        "stamp_unit",
+        stream,
+        f"the {stream} stream's stamps are {unit} instead of nanoseconds: they are {factor:g} "
+        f"times nearer to 1970 than the {other}'s",
+        f"multiply the {stream} stream's stamps by {factor:g}",
+    )
+
+
+# ---------------------------------------------------------- of both together
+
+
+def unrelated_rates(correlation: Correlation) -> Finding:
+    """The angular rates do not agree at any clock offset."""
+    return _error(
+        "unrelated",
+        "both",
+        "the angular rates of the two streams do not agree at any clock offset: "
+        f"{correlation.doubt()}",
+        "check that both sensors are on one rigid body, that the topics are of the same recording, "
+        "and that neither is derived from another body",
+        Confidence.LIKELY,
+    )
+
+
+def no_rotation() -> Finding:
+    """The streams do not rotate enough to check anything."""
+    return _error(
+        "no_turning",
+        "both",
+        "the streams hardly rotate, or at a constant rate, so that neither clock nor extrinsic can "
+        "be checked",
+        "drive curves, over slopes if there are any",
+        Confidence.LIKELY,
+    )
+
+
+def too_short_to_compare(what: str) -> Finding:
+    """The streams have too few motions in common."""
+    return _error("too_short", "both", what, "record longer")
+
+
+def not_one_body(unexplained: float, limit: float) -> Finding:
+    """No hypothesis explains both streams."""
+    return _error(
+        "unrelated",
+        "both",
+        f"no extrinsic, scale or usual mistake explains both streams: {unexplained:.0%} of the "
+        f"motion stays unexplained (at most {limit:.0%} would be good)",
+        "check that both sensors are on one rigid body and that the poses are those of the sensors",
+        Confidence.LIKELY,
+    )
+
+
+def noisy(unexplained: float) -> Finding:
+    """The angular rates agree and the motion does not."""
+    return Finding(
+        code="noisy",
+        stream="both",
+        severity=Severity.NOTE,
+        confidence=Confidence.LIKELY,
+        what=f"the streams rotate together, but {unexplained:.0%} of the motion stays unexplained: "
+        "noise or jumps are strong",
+        advice="expect large standard deviations; record longer and with more motion, or repair "
+        "the source",
+    )
+
+
+def quaternion_order(stream: str) -> Finding:
+    """Quaternions are scalar first."""
+    return _error(
+        "quaternion_order",
+        stream,
+        f"the {stream} stream's quaternions seem to be written w x y z and read as x y z w",
+        "write them as x y z w",
+        Confidence.LIKELY,
+    )
+
+
+def left_handed(stream: str) -> Finding:
+    """Positions are mirrored."""
+    return _error(
+        "left_handed",
+        stream,
+        f"the {stream} stream's axes are left-handed: with all positions mirrored the streams "
+        "agree",
+        "convert the stream to right-handed axes (REP 103)",
+        Confidence.LIKELY,
+    )
+
+
+def axes(stream: str, order: str) -> Finding:
+    """Positions are in other axes than orientations; ``order`` is what (x, y, z) should be."""
+    return _error(
+        "axes",
+        stream,
+        f"the {stream} stream's positions are in other axes than its orientations: (x, y, z) "
+        f"should be ({order})",
+        "write positions and orientations in the same right-handed axes",
+        Confidence.LIKELY,
+    )
+
+
+def inverse(stream: str, confidence: Confidence) -> Finding:
+    """Poses are inverted."""
+    return _error(
+        "inverse",
+        stream,
+        f"the {stream} stream seems to hold inverse poses (of the world in the sensor, not of the "
+        "sensor in its world)",
+        f"invert every pose of the {stream} stream",
+        confidence,
+    )
+
+
+def inverse_both(confidence: Confidence) -> Finding:
+    """Poses of both streams are inverted."""
+    return _error(
+        "inverse_both",
+        "both",
+        "both streams seem to hold inverse poses (of the world in the sensor): inverted, their "
+        "paths and the lever arm between them are shorter",
+        "invert every pose of both streams; otherwise the result is the pose of one world in the "
+        "other",
+        confidence,
+    )
+
+
+def time_offset(found: TimeOffset, total_s: float, severity: Severity) -> Finding:
+    """The clocks differ; ``total_s`` is the offset to set."""
+    direction = "behind" if found.seconds > 0 else "ahead of"
+    return Finding(
+        code="time_offset",
+        stream="child",
+        severity=severity,
+        confidence=Confidence.CERTAIN,
+        what=f"the child's clock is {abs(found.seconds):.4f} +/- {found.sigma_s:.4f} s {direction} "
+        "the parent's",
+        advice=f"add {total_s} s to the child's stamps, or have it estimated",
+        options=(("time_offset", total_s),),
+    )
+
+
+def units(scale: Scale, unit: str, factor: float) -> Finding:
+    """The child's lengths are in another unit."""
+    return Finding(
+        code="units",
+        stream="child",
+        severity=Severity.ERROR,
+        confidence=Confidence.CERTAIN,
+        what=f"the child's lengths are {unit} while the parent's are metres (factor "
+        f"{scale.value:.5g} +/- {scale.sigma:.2g})",
+        advice="convert them to metres",
+        options=(("scale", factor),),
+    )
+
+
+def scale_differs(scale: Scale, factor: float) -> Finding:
+    """The child's lengths are off by a factor."""
+    return Finding(
+        code="scale",
+        stream="child",
+        severity=Severity.WARNING,
+        confidence=Confidence.CERTAIN,
+        what=f"the child's lengths must be multiplied by {scale.value:.4f} +/- {scale.sigma:.4f} "
+        "to agree with the parent's",
+        advice="have the scale estimated, or find out which of the two measures wrongly",
+        options=(("scale", factor),),
+    )
+
+
+def one_axis(direction: FloatArray, hidden: Sequence[str], main: str) -> Finding:
+    """Nearly all rotation is about one axis, which hides the translation along it."""
+    axis = ", ".join(f"{component:.2f}" for component in direction)
+    return Finding(
+        code="one_axis",
+        stream="both",
+        severity=Severity.NOTE,
+        confidence=Confidence.LIKELY,
+        what=f"nearly all rotation is about one axis, ({axis}) in the parent sensor's frame: the "
+        f"translation along it, {' and '.join(hidden)}, will be unobservable",
+        advice=f"drive over slopes or kerbs, or measure {main} and give it",
+        options=((f"prior.{main}", "VALUE+/-SIGMA"),),
+    )

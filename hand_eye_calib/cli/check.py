@@ -14,9 +14,9 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.report.words import printable
 
 if TYPE_CHECKING:
-    from hand_eye_calib.checks.agreement import Agreement
+    from hand_eye_calib.checks.check import CheckResult
     from hand_eye_calib.checks.findings import Finding
-    from hand_eye_calib.checks.stream_checks import StreamSummary
+    from hand_eye_calib.checks.streams import StreamSummary
     from hand_eye_calib.geometry.trajectory import Trajectory
 
 EXAMPLES = """\
@@ -51,9 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if something is wrong with the streams, otherwise 0."""
-    from hand_eye_calib.checks.agreement import check_streams
+    from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import Severity
-    from hand_eye_calib.checks.stream_checks import summarise
+    from hand_eye_calib.checks.streams import summarise
 
     if len(arguments.inputs) > 2:
         raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.inputs)}")
@@ -89,23 +89,19 @@ _Read = tuple[dict[str, "Trajectory"], dict[str, str], "list[Finding]"]
 
 
 def _read_files(arguments: argparse.Namespace) -> _Read:
-    from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+    from hand_eye_calib.checks.findings import repaired_file
 
     arguments.parent, arguments.child = arguments.inputs
     arguments.repair_stamps = True
     trajectories, notes = read_files(arguments)
-    advice = "repair the file's source"
-    findings = [
-        Finding("disorder", "both", Severity.NOTE, Confidence.CERTAIN, text, advice)
-        for text in notes
-    ]
+    findings = [repaired_file(text) for text in notes]
     return trajectories, dict(zip(STREAMS, arguments.inputs, strict=True)), findings
 
 
 def _read_bag(arguments: argparse.Namespace) -> _Read:
     import numpy as np
 
-    from hand_eye_calib.checks.stream_checks import tidy
+    from hand_eye_calib.checks.streams import tidy
     from hand_eye_calib.io.bags import PoseBag
 
     columns: dict[str, tuple[list[Any], list[Any], list[Any]]] = {
@@ -136,7 +132,7 @@ def _document(
     sources: Mapping[str, str],
     streams: "Mapping[str, StreamSummary]",
     findings: "Sequence[Finding]",
-    agreement: "Agreement",
+    agreement: "CheckResult",
 ) -> dict[str, Any]:
     return {
         "streams": {
@@ -146,7 +142,7 @@ def _document(
             "time_offset_s": agreement.correlation.offset_s,
             "correlation": agreement.correlation.correlation,
             "distinctness": agreement.correlation.distinctness,
-            "rms_rad_in_3_s": agreement.turned_rad,
+            "rms_rad_in_3_s": agreement.rms_rotation,
         },
         "findings": [finding.to_dict() for finding in findings],
     }
@@ -156,7 +152,7 @@ def _text(
     sources: Mapping[str, str],
     streams: "Mapping[str, StreamSummary]",
     findings: "Sequence[Finding]",
-    agreement: "Agreement",
+    agreement: "CheckResult",
 ) -> str:
     from hand_eye_calib.cli.findings import table
 
@@ -165,12 +161,12 @@ def _text(
     for name, summary in streams.items():
         lines.append(
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} "
-            f"{summary.longest_interval_s:10.3f} s {summary.way_m:10.1f} m "
-            f"{math.degrees(summary.turned_rad):6.0f} deg"
+            f"{summary.longest_interval_s:10.3f} s {summary.path_m:10.1f} m "
+            f"{math.degrees(summary.rotation_rad):6.0f} deg"
         )
-    if agreement.turned_rad:
+    if agreement.rms_rotation:
         turned = "  ".join(
-            f"{axis} {math.degrees(angle):.2f}" for axis, angle in agreement.turned_rad.items()
+            f"{axis} {math.degrees(angle):.2f}" for axis, angle in agreement.rms_rotation.items()
         )
         lines.append(
             f"Rotation of the parent in 3 s about its axes, root mean square: {turned} deg"

@@ -14,7 +14,7 @@ import numpy as np
 from hand_eye_calib.alignment.angular_rates import Correlation
 from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
-from hand_eye_calib.checks.agreement import check_streams
+from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic
 from hand_eye_calib.errors import InputError, NotEnoughDataError

@@ -12,24 +12,22 @@ from hand_eye_calib.adaptive.estimator import AdaptiveSolution
 from hand_eye_calib.alignment.scale import Scale, child_scaled, estimate_scale
 from hand_eye_calib.alignment.similarity import MAX_UNEXPLAINED_TRANSLATION
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import select_reference
-from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
 
 # Largest share of jumps with which the trajectories' errors still fit the adaptive noise model.
 _MAX_JUMPS = 0.1
-
-# Motion pairs and increments with more weight than this count as inliers.
-_INLIER_WEIGHT = 0.5
 
 # Tried in turn if the reference that auto chose leaves an axis unobservable.
 _LONGER_REFERENCES = ("B5", "B20")
@@ -42,6 +40,7 @@ class _Evaluation:
     solution: Solution | AdaptiveSolution
     assessment: Assessment
     reference: str
+    pairs: MotionPairs
     weights: FloatArray
     reference_reason: str = ""
     noise: dict[str, Any] | None = None
@@ -94,11 +93,13 @@ def estimate_extrinsic(
     assessment = widened(evaluation.assessment, solution.T_parent_child[:3, :3], spread)
     fused = fuse(solution.T_parent_child, assessment, config.prior())
     offset_s = time_offset.seconds if time_offset else _in_seconds(config.time_offset)
+    residuals = _residuals(evaluation, pose_pairs.stamps_ns, fused.T_parent_child)
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
         status=_status(solution.converged, fused),
         observability=fused.assessment.observability,
+        T_method=solution.T_parent_child,
         objective=solution.objective,
         method=config.method,
         reference=evaluation.reference,
@@ -106,8 +107,8 @@ def estimate_extrinsic(
         noise=evaluation.noise,
         backend=config.backend,
         n_poses=len(pose_pairs),
-        n_pairs=len(evaluation.weights),
-        n_inliers=int((evaluation.weights > _INLIER_WEIGHT).sum()),
+        n_pairs=len(residuals),
+        n_inliers=int(residuals.is_inlier.sum()),
         time_offset_s=offset_s + evaluation.time_correction_s,
         time_offset_sigma_s=time_offset.sigma_s if time_offset else 0.0,
         scale=scale.value * evaluation.scale_correction,
@@ -118,6 +119,21 @@ def estimate_extrinsic(
             *_warnings_of(fused, solution.converged),
             *evaluation.warnings,
         ),
+        motion_residuals=residuals,
+    )
+
+
+def _residuals(
+    evaluation: _Evaluation, stamps_ns: IntArray, T_parent_child: FloatArray
+) -> Residuals:
+    pairs = evaluation.pairs
+    translation, rotation = pairs.residuals(T_parent_child)
+    return Residuals(
+        translation=translation,
+        rotation=rotation,
+        weights=evaluation.weights,
+        start_ns=stamps_ns[pairs.i],
+        end_ns=stamps_ns[pairs.j],
     )
 
 
@@ -166,6 +182,7 @@ def _solve_reference(
         solution=solution,
         assessment=assessment,
         reference=reference,
+        pairs=pairs,
         weights=solution.weights,
         reference_reason=reason,
     )
@@ -185,6 +202,9 @@ def _solve_adaptive(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluat
     solution = adaptive_estimator.solve(
         pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     )
+    stamps_ns = pose_pairs.stamps_ns
+    child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).scaled(solution.scale)
+    Ts_cw_c = child.shifted(solution.time_offset_s).at(stamps_ns, extrapolate=True)
     weights = (~solution.jumps).astype(float)
     jumps = float(np.mean(solution.jumps))
     warning = (
@@ -195,6 +215,7 @@ def _solve_adaptive(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluat
         solution=solution,
         assessment=assess_adaptive(pose_pairs, solution),
         reference="increments",
+        pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
         weights=weights,
         noise=solution.describe(pose_pairs.stamps_ns),
         scale_correction=solution.scale,

@@ -17,7 +17,6 @@ from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
 # Methods the result is compared with, the most poses each of them gets, and references.
@@ -333,26 +332,14 @@ def _scaled(Ts, scale):
 
 
 def _residuals(calibration, pose_pairs):
-    reference = calibration.reference if METHODS[calibration.method].uses_reference else "B1"
-    pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-    rotation, translation = calibration.T_parent_child[:3, :3], calibration.T_parent_child[:3, 3]
-    rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
-    around = rotation_a @ translation + pairs.Ts_parenti_parentj[:, :3, 3]
-    residual_t = np.linalg.norm(
-        around - translation - pairs.Ts_childi_childj[:, :3, 3] @ rotation.T, axis=1
+    residuals = calibration.residuals()
+    return Residuals(
+        _seconds(pose_pairs, residuals.end_ns),
+        residuals.translation_m,
+        residuals.rotation_rad,
+        ~residuals.is_inlier,
+        calibration.reference if METHODS[calibration.method].uses_reference else "B1",
     )
-    residual_r = se3.rotation_angle(
-        np.swapaxes(rotation_a @ rotation, 1, 2) @ (rotation @ rotation_b)
-    )
-    ends_ns = pose_pairs.stamps_ns[pairs.j]
-    if calibration.noise is not None:
-        is_outlier = np.isin(ends_ns, calibration.noise["jumps_before_stamp_ns"])
-    else:
-        is_outlier = np.zeros(len(pairs), dtype=bool)
-        # What the solver left out are the pairs of the largest cost |A X - X B|^2.
-        cost = residual_t**2 + 4 * (1 - np.cos(residual_r))
-        is_outlier[np.argsort(cost, kind="stable")[min(calibration.n_inliers, len(pairs)) :]] = True
-    return Residuals(_seconds(pose_pairs, ends_ns), residual_t, residual_r, is_outlier, reference)
 
 
 def _tracks(calibration, pose_pairs):

@@ -1,10 +1,14 @@
 """Pairs of relative motions, what every AX = XB solver starts from."""
 
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.references import reference_indices
 
 
@@ -22,24 +26,61 @@ class MotionPairs:
         Indices of the poses the motions run between.
     """
 
-    Ts_parenti_parentj: np.ndarray
-    Ts_childi_childj: np.ndarray
-    i: np.ndarray
-    j: np.ndarray
+    Ts_parenti_parentj: FloatArray
+    Ts_childi_childj: FloatArray
+    i: IntArray
+    j: IntArray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.i)
 
-    def __getitem__(self, index):
-        return MotionPairs(
+    def __getitem__(self, index: slice | NDArray[Any]) -> Self:
+        return type(self)(
             self.Ts_parenti_parentj[index],
             self.Ts_childi_childj[index],
             self.i[index],
             self.j[index],
         )
 
+    def residuals(self, T_parent_child: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals of AX = XB at a transform, per pair.
 
-def motion_pairs(Ts_pw_p, Ts_cw_c, reference):
+        Parameters
+        ----------
+        T_parent_child : (4, 4) array
+            X.
+
+        Returns
+        -------
+        translation : (K, 3) array
+            See :meth:`translation_residuals`.
+        rotation : (K, 3) array
+            See :meth:`rotation_residuals`.
+        """
+        return self.translation_residuals(T_parent_child), self.rotation_residuals(T_parent_child)
+
+    def translation_residuals(self, T_parent_child: FloatArray) -> FloatArray:
+        """``R_A t + t_A - R t_B - t`` (K, 3), in m, in the axes of the parent sensor at instant i.
+
+        It is the residual of Välimäki et al. 2023, eq. (6). The article prints its last term with
+        the opposite sign; its published results have this one.
+        """
+        rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
+        chord = self.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+        moved_child = self.Ts_childi_childj[:, :3, 3] @ rotation.T
+        return chord @ translation + self.Ts_parenti_parentj[:, :3, 3] - moved_child
+
+    def rotation_residuals(self, T_parent_child: FloatArray) -> FloatArray:
+        """Rotation vectors (K, 3), in rad, in the axes of the child sensor at instant j, of the
+        rotation from ``R_A R`` to ``R R_B``. Their lengths are the angles of eq. (7).
+        """
+        rotation = T_parent_child[:3, :3]
+        via_parent = self.Ts_parenti_parentj[:, :3, :3] @ rotation
+        via_child = rotation @ self.Ts_childi_childj[:, :3, :3]
+        return se3.rotation_log(np.swapaxes(via_parent, 1, 2) @ via_child)
+
+
+def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> MotionPairs:
     """Relative motions of two synchronised trajectories (Välimäki et al. 2023, eqs 1-2).
 
     Parameters
@@ -52,7 +93,9 @@ def motion_pairs(Ts_pw_p, Ts_cw_c, reference):
     Raises
     ------
     InputError
-        Where the two stacks differ in length.
+        If the two stacks differ in length.
+    ConfigError
+        If the reference is none of these.
     """
     if len(Ts_pw_p) != len(Ts_cw_c):
         raise InputError(
@@ -61,12 +104,14 @@ def motion_pairs(Ts_pw_p, Ts_cw_c, reference):
     return pairs_between(Ts_pw_p, Ts_cw_c, *reference_indices(reference, len(Ts_pw_p)))
 
 
-def pairs_between(Ts_pw_p, Ts_cw_c, i, j):
+def pairs_between(
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, i: IntArray, j: IntArray
+) -> MotionPairs:
     """MotionPairs from the instants i to the instants j, (K,) int arrays."""
     return MotionPairs(_relative(Ts_pw_p, i, j), _relative(Ts_cw_c, i, j), i, j)
 
 
-def _relative(Ts_world_sensor, i, j):
+def _relative(Ts_world_sensor: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
     start, end = Ts_world_sensor.take(i, axis=0), Ts_world_sensor.take(j, axis=0)
     # The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting
     # first costs ten digits.

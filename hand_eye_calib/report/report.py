@@ -15,7 +15,7 @@ from hand_eye_calib.assessment.covariance import AXES, WEAK_ROTATION, WEAK_TRANS
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.checks.stream_checks import summarise
+from hand_eye_calib.checks.streams import summarise
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.report_figures import draw_all, time_axis
 
@@ -431,7 +431,7 @@ def _streams(inputs, streams):
             whole = summarise(stream)
             row |= {
                 "gap": f"{whole.longest_interval_s:.2f} s",
-                "way": _length(whole.way_m),
+                "way": _length(whole.path_m),
                 "duration": _duration(whole.duration_s),
             }
             row |= {"poses": f"{whole.poses:,}", "rate": f"{whole.rate_hz:.1f} Hz"}

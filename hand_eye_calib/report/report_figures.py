@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hand_eye_calib.assessment.covariance import AXES
-from hand_eye_calib.assessment.excitation import ENOUGH_TURNING
+from hand_eye_calib.assessment.excitation import MIN_ROTATION
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.report.style import house_style, plain_decades
 
@@ -242,7 +242,7 @@ def _excitation(calibration, evidence):
     factor, unit = time_axis(evidence.tracks.times_s[-1])
     shown = _thin(len(turning.times_s), _MOST_ON_A_LINE)
     figure, panels = _figure(4.2, 3, 1, left=0.8, bottom=0.5, between=0.15, top=0.1, sharex=True)
-    enough = np.degrees(ENOUGH_TURNING)
+    enough = np.degrees(MIN_ROTATION)
     for index, panel in enumerate(panels):
         values = np.degrees(turning.vectors[shown, index])
         panel.axhspan(-enough, enough, color=MUTED, alpha=0.16, lw=0)

@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
-from hand_eye_calib.checks.agreement import ENOUGH_S, ENOUGH_TURNED_RAD
+from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD
 from hand_eye_calib.checks.findings import Confidence, Severity
 
 HARDWARE_ID = "hand_eye_calib"
@@ -171,10 +171,10 @@ class StreamChecks:
     def report(self, steady_s):
         """Level, message and values."""
         if self._agreement is None:
-            turned = f"{np.degrees(ENOUGH_TURNED_RAD):.0f} deg"
+            turned = f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
             return (
                 WARN,
-                f"not checked yet: that takes {ENOUGH_S:g} s of driving with turns of {turned}",
+                f"not checked yet: that takes {MIN_DURATION_S:g} s of driving with turns of {turned}",
                 {"checked": "not yet"},
             )
         correlation, grave = self._agreement.correlation, self.grave()
@@ -268,7 +268,7 @@ def calibration_report(state, steady_s, clock_ns):
             "distance (m)": f"{seen.distance:.1f}",
             **{
                 f"turned about {axis} (deg)": f"{angle:.1f}"
-                for axis, angle in zip("xyz", np.degrees(seen.turned), strict=True)
+                for axis, angle in zip("xyz", np.degrees(seen.rotation), strict=True)
             },
             **{
                 f"an offset of 1 m in {axis} shows as (m)": f"{gain:.3f}"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.checks.agreement import Agreement, tell_enough
+from hand_eye_calib.checks.check import CheckResult, can_check
 from hand_eye_calib.engine.calibrator import Snapshot
 
 # Whoever else needs the processor goes before the solver's process.
@@ -40,7 +40,7 @@ class Checked:
 
     session: int
     seconds: float
-    agreement: Agreement | None = None
+    agreement: CheckResult | None = None
     error: Exception | None = None
 
 
@@ -182,7 +182,7 @@ def _check(outcome):
     """Check the streams of a solve, with the time offset and the scale it found."""
     start, snapshot, agreement, failure = time.monotonic(), outcome.snapshot, None, None
     try:
-        if tell_enough(*snapshot.streams):
+        if can_check(*snapshot.streams):
             agreement = snapshot.check(outcome.calibration)
     except Exception as error:  # as with a solve
         failure = error

@@ -55,7 +55,4 @@ def solve_in_two_stages(pairs, rotation):
 
 def squared_translation_residual(pairs, T_parent_child):
     """Sum over pairs of ``|R_A t + t_A - R t_B - t|^2``, in m^2."""
-    residuals = (
-        pairs.Ts_parenti_parentj @ T_parent_child - T_parent_child @ pairs.Ts_childi_childj
-    )[:, :3, 3]
-    return float((residuals**2).sum())
+    return float((pairs.translation_residuals(T_parent_child) ** 2).sum())

@@ -11,7 +11,7 @@ import pytest
 import real_data
 from faults import FAULTS
 
-from hand_eye_calib.checks.agreement import check_streams
+from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
 
 # What is wrong with a recording by itself: the camera's stream of this one has 3 to 11 % gross

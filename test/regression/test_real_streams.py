@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.checks.agreement import check_streams
-from hand_eye_calib.checks.stream_checks import tidy
+from hand_eye_calib.checks.check import check_streams
+from hand_eye_calib.checks.streams import tidy
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory

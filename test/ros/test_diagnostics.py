@@ -116,7 +116,7 @@ def test_flat_ground_is_said_in_one_sentence(start_node, peer, heard):
     noise = se3.exp(np.random.default_rng(0).normal(size=(2, len(s), 6)) * 1e-3)
     peer.feed(peer.publishers(), stamps_ns, flat @ noise[0], flat @ noise[1])
     status = wait(
-        peer, heard, "extrinsic", lambda status: "turning about z is fine" in status.message
+        peer, heard, "extrinsic", lambda status: "rotation about z is fine" in status.message
     )
     assert status.level == DiagnosticStatus.WARN
     assert (

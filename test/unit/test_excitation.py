@@ -29,8 +29,8 @@ def test_turning_is_measured_about_the_axis_it_happens_about(axis):
     amplitudes = np.zeros(3)
     amplitudes[axis] = np.radians(20.0)
     seen = seen_in(turning(amplitudes))
-    assert np.degrees(seen.turned[axis]) == pytest.approx(40.0, abs=3.0)
-    assert np.degrees(np.delete(seen.turned, axis)).max() < 1e-6
+    assert np.degrees(seen.rotation[axis]) == pytest.approx(40.0, abs=3.0)
+    assert np.degrees(np.delete(seen.rotation, axis)).max() < 1e-6
     np.testing.assert_allclose(np.abs(seen.worst), np.eye(3)[axis], atol=1e-6)
     assert seen.worst_gain < 1e-6
     assert seen.gain[axis] < 1e-6 < np.delete(seen.gain, axis).min()
@@ -40,26 +40,26 @@ def test_it_does_not_depend_on_the_world_and_hardly_on_the_number_of_poses():
     poses = wandering_poses(400)
     seen = seen_in(poses)
     moved = seen_in(se3.exp(np.array([5.0, 3.0, -2.0, 0.4, 1.0, -2.0])) @ poses)
-    np.testing.assert_allclose(moved.turned, seen.turned, atol=1e-9)
+    np.testing.assert_allclose(moved.rotation, seen.rotation, atol=1e-9)
     np.testing.assert_allclose(moved.gain, seen.gain, atol=1e-9)
     many = seen_in(
         as_trajectory(poses).at(
             np.linspace(*as_trajectory(poses).stamps_ns[[0, -1]], 4000).astype(np.int64)
         )
     )
-    np.testing.assert_allclose(many.turned, seen.turned, rtol=0.2)
+    np.testing.assert_allclose(many.rotation, seen.rotation, rtol=0.2)
 
 
 def test_one_outlier_is_no_turn():
     poses = planar_poses(300)
     poses[150] = poses[150] @ se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
-    assert np.degrees(seen_in(poses).turned[0]) < 1.0
+    assert np.degrees(seen_in(poses).rotation[0]) < 1.0
 
 
 def test_flat_ground_is_said_in_plain_words():
     poses = disturbed(planar_poses(300), 0, 0.005, 0.002)
     text = what_is_missing(seen_in(poses))
-    assert text.startswith("turning about z is fine (")
+    assert text.startswith("rotation about z is fine (")
     assert (
         "; roll and pitch under 1 deg: vertical offset (z) not observable, drive over a ramp"
         in text
@@ -69,7 +69,9 @@ def test_flat_ground_is_said_in_plain_words():
 @pytest.mark.parametrize("n_poses", [0, 1, 20])
 def test_standing_still_is_said(n_poses):
     text = what_is_missing(seen_in(np.repeat(np.eye(4)[None], n_poses, axis=0)))
-    assert text.startswith("hardly any turning so far (at most 0.0 deg): x, y and z not observable")
+    assert text.startswith(
+        "hardly any rotation so far (at most 0.0 deg): x, y and z not observable"
+    )
 
 
 def test_nothing_is_missing_after_turns_about_all_axes():
@@ -94,4 +96,4 @@ def test_the_verdicts_of_a_result_win():
         seen_in(poses),
         dataclasses.replace(result, observability=(*result.observability[:5], hidden)),
     )
-    assert text.endswith("yaw not observable, turn about other axes as well")
+    assert text.endswith("yaw not observable, rotate about other axes as well")

@@ -6,7 +6,7 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.references import reference_indices
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream, synchronise
 
@@ -148,3 +148,29 @@ class TestKeyframes:
         whole = select_keyframes(poses, 0.199, 0.399, 0)
         rest = select_keyframes(poses[3:], 0.199, 0.399, 0, previous=poses[2:3])
         assert (rest + 3).tolist() == whole[whole > 2].tolist()
+
+
+class TestResiduals:
+    def pairs(self):
+        rng = np.random.default_rng(5)
+        A, B = se3.exp(0.7 * rng.standard_normal((2, 40, 6)))
+        i = np.arange(40)
+        return MotionPairs(A, B, i, i + 1), se3.exp(rng.standard_normal(6))
+
+    def test_they_are_the_difference_of_both_ways(self):
+        """Eqs (6) and (7), from whole transforms: A X and X B."""
+        pairs, X = self.pairs()
+        AX, XB = pairs.Ts_parenti_parentj @ X, X @ pairs.Ts_childi_childj
+        translation, rotation = pairs.residuals(X)
+        np.testing.assert_allclose(translation, (AX - XB)[:, :3, 3], atol=1e-14)
+        np.testing.assert_allclose(
+            AX[:, :3, :3] @ se3.rotation_exp(rotation), XB[:, :3, :3], atol=1e-14
+        )
+
+    def test_the_sign_of_the_last_term(self):
+        """The article prints + t; with it the truth would have residuals."""
+        poses = wandering_poses(30)
+        pairs = motion_pairs(poses, child_of(poses), "B4")
+        translation, rotation = pairs.residuals(T_PARENT_CHILD)
+        assert np.abs(translation).max() < 1e-13
+        assert np.abs(rotation).max() < 1e-13

@@ -5,13 +5,23 @@ import inspect
 
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    planar_poses,
+    wandering_poses,
+)
 
 import hand_eye_calib as hec
 from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, prior_fields
 from hand_eye_calib.engine.offline import offline_config
-from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.methods import BACKENDS, METHODS
+from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.solvers.dnl import pair_costs
 from hand_eye_calib.solvers.registry import Method
 
 PRIOR_FIELDS = {f"prior_{axis}" for axis in (*AXIS_UNITS, "transform")}
@@ -20,6 +30,12 @@ PRIOR_FIELDS = {f"prior_{axis}" for axis in (*AXIS_UNITS, "transform")}
 def streams(n_poses=40):
     poses = wandering_poses(n_poses)
     return as_trajectory(poses), as_trajectory(child_of(poses))
+
+
+def smooth_poses(times_s):
+    """(N, 4, 4) poses on a smooth curve in all six degrees of freedom."""
+    k = np.arange(1, 7)
+    return se3.exp(np.sin(times_s[:, None] * (0.5 + 0.15 * k) + k) * np.repeat([3.0, 0.8], 3))
 
 
 class TestOptionsOfCalibrate:
@@ -133,3 +149,74 @@ class TestMethods:
             else:
                 with pytest.raises(ConfigError, match=f"method {name} has no {backend} backend"):
                     hec.calibrate(parent, child, method=name, reference="B1", backend=backend)
+
+
+class TestResiduals:
+    @pytest.mark.parametrize("name", METHODS)
+    def test_they_belong_to_the_pairs_of_the_result(self, name):
+        parent, child = streams(80)
+        poses = child.poses.copy()
+        poses[40:, :3, 3] += [1.0, -0.7, 0.4]
+        jumped = hec.Trajectory(child.stamps_ns, poses)
+        result = hec.calibrate(parent, jumped, method=name, reference="B2")
+        residuals = result.residuals()
+        assert len(residuals) == len(result.weights) == result.n_pairs
+        assert residuals.is_inlier.sum() == result.n_inliers
+        step_ns = 100_000_000 * (2 if METHODS[name].uses_reference else 1)
+        assert set(residuals.end_ns - residuals.start_ns) == {step_ns}
+        crosses = (residuals.start_ns < parent.stamps_ns[40]) & (
+            residuals.end_ns >= parent.stamps_ns[40]
+        )
+        if METHODS[name].rejects_outliers:
+            np.testing.assert_array_equal(residuals.is_inlier, ~crosses)
+            assert residuals.translation_m[~crosses].max() < 1e-6
+            assert residuals.rotation_rad.max() < 1e-6
+        assert residuals.translation_m[crosses].min() > 0.3
+        assert residuals.translation.shape == residuals.rotation.shape == (result.n_pairs, 3)
+
+    def test_those_of_the_adaptive_estimator_have_its_scale_and_time_offset(self):
+        times_s = np.arange(400) / 20
+        parent = as_trajectory(disturbed(smooth_poses(times_s), 1, 1e-4, 1e-4), 20.0)
+        late = child_of(smooth_poses(times_s + 0.05))
+        child = as_trajectory(disturbed(late, 2, 1e-4, 1e-4), 20.0).scaled(0.95)
+        exact = hec.calibrate(parent, child, method="adaptive", time_offset=0.05, scale=1 / 0.95)
+        found = hec.calibrate(parent, child, method="adaptive")
+        assert found.time_offset_s == pytest.approx(0.05, abs=1e-3)
+        rms = [np.sqrt((r.residuals().translation ** 2).mean()) for r in (exact, found)]
+        # Without the time offset it would be fifteen times as much.
+        assert rms[1] == pytest.approx(rms[0], rel=0.2)
+
+    def test_files_do_not_have_them(self):
+        result = hec.calibrate(*streams(), reference="B1")
+        loaded = hec.Calibration.from_dict(result.to_dict())
+        with pytest.raises(InputError, match="read from a file has no residuals"):
+            loaded.residuals()
+        with pytest.raises(InputError, match="read from a file has no residuals"):
+            _ = loaded.weights
+
+
+class TestAnswerOfTheMethod:
+    def test_it_has_the_objective_and_the_result_is_the_settled_one(self):
+        """Flat ground does not reveal z: the method's answer has one, the result has about 0."""
+        poses = planar_poses(300)
+        parent = as_trajectory(disturbed(poses, 1, 2e-3, 1e-3))
+        child = as_trajectory(disturbed(child_of(poses), 2, 2e-3, 1e-3))
+        result = hec.calibrate(parent, child, method="dnl", reference="B10")
+        assert result.unobservable() == ["z"]
+        pairs = motion_pairs(parent.poses, child.poses, "B10")
+        own = pair_costs(pairs, result.T_method).sum()
+        assert own == pytest.approx(result.objective, rel=1e-9)
+        assert pair_costs(pairs, result.T_parent_child).sum() > result.objective
+        assert abs(result.T_method[2, 3] - result.T_parent_child[2, 3]) > 1e-3
+
+    def test_it_is_the_result_if_all_is_observable(self):
+        result = hec.calibrate(*streams(100), reference="B5")
+        np.testing.assert_allclose(result.T_method, result.T_parent_child, atol=1e-12)
+
+    def test_it_comes_back_from_files_that_have_it(self):
+        result = hec.calibrate(*streams(), reference="B1")
+        document = result.to_dict()
+        loaded = hec.Calibration.from_dict(document)
+        np.testing.assert_array_equal(loaded.T_method, result.T_method)
+        del document["T_method"]
+        assert hec.Calibration.from_dict(document).T_method is None

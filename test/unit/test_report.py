@@ -183,7 +183,7 @@ def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
     verdict = page.text[: page.text.index("Pose of camera in lidar")]
     assert "Status: unobservable" in verdict
     assert "does not reveal z" in verdict
-    assert "What to do: turning about z is fine" in verdict
+    assert "What to do: rotation about z is fine" in verdict
     assert "static_transform_publisher" not in page.text
     assert "z: unknown, unobservable" in {a.get("aria-label") for a in page.all("div")}
 

@@ -10,9 +10,9 @@ from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_a
 from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
-from hand_eye_calib.checks.agreement import check_streams
+from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.checks.stream_checks import (
+from hand_eye_calib.checks.streams import (
     check_stamps,
     check_stream,
     frozen_share,

@@ -1,0 +1,230 @@
+"""The stream checks: whether two streams can be of sensors on one rigid body, and if not, what is
+wrong with them.
+
+1. Each stream alone (:mod:`~hand_eye_calib.checks.streams`).
+2. The angular rates (:mod:`~hand_eye_calib.alignment.angular_rates`): whether they agree at any
+   clock offset. Reordered or inverted quaternions, units and axes do not affect them.
+3. The whole motion (:mod:`~hand_eye_calib.checks.hypotheses`): which usual mistake, undone, makes
+   the streams agree.
+4. Under the hypothesis that holds: clock offset, scale, and directions that the motion hides.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hand_eye_calib.alignment.angular_rates import (
+    MIN_VARIATION,
+    NO_CORRELATION,
+    Correlation,
+    correlate_rates,
+)
+from hand_eye_calib.alignment.motions import pairs_over
+from hand_eye_calib.alignment.scale import Scale, estimate_scale
+from hand_eye_calib.alignment.similarity import SimilarityFit
+from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.lever_arm import LeverArms
+from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
+from hand_eye_calib.checks.hypotheses import (
+    LAGS_S,
+    MAX_PAIRS,
+    MIN_PAIRS,
+    Explanation,
+    StreamPair,
+    explain,
+)
+from hand_eye_calib.checks.streams import check_frozen, check_stamps, check_stream
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+
+# Time offsets (s) from which on a warning, a note is given; a note also needs this many standard
+# deviations.
+_OFFSET_WARNING_S, _OFFSET_NOTE_S, _OFFSET_SIGMAS = 0.03, 0.005, 5.0
+
+_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
+_UNIT_TOLERANCE = 0.1
+
+# Shortest duration and smallest rotation with which the checks of a live session mean something.
+MIN_DURATION_S, MIN_ROTATION_RAD = 20.0, float(np.radians(30.0))
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """Result of the stream checks.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        The gravest first.
+    correlation : Correlation
+        Of the angular rates of both streams.
+    fit : SimilarityFit or None
+        The fit under the hypothesis that holds; None if none does.
+    rms_rotation : dict
+        Root mean square rotation over 3 s about each axis of the parent sensor, rad; empty if not
+        known.
+    """
+
+    findings: tuple[Finding, ...]
+    correlation: Correlation = NO_CORRELATION
+    fit: SimilarityFit | None = None
+    rms_rotation: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nothing speaks against calibrating with these streams as they are."""
+        return all(finding.severity is Severity.NOTE for finding in self.findings)
+
+
+def check_streams(
+    parent: Trajectory,
+    child: Trajectory,
+    time_offset_s: float = 0.0,
+    scale: float = 1.0,
+    max_gap_s: float = CalibratorConfig.max_gap,
+) -> CheckResult:
+    """Check two streams.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+    time_offset_s : float
+        Known offset: seconds that are added to the child's stamps.
+    scale : float
+        Known scale: factor of the child's lengths.
+    max_gap_s : float
+        Longest time between two poses that interpolation may bridge, in seconds.
+
+    Returns
+    -------
+    CheckResult
+    """
+    findings = _check_each(parent, child, max_gap_s)
+    if any(finding.severity is Severity.ERROR for finding in findings):
+        return CheckResult(gravest_first(findings))
+    streams = StreamPair(parent, child.shifted(time_offset_s).scaled(scale), max_gap_s)
+    correlation = correlate_rates(streams.parent, streams.child, max_gap_s)
+    aligned = streams
+    if correlation.is_clear:
+        aligned = replace(streams, child=streams.child.shifted(correlation.offset_s))
+    frozen = check_frozen(aligned.parent, aligned.child)
+    findings += frozen
+    explanation, reason = None, ""
+    try:
+        explanation = explain(aligned, thorough=correlation.is_clear)
+    except NotEnoughDataError as error:
+        reason = str(error)
+    if explanation is None or not explanation.holds:
+        if not correlation.is_clear:
+            # Nothing is said about the rates of a frozen stream.
+            findings += [] if frozen else [_rates_disagree(correlation)]
+        elif explanation is None:
+            findings.append(wording.too_short_to_compare(reason))
+        else:
+            findings += explanation.findings
+        return CheckResult(gravest_first(findings), correlation)
+    if not correlation.is_clear:
+        # Short recordings may not show the offset, and yet the streams agree at the given one.
+        correlation = replace(correlation, offset_s=0.0)
+    findings += explanation.findings
+    return _check_agreeing(streams, explanation, correlation, findings, time_offset_s, scale)
+
+
+def _check_each(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
+    findings = []
+    if min(len(parent), len(child)):
+        findings += check_stamps(parent.stamps_ns, child.stamps_ns)
+    findings += check_stream(parent, "parent", max_gap_s)
+    findings += check_stream(child, "child", max_gap_s)
+    return findings
+
+
+def _check_agreeing(
+    streams: StreamPair,
+    explanation: Explanation,
+    correlation: Correlation,
+    findings: list[Finding],
+    known_offset_s: float,
+    known_scale: float,
+) -> CheckResult:
+    """What else there is to say of streams that agree under a hypothesis."""
+    corrected = explanation.hypothesis.undo(streams)
+    offset = refine_time_offset(
+        corrected.parent, corrected.child, correlation, corrected.max_gap_s, explanation.fit
+    )
+    pose_pairs = synchronise(
+        corrected.parent, corrected.child.shifted(correlation.offset_s), corrected.max_gap_s
+    )
+    scale = estimate_scale(pose_pairs, start=explanation.fit)
+    rotations = _rotations(pose_pairs)
+    findings = [
+        *findings,
+        *_check_offset(offset, known_offset_s),
+        *_check_scale(scale, known_scale),
+        *_check_axes(rotations, explanation.fit.sigma_rotation),
+    ]
+    rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
+    return CheckResult(
+        gravest_first(findings),
+        correlation,
+        explanation.fit,
+        dict(zip("xyz", rms.tolist(), strict=True)),
+    )
+
+
+def can_check(parent: Trajectory, child: Trajectory) -> bool:
+    """Whether two streams last so long, and rotate so far, that the checks mean something: to be
+    asked during a session.
+    """
+    return min(stream.duration_s for stream in (parent, child)) >= MIN_DURATION_S and any(
+        se3.rotation_angle(stream.poses[0, :3, :3].T @ stream.poses[:, :3, :3]).max()
+        >= MIN_ROTATION_RAD
+        for stream in (parent, child)
+    )
+
+
+def _rates_disagree(correlation: Correlation) -> Finding:
+    if correlation.variation < MIN_VARIATION:
+        return wording.no_rotation()
+    return wording.unrelated_rates(correlation)
+
+
+def _check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
+    if abs(found.seconds) < max(_OFFSET_NOTE_S, _OFFSET_SIGMAS * found.sigma_s):
+        return []
+    is_large = abs(found.seconds) > _OFFSET_WARNING_S
+    severity = Severity.WARNING if is_large else Severity.NOTE
+    return [wording.time_offset(found, round(known_s + found.seconds, 4), severity)]
+
+
+def _check_scale(scale: Scale, known: float) -> list[Finding]:
+    if not scale.differs:
+        return []
+    for factor, unit in _UNITS.items():
+        if abs(scale.value / factor - 1.0) < _UNIT_TOLERANCE:
+            return [wording.units(scale, unit, round(known * factor, 9))]
+    return [wording.scale_differs(scale, round(known * scale.value, 4))]
+
+
+def _rotations(pose_pairs: PosePairs) -> FloatArray:
+    """Rotations (K, 3, 3) of the parent over 3 s, or less if there are too few of those."""
+    motions = (pairs_over(pose_pairs, lag_s, MAX_PAIRS) for lag_s in LAGS_S)
+    # There are enough over one of the lags: the fit is over it.
+    pairs = next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
+    return pairs.Ts_parenti_parentj[:, :3, :3]
+
+
+def _check_axes(rotations: FloatArray, sigma_rotation: float) -> list[Finding]:
+    """A note if nearly all rotation is about one axis."""
+    lever_arms = LeverArms.of(rotations - np.eye(3))
+    hidden = lever_arms.hidden_axes(sigma_rotation**2 * np.eye(3))
+    if not hidden:
+        return []
+    direction = lever_arms.directions[:, 0]
+    main = int(np.argmax(np.abs(direction)))
+    return [wording.one_axis(direction * np.sign(direction[main]), hidden, "xyz"[main])]

@@ -1,0 +1,369 @@
+"""Hypotheses about what is wrong with two streams: each undoes one usual mistake, and the fit that
+follows shows whether the streams agree without it.
+
+For every motion pair and any X, both sensors rotate through the same angle and move by the same
+distance along the same screw axis. The robust fit of :mod:`~hand_eye_calib.alignment.similarity`
+measures how much of the motion breaks this. The plain hypothesis, nothing is wrong, is kept unless
+another leaves several times less of the motion unexplained.
+
+Two inverted streams agree with each other as well as two correct ones: X is then the pose of one
+world in the other. Path lengths tell them apart. The path of the world's origin, seen from a
+rotating sensor, is longer than the sensor's own path, and the lever arm between the worlds is
+longer than that between the sensors.
+"""
+
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hand_eye_calib.alignment.motions import pairs_over
+from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.findings import Confidence, Finding
+from hand_eye_calib.checks.streams import coarse_poses
+from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.pairing.synchronise import synchronise
+from hand_eye_calib.solvers.separable import align_rotation_vectors
+
+# Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree.
+LAGS_S = (3.0, 1.0, 0.4)
+MAX_PAIRS, _MAX_PAIRS_FOR_AXES = 400, 120
+MIN_PAIRS = 12
+
+# A hypothesis holds if it leaves at most this share of the motion unexplained. It replaces the
+# plain one if it leaves this many times less.
+HOLDS, _DECISIVE = 0.12, 3.0
+
+# Largest unexplained share that noise can cause, in streams whose angular rates clearly agree.
+_NOISY = 0.3
+
+# Among hypotheses that are about equally good the simpler one is taken, and the child's rather than
+# the parent's. A scale farther from 1 than this (logarithm) makes one less simple.
+_ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
+
+# Evidence (in logarithms of lengths) from which on streams are called inverted, and likely so.
+_INVERTED, _LIKELY_INVERTED = 0.3, 1.0
+_PATH_STEP_S = 0.3
+
+# Two frames are one if they are this close to each other (m, rad).
+_SAME_FRAME_M, _SAME_FRAME_RAD = 0.01, 0.01
+
+
+@dataclass(frozen=True)
+class StreamPair:
+    """Two streams on about one clock, and the longest gap to interpolate across."""
+
+    parent: Trajectory
+    child: Trajectory
+    max_gap_s: float
+
+    def pairs(self, lag_s: float, max_pairs: int) -> MotionPairs:
+        """Motion pairs over ``lag_s`` seconds.
+
+        Raises
+        ------
+        NotEnoughDataError
+            If the streams have too few in common.
+        """
+        pairs = pairs_over(synchronise(self.parent, self.child, self.max_gap_s), lag_s, max_pairs)
+        if len(pairs) < MIN_PAIRS:
+            raise NotEnoughDataError(
+                f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
+            )
+        return pairs
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A mistake that can be undone.
+
+    Attributes
+    ----------
+    code : str
+        Code of its finding; empty for the plain hypothesis.
+    stream : str
+        The stream with the mistake: "parent", "child" or "both".
+    correct : callable
+        Gives the trajectory without the mistake.
+    complexity : int
+        Number of things that are wrong under it.
+    detail : str
+        For wrong axes, what (x, y, z) should be.
+    """
+
+    code: str
+    stream: str
+    correct: Callable[[Trajectory], Trajectory]
+    complexity: int = 1
+    detail: str = ""
+
+    def undo(self, streams: StreamPair) -> StreamPair:
+        """Both streams without the mistake."""
+        parent, child = streams.parent, streams.child
+        return replace(
+            streams,
+            parent=parent if self.stream == "child" else self.correct(parent),
+            child=child if self.stream == "parent" else self.correct(child),
+        )
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A hypothesis with its fit.
+
+    Attributes
+    ----------
+    hypothesis : Hypothesis
+    fit : SimilarityFit
+    findings : tuple of Finding
+    limit : float
+        Unexplained share below which it holds.
+    """
+
+    hypothesis: Hypothesis
+    fit: SimilarityFit
+    findings: tuple[Finding, ...] = ()
+    limit: float = HOLDS
+
+    @property
+    def holds(self) -> bool:
+        """Whether the streams agree under the hypothesis."""
+        return self.fit.unexplained < self.limit
+
+
+def _reordered(trajectory: Trajectory) -> Trajectory:
+    """Quaternions read as x y z w that were written w x y z, put right."""
+    quats = np.roll(se3.to_quat_xyzw(trajectory.poses), -1, axis=1)
+    return Trajectory(trajectory.stamps_ns, se3.from_quat_xyzw(trajectory.poses[:, :3, 3], quats))
+
+
+def _inverted(trajectory: Trajectory) -> Trajectory:
+    return Trajectory(trajectory.stamps_ns, se3.inverse(trajectory.poses))
+
+
+def _with_axes(matrix: FloatArray, trajectory: Trajectory) -> Trajectory:
+    poses = trajectory.poses.copy()
+    poses[:, :3, 3] = poses[:, :3, 3] @ matrix.T
+    return Trajectory(trajectory.stamps_ns, poses)
+
+
+_MIRROR = -np.eye(3)
+_PLAIN = Hypothesis("", "child", lambda trajectory: trajectory, 0)
+_BOTH_INVERTED = Hypothesis("inverse_both", "both", _inverted)
+_USUAL = [
+    Hypothesis(code, stream, correct)
+    for stream in ("child", "parent")
+    for code, correct in (
+        ("quaternion_order", _reordered),
+        ("inverse", _inverted),
+        ("left_handed", functools.partial(_with_axes, _MIRROR)),
+    )
+]
+
+
+@functools.cache
+def _axis_hypotheses() -> list[Hypothesis]:
+    """All permutations and flips of the axes of the positions, except the mirror of all three; the
+    simplest first.
+    """
+    hypotheses = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            n_changed = int(3 - np.isclose(matrix.diagonal(), 1.0).sum())
+            if n_changed == 0 or np.array_equal(matrix, _MIRROR):
+                continue
+            detail = " ".join(
+                f"{'-' * (sign < 0)}{'xyz'[column]}"
+                for column, sign in zip(order, signs, strict=True)
+            )
+            hypotheses += [
+                Hypothesis("axes", stream, functools.partial(_with_axes, matrix), n_changed, detail)
+                for stream in ("child", "parent")
+            ]
+    return sorted(hypotheses, key=lambda hypothesis: hypothesis.complexity)
+
+
+def explain(streams: StreamPair, thorough: bool) -> Explanation:
+    """Find the mistake that explains the streams, or that none does.
+
+    Parameters
+    ----------
+    streams : StreamPair
+    thorough : bool
+        The angular rates agree, so that it pays to try wrong axes, too. They are many and tried at
+        most twice.
+
+    Returns
+    -------
+    Explanation
+
+    Raises
+    ------
+    NotEnoughDataError
+        If the streams have too few motions in common.
+    """
+    failed: list[tuple[float, Explanation]] = []
+    for lag_s in LAGS_S:
+        try:
+            chosen = _plain_or_usual(streams, lag_s)
+        except NotEnoughDataError as error:
+            too_few = error
+            continue
+        if not chosen.holds and thorough and not failed:
+            chosen = _or_other_axes(chosen, streams, lag_s)
+        if chosen.holds:
+            return _attribute(chosen, streams, lag_s)
+        # Jumps spoil long motions more than short ones.
+        failed.append((lag_s, chosen))
+    if not failed:
+        raise too_few
+    lag_s, best = min(failed, key=lambda tried: tried[1].fit.unexplained)
+    if thorough and lag_s != failed[0][0]:
+        best = _or_other_axes(best, streams, lag_s)
+        if best.holds:
+            return _attribute(best, streams, lag_s)
+    unexplained = best.fit.unexplained
+    if thorough and unexplained < _NOISY:
+        return replace(best, findings=(wording.noisy(unexplained),), limit=_NOISY)
+    return replace(best, findings=(wording.not_one_body(unexplained, HOLDS),))
+
+
+def _plain_or_usual(streams: StreamPair, lag_s: float) -> Explanation:
+    plain = _fitted(_PLAIN, streams, lag_s)
+    if plain.fit.unexplained < EXPLAINED:
+        return plain
+    usual = _simplest_of_the_best([_fitted(hypothesis, streams, lag_s) for hypothesis in _USUAL])
+    return usual if _is_decisive(plain, usual) else plain
+
+
+def _or_other_axes(plain: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+    """The explanation by wrong axes if it is decisive, otherwise the given one."""
+    rotation = _agreed_rotation(streams, lag_s)
+    if rotation is None:
+        return plain
+    start = replace(plain.fit, T_parent_child=se3.from_rotation_translation(rotation, np.zeros(3)))
+    axes = _simplest_of_the_best(
+        [
+            _fitted(hypothesis, streams, lag_s, _MAX_PAIRS_FOR_AXES, start)
+            for hypothesis in _axis_hypotheses()
+        ]
+    )
+    return axes if _is_decisive(plain, axes) else plain
+
+
+def _fitted(
+    hypothesis: Hypothesis,
+    streams: StreamPair,
+    lag_s: float,
+    max_pairs: int = MAX_PAIRS,
+    start: SimilarityFit | None = None,
+) -> Explanation:
+    pairs = hypothesis.undo(streams).pairs(lag_s, max_pairs)
+    return Explanation(hypothesis, fit_similarity(pairs, start=start))
+
+
+def _agreed_rotation(streams: StreamPair, lag_s: float) -> FloatArray | None:
+    """The rotation X on which the rotations alone agree, or None: wrong axes of the positions do
+    not affect them.
+    """
+    pairs = streams.pairs(lag_s, MAX_PAIRS)
+    rotation = align_rotation_vectors(pairs)
+    T_rotation = se3.from_rotation_translation(rotation, np.zeros(3))
+    errors = np.linalg.norm(pairs.rotation_residuals(T_rotation), axis=1)
+    angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
+    rms_rotation = np.sqrt(np.mean(angles**2))
+    return rotation if np.median(errors) < 2 * HOLDS * rms_rotation else None
+
+
+def _simplest_of_the_best(explanations: Sequence[Explanation]) -> Explanation:
+    limit = _ABOUT_EQUAL * min(explanation.fit.unexplained for explanation in explanations)
+    best = [explanation for explanation in explanations if explanation.fit.unexplained <= limit]
+    return min(best, key=_complexity)
+
+
+def _complexity(explanation: Explanation) -> tuple[int, bool]:
+    """Number of things that would have to be wrong; for equal numbers, the child's come first."""
+    odd_scale = abs(np.log(explanation.fit.scale)) > _ODD_SCALE
+    hypothesis = explanation.hypothesis
+    return hypothesis.complexity + int(odd_scale), hypothesis.stream == "parent"
+
+
+def _is_decisive(plain: Explanation, rival: Explanation) -> bool:
+    return rival.holds and _DECISIVE * rival.fit.unexplained < plain.fit.unexplained
+
+
+def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+    """The explanation with its finding, after deciding by path lengths which stream is inverted, or
+    both: the fits do not differ.
+    """
+    hypothesis = explanation.hypothesis
+    if hypothesis.code not in ("", "inverse"):
+        return replace(explanation, findings=(_finding(hypothesis),))
+    evidence, inverted_fit = _evidence_for_inverse(hypothesis.undo(streams), explanation.fit, lag_s)
+    if evidence < _INVERTED:
+        if not hypothesis.code:
+            return explanation
+        finding = wording.inverse(hypothesis.stream, _confidence(-evidence, _INVERTED))
+        return replace(explanation, findings=(finding,))
+    if hypothesis.code:
+        other = "parent" if hypothesis.stream == "child" else "child"
+        finding = wording.inverse(other, _confidence(evidence, _INVERTED))
+        return Explanation(Hypothesis("inverse", other, _inverted), inverted_fit, (finding,))
+    finding = wording.inverse_both(_confidence(evidence, _LIKELY_INVERTED))
+    return Explanation(_BOTH_INVERTED, inverted_fit, (finding,))
+
+
+def _finding(hypothesis: Hypothesis) -> Finding:
+    if hypothesis.code == "axes":
+        return wording.axes(hypothesis.stream, hypothesis.detail)
+    make = {"quaternion_order": wording.quaternion_order, "left_handed": wording.left_handed}
+    return make[hypothesis.code](hypothesis.stream)
+
+
+def _confidence(evidence: float, likely: float) -> Confidence:
+    return Confidence.LIKELY if evidence > likely else Confidence.POSSIBLE
+
+
+def _evidence_for_inverse(
+    streams: StreamPair, fit: SimilarityFit, lag_s: float
+) -> tuple[float, SimilarityFit]:
+    """Sum of logarithms by which paths and lever arm are shorter with both streams inverted, and
+    the fit then.
+    """
+    inverted = _fitted(_BOTH_INVERTED, streams, lag_s).fit
+    by_paths = sum(
+        np.log(_path_length(stream) / _path_length(_inverted(stream)))
+        for stream in (streams.parent, streams.child)
+    )
+    if _is_identity(fit) or _is_identity(inverted):
+        # One world for both streams: the lever arm between the worlds says nothing.
+        return float(by_paths), inverted
+    lever_arms = [
+        max(float(np.linalg.norm(f.T_parent_child[:3, 3])), 3 * f.sigma_translation, 1e-3)
+        for f in (fit, inverted)
+    ]
+    return float(by_paths + 0.5 * np.log(lever_arms[0] / lever_arms[1])), inverted
+
+
+def _is_identity(fit: SimilarityFit) -> bool:
+    """Whether a fit's transform differs from the identity by no more than noise."""
+    T = fit.T_parent_child
+    if np.linalg.norm(T[:3, 3]) > max(_SAME_FRAME_M, 3 * fit.sigma_translation):
+        return False
+    max_angle = max(_SAME_FRAME_RAD, 3 * fit.sigma_rotation)
+    return bool(se3.rotation_angle(T[:3, :3]) < max_angle)
+
+
+def _path_length(trajectory: Trajectory) -> float:
+    """Length of the path, in coarse steps so that noise does not add to it."""
+    positions = coarse_poses(trajectory, _PATH_STEP_S)[:, :3, 3]
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()) + 1e-9

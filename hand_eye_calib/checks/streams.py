@@ -1,0 +1,232 @@
+"""Checks of a single stream, and of the stamps of two."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.findings import Finding
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.leaps import find_leap
+
+# Shortest step (s) of a path length: over shorter steps it would be the length of the noise.
+_PATH_STEP_S = 0.2
+
+# An interval is a gap if it is longer than the limit and than this many median intervals.
+_GAP_INTERVALS = 5.0
+
+# A step is a jump if it differs from the steps around it by this many times the median difference,
+# and by this many times a fast step. Jumps matter from this share of the steps on.
+_JUMP_SIGMAS, _JUMP_STEPS = 12.0, 3.0
+_MIN_JUMPS = 0.002
+
+# A stream is frozen if its pose is repeated to the last digits for this long (s) and at least this
+# many times, while the other stream moves.
+_FROZEN_S, _FROZEN_POSES = 1.0, 10
+_SAME_POSE = 1e-12
+
+# Largest share of the time in which a stream may be frozen.
+_MAX_FROZEN = 0.02
+
+# Motion (rad, m) from which on a stream moves.
+_MOVES_RAD, _MOVES_M = 0.02, 0.02
+
+# Stamps of a date are around 1.7e18 ns. Read in another unit they are off by powers of a thousand.
+_STAMP_UNITS = {1e3: "microseconds", 1e6: "milliseconds", 1e9: "seconds"}
+_SAME_TIME = 0.2
+_DATE_NS = 1e17
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamSummary:
+    """Size and motion of a stream.
+
+    Attributes
+    ----------
+    poses : int
+    duration_s : float
+    rate_hz : float
+        Of the median interval.
+    longest_interval_s : float
+    path_m : float
+        Path length.
+    rotation_rad : float
+        Sum of all rotation angles.
+    """
+
+    poses: int
+    duration_s: float
+    rate_hz: float
+    longest_interval_s: float
+    path_m: float
+    rotation_rad: float
+
+
+def summarise(trajectory: Trajectory) -> StreamSummary:
+    """StreamSummary of a trajectory of at least two poses."""
+    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
+    coarse = coarse_poses(trajectory, max(_PATH_STEP_S, float(np.median(intervals_s))))
+    steps = np.linalg.norm(np.diff(coarse[:, :3, 3], axis=0), axis=1)
+    angles = se3.rotation_angle(np.swapaxes(coarse[:-1, :3, :3], 1, 2) @ coarse[1:, :3, :3])
+    return StreamSummary(
+        poses=len(trajectory),
+        duration_s=trajectory.duration_s,
+        rate_hz=float(1.0 / np.median(intervals_s)),
+        longest_interval_s=float(intervals_s.max()),
+        path_m=float(steps.sum()),
+        rotation_rad=float(angles.sum()),
+    )
+
+
+def coarse_poses(trajectory: Trajectory, step_s: float) -> FloatArray:
+    """Poses (M, 4, 4): the first in every step of ``step_s`` seconds that has one."""
+    steps = (trajectory.stamps_ns - trajectory.stamps_ns[0]) // round(step_s * 1e9)
+    return trajectory.poses[np.unique(steps, return_index=True)[1]]
+
+
+def tidy(
+    stamps_ns: IntArray,
+    translations: FloatArray,
+    quats_xyzw: FloatArray,
+    stream: str,
+    **frames: str,
+) -> tuple[Trajectory, list[Finding]]:
+    """A Trajectory from poses in the order of their arrival, and findings about that order.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    translations : (N, 3) array
+    quats_xyzw : (N, 4) array
+    stream : str
+        "parent" or "child".
+    **frames
+        Frame names of the Trajectory.
+
+    Returns
+    -------
+    trajectory : Trajectory
+        Sorted; of poses with the same stamp the first.
+    findings : list of Finding
+    """
+    stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
+    sorted_ns, first = np.unique(stamps_ns, return_index=True)
+    findings = []
+    if n_repeated := len(stamps_ns) - len(sorted_ns):
+        findings.append(wording.duplicates(stream, n_repeated, len(stamps_ns)))
+    if n_backwards := int((np.diff(stamps_ns) < 0).sum()):
+        findings.append(wording.disorder(stream, n_backwards))
+    trajectory = Trajectory.from_quat_xyzw(
+        sorted_ns, np.asarray(translations)[first], np.asarray(quats_xyzw)[first], **frames
+    )
+    return trajectory, findings
+
+
+def check_stream(
+    trajectory: Trajectory, stream: str, max_gap_s: float = CalibratorConfig.max_gap
+) -> list[Finding]:
+    """Findings about one stream: too short, a leap in time, gaps, jumps.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    stream : str
+        "parent" or "child".
+    max_gap_s : float
+
+    Returns
+    -------
+    list of Finding
+    """
+    if len(trajectory) < 4:
+        return [wording.too_few_poses(stream, len(trajectory))]
+    if leap := find_leap(trajectory.stamps_ns):
+        return [wording.leaping_stamps(stream, leap)]
+    findings = []
+    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
+    gaps = intervals_s > max(max_gap_s, _GAP_INTERVALS * float(np.median(intervals_s)))
+    if gaps.any():
+        share = float(intervals_s[gaps].sum() / intervals_s.sum())
+        longest_s = float(intervals_s.max())
+        findings.append(wording.gaps(stream, int(gaps.sum()), longest_s, share))
+    share = float(_jumps(trajectory).mean())
+    if share > _MIN_JUMPS:
+        findings.append(wording.jumps(stream, share))
+    return findings
+
+
+def _jumps(trajectory: Trajectory) -> BoolArray:
+    """Mask (N - 1,) of steps that are far from those around them."""
+    interval_s = np.diff(trajectory.stamps_ns) * 1e-9
+    poses = trajectory.poses
+    translations = np.einsum("kji,kj->ki", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
+    rotations = se3.rotation_log(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+    jumps = np.zeros(len(interval_s), dtype=bool)
+    for steps in (translations, rotations):
+        velocities = steps / interval_s[:, None]
+        padded = np.concatenate([velocities[2:0:-1], velocities, velocities[-2:-4:-1]])
+        around = np.median([padded[shift : shift + len(velocities)] for shift in range(5)], axis=0)
+        excess = np.linalg.norm(velocities - around, axis=1)
+        speed = np.linalg.norm(velocities, axis=1)
+        jumps |= excess > np.maximum(
+            _JUMP_SIGMAS * (float(np.median(excess)) + 1e-12),
+            _JUMP_STEPS * np.quantile(speed, 0.9),
+        )
+    return jumps
+
+
+def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
+    """Findings about streams that repeat their pose while the other moves, on one clock."""
+    shares = {"parent": frozen_share(parent, child), "child": frozen_share(child, parent)}
+    return [wording.frozen(name, share) for name, share in shares.items() if share > _MAX_FROZEN]
+
+
+def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
+    """Share of the time in which a stream repeats its pose to the last digits while another one, on
+    the same clock, moves.
+    """
+    same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME_POSE
+    edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(int)))
+    frozen_ns = 0
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        from_ns, until_ns = (int(trajectory.stamps_ns[index]) for index in (start, end))
+        if end - start < _FROZEN_POSES or until_ns - from_ns < _FROZEN_S * 1e9:
+            continue
+        during = other.poses[(other.stamps_ns >= from_ns) & (other.stamps_ns <= until_ns)]
+        if len(during) < 2:
+            continue
+        distance = np.linalg.norm(during[:, :3, 3] - during[0, :3, 3], axis=1).max()
+        angle = se3.rotation_angle(during[0, :3, :3].T @ during[:, :3, :3]).max()
+        if distance > _MOVES_M or angle > _MOVES_RAD:
+            frozen_ns += until_ns - from_ns
+    return frozen_ns * 1e-9 / max(trajectory.duration_s, 1e-9)
+
+
+def check_stamps(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> list[Finding]:
+    """Finding about stamps in another unit than those of the other stream, or none.
+
+    Parameters
+    ----------
+    parent_stamps_ns, child_stamps_ns : (N,) int64 arrays
+        Stamps as read, as if in nanoseconds.
+
+    Returns
+    -------
+    list of Finding
+    """
+    stamps = {
+        "parent": float(np.median(parent_stamps_ns)),
+        "child": float(np.median(child_stamps_ns)),
+    }
+    early, late = sorted(stamps, key=lambda name: stamps[name])
+    for factor, unit in _STAMP_UNITS.items():
+        if (
+            stamps[early] > 0
+            and stamps[late] > _DATE_NS
+            and abs(np.log10(stamps[late] / (stamps[early] * factor))) < _SAME_TIME
+        ):
+            return [wording.stamp_unit(early, late, unit, factor)]
+    return []
