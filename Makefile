@@ -1,14 +1,14 @@
-# Everything a newcomer or CI types. Needs python3 (3.11 or newer) and pip; the rest is installed into .venv here.
-#   make demo          simulate a drive, calibrate it from its bag and on the live node, compare with the truth
+# Needs python3 (3.11 or newer) and pip; everything else is installed into .venv here.
+#   make demo          simulate a drive, calibrate it offline and on the live node, compare with the truth
 #   make test          the whole test suite
-#   make test-oldest   the same, slow tests left out, on the oldest supported versions
+#   make test-oldest   the same without slow tests, on the oldest supported versions
 #   make lint          style and types
-#   make coverage      the test suite with the lines it leaves out
-#   make paper DATA=x  every figure and table of the paper from its published data in folder x, into reproduced/
-#   make coverage-study DATA=x  errors over the least possible and what the sigmas hold, on simulated and real recordings
-#   make bench         benchmarks against the baseline; about two minutes (BENCH_ARGS=--full: four)
-#   make bench-node    load, soak and crashes of the node, measured; about four minutes
-#   make clean         remove everything the above made
+#   make coverage      the test suite, and the lines that no test runs
+#   make paper DATA=x  every figure and table of the paper from its published data in x, to reproduced/
+#   make coverage-study DATA=x  errors over their lower bound, and what the stated sigmas are worth
+#   make bench         benchmarks against the baseline; two minutes (BENCH_ARGS=--full: four)
+#   make bench-node    load, soak and crashes of the node; about four minutes
+#   make clean         remove everything that the targets above made
 # PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest.
 PYTHON ?= python3
 PYTEST_ARGS ?=
@@ -20,6 +20,7 @@ DEMO_ARGS ?= --out demo_output
 
 VENV := .venv
 OLDEST := .venv-oldest
+PIP_FLAGS := --quiet --disable-pip-version-check
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
 .PHONY: help demo test test-oldest coverage coverage-study paper bench bench-node lint format clean
@@ -30,7 +31,8 @@ help:
 demo: $(VENV)/.ready-demo
 	$(VENV)/bin/hand_eye_calib demo $(DEMO_ARGS)
 
-# One thread per process: small matrices gain nothing from more, and the last digit does not depend on the number of cores.
+# One thread per process: small matrices gain nothing from more, and results do not depend on the
+# number of cores.
 test test-oldest coverage coverage-study paper: export OMP_NUM_THREADS := 1
 test test-oldest coverage coverage-study paper: export OPENBLAS_NUM_THREADS := 1
 
@@ -41,13 +43,14 @@ test-oldest: $(OLDEST)/.ready-test
 	$(OLDEST)/bin/python -m pytest -m 'not slow' $(PYTEST_ARGS)
 
 coverage: $(VENV)/.ready-test
-	$(VENV)/bin/python -m pytest --cov=hand_eye_calib --cov-report=term:skip-covered $(PYTEST_ARGS)
+	$(VENV)/bin/python -m pytest --cov --cov-report=term:skip-covered $(PYTEST_ARGS)
 
 paper: $(VENV)/.ready-test
 	$(VENV)/bin/python -m reproduction all $(if $(DATA),--data-folder $(DATA)) $(PAPER_ARGS)
 
 coverage-study: $(VENV)/.ready-test
-	$(VENV)/bin/python -m reproduction.coverage --page docs/coverage.md $(if $(DATA),--data-folder $(DATA)) $(STUDY_ARGS)
+	$(VENV)/bin/python -m reproduction.coverage --page docs/coverage.md \
+		$(if $(DATA),--data-folder $(DATA)) $(STUDY_ARGS)
 
 bench: $(VENV)/.ready-bench
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py $(BENCH_ARGS)
@@ -65,11 +68,13 @@ format: $(VENV)/.ready-test
 	$(VENV)/bin/ruff format .
 
 clean:
-	rm -rf $(VENV) $(OLDEST) build install log demo_output reproduced *.egg-info .pytest_cache .hypothesis .ruff_cache .mypy_cache .coverage
-	find hand_eye_calib reproduction test benchmarks launch -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) $(OLDEST) build install log demo_output reproduced *.egg-info .coverage*
+	rm -rf .pytest_cache .hypothesis .ruff_cache .mypy_cache
+	find hand_eye_calib reproduction test benchmarks launch -name __pycache__ -type d -prune \
+		-exec rm -rf {} +
 
-# The package is installed editable, so that what runs and what is tested is this work tree. A stamp is touched last: set-up
-# is repeated when it was interrupted or when one of the files that decide on it is newer.
+# The package is installed editable: what runs and what is tested is this work tree. A stamp file is
+# touched last, so that set-up is repeated if it was interrupted or a file it depends on is newer.
 $(VENV)/.ready-demo: EXTRAS := ros
 $(VENV)/.ready-test: EXTRAS := ros,cluster,test,lint
 $(OLDEST)/.ready-test: EXTRAS := ros,cluster,test
@@ -78,11 +83,11 @@ $(OLDEST)/.ready-test: requirements/oldest.txt
 
 # What the benchmarks compare with, and nothing else needs.
 $(VENV)/.ready-bench: $(VENV)/.ready-test requirements/bench.txt
-	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --requirement requirements/bench.txt
+	@$(VENV)/bin/python -m pip install $(PIP_FLAGS) --requirement requirements/bench.txt
 	@touch $@
 
 $(VENV)/.ready-demo $(VENV)/.ready-test $(OLDEST)/.ready-test: $(SETUP_FILES)
 	@PYTHON="$(PYTHON)" sh requirements/make_venv.sh $(@D)
 	@echo "installing hand_eye_calib with [$(EXTRAS)] into $(@D)"
-	@$(@D)/bin/python -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable ".[$(EXTRAS)]"
+	@$(@D)/bin/python -m pip install $(PIP_FLAGS) $(CONSTRAINTS) --editable ".[$(EXTRAS)]"
 	@touch $@

@@ -64,6 +64,7 @@ setup(
             "hypothesis>=6.98",
             "packaging",
             "pytest>=7.4",
+            "pytest-cov>=5",
             "wheel",
         ],
         "lint": ["mypy==2.4.1", "ruff==0.17.5", "types-PyYAML"],

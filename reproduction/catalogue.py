@@ -9,7 +9,7 @@ from reproduction import (
     conclusions,
     figures,
     findings,
-    past_the_paper,
+    hindsight,
     repeats,
     runner,
     statistics,
@@ -76,7 +76,7 @@ def _artefacts():
     found["conclusions"] = Artefact("conclusions", everything, conclusions.write)
     found["findings"] = Artefact("findings", everything, findings.write)
     found["adaptive"] = Artefact(
-        "adaptive", [], lambda results: past_the_paper.write("adaptive", results)
+        "adaptive", [], lambda results: hindsight.write("adaptive", results)
     )
     found["repeats"] = Artefact(
         "repeats", [], lambda results: repeats.write("repeats", results), ("published",)

@@ -15,6 +15,7 @@ from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.main import exit_code_of
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import ConfigError
+from reproduction.writing import put_into_page
 
 _SILENT_S = 2.0
 
@@ -31,6 +32,8 @@ EXPERIMENTS = {
     "unlike": "study: simulations unlike the paper's (--data simulated)",
     "all": "all figures and tables of the paper, its conclusions and our findings",
 }
+
+STUDIES = ("adaptive", "repeats", "unlike")
 
 _EPILOG = (
     "\n".join(f"{name:<11}{about}" for name, about in EXPERIMENTS.items())
@@ -94,6 +97,12 @@ def add_arguments(parser):
         help="directory for the files. Default: reproduced",
     )
     parser.add_argument(
+        "--page",
+        metavar="FILE",
+        type=Path,
+        help="put the text of a study into this Markdown page, between its marked lines",
+    )
+    parser.add_argument(
         "--jobs",
         type=int,
         metavar="N",
@@ -110,11 +119,17 @@ def run(arguments):
     jobs = _cores() if arguments.jobs is None else arguments.jobs
     if jobs < 1:
         raise ConfigError(f"--jobs must be at least 1; got {jobs}")
+    if arguments.page is not None and arguments.id not in STUDIES:
+        raise ConfigError(f"--page is for {', '.join(STUDIES)}; got {arguments.id}")
     experiment = Experiment(arguments.id, source, theirs)
     if experiment.left_out:
         note(f"left out, since they need the published data: {', '.join(experiment.left_out)}")
     with _progress(len(experiment.cells) + len(experiment.artefacts)) as advance:
         results, files = experiment.run(arguments.out, jobs, advance, advance)
+    if arguments.page is not None:
+        put_into_page(
+            arguments.page, arguments.id, (arguments.out / f"{arguments.id}.md").read_text()
+        )
     document = _document(arguments, results, files)
     print(
         json.dumps(document, indent=2, allow_nan=False)

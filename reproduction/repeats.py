@@ -95,9 +95,9 @@ def write(name, results):
         _ratio_table(ratios),
         "All sets and axes together:",
         _pooled_table(ratios),
-        "# Against the rectified ground truth of KITTI",
-        f"Every z above {_SUSPICIOUS:g} has a reason beside it, from the same axis: how far the "
-        "thirds of the drive scatter, and what other references (DNLO) say.",
+        "### Against the rectified ground truth of KITTI",
+        f"Every axis whose error is above {_SUSPICIOUS:g} sigma, with a reason from the scatter of the "
+        f"thirds and from other references (DNLO). {name}_truth.csv has every axis.",
         _truth_table(truths),
     ]
     paths = [
@@ -323,10 +323,10 @@ def _reason(error, sigma, of_thirds, of_others):
         abs(error) < _SUSPICIOUS * reach / np.sqrt(len(of_others))
         or of_others.min() * of_others.max() < 0
     ):
-        return "depends on the reference: errors that last longer than the noise model knows"
+        return "depends on the reference: errors correlated for longer than the noise model assumes"
     return (
-        "the same in all thirds and with all references: wrong in the recordings as a whole, "
-        "or in the ground truth"
+        "the same in all thirds and with all references: an error of the whole recording or of "
+        "the ground truth"
     )
 
 
@@ -359,5 +359,6 @@ def _truth_table(truths):
             row["why"],
         ]
         for row in truths
+        if row["why"]
     ]
     return markdown_table(header, rows)

@@ -9,7 +9,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.noise import add_drift, add_gaussian, add_noise
 from hand_eye_calib.simulation.options import MIXTURE, DriveConfig
-from reproduction.past_the_paper import study_level
+from reproduction.hindsight import study_level
 from reproduction.published import Case
 from reproduction.runner import in_parallel
 from reproduction.writing import markdown_table, write_csv, write_text
@@ -130,9 +130,9 @@ SCENARIOS = {
     ),
     "handheld mixture": Scenario("the same with jumps and drift too", _mixture, handheld=True),
     "parent drifts": Scenario("3 % on the parent, not the child", _parent_drifts),
-    "random walks": Scenario("both odometries wander, rotation too", _random_walks),
-    "turning jumps": Scenario("jumps in rotation and place, both sensors", _turning_jumps),
-    "lever of 3 m": Scenario(
+    "random walks": Scenario("random walk of both odometries, rotation too", _random_walks),
+    "jumps with rotation": Scenario("jumps in rotation and position, both sensors", _turning_jumps),
+    "lever arm of 3 m": Scenario(
         "sensors up to 3 m apart per axis, white noise",
         _white(0.005),
         DriveConfig(poses=200, max_offset=3.0),
@@ -208,8 +208,8 @@ def write(name, results):
     header = [
         "scenario",
         "what it is",
-        "adaptive e_at (m)",
-        "e_aR (deg)",
+        "adaptive: translation (m)",
+        "rotation (deg)",
         "best fixed DNLO (m)",
         "adaptive / fixed",
         "auto / fixed",

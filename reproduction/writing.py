@@ -1,6 +1,9 @@
 """CSV and Markdown files."""
 
 import csv
+import re
+
+from hand_eye_calib.errors import InputError
 
 
 def write_csv(path, header, rows):
@@ -22,6 +25,37 @@ def markdown_table(header, rows):
     """A Markdown table of strings and numbers."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def put_into_page(page, name, text):
+    """Replace the tables of an earlier run in a Markdown page.
+
+    Parameters
+    ----------
+    page : pathlib.Path
+        Has the lines ``<!-- NAME: begin -->`` and ``<!-- NAME: end -->``, between which the text is
+        put.
+    name : str
+    text : str
+        Markdown; a heading at its beginning is left out, because the page has its own.
+
+    Raises
+    ------
+    InputError
+        If the page cannot be read or has no such lines.
+    """
+    begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->"
+    try:
+        before, found, rest = page.read_text(encoding="utf-8").partition(begin)
+        _, closed, after = rest.partition(end)
+        if not (found and closed):
+            raise InputError(
+                f"{page} has no lines {begin.strip()} and {end} to put the tables into"
+            )
+        body = re.sub(r"\A# .*\n+", "", text).strip()
+        page.write_text(f"{before}{begin}\n{body}\n\n{end}{after}", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot use {page}: {error.strerror}") from None
 
 
 def bullets(items):

@@ -1,17 +1,20 @@
-"""Repeats on real data, drives unlike the article's: on drives of our own."""
+"""The studies of repeats and of drives unlike the paper's, on drives of our own."""
 
 import csv
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 from published_data import data_folder
 
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from reproduction import repeats, unlike
 from reproduction.command import main
 from reproduction.recordings import RecordedSet, Recording, recorded_sets
+from reproduction.writing import put_into_page
 
 
 def recording(seed, noise=0.004):
@@ -22,7 +25,7 @@ def recording(seed, noise=0.004):
 
 def test_ratios_of_right_sigmas_lie_in_the_band():
     ratios = []
-    for seed in range(8):
+    for seed in range(5):
         found = RecordedSet("ours", (recording(seed),))
         ratios += repeats._set_ratios(found, "adaptive")
     assert {ratio.axis for ratio in ratios} == {"x", "y", "z", "roll", "pitch", "yaw"}
@@ -115,15 +118,31 @@ def test_commands_are_told_which_data_they_need(tmp_path, capsys):
     assert "--data published" in capsys.readouterr().err
 
 
+def test_a_page_must_have_the_marks_of_the_study(tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("no marks")
+    with pytest.raises(
+        InputError, match="has no lines <!-- unlike: begin --> and <!-- unlike: end"
+    ):
+        put_into_page(page, "unlike", "| table |")
+    with pytest.raises(InputError, match="absent.md: No such file"):
+        put_into_page(tmp_path / "absent.md", "unlike", "| table |")
+    assert page.read_text() == "no marks"
+    assert main(["fig4", "--data", "simulated", "--page", str(page)]) == 2
+    assert "--page is for adaptive, repeats, unlike; got fig4" in capsys.readouterr().err
+
+
 def test_unlike_writes_and_prints_its_table(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(unlike, "SCENARIOS", {"handheld": unlike.SCENARIOS["handheld"]})
-    assert (
-        main(
-            ["unlike", "--data", "simulated", "--runs", "2", "--jobs", "1", "--out", str(tmp_path)]
-        )
-        == 0
-    )
+    page = tmp_path / "page.md"
+    page.write_text("# Ours\n\n<!-- unlike: begin -->\nold\n<!-- unlike: end -->\n\nThe rest.\n")
+    command = ["unlike", "--data", "simulated", "--runs", "2", "--jobs", "1"]
+    assert main([*command, "--out", str(tmp_path), "--page", str(page)]) == 0
     assert "| handheld |" in capsys.readouterr().out
+    text = page.read_text()
+    assert text.startswith("# Ours\n\n<!-- unlike: begin -->\n\nMedians over 2 drives")
+    assert "old" not in text
+    assert re.search(r"\| handheld \|.*\n\n<!-- unlike: end -->\n\nThe rest\.\n$", text)
     with open(tmp_path / "unlike.csv", encoding="utf-8") as file:
         (row,) = csv.DictReader(file)
-    assert float(row["adaptive e_at (m)"]) < 0.05
+    assert float(row["adaptive: translation (m)"]) < 0.05
