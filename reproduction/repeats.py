@@ -96,8 +96,8 @@ def write(name, results):
         "All sets and axes together:",
         _pooled_table(ratios),
         "### Against the rectified ground truth of KITTI",
-        f"Every axis whose error is above {_SUSPICIOUS:g} sigma, with a reason from the scatter of the "
-        f"thirds and from other references (DNLO). {name}_truth.csv has every axis.",
+        f"Every axis whose error is above {_SUSPICIOUS:g} sigma, with a reason from the scatter of "
+        f"the thirds and from other references (DNLO). {name}_truth.csv has every axis.",
         _truth_table(truths),
     ]
     paths = [

@@ -61,8 +61,13 @@ def _document(row: Row) -> dict[str, object]:
         kind: {key: float(f"{value:.{_DIGITS}g}") for key, value in found.items()}
         for kind, found in row.cases.items()
     }
-    return {"table": row.table, "name": row.name, "method": row.method, "seconds": round(row.seconds, 4),
-            "cases": cases}  # fmt: skip
+    return {
+        "table": row.table,
+        "name": row.name,
+        "method": row.method,
+        "seconds": round(row.seconds, 4),
+        "cases": cases,
+    }
 
 
 def load(path: Path) -> dict[str, Row]:

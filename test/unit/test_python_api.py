@@ -63,10 +63,22 @@ class TestOptionsOfCalibrate:
             lambda config, parent, child: seen.append(config) or _Unsolved(),
         )
         given = dict(
-            method="dnl", reference="C7", backend="ipopt", threshold=0.25, min_inlier_fraction=0.125, min_pairs=4, max_pairs=77,
-            keyframe_min_translation=0.5, keyframe_min_rotation=0.25, keyframe_min_interval=2.0, max_gap=3.0, time_offset="estimate",
-            scale=2.0, parent_frame="lidar", child_frame="camera",
-        )  # fmt: skip
+            method="dnl",
+            reference="C7",
+            backend="ipopt",
+            threshold=0.25,
+            min_inlier_fraction=0.125,
+            min_pairs=4,
+            max_pairs=77,
+            keyframe_min_translation=0.5,
+            keyframe_min_rotation=0.25,
+            keyframe_min_interval=2.0,
+            max_gap=3.0,
+            time_offset="estimate",
+            scale=2.0,
+            parent_frame="lidar",
+            child_frame="camera",
+        )
         assert set(given) | {"prior"} == set(self.keywords())
         hec.calibrate(*streams(), **given, prior={"z": (1.85, 0.02)})
         (config,) = seen

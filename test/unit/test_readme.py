@@ -199,6 +199,21 @@ def test_make_targets_exist(page):
     assert mentioned <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
 
 
+def test_every_package_has_its_line():
+    table = re.findall(r"^\| `([a-z_]+(?:/|\.py))` \|", PAGES["docs/architecture.md"], re.MULTILINE)
+    source = ROOT / "hand_eye_calib"
+    found = [f"{path.parent.name}/" for path in source.glob("*/__init__.py")]
+    assert sorted(table) == sorted([*found, *(path.name for path in source.glob("*.py"))])
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_files_of_the_package_exist(page):
+    """Pages name files of the package from its root, such as ``solvers/ipopt.py``."""
+    names = re.findall(r"`([a-z_]+(?:/[a-z_]+)+\.py)(?::\d+)?`", PAGES[page])
+    folders = (ROOT, ROOT / "hand_eye_calib")
+    assert [name for name in names if not any((top / name).exists() for top in folders)] == []
+
+
 # Words that stand for something else here, and the field's word for it.
 UNWANTED = {
     "waiting room": "buffer",
