@@ -436,11 +436,11 @@ def _store(task: Task, outcome: Outcome, page: str | None, directory: Path) -> N
 
 
 def _write(path: Path, document: Any) -> None:
-    from hand_eye_calib.io.results import replace_file
+    from hand_eye_calib.io.files import write_atomically
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
+        write_atomically({path: json.dumps(document, indent=2, allow_nan=False) + "\n"})
     except OSError as error:
         raise InputError(
             f"cannot write {path}: {error.strerror}; choose another directory with --out"

@@ -152,7 +152,7 @@ def _replay(bag_path: Path) -> "Calibrator":
 
     calibrator = Calibrator()
     with _opened(bag_path) as bag:
-        feed(calibrator, bag.blocks(*TOPICS.values()), TOPICS)
+        feed(calibrator, bag.blocks(TOPICS["parent"], TOPICS["child"]), TOPICS)
     return calibrator
 
 
@@ -163,7 +163,7 @@ def _play(player_type: "type[Player]", bag_path: Path, log_path: Path, stamp_ns:
         player_type(TOPICS, check) as player,
         _opened(bag_path) as bag,
     ):
-        player.play(bag.poses(*TOPICS.values()), PLAY_SPEED)
+        player.play(bag.poses(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
         return player.wait_for_extrinsic(stamp_ns)
 
 

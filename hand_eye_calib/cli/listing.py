@@ -32,12 +32,11 @@ def list_bag(paths: Sequence[Path], as_json: bool) -> int:
     with PoseBag(*paths) as bag:
         with waiting_for(f"reading {bag}"):
             topics = bag.describe()
-        has_messages = bag.start_ns is not None and bag.end_ns is not None
-        document = {
+        document: dict[str, Any] = {
             "bag": str(bag),
             "start_ns": bag.start_ns,
             "end_ns": bag.end_ns,
-            "duration_s": (bag.end_ns - bag.start_ns) * 1e-9 if has_messages else 0.0,
+            "duration_s": bag.duration_s,
             "topics": [topic._asdict() for topic in topics],
             "warnings": bag.warnings,
         }

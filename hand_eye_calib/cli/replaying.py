@@ -217,7 +217,7 @@ def _place(part: "PoseBlock", topics: Mapping[str, Any], error: InputError) -> s
     row = getattr(error, "index", 0)
     seconds, nanoseconds = divmod(int(part.stamps_ns[row]), _NS_PER_S)
     topic = topics[part.streams[row]]
-    return f"{topic}, message {part.numbers[row]}, stamp {seconds}.{nanoseconds:09d}"
+    return f"{topic}, message {part.message_numbers[row]}, stamp {seconds}.{nanoseconds:09d}"
 
 
 class Convergence:

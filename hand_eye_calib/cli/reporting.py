@@ -166,11 +166,11 @@ def save_page(path: Path, text: str) -> Path:
     InputError
         If it cannot be written.
     """
-    from hand_eye_calib.io.results import replace_file
+    from hand_eye_calib.io.files import write_atomically
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, text)
+        write_atomically({path: text})
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or path}: {error.strerror}; choose another directory"

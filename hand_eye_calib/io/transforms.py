@@ -1,34 +1,42 @@
-"""Trajectories out of the transform tree: from the edges on ``/tf`` and ``/tf_static`` to the pose
-of one frame in another.
+"""Trajectories from the transform tree: from the edges on ``/tf`` and ``/tf_static`` to the pose of
+one frame in another.
 """
 
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.limits import MOST_FRAMES
+from hand_eye_calib.io.plausibility import check_positions
+
+# Edges that are listed in a message.
+_MOST_LISTED = 50
 
 
 class TfSource(NamedTuple):
-    """A pair of frames: the sensor's, whose poses are wanted, and the fixed one they are given in."""
+    """A pair of frames: the sensor's, and the fixed frame in which its poses are wanted."""
 
     world_frame: str
     sensor_frame: str
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"transform {self.world_frame}:{self.sensor_frame}"
 
     @classmethod
-    def parse(cls, text):
+    def parse(cls, text: str) -> "TfSource":
         """From ``world:sensor``.
 
         Raises
         ------
         ConfigError
-            Where that are not two different frames.
+            If these are not two different frames.
         """
         frames = [frame.strip().lstrip("/") for frame in text.split(":")]
         if len(frames) != 2 or not all(frames) or frames[0] == frames[1]:
@@ -38,61 +46,85 @@ class TfSource(NamedTuple):
         return cls(*frames)
 
 
+class Transform(Protocol):
+    """A stamped transform: the pose of the sensor frame in the world frame."""
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+    @property
+    def world_frame(self) -> str: ...
+
+    @property
+    def sensor_frame(self) -> str | None: ...
+
+    @property
+    def position(self) -> Sequence[float]: ...
+
+    @property
+    def quat_xyzw(self) -> Sequence[float]: ...
+
+
 @dataclass
 class Edge:
-    """What the bag says about one frame: its parent, and its poses in it."""
+    """A frame's parent, and the frame's poses in it: N bag times, stamps and rows of seven."""
 
     parent: str
     is_static: bool = True
-    log_ns: list = field(default_factory=list)
-    stamps_ns: list = field(default_factory=list)
-    numbers: list = field(default_factory=list)
+    log_ns: list[int] = field(default_factory=list)
+    stamps_ns: list[int] = field(default_factory=list)
+    values: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def poses(self) -> FloatArray:
+        """(N, 7) array of x y z qx qy qz qw."""
+        return np.array(self.values, dtype=float).reshape(-1, 7)
 
 
 class TransformTree:
-    """The frames of a bag and how they hang together.
+    """The frames of a bag and the edges between them.
 
-    Transforms are noted with :meth:`note` in a first pass over the messages, and their numbers kept
-    with :meth:`keep` in a second one, when it is known which of them are needed.
+    Edges are noted with :meth:`note` in a first pass over the messages. Poses are kept with
+    :meth:`keep` in a second one, when it is known which edges are needed.
     """
 
-    def __init__(self):
-        self.edges = {}
+    def __init__(self) -> None:
+        self.edges: dict[str, Edge] = {}
 
-    def note(self, transform, is_static):
-        """Take notice of an edge.
+    def note(self, transform: Transform, is_static: bool) -> None:
+        """Add an edge, without its pose.
 
         Raises
         ------
         InputError
-            Where the frame has another parent already.
+            If the frame has another parent already, or there are too many frames.
         """
-        edge = self.edges.setdefault(transform.sensor_frame, Edge(transform.world_frame))
+        frame = transform.sensor_frame or ""
+        edge = self.edges.setdefault(frame, Edge(transform.world_frame))
+        if len(self.edges) > MOST_FRAMES:
+            raise InputError(f"the transforms have more than {MOST_FRAMES} frames")
         if edge.parent != transform.world_frame:
             raise InputError(
-                f"frame {transform.sensor_frame!r} has two parents, {edge.parent!r} and {transform.world_frame!r}: the transforms do not form "
-                "a tree; record only one of their publishers"
+                f"frame {frame!r} has two parents, {edge.parent!r} and "
+                f"{transform.world_frame!r}: the transforms do not form a tree; record only one of "
+                "their publishers"
             )
         edge.is_static &= is_static
 
-    def keep(self, transform, is_static, log_ns):
-        """Keep the numbers of a transform that is needed. An edge that moves is not bothered by
-        what is said to be static.
-        """
-        edge = self.edges[transform.sensor_frame]
+    def keep(self, transform: Transform, is_static: bool, log_ns: int) -> None:
+        """Keep the pose of a transform that is needed; static ones of a moving edge are ignored."""
+        edge = self.edges[transform.sensor_frame or ""]
         if edge.is_static or not is_static:
             edge.log_ns.append(log_ns)
             edge.stamps_ns.append(transform.stamp_ns)
-            edge.numbers.append((*transform.position, *transform.quat_xyzw))
+            edge.values.extend((*transform.position, *transform.quat_xyzw))
 
-    def chain(self, source):
-        """The frames whose edges lead from the world frame to the sensor's: those to go up from the
-        world, those to come down by.
+    def chain(self, source: TfSource) -> tuple[list[str], list[str]]:
+        """Frames whose edges lead up from the world frame, and down to the sensor's.
 
         Raises
         ------
         InputError
-            Where a frame is not there, or nothing moves between the two.
+            If a frame is not there, or nothing moves between the two.
         """
         for frame in source:
             if frame not in self.edges and frame not in {
@@ -102,45 +134,46 @@ class TransformTree:
         up, down = self._to_root(source.world_frame), self._to_root(source.sensor_frame)
         if self._root(source.world_frame) != self._root(source.sensor_frame):
             raise InputError(
-                f"frames {source.world_frame!r} and {source.sensor_frame!r} are not connected; {self.listing()}"
+                f"frames {source.world_frame!r} and {source.sensor_frame!r} are not connected; "
+                f"{self.listing()}"
             )
         shared = set(up) & set(down)
-        up, down = (
-            [frame for frame in up if frame not in shared],
-            [frame for frame in down if frame not in shared],
-        )
+        up = [frame for frame in up if frame not in shared]
+        down = [frame for frame in down if frame not in shared]
         if all(self.edges[frame].is_static for frame in up + down):
             raise InputError(
                 f"{source} does not move: all of its transforms are static; {self.listing()}"
             )
         return up, down[::-1]
 
-    def listing(self):
-        """All edges in one line."""
+    def listing(self) -> str:
+        """List the edges in one line."""
         if not self.edges:
             return "it has none"
         edges = sorted(
             f"{edge.parent}:{frame}{' (static)' * edge.is_static}"
             for frame, edge in self.edges.items()
         )
-        return f"it has {', '.join(edges)}"
+        n_more = len(edges) - _MOST_LISTED
+        more = [f"and {n_more} more"] if n_more > 0 else []
+        return f"it has {', '.join(edges[:_MOST_LISTED] + more)}"
 
-    def _to_root(self, frame):
-        frames = []
+    def _to_root(self, frame: str) -> list[str]:
+        frames: dict[str, None] = {}
         while frame in self.edges:
             if frame in frames:
                 raise InputError(f"the transforms form a loop through frame {frame!r}")
-            frames.append(frame)
+            frames[frame] = None
             frame = self.edges[frame].parent
-        return frames
+        return list(frames)
 
-    def _root(self, frame):
+    def _root(self, frame: str) -> str:
         frames = self._to_root(frame)
         return self.edges[frames[-1]].parent if frames else frame
 
-    def trajectory(self, source, max_gap_s):
-        """Poses of the sensor's frame in the world frame, at the stamps of the chain's slowest
-        moving edge.
+    def trajectory(self, source: TfSource, max_gap_s: float) -> tuple[Trajectory, IntArray, int]:
+        """Poses of the sensor's frame in the world frame, at the stamps of the moving edge with the
+        lowest rate.
 
         The other moving edges are interpolated there, never extrapolated and never across more than
         ``max_gap_s``.
@@ -156,31 +189,24 @@ class TransformTree:
         Raises
         ------
         InputError
-            Where a transform is not a pose.
+            If a transform is not a pose.
         """
         up, down = self.chain(source)
-        static = {frame: self._static(frame) for frame in up + down if self.edges[frame].is_static}
-        moving = {frame: self._moving(frame) for frame in up + down if frame not in static}
+        moving = {
+            frame: self._moving(frame) for frame in up + down if not self.edges[frame].is_static
+        }
         slowest = max(moving, key=lambda frame: _interval(moving[frame][0]))
-        (base, log_ns) = moving[slowest]
-        stamps_ns = base.stamps_ns
-        known = np.ones(len(stamps_ns), dtype=bool)
-        for frame, (edge, _) in moving.items():
-            if frame != slowest:
-                known &= _is_known(edge.stamps_ns, stamps_ns, max_gap_s)
-        stamps_ns = stamps_ns[known]
+        base, log_ns = moving[slowest]
+        known = np.ones(len(base), dtype=bool)
+        for edge, _ in moving.values():
+            if edge is not base:
+                known &= _is_known(edge.stamps_ns, base.stamps_ns, max_gap_s)
+        stamps_ns = base.stamps_ns[known]
 
-        def at(frame):
-            if frame in static:
-                return static[frame]
-            if frame == slowest:
-                return base.poses[known]
-            edge = moving[frame][0]
-            return (
-                edge.at(stamps_ns)
-                if len(edge) > 1
-                else np.repeat(edge.poses, len(stamps_ns), axis=0)
-            )
+        def at(frame: str) -> FloatArray:
+            if frame not in moving:
+                return self._static(frame)
+            return base.poses[known] if frame == slowest else _at(moving[frame][0], stamps_ns)
 
         Ts_world_sensor = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
         for frame in up:
@@ -190,35 +216,39 @@ class TransformTree:
         trajectory = Trajectory(stamps_ns, Ts_world_sensor, source.sensor_frame, source.world_frame)
         return trajectory, log_ns[known], int((~known).sum())
 
-    def _static(self, frame):
-        """(4, 4): the last that was said."""
-        return self._checked(frame, [0], self.edges[frame].numbers[-1:]).poses[0]
+    def _static(self, frame: str) -> FloatArray:
+        """(4, 4): the last pose of a static edge."""
+        stamps_ns = np.zeros(1, dtype=np.int64)
+        pose: FloatArray = self._checked(frame, stamps_ns, self.edges[frame].poses()[-1:]).poses[0]
+        return pose
 
-    def _moving(self, frame):
-        """Trajectory and bag times of an edge; transforms are often repeated, the first with a
-        stamp counts.
-        """
+    def _moving(self, frame: str) -> tuple[Trajectory, IntArray]:
+        """Trajectory and bag times of an edge; of repeated transforms the first counts."""
         edge = self.edges[frame]
         stamps_ns, first = np.unique(np.array(edge.stamps_ns, dtype=np.int64), return_index=True)
-        return self._checked(frame, stamps_ns, np.array(edge.numbers)[first]), np.array(
-            edge.log_ns, dtype=np.int64
-        )[first]
+        trajectory = self._checked(frame, stamps_ns, edge.poses()[first])
+        return trajectory, np.array(edge.log_ns, dtype=np.int64)[first]
 
-    def _checked(self, frame, stamps_ns, numbers):
-        numbers = np.array(numbers, dtype=float).reshape(-1, 7)
+    def _checked(self, frame: str, stamps_ns: IntArray, poses: FloatArray) -> Trajectory:
         try:
-            return Trajectory.from_quat_xyzw(
-                np.array(stamps_ns, dtype=np.int64), numbers[:, :3], numbers[:, 3:]
-            )
+            check_positions(poses[:, :3])
+            return Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
         except InputError as error:
             raise InputError(f"transform {self.edges[frame].parent}:{frame}: {error}") from None
 
 
-def _interval(trajectory):
+def _at(trajectory: Trajectory, stamps_ns: IntArray) -> FloatArray:
+    """(N, 4, 4): poses at stamps that are known to be within the trajectory."""
+    if len(trajectory) > 1:
+        return trajectory.at(stamps_ns)
+    return np.repeat(trajectory.poses, len(stamps_ns), axis=0)
+
+
+def _interval(trajectory: Trajectory) -> float:
     return float(np.median(np.diff(trajectory.stamps_ns))) if len(trajectory) > 1 else np.inf
 
 
-def _is_known(available_ns, wanted_ns, max_gap_s):
+def _is_known(available_ns: IntArray, wanted_ns: IntArray, max_gap_s: float) -> BoolArray:
     """Mask of the stamps at which an edge has a transform or lies between two that are not too far
     apart.
     """
@@ -227,6 +257,5 @@ def _is_known(available_ns, wanted_ns, max_gap_s):
     after = np.minimum(after, len(available_ns) - 1)
     before = np.maximum(after - 1, 0)
     gap_ns = available_ns[after] - available_ns[before]
-    return inside & (
-        (available_ns[after] == wanted_ns) | ((after > 0) & (gap_ns <= max_gap_s * 1e9))
-    )
+    is_near = (after > 0) & (gap_ns <= max_gap_s * 1e9)
+    return inside & ((available_ns[after] == wanted_ns) | is_near)

@@ -15,9 +15,9 @@ import hand_eye_calib as hec
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io import bags
 from hand_eye_calib.io.bags import PoseBag, write_bag
-from hand_eye_calib.io.messages import POSE_TYPES
+from hand_eye_calib.io.bags.messages import POSE_TYPES
+from hand_eye_calib.io.bags.writer import write_streams
 from hand_eye_calib.io.transforms import TfSource
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -273,7 +273,7 @@ def test_a_path_whose_poses_have_no_stamps_is_refused(tmp_path):
 def choose(tmp_path, streams, extra=()):
     path = tmp_path / "bag"
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
-        bags._write_streams(writer, streams, "mcap")
+        write_streams(writer, streams, "mcap")
         from bag_making import JAZZY
 
         for topic, message_type, make in extra:
@@ -353,7 +353,7 @@ def test_compressed_bags(tmp_path, storage, mode):
     )
     writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
     with writer:
-        bags._write_streams(writer, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, storage)
+        write_streams(writer, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, storage)
     expected = read_all(tmp_path / "plain")
     assert read_all(tmp_path / "bag") == expected
     (tmp_path / "bag" / "metadata.yaml").unlink()
@@ -371,7 +371,7 @@ def test_compressed_chunks_of_rosbag1(tmp_path, compression):
     writer = rosbag1.Writer(tmp_path / "bag.bag")
     writer.set_compression(compression)
     with writer:
-        bags._write_streams(writer, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, "rosbag1")
+        write_streams(writer, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, "rosbag1")
     assert read_all(tmp_path / "bag.bag") == read_all(tmp_path / "plain.bag")
 
 
@@ -436,10 +436,10 @@ def test_of_chunks_with_other_topics_only_the_wanted_bytes_are_read(tmp_path):
         raw = JAZZY.serialize_cdr(blob, "sensor_msgs/msg/CompressedImage")
         for stamp_ns in PARENT.stamps_ns[::5]:
             writer.write(image, int(stamp_ns), raw)
-        bags._write_streams(writer, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, "mcap")
+        write_streams(writer, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, "mcap")
     write_bag(tmp_path / "plain", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)})
     with PoseBag(tmp_path / "bag") as bag:
-        mcap = bag._parts[0]._mcap
+        mcap = bag._files.storages[0]
         sizes, read = [], mcap._read
         mcap._read = lambda offset, size: sizes.append(size) or read(offset, size)
         assert list(bag.poses("/a", "/b")) == read_all(tmp_path / "plain")

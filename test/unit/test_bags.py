@@ -13,9 +13,9 @@ from rosbags.typesys import Stores, get_typestore
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io import bags
 from hand_eye_calib.io.bags import PoseBag, write_bag
-from hand_eye_calib.io.mcap import McapFile
+from hand_eye_calib.io.bags.mcap import McapFile
+from hand_eye_calib.io.bags.writer import stamped_messages, write_streams
 
 ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 STORAGES = ("mcap", "sqlite3", "rosbag1")
@@ -95,7 +95,7 @@ def test_topics_lists_everything_in_the_bag(new_bag):
 def add_text_topic(path):
     """A rosbag2 with poses and a topic of strings."""
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
-        bags._write_streams(writer, STREAMS, "mcap")
+        write_streams(writer, STREAMS, "mcap")
         connection = writer.add_connection("/log", "std_msgs/msg/String", typestore=JAZZY)
         text = JAZZY.types["std_msgs/msg/String"]("hello")
         writer.write(
@@ -199,7 +199,7 @@ def test_an_mcap_cut_off_gives_what_came_before(tmp_path, compression, share):
     if compression == "zstd":
         writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
     with writer:
-        bags._write_streams(writer, streams, "mcap")
+        write_streams(writer, streams, "mcap")
     whole = read(path)
     cut_off(path, share)
     (path / "metadata.yaml").unlink()
@@ -235,8 +235,8 @@ def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):
     write_bag(path, streams)
     whole = read(path)
     data = bytearray(storage_file(path).read_bytes())
-    with McapFile(storage_file(path), None) as mcap:
-        offsets = [chunk.offset for chunk in mcap._chunks]
+    with McapFile(storage_file(path)) as mcap:
+        offsets = mcap._chunks.rows()[:, 0].tolist()
     assert len(offsets) > 2
     # 9 bytes of record header, 3 x 8 of times and size, 4 of checksum, 4 of no compression, 8 of
     # size.
@@ -256,7 +256,7 @@ def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):
     assert {(pose.stream, pose.stamp_ns) for pose in poses} < {
         (pose.stream, pose.stamp_ns) for pose in whole
     }
-    assert f"at byte {offsets[1]} is damaged (Chunk checksum mismatch.) and was left out" in warning
+    assert f"at byte {offsets[1]} is damaged (its checksum is wrong) and was left out" in warning
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -371,7 +371,7 @@ def test_qos_that_differs_between_metadata_and_storage_hides_no_message(new_bag,
 )
 def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, data, reason):
     with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
-        bags._write_streams(writer, {"/camera/pose": (CHILD, POSE_STAMPED)}, "sqlite3")
+        write_streams(writer, {"/camera/pose": (CHILD, POSE_STAMPED)}, "sqlite3")
         connection = writer.add_connection("/lidar/odom", ODOMETRY, typestore=JAZZY)
         writer.write(connection, 1, data)
     with pytest.raises(
@@ -385,7 +385,7 @@ def test_several_publishers_and_types_on_one_topic(tmp_path):
     """Two connections of one type are one stream; of two types, the topic is refused."""
     for name, second_type in (("one.bag", ODOMETRY), ("two.bag", "std_msgs/msg/String")):
         with rosbag1.Writer(tmp_path / name) as writer:
-            bags._write_streams(
+            write_streams(
                 writer, {"/odom": (PARENT, ODOMETRY), "/pose": (CHILD, POSE_STAMPED)}, "rosbag1"
             )
             connection = writer.add_connection(
@@ -393,10 +393,8 @@ def test_several_publishers_and_types_on_one_topic(tmp_path):
             )
             stamp_ns = int(PARENT.stamps_ns[-1]) + 1
             message = next(
-                bags._stamped_messages(
-                    NOETIC, trajectory(stamp_ns, count=1), ODOMETRY, True, connection
-                )
-            )[2]
+                stamped_messages(NOETIC.types, trajectory(stamp_ns, count=1), ODOMETRY, True)
+            )[1]
             text = NOETIC.types["std_msgs/msg/String"]("hello")
             message = message if second_type == ODOMETRY else text
             writer.write(connection, stamp_ns, NOETIC.serialize_ros1(message, second_type))

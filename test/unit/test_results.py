@@ -247,5 +247,5 @@ def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"cannot read .*extrinsic\.yaml: No such file"):
         load_result(tmp_path)
     (tmp_path / "extrinsic.yaml").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(InputError, match="is not YAML"):
+    with pytest.raises(InputError, match="not a text file; expected YAML"):
         load_result(tmp_path)

@@ -1,0 +1,20 @@
+"""Poses in bags: rosbag2 (sqlite3, mcap) and rosbag1, read and written without ROS.
+
+Only the messages of the chosen topics are read, and of these only stamp, frames and pose.
+"""
+
+from hand_eye_calib.io.bags.blocks import PoseBlock, StampedPose
+from hand_eye_calib.io.bags.reader import PoseBag, read_bag_trajectory
+from hand_eye_calib.io.bags.topics import TopicDescription, TopicInfo
+from hand_eye_calib.io.bags.writer import STORAGES, write_bag
+
+__all__ = [
+    "STORAGES",
+    "PoseBag",
+    "PoseBlock",
+    "StampedPose",
+    "TopicDescription",
+    "TopicInfo",
+    "read_bag_trajectory",
+    "write_bag",
+]

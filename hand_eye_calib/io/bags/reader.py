@@ -1,0 +1,515 @@
+"""Reading the poses of two streams from bags."""
+
+import heapq
+from collections.abc import Container, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from hand_eye_calib.arrays import BoolArray, IntArray
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags.blocks import (
+    Message,
+    MessageKind,
+    PoseBlock,
+    StampedPose,
+    blocks_of,
+    message_blocks,
+)
+from hand_eye_calib.io.bags.decompression import ZSTD_MAGIC, Budget, unpack
+from hand_eye_calib.io.bags.files import BagFiles, reading
+from hand_eye_calib.io.bags.messages import (
+    MALFORMED,
+    PATH_TYPE,
+    POSE_TYPES,
+    TF_TYPES,
+    MalformedMessage,
+    PoseColumns,
+    PoseFields,
+    unpack_path,
+    unpack_poses,
+    unpack_transforms,
+)
+from hand_eye_calib.io.bags.storage import Storage
+from hand_eye_calib.io.bags.topics import (
+    Source,
+    TopicDescription,
+    TopicInfo,
+    TopicScan,
+    check_source,
+    select_sources,
+    unreadable,
+)
+from hand_eye_calib.io.limits import LARGEST_MESSAGE
+from hand_eye_calib.io.plausibility import PoseWatch
+from hand_eye_calib.io.transforms import TfSource, TransformTree
+
+
+class PoseBag:
+    """One bag, or several of one recording, opened for reading; a context manager.
+
+    Parameters
+    ----------
+    *paths : str or path-like
+        Each a rosbag2 directory, a single ``.mcap`` or ``.db3`` file of one, or a rosbag1 ``.bag``
+        file. They are read in the order of their times; those that were recorded at the same time
+        are merged.
+
+    Raises
+    ------
+    InputError
+        If there is no bag or it cannot be read: one line that names the path and says what to do.
+    """
+
+    def __init__(self, *paths: str | Path) -> None:
+        self.paths = [Path(path) for path in paths]
+        self._files = BagFiles()
+        self._watches: dict[str, PoseWatch] = {}
+        self._gaps: list[str] = []
+        try:
+            for path in self.paths:
+                self._files.open(path)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files."""
+        self._files.close()
+
+    def __str__(self) -> str:
+        return ", ".join(map(str, self.paths))
+
+    @property
+    def warnings(self) -> list[str]:
+        """What could not be read, and poses that cannot be right; complete after reading."""
+        losses = [
+            f"{storage.path}: {loss}"
+            for storage in self._files.storages
+            for loss in storage.losses.texts()
+        ]
+        watched = [text for name, watch in self._watches.items() for text in watch.warnings(name)]
+        return [*self._files.notes, *self._gaps, *losses, *watched]
+
+    @property
+    def n_left_out(self) -> int:
+        """Messages left out because their stamps cannot be right; complete after reading."""
+        return sum(watch.n_stamps for watch in self._watches.values())
+
+    @property
+    def start_ns(self) -> int | None:
+        """Bag time of the first message, None if there is none."""
+        starts_ns = [storage.start_ns for storage in self._files.storages]
+        return min((each for each in starts_ns if each is not None), default=None)
+
+    @property
+    def end_ns(self) -> int | None:
+        """Bag time of the last message, None if there is none."""
+        ends_ns = [storage.end_ns for storage in self._files.storages]
+        return max((each for each in ends_ns if each is not None), default=None)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first message to the last; 0 if there is none."""
+        return ((self.end_ns or 0) - (self.start_ns or 0)) * 1e-9
+
+    def files(self) -> list[Path]:
+        """Paths of all files that are read."""
+        return [storage.path for storage in self._files.storages]
+
+    # ---- topics
+
+    def topics(self) -> list[TopicInfo]:
+        """All topics, in the order of their names."""
+        return list(self._topics().values())
+
+    def _topics(self) -> dict[str, TopicInfo]:
+        found: dict[str, tuple[str, int]] = {}
+        for storage in self._files.storages:
+            for name, (message_type, count) in storage.topics.items():
+                known, before = found.get(name, (message_type, 0))
+                found[name] = (message_type if message_type == known else "", before + count)
+        return {name: TopicInfo(name, *found[name]) for name in sorted(found)}
+
+    def describe(self) -> list[TopicDescription]:
+        """All topics with rates and frames; reads all poses and transforms.
+
+        Raises
+        ------
+        InputError
+            If a message cannot be read.
+        """
+        infos = self.topics()
+        known_types = (*POSE_TYPES, PATH_TYPE, *TF_TYPES)
+        scans = {info.name: TopicScan() for info in infos if info.type in known_types}
+        counts = dict.fromkeys(scans, 0)
+        for block in self._messages(scans):
+            for kind in {message[0] for message in block}:
+                messages = [message[2] for message in block if message[0] == kind]
+                scans[kind.topic].take(kind, counts[kind.topic] + 1, messages)
+                counts[kind.topic] += len(messages)
+        duration_s = self.duration_s
+        return [scans.get(info.name, TopicScan()).describe(info, duration_s) for info in infos]
+
+    def select_topics(
+        self, parent: Source | None = None, child: Source | None = None
+    ) -> tuple[Source, Source]:
+        """Choose the sources of the parent's and the child's poses.
+
+        What is not named is chosen if there is only one way to do it: with neither named, the bag
+        has exactly two topics of poses, and the first in alphabetical order becomes the parent.
+        Topics of paths count if there are not enough others.
+
+        Parameters
+        ----------
+        parent, child : str, TfSource or None
+            A topic, or a pair of frames.
+
+        Raises
+        ------
+        InputError
+            If a named topic is not in the bag or holds no poses, if both are the same, or if there
+            is a choice to make. The message lists the topics that are there.
+        """
+        return select_sources(parent, child, self._topics(), str(self))
+
+    def check(self, source: Source) -> None:
+        """Refuse a topic that is not in the bag or has no poses, and frames without transforms.
+
+        Raises
+        ------
+        InputError
+            The message lists the topics that are there.
+        """
+        check_source(source, self._topics(), str(self))
+
+    def expected(self, *sources: Source | None) -> int | None:
+        """Number of poses that the sources will give, as far as the bag says; None for paths and
+        transforms.
+        """
+        topics = self._topics()
+        count = 0
+        for source in sources:
+            if not isinstance(source, str) or source not in topics:
+                return None
+            if topics[source].type not in POSE_TYPES:
+                return None
+            count += topics[source].count
+        return count
+
+    # ---- poses
+
+    def poses(
+        self, parent: Source, child: Source | None, max_gap_s: float = CalibratorConfig.max_gap
+    ) -> Iterator[StampedPose]:
+        """Iterate over the poses of both streams one by one; see :meth:`blocks`."""
+        for block in self.blocks(parent, child, max_gap_s):
+            yield from block.rows()
+
+    def blocks(
+        self, parent: Source, child: Source | None, max_gap_s: float = CalibratorConfig.max_gap
+    ) -> Iterator[PoseBlock]:
+        """Iterate over the poses of both streams in the order of the bag's time, many at once.
+
+        A path's poses are those of its newest message, and before its first stamp those of older
+        messages; they count as recorded when they first appeared. Transforms are composed at the
+        stamps of the moving transform with the lowest rate in the chain.
+
+        Parameters
+        ----------
+        parent, child : str or TfSource
+            A topic, or a pair of frames.
+        max_gap_s : float
+            Longest time that is interpolated between two transforms of a chain.
+
+        Yields
+        ------
+        PoseBlock
+
+        Raises
+        ------
+        InputError
+            If the bag is damaged, or the transforms do not lead from one frame to the other.
+        """
+        sources = {"parent": parent, "child": child}
+        types = {topic.name: topic.type for topic in self.topics()}
+        self._watches = {str(source): PoseWatch() for source in sources.values()}
+        direct, paths, transforms = {}, {}, {}
+        for stream, source in sources.items():
+            if isinstance(source, TfSource):
+                transforms[stream] = source
+            elif source is not None and types.get(source) in POSE_TYPES:
+                direct[source] = stream
+            elif source is not None and types.get(source) == PATH_TYPE:
+                paths[stream] = source
+        streams: list[Iterator[PoseBlock]] = [self._direct_blocks(direct)] if direct else []
+        if transforms:
+            streams += [iter([each]) for each in self._transformed_poses(transforms, max_gap_s)]
+        streams += [iter([self._path_poses(*each)]) for each in paths.items()]
+        if len(streams) == 1:
+            yield from filter(len, streams[0])
+        else:
+            rows = [chain.from_iterable(map(PoseBlock.rows, blocks)) for blocks in streams]
+            yield from map(PoseBlock.of_rows, blocks_of(heapq.merge(*rows, key=_bag_time)))
+
+    def _direct_blocks(self, streams: dict[str, str]) -> Iterator[PoseBlock]:
+        """Poses of topics that carry one in each message."""
+        counts = dict.fromkeys(streams, 0)
+        for messages in self._messages(streams):
+            rows_of: dict[MessageKind, list[int]] = {}
+            for row, message in enumerate(messages):
+                rows_of.setdefault(message[0], []).append(row)
+            parts, kept_rows = [], []
+            for kind, rows in rows_of.items():
+                chosen = [messages[row] for row in rows]
+                first_number = counts[kind.topic] + 1
+                part, keep = self._unpacked_poses(kind, streams[kind.topic], first_number, chosen)
+                counts[kind.topic] += len(rows)
+                parts.append(part[keep])
+                kept_rows.append(np.array(rows)[keep])
+            yield PoseBlock.concatenate(parts)[np.argsort(np.concatenate(kept_rows))]
+
+    def _unpacked_poses(
+        self, kind: MessageKind, stream: str, first_number: int, messages: Sequence[Message]
+    ) -> tuple[PoseBlock, BoolArray]:
+        """PoseBlock of messages, and which of them to keep."""
+        try:
+            columns = unpack_poses([message[2] for message in messages], kind.type, kind.is_ros1)
+        except MalformedMessage as error:
+            raise unreadable(kind, first_number + error.index, error) from error
+        message_numbers = first_number + np.arange(len(messages))
+        bag_ns = np.array([message[1] for message in messages], dtype=np.int64)
+        keep = self._watches[kind.topic].believable(first_number, columns.stamps_ns, bag_ns)
+        self._watch(kind.topic, message_numbers, columns, keep)
+        return PoseBlock.of_columns(stream, message_numbers, columns, bag_ns), keep
+
+    def _watch(
+        self, name: str, message_numbers: IntArray, columns: PoseColumns, keep: BoolArray
+    ) -> None:
+        """Look at the poses that are kept."""
+        try:
+            self._watches[name].add(
+                message_numbers[keep], columns.stamps_ns[keep], columns.poses[keep]
+            )
+        except InputError as error:
+            raise InputError(f"{name}, {error}") from None
+
+    def _watched_block(
+        self, name: str, stream: str, columns: PoseColumns, bag_ns: IntArray
+    ) -> PoseBlock:
+        """PoseBlock of all poses of a stream, in the order of bag time."""
+        message_numbers = 1 + np.arange(len(bag_ns))
+        self._watch(name, message_numbers, columns, np.ones(len(bag_ns), dtype=bool))
+        block = PoseBlock.of_columns(stream, message_numbers, columns, bag_ns)
+        return block[np.argsort(bag_ns, kind="stable")]
+
+    def _path_poses(self, stream: str, topic: str) -> PoseBlock:
+        """Poses of a path that is published again and again as it grows, perhaps with all poses
+        corrected.
+        """
+        stamps_ns, bag_ns = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        poses, world_frame = np.empty((0, 7)), ""
+        messages = chain.from_iterable(self._messages([topic]))
+        for number, (kind, message_ns, data) in enumerate(messages, start=1):
+            try:
+                world_frame, new_stamps_ns, new_poses = unpack_path(data, kind.is_ros1)
+            except MALFORMED as error:
+                raise unreadable(kind, number, error) from error
+            if not len(new_stamps_ns):
+                continue
+            order = np.argsort(new_stamps_ns, kind="stable")
+            new_stamps_ns = new_stamps_ns[order]
+            new_bag_ns = _first_seen(new_stamps_ns, message_ns, stamps_ns, bag_ns)
+            older = stamps_ns < new_stamps_ns[0]
+            stamps_ns = np.concatenate([stamps_ns[older], new_stamps_ns])
+            bag_ns = np.concatenate([bag_ns[older], new_bag_ns])
+            poses = np.concatenate([poses[older], new_poses[order]])
+        if len(stamps_ns) > 1 and not stamps_ns.any():
+            raise InputError(
+                f"the poses of path {topic} have no stamps: all are zero; use the odometry that "
+                "the path was made from"
+            )
+        count = len(stamps_ns)
+        columns = PoseColumns(stamps_ns, [world_frame] * count, [None] * count, poses)
+        return self._watched_block(topic, stream, columns, bag_ns)
+
+    def _transformed_poses(self, sources: dict[str, TfSource], max_gap_s: float) -> list[PoseBlock]:
+        """A PoseBlock for each stream whose poses come from the transform tree."""
+        tree = self.transforms()
+        chains = [side for source in sources.values() for side in tree.chain(source)]
+        for transform, is_static, bag_ns in self._transforms(set(chain.from_iterable(chains))):
+            tree.keep(transform, is_static, bag_ns)
+        found = []
+        for stream, source in sources.items():
+            trajectory, log_ns, n_left_out = tree.trajectory(source, max_gap_s)
+            if n_left_out:
+                self._gaps.append(
+                    f"{source}: {n_left_out} of {n_left_out + len(trajectory)} poses were left "
+                    "out, because another transform of the chain was not known within "
+                    f"{max_gap_s:g} s"
+                )
+            quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
+            columns = PoseColumns(
+                trajectory.stamps_ns,
+                [source.world_frame] * len(trajectory),
+                [source.sensor_frame] * len(trajectory),
+                np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1),
+            )
+            found.append(self._watched_block(str(source), stream, columns, log_ns))
+        return found
+
+    def transforms(self) -> TransformTree:
+        """The TransformTree of the bag, without poses.
+
+        Raises
+        ------
+        InputError
+            If the transforms form no tree or are damaged.
+        """
+        tree = TransformTree()
+        for transform, is_static, _ in self._transforms():
+            tree.note(transform, is_static)
+        return tree
+
+    def _transforms(
+        self, frames: Container[str] | None = None
+    ) -> Iterator[tuple[PoseFields, bool, int]]:
+        """Transforms, whether each is static, and its bag time; of some frames, or of all."""
+        names = [topic.name for topic in self.topics() if topic.type in TF_TYPES]
+        messages = chain.from_iterable(self._messages(names))
+        for number, (kind, bag_ns, data) in enumerate(messages, start=1):
+            try:
+                for transform in unpack_transforms(data, kind.is_ros1):
+                    if frames is None or transform.sensor_frame in frames:
+                        yield transform, kind.topic.endswith("tf_static"), bag_ns
+            except MALFORMED as error:
+                raise unreadable(kind, number, error) from error
+
+    # ---- messages
+
+    def _messages(self, topics: Container[str]) -> Iterator[list[Message]]:
+        """Messages of some topics in the order of bag time, many at once."""
+        for group in _overlapping(self._files.storages):
+            streams = [_storage_messages(storage, topics) for storage in group]
+            if len(streams) == 1:
+                yield from streams[0]
+            else:
+                merged = heapq.merge(*map(chain.from_iterable, streams), key=_recorded)
+                yield from message_blocks(merged)
+
+
+def read_bag_trajectory(
+    path: str | Path, topic: str | None = None, tf: str | None = None
+) -> tuple[Trajectory, list[str]]:
+    """Read one trajectory of a bag.
+
+    Parameters
+    ----------
+    path : str or path-like
+    topic : str, optional
+    tf : str, optional
+        ``world:sensor``, instead of a topic.
+
+    Returns
+    -------
+    Trajectory
+        In the order of stamps; of those with equal stamps the first.
+    notes : list of str
+        What a person should know.
+
+    Raises
+    ------
+    InputError
+        If the bag or a pose cannot be read.
+    """
+    source: Source = TfSource.parse(tf) if tf else topic or ""
+    with PoseBag(path) as bag:
+        bag.check(source)
+        blocks = list(bag.blocks(source, None))
+        notes = bag.warnings
+    if not blocks:
+        raise InputError(f"no poses on {source} of {path}")
+    poses = PoseBlock.concatenate(blocks)
+    stamps_ns, first = np.unique(poses.stamps_ns, return_index=True)
+    if len(first) < len(poses):
+        notes.append(
+            f"{source}: {len(poses) - len(first)} of {len(poses)} poses had a stamp that was there "
+            "already and were dropped"
+        )
+    if (np.diff(first) < 0).any():
+        notes.append(f"{source}: stamps were not in the order of the bag and were sorted")
+    poses = poses[first]
+    trajectory = Trajectory.from_quat_xyzw(
+        stamps_ns,
+        poses.poses[:, :3],
+        poses.poses[:, 3:],
+        sensor_frame=poses.sensor_frames[0] or "",
+        world_frame=poses.world_frames[0],
+    )
+    return trajectory, notes
+
+
+def _first_seen(
+    new_stamps_ns: IntArray, message_ns: int, stamps_ns: IntArray, bag_ns: IntArray
+) -> IntArray:
+    """Bag time at which each stamp appeared first; ``stamps_ns`` are sorted."""
+    first_ns = np.full(len(new_stamps_ns), message_ns, dtype=np.int64)
+    if len(stamps_ns):
+        index = np.minimum(np.searchsorted(stamps_ns, new_stamps_ns), len(stamps_ns) - 1)
+        is_known = stamps_ns[index] == new_stamps_ns
+        first_ns[is_known] = bag_ns[index[is_known]]
+    return first_ns
+
+
+def _bag_time(pose: StampedPose) -> int:
+    return pose.bag_ns
+
+
+def _recorded(message: Message) -> int:
+    return message[1]
+
+
+def _overlapping(storages: list[Storage]) -> Iterator[list[Storage]]:
+    """Storages in order, those that overlap in time together."""
+    group: list[Storage] = []
+    last_ns = 0
+    for storage in storages:
+        if storage.start_ns is None or storage.end_ns is None:
+            continue
+        if group and storage.start_ns > last_ns:
+            yield group
+            group = []
+        last_ns = max(last_ns, storage.end_ns) if group else storage.end_ns
+        group.append(storage)
+    if group:
+        yield group
+
+
+def _storage_messages(storage: Storage, topics: Container[str]) -> Iterator[list[Message]]:
+    """Messages of a storage; those that are compressed one by one are unpacked."""
+    with reading(storage.path):
+        budget = Budget(storage.path.stat().st_size)
+        for block in storage.messages(topics):
+            # Plain CDR never begins with the mark of zstd.
+            if any(message[2][:4] == ZSTD_MAGIC for message in block):
+                yield from message_blocks(_unpacked(message, budget) for message in block)
+            else:
+                yield block
+
+
+def _unpacked(message: Message, budget: Budget) -> Message:
+    kind, bag_ns, data = message
+    if data[:4] == ZSTD_MAGIC:
+        data = unpack(data, "zstd", LARGEST_MESSAGE, budget)
+    return kind, bag_ns, data

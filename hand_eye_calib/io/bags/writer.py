@@ -1,0 +1,131 @@
+"""Bags written from trajectories, with the library rosbags; the only module that imports it."""
+
+import heapq
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags.messages import POSE_TYPES
+
+STORAGES = ("mcap", "sqlite3", "rosbag1")
+
+_NS_PER_S = 1_000_000_000
+
+Streams = Mapping[str, tuple[Trajectory, str]]
+
+
+def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None:
+    """Write trajectories into a new bag, the poses of all topics in the order of their stamps.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Directory to make, or for rosbag1 the ``.bag`` file. It must not exist.
+    streams : mapping of str to (Trajectory, str)
+        Topic to trajectory and message type, one of POSE_TYPES. If the type has a place for the
+        sensor's frame, the trajectory's is put there. Stamps are written to both header and bag.
+    storage : str
+        "mcap", "sqlite3" or "rosbag1".
+
+    Raises
+    ------
+    InputError
+        If the path exists or cannot be written.
+    ConfigError
+        For an unknown storage or message type.
+    """
+    path = Path(path)
+    _check(path, streams, storage)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _writer(path, storage) as writer:
+            write_streams(writer, streams, storage)
+    except OSError as error:
+        raise InputError(f"cannot write bag {path}: {error.strerror}") from None
+
+
+def _check(path: Path, streams: Streams, storage: str) -> None:
+    if storage not in STORAGES:
+        raise ConfigError(f"unknown bag storage {storage!r}; known are {', '.join(STORAGES)}")
+    unknown = [each for _, each in streams.values() if each not in POSE_TYPES]
+    if unknown:
+        raise ConfigError(
+            f"cannot write messages of type {unknown[0]!r}; known are {', '.join(POSE_TYPES)}"
+        )
+    if (path.suffix == ".bag") != (storage == "rosbag1"):
+        raise InputError(
+            f"cannot write {path} as {storage}: a rosbag1 file, and nothing else, must be named "
+            ".bag"
+        )
+    if path.exists():
+        raise InputError(f"{path} exists already; remove it or choose another name")
+
+
+def _writer(path: Path, storage: str) -> Any:
+    from rosbags import rosbag1, rosbag2
+
+    if storage == "rosbag1":
+        return rosbag1.Writer(path)
+    return rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+
+
+def write_streams(writer: Any, streams: Streams, storage: str) -> None:
+    """Write trajectories with a writer of rosbags that is open; see :func:`write_bag`."""
+    from rosbags.typesys import Stores, get_typestore
+
+    is_ros1 = storage == "rosbag1"
+    typestore = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+    serialize = typestore.serialize_ros1 if is_ros1 else typestore.serialize_cdr
+    sequences = []
+    for topic, (trajectory, message_type) in streams.items():
+        connection = writer.add_connection(topic, message_type, typestore=typestore)
+        messages = stamped_messages(typestore.types, trajectory, message_type, is_ros1)
+        sequences.append([(stamp_ns, connection, message) for stamp_ns, message in messages])
+    for stamp_ns, connection, message in heapq.merge(*sequences, key=lambda item: item[0]):
+        writer.write(connection, stamp_ns, serialize(message, connection.msgtype))
+
+
+def stamped_messages(
+    types: Mapping[str, Any], trajectory: Trajectory, message_type: str, is_ros1: bool
+) -> Iterator[tuple[int, Any]]:
+    """Iterate over stamps in ns and messages of a trajectory; ``types`` are rosbags' classes."""
+    positions = trajectory.poses[:, :3, 3].tolist()
+    quats_xyzw = se3.to_quat_xyzw(trajectory.poses).tolist()
+    for number, stamp_ns in enumerate(trajectory.stamps_ns.tolist()):
+        header = types["std_msgs/msg/Header"](
+            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _NS_PER_S)),
+            frame_id=trajectory.world_frame,
+            **({"seq": number} if is_ros1 else {}),
+        )
+        pose = types["geometry_msgs/msg/Pose"](
+            types["geometry_msgs/msg/Point"](*positions[number]),
+            types["geometry_msgs/msg/Quaternion"](*quats_xyzw[number]),
+        )
+        yield stamp_ns, _message(types, message_type, header, pose, trajectory.sensor_frame)
+
+
+def _message(
+    types: Mapping[str, Any], message_type: str, header: Any, pose: Any, sensor_frame: str
+) -> Any:
+    """A message of one of POSE_TYPES."""
+    make = types[message_type]
+    if message_type == "geometry_msgs/msg/PoseStamped":
+        return make(header, pose)
+    if message_type == "geometry_msgs/msg/TransformStamped":
+        position = pose.position
+        translation = types["geometry_msgs/msg/Vector3"](position.x, position.y, position.z)
+        transform = types["geometry_msgs/msg/Transform"](translation, pose.orientation)
+        return make(header, sensor_frame, transform)
+    no_covariance = np.zeros(36)
+    with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](pose, no_covariance)
+    if message_type == "geometry_msgs/msg/PoseWithCovarianceStamped":
+        return make(header, with_covariance)
+    zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+    twist = types["geometry_msgs/msg/Twist"](zero, zero)
+    with_twist = types["geometry_msgs/msg/TwistWithCovariance"](twist, no_covariance)
+    return make(header, sensor_frame, with_covariance, with_twist)
