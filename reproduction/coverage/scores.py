@@ -18,7 +18,7 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from reproduction.coverage import classes
+from reproduction.coverage import classes, mixed
 from reproduction.coverage.measures import COVERAGE, Row
 from reproduction.coverage.real_sets import CYCLE, Rig, Truth
 from reproduction.recordings import PARTS, Recording
@@ -55,16 +55,18 @@ def answer(parent: Trajectory, child: Trajectory, options: Mapping[str, Any]) ->
 
 
 def class_row(name: str, method: str, seeds: int) -> Row:
-    """Errors over the bound, NEES and coverage of a simulated class."""
+    """Errors over the bound, NEES and coverage of a simulated class, fixed or mixed."""
+    is_mixed = name in mixed.MIXED
     cases: dict[str, dict[str, float]] = {}
     seconds = []
     for seed in range(seeds):
-        recording = classes.make(name, seed)
+        recording = (mixed if is_mixed else classes).make(name, seed)
         found = answer(recording.parent, recording.child, METHODS[method])
         seconds.append(found.seconds)
         for kind, value in _class_case(name, recording, found.calibration).items():
             cases.setdefault(kind, {})[f"{seed}"] = value
-    return Row("simulated", name, method, cases, float(np.median(seconds)))
+    table = "mixed" if is_mixed else "simulated"
+    return Row(table, name, method, cases, float(np.median(seconds)))
 
 
 def _class_case(

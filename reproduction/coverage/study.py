@@ -9,6 +9,7 @@ from pathlib import Path
 from hand_eye_calib.errors import InputError
 from reproduction.coverage.classes import CLASSES
 from reproduction.coverage.measures import POOLED, Row, pooled
+from reproduction.coverage.mixed import MIXED
 from reproduction.coverage.real_sets import CYCLE, Rig
 from reproduction.coverage.scores import class_row, cycle_row, parts_row, scatter_row, truth_row
 from reproduction.runner import in_parallel
@@ -31,7 +32,9 @@ def measure(rigs: Sequence[Rig], methods: Sequence[str], seeds: int, jobs: int) 
 
 
 def _tasks(rigs: Sequence[Rig], method: str, seeds: int) -> list[tuple[object, ...]]:
-    tasks: list[tuple[object, ...]] = [(class_row, name, method, seeds) for name in CLASSES]
+    tasks: list[tuple[object, ...]] = [
+        (class_row, name, method, seeds) for name in (*CLASSES, *MIXED)
+    ]
     for rig in rigs:
         names = list(rig.recordings)
         if rig.truth is not None:

@@ -9,7 +9,7 @@ from published_data import data_folder
 from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.geometry import se3
 from reproduction.coverage import __main__ as command
-from reproduction.coverage import classes, measures, motions, study
+from reproduction.coverage import classes, measures, mixed, motions, study
 from reproduction.coverage.bound import ideal_estimate
 from reproduction.coverage.measures import Row, pooled, worsened
 from reproduction.coverage.page import page
@@ -115,6 +115,14 @@ def test_recordings_of_a_class_repeat_and_differ():
     X, parent, child = recording.T_parent_child, recording.parent.poses, recording.child.poses
     A, B = (se3.inverse(poses[0]) @ poses[-1] for poses in (parent, child))
     np.testing.assert_allclose(A @ X, X @ B, atol=1e-6)
+
+
+def test_mixtures_differ_from_seed_to_seed():
+    kinds = [mixed.drawn_class("mixed_car", np.random.default_rng(seed)) for seed in range(30)]
+    assert len({kind.rate_hz for kind in kinds}) > 2
+    assert any(kind.child.slow for kind in kinds)
+    assert not all(kind.child.slow for kind in kinds)
+    assert all(np.isfinite(mixed.make(name, 0).bound()).all() for name in mixed.MIXED)
 
 
 def _nearly_none():
@@ -248,10 +256,12 @@ def _calibration(T_parent_child, covariance, scale):
 
 def test_one_class_from_end_to_end(monkeypatch):
     monkeypatch.setattr(study, "CLASSES", ("hand_white", "flat_agv"))
+    monkeypatch.setattr(study, "MIXED", ("mixed_arm",))
     rows = study.measure([], ["dnlo"], 2, 1)
     found = {one.name: one for one in rows}
     assert 0.3 < found["hand_white"].value("bound") < 3.0
     assert found["flat_agv"].value("refused") == 1.0
+    assert found["mixed_arm"].table == "mixed"
     assert set(found["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
     assert "| hand_white | dnlo |" in page(rows, {}, ["a folder"], 2)
 

@@ -1,0 +1,109 @@
+"""Recordings whose noise is drawn at random, every one another mixture: what the fixed classes did
+not think of.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from reproduction.coverage import motions
+from reproduction.coverage.classes import RecordingClass, Simulated, simulate
+from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, Tail, sigmas
+
+# Motion, lever arm (m) and size of its errors; whether odometry drifts by the metre.
+_KINDS = {
+    "mixed_hand": (motions.hand_held, 0.3, 1.0, False),
+    "mixed_car": (motions.car, 1.2, 4.0, True),
+    "mixed_agv": (motions.agv, 0.6, 2.0, True),
+    "mixed_drone": (motions.drone, 0.25, 1.5, False),
+    "mixed_arm": (motions.arm, 0.12, 0.5, False),
+}
+MIXED = tuple(_KINDS)
+
+_TAILS = (Tail("student", factor=4.0), Tail("spikes", 0.03, 15.0), Tail("bursts", 0.1, 8.0))
+_RATES_HZ = (5.0, 10.0, 15.0, 20.0, 30.0)
+_MOST_POSES = 2500
+
+
+def make(name: str, seed: int) -> Simulated:
+    """The recording of a motion by this seed."""
+    key = (77, seed, MIXED.index(name))
+    return simulate(drawn_class(name, np.random.default_rng(key)), key)
+
+
+def drawn_class(name: str, rng: np.random.Generator) -> RecordingClass:
+    """A class with rate, duration, lever arm and noise drawn."""
+    motion, lever_m, size, by_metre = _KINDS[name]
+    rate_hz = float(rng.choice(_RATES_HZ))
+    duration_s = min(_between(rng, 40.0, 300.0), _MOST_POSES / rate_hz)
+    parent, child = (_drawn_errors(rng, size, by_metre) for _ in range(2))
+    if not (child.walk.any() or child.walk_by_metre.any()):
+        # Jumps and a drifting scale are terms of an odometry that drifts.
+        child = replace(child, walk=sigmas(0.0003 * size, 0.003))
+    return RecordingClass(
+        motion=motion,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        parent=parent,
+        child=child,
+        lever_m=lever_m * _between(rng, 0.5, 2.0),
+    )
+
+
+def _drawn_errors(rng: np.random.Generator, size: float, by_metre: bool) -> SensorErrors:
+    errors = SensorErrors(
+        white=sigmas(
+            _between(rng, 0.0005, 0.006) * size * _by_axis(rng),
+            _between(rng, 0.02, 0.25) * (0.3 if by_metre else 1.0) * _by_axis(rng),
+        )
+    )
+    if rng.random() < 0.55:
+        errors = _drifting(errors, rng, size, by_metre)
+    if rng.random() < 0.5:
+        errors = _slow(errors, rng, (0.15, 10.0), (0.001 * size, 0.01 * size), False)
+    if rng.random() < 0.4:
+        errors = _slow(errors, rng, (2.0, 40.0), (0.005 * size, 0.05 * size), True)
+    if rng.random() < 0.2:
+        errors = replace(errors, scale=(_between(rng, 0.002, 0.015), _between(rng, 5.0, 60.0)))
+    if rng.random() < 0.15:
+        errors = replace(errors, jitter_s=_between(rng, 0.0005, 0.004))
+    if rng.random() < 0.25:
+        errors = replace(errors, tail=_TAILS[rng.integers(len(_TAILS))])
+    if rng.random() < 0.12:
+        errors = replace(errors, jumps_per_s=0.05, jump=sigmas(0.05 * size, 0.5))
+    return errors
+
+
+def _drifting(
+    errors: SensorErrors, rng: np.random.Generator, size: float, by_metre: bool
+) -> SensorErrors:
+    metres = _between(rng, 0.001, 0.01) * size * _by_axis(rng)
+    degrees = _between(rng, 0.01, 0.08) * _by_axis(rng)
+    if by_metre:
+        return replace(errors, walk_by_metre=sigmas(metres / 2, degrees / 4))
+    return replace(errors, walk=sigmas(metres, degrees))
+
+
+def _slow(
+    errors: SensorErrors,
+    rng: np.random.Generator,
+    tau_s: tuple[float, float],
+    metres: tuple[float, float],
+    in_world: bool,
+) -> SensorErrors:
+    sigma = sigmas(_between(rng, *metres), _between(rng, 0.03, 0.3))
+    part = GaussMarkov(_between(rng, *tau_s), sigma, in_world)
+    return replace(errors, slow=(*errors.slow, part))
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    """A log-uniform draw."""
+    return float(low * (high / low) ** rng.random())
+
+
+def _by_axis(rng: np.random.Generator) -> FloatArray:
+    """Factors (3,) about 1."""
+    return np.exp(0.35 * rng.standard_normal(3))
