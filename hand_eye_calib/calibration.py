@@ -218,8 +218,8 @@ class Calibration:
 
     @property
     def sigmas_rpy(self) -> FloatArray:
-        """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed; infinite
-        if one is unknown. Those of ``sigmas`` are of rotations about the parent's axes instead.
+        """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed;
+        infinite if one is unknown. Those of ``sigmas`` are of rotations about the parent's axes.
         """
         return sigmas_rpy(self.T_parent_child, self.covariance)
 

@@ -1,15 +1,15 @@
 """Every option of the package, once: name, unit, range, default and meaning.
 
-The node's parameters, the command line's options, ``config/calibrator.yaml`` and the README's
-tables are made from these dataclasses or tested against them.
+The node's parameters, the options of the command line, ``config/calibrator.yaml`` and the tables of
+the documentation are made from these dataclasses or tested against them.
 """
 
 import dataclasses
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, Self, TypeAlias
 
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.methods import BACKENDS, METHODS
@@ -25,119 +25,147 @@ POSE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
 )
 
+OptionValue: TypeAlias = bool | int | float | str
+OptionField: TypeAlias = dataclasses.Field[Any]
+
+_TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+
 
 def option(
-    default,
-    doc,
+    default: OptionValue,
+    doc: str,
     *,
-    unit="",
-    minimum=None,
-    maximum=None,
-    choices=None,
-    pattern=None,
-    words=(),
-    name=None,
-    read_only=False,
-    parse=None,
-):
-    """A dataclass field that knows all there is to know about an option.
+    unit: str = "",
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] | None = None,
+    pattern: str | None = None,
+    form: str = "",
+    words: tuple[str, ...] = (),
+    name: str | None = None,
+    read_only: bool = False,
+    parse: Callable[[str, str], object] | None = None,
+) -> Any:
+    """Make a dataclass field with everything there is to know about an option.
 
     Parameters
     ----------
     default
         Its type is the option's type.
-    doc : str
+    doc
         One line for a person who is about to set it.
-    unit : str
+    unit
         Unit of the value, empty for none.
-    minimum, maximum : float, optional
+    minimum, maximum
         Bounds, both allowed values.
-    choices : tuple of str, optional
+    choices
         The allowed values.
-    pattern : str, optional
+    pattern
         Regular expression that the whole value must match.
-    words : tuple of str
-        Words that a number may be replaced by, such as "none".
-    name : str, optional
-        Public name where it differs from the attribute's, such as ``keyframe.min_translation``.
-    read_only : bool
+    form
+        The same in words, for messages.
+    words
+        Words that may stand for a number, such as "none".
+    name
+        Public name if it differs from the attribute's, such as ``keyframe.min_translation``.
+    read_only
         The node cannot change it while it runs.
-    parse : callable, optional
-        Of a text option: ``parse(name, value)`` raises ConfigError where the value does not say
-        what it has to.
+    parse
+        For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
     """
     metadata = dict(
-        doc=doc, unit=unit, minimum=minimum, maximum=maximum, choices=choices, pattern=pattern, words=words, name=name,
-        read_only=read_only, parse=parse,
-    )  # fmt: skip
+        doc=doc,
+        unit=unit,
+        minimum=minimum,
+        maximum=maximum,
+        choices=choices,
+        pattern=pattern,
+        form=form,
+        words=words,
+        name=name,
+        read_only=read_only,
+        parse=parse,
+    )
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def option_name(field):
+def option_name(field: OptionField) -> str:
     """Public name of an option: the ROS parameter, the YAML key."""
-    return field.metadata["name"] or field.name
+    name: str = field.metadata["name"] or field.name
+    return name
 
 
-def check_value(field, value):
-    """The value in the option's own type.
+def check_value(field: OptionField, value: object) -> OptionValue:
+    """Check a value of an option and give it the option's own type.
 
     Raises
     ------
     ConfigError
-        Where the value is of the wrong type, out of range or not among the choices; one line that
+        If the value has the wrong type, is out of range or is not among the choices; one line that
         says what is allowed.
     """
-    meta, name, kind = field.metadata, option_name(field), type(field.default)
+    meta, name = field.metadata, option_name(field)
     if isinstance(value, str) and value in meta["words"]:
         return value
+    kind: type = float if meta["words"] else type(field.default)
     if meta["words"]:
-        value, kind = _number(name, value, meta), float
-    if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        value = float(value)
-        if not math.isfinite(value):
-            raise ConfigError(f"{name} must be a finite number; got {value}")
-    elif kind is not type(value):
-        raise ConfigError(f"{name} must be of type {kind.__name__}; got {value!r}")
+        value = _number(name, value, meta)
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        number = float(value)
+        if not math.isfinite(number):
+            raise ConfigError(f"{name} must be a finite number; got {number}")
+        return _in_range(name, number, meta)
+    if type(value) is not kind or not isinstance(value, bool | int | float | str):
+        raise ConfigError(f"{name} must be {_TYPE_NAMES[kind]}; got {value!r}")
+    return _allowed(name, value, meta) if isinstance(value, str) else _in_range(name, value, meta)
+
+
+def _number(name: str, value: Any, meta: Mapping[str, Any]) -> float:
+    """The number that may stand in place of the words of an option."""
+    try:
+        if not isinstance(value, bool):
+            return float(value)
+    except (TypeError, ValueError):
+        pass
+    raise ConfigError(f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}")
+
+
+def _in_range(name: str, value: float, meta: Mapping[str, Any]) -> float:
     unit = f" {meta['unit']}" if meta["unit"] else ""
     if meta["minimum"] is not None and value < meta["minimum"]:
         raise ConfigError(f"{name} must be at least {meta['minimum']}{unit}; got {value}")
     if meta["maximum"] is not None and value > meta["maximum"]:
         raise ConfigError(f"{name} must be at most {meta['maximum']}{unit}; got {value}")
+    return value
+
+
+def _allowed(name: str, value: str, meta: Mapping[str, Any]) -> str:
     if meta["choices"] is not None and value not in meta["choices"]:
         raise ConfigError(f"{name} must be one of {', '.join(meta['choices'])}; got {value!r}")
     if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
-        raise ConfigError(f"{name} must match {meta['pattern']}; got {value!r}")
+        raise ConfigError(f"{name} must be {meta['form']}; got {value!r}")
     if meta["parse"] is not None:
         meta["parse"](name, value)
     return value
 
 
-def _number(name, value, meta):
-    if isinstance(value, bool):
-        raise ConfigError(f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}")
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ConfigError(
-            f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}"
-        ) from None
-
-
 class OptionSet:
-    """Base of dataclasses made of options: checks every value, and knows the options by their
-    public names.
-    """
+    """Base of dataclasses made of options: checks every value and knows the public names."""
 
-    def __post_init__(self):
-        for field in dataclasses.fields(self):
+    def __post_init__(self) -> None:
+        for field in _fields(self):
             object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
 
     @classmethod
-    def from_options(cls, options):
-        """Build from a mapping of public names; unknown names are an error that lists the known
-        ones.
+    def from_options(cls, options: Mapping[str, object]) -> Self:
+        """Build from a mapping of public names to values.
+
+        Raises
+        ------
+        ConfigError
+            If a name is unknown, with a list of the known ones, or a value is not allowed.
         """
-        known = {option_name(field): field.name for field in dataclasses.fields(cls)}
+        known = {option_name(field): field.name for field in _fields(cls)}
         unknown = [name for name in options if name not in known]
         if unknown:
             raise ConfigError(
@@ -145,9 +173,13 @@ class OptionSet:
             )
         return cls(**{known[name]: value for name, value in options.items()})
 
-    def to_options(self):
+    def to_options(self) -> dict[str, OptionValue]:
         """Mapping of public names to values."""
-        return {option_name(field): getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {option_name(field): getattr(self, field.name) for field in _fields(self)}
+
+
+def _fields(options: Any) -> tuple[OptionField, ...]:
+    return dataclasses.fields(options)
 
 
 AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
@@ -155,14 +187,14 @@ _IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": m
 _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
 
 
-# What is known of the pose of the child sensor in the parent sensor's frame: for each of x, y, z (m),
-# roll, pitch, yaw (rad) its value and standard deviation, or both as the text of the option
+# Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
+# pitch, yaw (rad): value and standard deviation, or both as the text of the option
 # ``prior.<axis>``. "transform" takes the text of ``prior.transform``.
 Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:
-    """The prior options of a CalibratorConfig, by attribute, that say the same.
+    """The same prior as options of a CalibratorConfig, attribute to text.
 
     Raises
     ------
@@ -185,7 +217,7 @@ def prior_fields(prior: Prior) -> dict[str, str]:
     return fields
 
 
-def parse_prior(name, text):
+def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
     """Values and standard deviations of the axes that a prior option gives.
 
     Parameters
@@ -195,7 +227,7 @@ def parse_prior(name, text):
     text : str
         ``VALUE+/-SIGMA`` for an axis; ``X Y Z ROLL PITCH YAW +/- SIGMA_TRANSLATION SIGMA_ROTATION``
         for the transform. Metres and radians, or with units (m, cm, mm, rad, deg). Empty for
-        nothing.
+        none.
 
     Returns
     -------
@@ -205,6 +237,7 @@ def parse_prior(name, text):
     Raises
     ------
     ConfigError
+        If the text has another form, an unknown unit or a standard deviation of 0.
     """
     if not text:
         return {}
@@ -215,12 +248,12 @@ def parse_prior(name, text):
         if axis == "transform"
         else "VALUE+/-SIGMA"
     )
-    values, plus_minus, sigmas = text.replace("±", "+/-").partition("+/-")
-    values, sigmas = values.split(), sigmas.split()
+    before, plus_minus, after = text.replace("±", "+/-").partition("+/-")
+    values, sigmas = before.split(), after.split()
     if axis == "transform" and len(sigmas) == 2:
         sigmas = [sigmas[0]] * 3 + [sigmas[1]] * 3
     if not plus_minus or len(values) != len(axes) or len(sigmas) != len(axes):
-        raise ConfigError(f"{name} must be {expected}, with how sure that is; got {text!r}")
+        raise ConfigError(f"{name} must be {expected}, with its standard deviation; got {text!r}")
     prior = {}
     for axis, value, sigma in zip(axes, values, sigmas, strict=True):
         unit = AXIS_UNITS[axis]
@@ -234,74 +267,96 @@ def parse_prior(name, text):
     return prior
 
 
-def _quantity(name, text, unit):
+def _quantity(name: str, text: str, unit: str) -> float:
     match = _QUANTITY.fullmatch(text)
     if not match or (match[2] or unit) not in _IN_SI[unit]:
         raise ConfigError(f"{name} must be numbers in {' or '.join(_IN_SI[unit])}; got {text!r}")
     return float(match[1]) * _IN_SI[unit][match[2] or unit]
 
 
-def _prior(axis, unit):
+def _prior(axis: str) -> Any:
+    unit = AXIS_UNITS[axis]
     example = "1.85+/-0.02 or 185cm+/-2cm" if unit == "m" else "-90deg+/-2deg"
     return option(
         "",
-        f"What is known of {axis} of the child sensor in the parent sensor's frame: VALUE+/-SIGMA, such as {example}. Empty for nothing.",
+        f"Prior on {axis} of the child sensor in the parent sensor's frame: VALUE+/-SIGMA, "
+        f"such as {example}. Empty for none.",
         unit=unit,
         name=f"prior.{axis}",
         parse=parse_prior,
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CalibratorConfig(OptionSet):
     """Options of the engine: the same for the node, the replay of bags, files and Python."""
 
     method: str = option(
         "dnlo",
-        "Solver; dnlo rejects outliers, adaptive models the noise and needs no reference, the others use every pair.",
+        "How motion pairs are solved; dnlo rejects outliers, adaptive estimates the noise and uses "
+        "no reference, the others use every pair.",
         choices=tuple(METHODS),
     )
     reference: str = option(
         "auto",
-        "Which poses form motion pairs: A (all against the first), B<n> (against the n-th before), C<n> (segments of n), or auto "
-        "(one from which the noise of these trajectories promises the least error).",
+        "Which poses form motion pairs: A (each with the first), B<n> (each with the n-th before "
+        "it), C<n> (each with the first of its segment of n), or auto (chosen by the error that "
+        "the noise of these trajectories predicts).",
         pattern=REFERENCE_PATTERN,
+        form="A, B<n> (n >= 1), C<n> (n >= 2) or auto, such as B5",
     )
     backend: str = option(
         "fast",
-        "fast is the quadratic-form solver; ipopt the paper's CasADi + Ipopt formulation.",
+        "fast: the quadratic-form solver; ipopt: the paper's CasADi + Ipopt formulation, for dnlo "
+        "and dnl.",
         choices=BACKENDS,
     )
     threshold: float = option(
         0.01,
-        "DNLO: pairs whose cost exceeds this are outliers (c of eq. 5).",
+        "DNLO: pairs with a larger cost are outliers (c of eq. 5).",
         unit="m^2",
         minimum=1e-12,
         maximum=1e6,
     )
     min_inlier_fraction: float = option(
         0.5,
-        "DNLO: share of the pairs that always counts as inliers (d of eq. 5 over the pairs).",
+        "DNLO: at least this share of the pairs counts as inliers (d of eq. 5 over the pairs).",
         minimum=0.0,
         maximum=1.0,
     )
     min_pairs: int = option(
-        10, "Fewest synchronised pose pairs to solve with.", minimum=3, maximum=1_000_000
+        10,
+        "Smallest number of synchronised pose pairs to solve with.",
+        minimum=3,
+        maximum=1_000_000,
     )
     max_pairs: int = option(
-        5000, "Most synchronised pose pairs kept.", minimum=10, maximum=100_000_000
+        5000,
+        "Largest number of synchronised pose pairs kept; more are downsampled.",
+        minimum=10,
+        maximum=100_000_000,
     )
     keyframe_min_translation: float = option(
-        0.0, "Keep a pose pair when the parent sensor has moved this far since the last one kept, or turned min_rotation.",
-        unit="m", minimum=0.0, maximum=100.0, name="keyframe.min_translation",
-    )  # fmt: skip
+        0.0,
+        "Keep a pose pair if the parent sensor has moved this far since the last one kept, or "
+        "rotated by keyframe.min_rotation. 0 switches this off.",
+        unit="m",
+        minimum=0.0,
+        maximum=100.0,
+        name="keyframe.min_translation",
+    )
     keyframe_min_rotation: float = option(
-        0.0, "Keep a pose pair when the parent sensor has turned this far since the last one kept, or moved min_translation.",
-        unit="rad", minimum=0.0, maximum=math.pi, name="keyframe.min_rotation",
-    )  # fmt: skip
+        0.0,
+        "Keep a pose pair if the parent sensor has rotated by this angle since the last one kept, "
+        "or moved keyframe.min_translation. 0 switches this off.",
+        unit="rad",
+        minimum=0.0,
+        maximum=math.pi,
+        name="keyframe.min_rotation",
+    )
     keyframe_min_interval: float = option(
         0.0,
-        "Time between pose pairs that are kept.",
+        "Smallest time between pose pairs that are kept.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -309,36 +364,38 @@ class CalibratorConfig(OptionSet):
     )
     max_gap: float = option(
         0.5,
-        "Longest time between two poses of a stream that interpolation may bridge.",
+        "Longest time between two poses of a stream across which it is interpolated.",
         unit="s",
         minimum=1e-3,
         maximum=60.0,
     )
     time_offset: float | str = option(
         0.0,
-        "Added to the child's stamps to get the parent's clock; estimate finds it from how both streams turn.",
+        "Added to the child's stamps to get the parent's clock; estimate finds it from the angular "
+        "rates of both streams.",
         unit="s",
         words=("estimate",),
         minimum=-1e9,
         maximum=1e9,
     )
-    scale: str | float = option(
+    scale: float | str = option(
         "none",
-        "Factor from the child's lengths to metres; estimate finds it, auto does so where it differs from 1 beyond doubt.",
+        "Factor from the child's lengths to metres; estimate finds it; auto finds it and uses it "
+        "only if it clearly differs from 1.",
         words=("none", "auto", "estimate"),
         minimum=1e-6,
         maximum=1e6,
     )
-    prior_x: str = _prior("x", "m")
-    prior_y: str = _prior("y", "m")
-    prior_z: str = _prior("z", "m")
-    prior_roll: str = _prior("roll", "rad")
-    prior_pitch: str = _prior("pitch", "rad")
-    prior_yaw: str = _prior("yaw", "rad")
+    prior_x: str = _prior("x")
+    prior_y: str = _prior("y")
+    prior_z: str = _prior("z")
+    prior_roll: str = _prior("roll")
+    prior_pitch: str = _prior("pitch")
+    prior_yaw: str = _prior("yaw")
     prior_transform: str = option(
         "",
-        "What is known of the whole pose: X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION, such as "
-        "0.4 0 1.85 0 0 -90deg+/-0.05 5deg. Empty for nothing.",
+        "Prior on the whole pose: X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION, such as "
+        "0.4 0 1.85 0 0 -90deg+/-0.05 5deg. Empty for none.",
         name="prior.transform",
         parse=parse_prior,
     )
@@ -349,17 +406,17 @@ class CalibratorConfig(OptionSet):
         "", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True
     )
 
-    def prior(self):
-        """What is known beforehand: axis name to (value, sigma), in m and rad; a single axis goes
-        before the transform.
+    def prior(self) -> dict[str, tuple[float, float]]:
+        """The prior: axis name to (value, standard deviation), in m and rad; an option of a single
+        axis overrides ``prior.transform``.
         """
-        known = {}
+        known: dict[str, tuple[float, float]] = {}
         for name in ("transform", *AXIS_UNITS):
             known |= parse_prior(f"prior.{name}", getattr(self, f"prior_{name}"))
         return known
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NodeConfig(OptionSet):
     """Options that only the node has."""
 
@@ -368,28 +425,31 @@ class NodeConfig(OptionSet):
     )
     parent_type: str = option(
         "auto",
-        "Message type of parent_odom; auto looks at the publisher.",
+        "Message type of parent_odom; auto takes it from the publisher.",
         choices=POSE_TYPES,
         read_only=True,
     )
     child_type: str = option(
         "auto",
-        "Message type of child_odom; auto looks at the publisher.",
+        "Message type of child_odom; auto takes it from the publisher.",
         choices=POSE_TYPES,
         read_only=True,
     )
     output_directory: str = option(
         "",
-        "Where ~/save and the end of the node write the result files, and the journal is; empty for nowhere.",
+        "Directory of the journal and of the result files, which ~/save and the end of the node "
+        "write; empty for none.",
     )
     journal: str = option(
         "new",
-        "The session on disk, in journal/ of output_directory, so that a crash loses less than a second of it: new begins a session "
-        "and keeps the one before aside, resume goes on with the one there.",
+        "Journal of the session, in journal/ of output_directory; with it a crash loses less than "
+        "a second. new: start a session and keep the previous journal aside; resume: continue the "
+        "session on disk; off: no journal.",
         choices=("new", "resume", "off"),
         read_only=True,
     )
     publish_tf: bool = option(
         False,
-        "Broadcast the result on /tf_static once all of it is observable; leave it off where the robot's description has this edge.",
+        "Broadcast the result on /tf_static once all of it is observable; leave it off if the "
+        "robot description has this transform.",
     )

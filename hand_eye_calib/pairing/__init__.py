@@ -1,1 +1,1 @@
-"""From two streams of poses to pairs of relative motions."""
+"""Two streams of poses to pairs of relative motions."""

@@ -1,18 +1,26 @@
-"""Which synchronised poses are worth keeping."""
+"""Selection of the synchronised poses that are kept."""
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.synchronise import PosePairs
 
-# Poses looked at together in the search for the next keyframe.
+# Number of poses checked at once in the search for the next keyframe.
 _WINDOW = 64
 
 
-def select_keyframes(pose_pairs, min_translation, min_rotation, min_interval_s, previous=None):
+def select_keyframes(
+    pose_pairs: PosePairs,
+    min_translation: float,
+    min_rotation: float,
+    min_interval_s: float,
+    previous: PosePairs | None = None,
+) -> IntArray:
     """Indices of the pose pairs to keep, in order.
 
-    A pose pair is kept when ``min_interval_s`` has passed since the last one kept and the parent
-    sensor has since moved ``min_translation`` or turned ``min_rotation``. A threshold of zero
+    A pose pair is kept if ``min_interval_s`` has passed since the last one kept and the parent
+    sensor has since moved ``min_translation`` or rotated by ``min_rotation``. A threshold of zero
     switches that criterion off.
 
     Parameters
@@ -25,7 +33,7 @@ def select_keyframes(pose_pairs, min_translation, min_rotation, min_interval_s, 
     min_interval_s : float
         Seconds.
     previous : PosePairs, optional
-        The last one kept before these, of length 1 (or 0 for none).
+        The last one kept before these, of length 1 (0 for none).
 
     Returns
     -------
@@ -37,9 +45,9 @@ def select_keyframes(pose_pairs, min_translation, min_rotation, min_interval_s, 
     stamps_ns, poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p
     if previous is not None and len(previous):
         kept, last_stamp_ns, T_last = [], previous.stamps_ns[-1], previous.Ts_pw_p[-1]
-        next_index = 0
     else:
-        kept, last_stamp_ns, T_last, next_index = [0], stamps_ns[0], poses[0], 1
+        kept, last_stamp_ns, T_last = [0], stamps_ns[0], poses[0]
+    next_index = len(kept)
     while next_index < n_poses:
         window = slice(next_index, next_index + _WINDOW)
         wanted = stamps_ns[window] - last_stamp_ns >= min_interval_s * 1e9
@@ -55,7 +63,10 @@ def select_keyframes(pose_pairs, min_translation, min_rotation, min_interval_s, 
     return np.array(kept, dtype=int)
 
 
-def _has_moved(T_last, poses, min_translation, min_rotation):
+def _has_moved(
+    T_last: FloatArray, poses: FloatArray, min_translation: float, min_rotation: float
+) -> BoolArray:
+    """Whether each pose (N, 4, 4) is at least one of both thresholds away from the last."""
     moved = np.zeros(len(poses), dtype=bool)
     if min_translation > 0.0:
         moved |= np.linalg.norm(poses[:, :3, 3] - T_last[:3, 3], axis=1) >= min_translation

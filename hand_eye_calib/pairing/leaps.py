@@ -1,10 +1,12 @@
-"""Leaps in time: stamps that lie days apart from the others, which no recording has."""
+"""Leaps in time: stamps days apart from the others, which no recording has."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-# No recording pauses for so long (s): a stamp is wrong.
+from hand_eye_calib.arrays import IntArray
+
+# No recording pauses this long (s): a stamp is wrong.
 _LEAP_S = 86_400.0
 
 
@@ -24,21 +26,21 @@ class Leap:
     before: int
     after: int
 
-    def what(self):
-        """What was found, to follow "the parent stream's"."""
-        return f"stamps leap by {self.seconds / _LEAP_S:,.0f} days after pose {self.before} of {self.before + self.after}"
+    def what(self) -> str:
+        """The finding, to follow "the parent stream's"."""
+        return (
+            f"stamps leap by {self.seconds / _LEAP_S:,.0f} days after pose {self.before} "
+            f"of {self.before + self.after}"
+        )
 
-    def advice(self):
-        """What to do."""
+    def advice(self) -> str:
+        """The remedy."""
         few = f"the first {self.before}" if self.before < self.after else f"the last {self.after}"
         return f"repair the stamps, or remove {few} of its poses"
 
 
-def find_leap(stamps_ns):
-    """The Leap in these stamps, (N,) int64 in rising order; None without one.
-
-    A stream of fewer than two poses has none.
-    """
+def find_leap(stamps_ns: IntArray) -> Leap | None:
+    """The longest leap in stamps (N,), in rising order; None without one."""
     if len(stamps_ns) < 2:
         return None
     intervals_s = np.diff(stamps_ns) * 1e-9

@@ -1,23 +1,22 @@
-"""Reference selection: which index pairs (i, j) become motion pairs (Välimäki et al. 2023, section
-3.4).
-"""
+"""References: which index pairs (i, j) become motion pairs (Välimäki et al. 2023, section 3.4)."""
 
 import re
 
 import numpy as np
 
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.errors import ConfigError
 
 _PATTERN = re.compile(r"A|([BC])([1-9][0-9]*)")
 
 
-def parse_reference(reference):
+def parse_reference(reference: str) -> tuple[str, int]:
     """Split a reference into its kind ("A", "B" or "C") and its step (1 for "A").
 
     Raises
     ------
     ConfigError
-        For anything but A, B<n> with n >= 1, or C<n> with n >= 2.
+        If it is not A, B<n> with n >= 1, or C<n> with n >= 2.
     """
     match = _PATTERN.fullmatch(reference) if isinstance(reference, str) else None
     if match and reference == "A":
@@ -29,22 +28,27 @@ def parse_reference(reference):
     )
 
 
-def reference_indices(reference, n_poses):
+def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]:
     """Index pairs of a reference.
 
     Parameters
     ----------
     reference : str
-        ``"A"``: every pose against the first. ``"B<n>"``: against the n-th before it. ``"C<n>"``:
-        against the keyframe that opens its segment of n poses; a last segment whose keyframe is N -
-        n or later is left out, as in the published results.
+        ``"A"``: every pose with the first. ``"B<n>"``: with the n-th before it. ``"C<n>"``: with
+        the keyframe that starts its segment of n poses; a last segment whose keyframe is N - n or
+        later is left out, as in the published results.
     n_poses : int
         Number of poses N.
 
     Returns
     -------
     i, j : (K,) int arrays
-        Motion k runs from pose ``i[k]`` to pose ``j[k]``; K is 0 where there are too few poses.
+        Motion k runs from pose ``i[k]`` to pose ``j[k]``; K is 0 if there are too few poses.
+
+    Raises
+    ------
+    ConfigError
+        If the reference has another form.
     """
     kind, step = parse_reference(reference)
     if kind == "A":

@@ -1,13 +1,16 @@
-"""Two streams with stamps of their own, brought to common instants by interpolation."""
+"""Synchronisation: poses of two streams at common instants, by interpolation."""
 
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry.trajectory import Trajectory
 
-# Streams whose intervals differ by less than this factor count as equally fast: the child's stamps
-# are then used.
+# Streams whose intervals differ by less than this factor count as equally fast: they are paired at
+# the child's stamps.
 _EQUALLY_FAST = 1.2
 
 
@@ -23,22 +26,24 @@ class PosePairs:
         Pose of each sensor in its own world.
     """
 
-    stamps_ns: np.ndarray
-    Ts_pw_p: np.ndarray
-    Ts_cw_c: np.ndarray
+    stamps_ns: IntArray
+    Ts_pw_p: FloatArray
+    Ts_cw_c: FloatArray
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def __getitem__(self, index):
-        return PosePairs(self.stamps_ns[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
+    def __getitem__(self, index: slice | NDArray[Any]) -> Self:
+        return type(self)(self.stamps_ns[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
 
     @classmethod
-    def empty(cls):
+    def empty(cls) -> Self:
+        """No poses."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)))
 
     @classmethod
-    def concatenate(cls, *parts):
+    def concatenate(cls, *parts: Self) -> Self:
+        """All parts in the given order."""
         return cls(
             *(
                 np.concatenate([getattr(part, name) for part in parts])
@@ -47,10 +52,11 @@ class PosePairs:
         )
 
 
-def slower_stream(parent: Trajectory, child: Trajectory):
-    """ "parent" or "child": whose stamps to pair at. The child's where both are about equally fast.
+def slower_stream(parent: Trajectory, child: Trajectory) -> str:
+    """Choose the stream at whose stamps to pair: "parent" or "child".
 
-    The typical interval is the median, so that a gap or a late start does not make a stream slow.
+    The slower one; the child if both are about equally fast. The typical interval is the median, so
+    that a gap or a late start does not make a stream slow.
     """
     if len(parent) < 2 or len(child) < 2:
         return "child"
@@ -61,11 +67,13 @@ def slower_stream(parent: Trajectory, child: Trajectory):
     return "parent" if interval_parent > _EQUALLY_FAST * interval_child else "child"
 
 
-def synchronise(parent: Trajectory, child: Trajectory, max_gap_s, at=None) -> PosePairs:
-    """Poses of both sensors at the slower stream's stamps.
+def synchronise(
+    parent: Trajectory, child: Trajectory, max_gap_s: float, at: str | None = None
+) -> PosePairs:
+    """Interpolate the faster stream at the slower stream's stamps.
 
-    The faster stream is interpolated along the geodesic of SE(3). An instant outside it, or between
-    two of its poses that lie more than ``max_gap_s`` apart, is left out; an instant at which it has
+    Interpolation is along the geodesic of SE(3). An instant outside the faster stream, or between
+    two of its poses that are more than ``max_gap_s`` apart, is left out. An instant at which it has
     a pose of its own is always kept.
 
     Parameters
@@ -75,7 +83,7 @@ def synchronise(parent: Trajectory, child: Trajectory, max_gap_s, at=None) -> Po
     max_gap_s : float
         Seconds.
     at : {"parent", "child"}, optional
-        Whose stamps to use; the slower stream's by default.
+        The stream at whose stamps to pair; the slower one by default.
     """
     if len(parent) == 0 or len(child) == 0:
         return PosePairs.empty()
@@ -91,10 +99,8 @@ def synchronise(parent: Trajectory, child: Trajectory, max_gap_s, at=None) -> Po
     return PosePairs(stamps_ns, fast_poses, slow.poses[keep])
 
 
-def _interpolable(available_ns, wanted_ns, max_gap_s):
-    """Mask of the wanted stamps at which a stream with the available stamps has a pose or may be
-    interpolated.
-    """
+def _interpolable(available_ns: IntArray, wanted_ns: IntArray, max_gap_s: float) -> BoolArray:
+    """Mask of the wanted stamps at which a stream has a pose or may be interpolated."""
     after = np.searchsorted(available_ns, wanted_ns)
     inside = after < len(available_ns)
     after = np.minimum(after, len(available_ns) - 1)

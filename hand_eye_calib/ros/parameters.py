@@ -151,7 +151,7 @@ def _descriptor(field):
     )
     descriptor = ParameterDescriptor(
         description=description,
-        additional_constraints=f"must match {meta['pattern']}" if meta["pattern"] else "",
+        additional_constraints=f"must be {meta['form']}" if meta["form"] else "",
         read_only=meta["read_only"],
         dynamic_typing=_dynamic(field),
     )

@@ -134,10 +134,10 @@ def test_every_method_is_available(method):
     ("options", "message"),
     [
         ({"method": "tsai"}, "method must be one of dnlo, dnl, park"),
-        ({"reference": "B0"}, "reference must match"),
+        ({"reference": "B0"}, "reference must be A, B<n>"),
         ({"threshold": -1.0}, "threshold must be at least"),
         ({"min_inlier_fraction": 1.5}, "min_inlier_fraction must be at most 1"),
-        ({"min_pairs": 2.5}, "min_pairs must be of type int"),
+        ({"min_pairs": 2.5}, "min_pairs must be a whole number"),
         ({"scale": "big"}, "scale must be none or auto or estimate or a number"),
         ({"time_offset": float("nan")}, "time_offset must be a finite number"),
         ({"method": "park", "backend": "ipopt"}, "park has no ipopt backend"),

@@ -465,11 +465,11 @@ def parsed(options):
         ),
         (
             ["replay", "bag", "--threshold", "big"],
-            "argument --threshold: must be of type float; got 'big'",
+            "argument --threshold: must be a number; got 'big'",
         ),
         (
             ["replay", "bag", "--min-pairs", "3.5"],
-            "argument --min-pairs: must be of type int; got '3.5'",
+            "argument --min-pairs: must be a whole number; got '3.5'",
         ),
         (["replay", "bag", "--scale", "0"], "argument --scale: must be at least"),
         (["replay", "bag", "--reference", "D4"], "--reference: must be auto, A, B<n> such as B5"),
@@ -552,8 +552,8 @@ def test_options_of_the_node_are_ignored_and_named(config_file, capsys):
             r"config\.yaml: unknown option 'keyframe.minimum'",
         ),
         ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
-        ("{min_pairs: 12.5}", r"config\.yaml: 'min_pairs' must be of type int; got 12.5"),
-        ("{method: 3}", r"config\.yaml: 'method' must be of type str; got 3"),
+        ("{min_pairs: 12.5}", r"config\.yaml: 'min_pairs' must be a whole number; got 12.5"),
+        ("{method: 3}", r"config\.yaml: 'method' must be a text; got 3"),
         ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
         (
             "/slam: {ros__parameters: {a: 1}}",

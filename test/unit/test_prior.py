@@ -58,7 +58,7 @@ class TestOption:
     @pytest.mark.parametrize(
         ("name", "text", "message"),
         [
-            ("prior_z", "1.85", "with how sure that is"),
+            ("prior_z", "1.85", "with its standard deviation"),
             ("prior_z", "1.85+/-0", "standard deviation above 0"),
             ("prior_z", "1.85deg+/-0.02", "numbers in m or cm or mm"),
             ("prior_z", "high+/-0.02", "numbers in m or cm or mm"),
