@@ -1,1 +1,1 @@
-"""Rigid transforms and trajectories. Knows nothing of calibration."""
+"""Rigid transforms and trajectories."""

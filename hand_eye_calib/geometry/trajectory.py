@@ -1,19 +1,21 @@
-"""A sensor's trajectory: poses of one sensor in its own fixed frame, with their stamps."""
+"""Trajectories: stamped poses of one sensor in a fixed frame of its own."""
 
 import copy
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 
-# Farther from unit length than this a quaternion is not a rounded rotation but a wrong one (tf2
-# uses the same bound).
+# A quaternion further from unit length than this is wrong and not just rounded (tf2 has the same
+# bound).
 QUATERNION_NORM_TOLERANCE = 1e-2
 
-# Poses given as matrices must be rotations to this tolerance; a file with six digits passes, a
-# scaled matrix does not.
+# Tolerance for rotation matrices: a file with six digits passes, a scaled matrix does not.
 ROTATION_TOLERANCE = 1e-3
 
 
@@ -28,86 +30,109 @@ class Trajectory:
     poses : (N, 4, 4) float64 array
         ``Ts_world_sensor``: poses of the sensor in its own world (odometry) frame, metres.
     sensor_frame : str
-        Name of the moving frame; empty where it is not known.
+        Name of the moving frame; empty if unknown.
     world_frame : str
-        Name of the fixed frame; empty where it is not known.
+        Name of the fixed frame; empty if unknown.
 
     Raises
     ------
     InputError
-        Where shapes, stamps or poses are unusable; the message names the first offending pose.
+        If shapes, stamps or poses are unusable; the message names the first such pose.
     """
 
-    stamps_ns: np.ndarray
-    poses: np.ndarray
+    stamps_ns: IntArray
+    poses: FloatArray
     sensor_frame: str = ""
     world_frame: str = ""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         stamps_ns = np.ascontiguousarray(self.stamps_ns)
         poses = np.ascontiguousarray(self.poses, dtype=float)
         if stamps_ns.ndim != 1 or not np.issubdtype(stamps_ns.dtype, np.integer):
             raise InputError(
-                f"stamps_ns must be one-dimensional integers (nanoseconds); found shape {stamps_ns.shape} of {stamps_ns.dtype}"
+                "stamps_ns must be one-dimensional integers (nanoseconds); "
+                f"found shape {stamps_ns.shape} of {stamps_ns.dtype}"
             )
         if poses.shape != (len(stamps_ns), 4, 4):
             raise InputError(
-                f"poses must have shape ({len(stamps_ns)}, 4, 4), one per stamp; found {poses.shape}"
+                f"poses must have shape ({len(stamps_ns)}, 4, 4), one per stamp; "
+                f"found {poses.shape}"
             )
         stamps_ns = stamps_ns.astype(np.int64, copy=False)
         backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
         if backwards.size:
             index = int(backwards[0]) + 1
             raise InputError(
-                f"stamps must increase: pose {index} has stamp {stamps_ns[index]} ns after {stamps_ns[index - 1]} ns; "
-                "sort the poses and drop repeated stamps"
+                f"stamps must increase: pose {index} has stamp {stamps_ns[index]} ns "
+                f"after {stamps_ns[index - 1]} ns; sort the poses and drop repeated stamps"
             )
         _check_poses(poses)
         object.__setattr__(self, "stamps_ns", stamps_ns)
         object.__setattr__(self, "poses", poses)
 
     @classmethod
-    def from_quat_xyzw(cls, stamps_ns, translations, quats_xyzw, **frames):
-        """Build from translations (N, 3) in metres and quaternions (N, 4), scalar last, of nearly
-        unit length.
+    def from_quat_xyzw(
+        cls,
+        stamps_ns: IntArray,
+        translations: ArrayLike,
+        quats_xyzw: ArrayLike,
+        sensor_frame: str = "",
+        world_frame: str = "",
+    ) -> Self:
+        """Build from translations (N, 3), m, and quaternions (N, 4), scalar last.
 
         Raises
         ------
         InputError
-            Where a number is not finite or a quaternion is more than 1 % away from unit length.
+            If a value is not finite or a quaternion is more than 1 % away from unit length.
         """
         translations = np.asarray(translations, dtype=float).reshape(-1, 3)
         quats_xyzw = np.asarray(quats_xyzw, dtype=float).reshape(-1, 4)
         finite = np.isfinite(translations).all(axis=1) & np.isfinite(quats_xyzw).all(axis=1)
         if not finite.all():
             raise InputError(
-                f"pose {int(np.argmin(finite))} has a value that is not finite; remove it or repair its source"
+                f"pose {int(np.argmin(finite))} has a value that is not finite; "
+                "remove it or repair its source"
             )
         norms = np.linalg.norm(quats_xyzw, axis=1)
         wrong = np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE
         if wrong.any():
             index = int(np.argmax(wrong))
             raise InputError(
-                f"pose {index} has a quaternion of length {norms[index]:.4g}, expected 1 within {QUATERNION_NORM_TOLERANCE}; "
+                f"pose {index} has a quaternion of length {norms[index]:.4g}, "
+                f"expected 1 within {QUATERNION_NORM_TOLERANCE}; "
                 "check the column order (x y z qx qy qz qw)"
             )
-        return cls(stamps_ns, se3.from_quat_xyzw(translations, quats_xyzw), **frames)
+        poses = se3.from_quat_xyzw(translations, quats_xyzw)
+        return cls(stamps_ns, poses, sensor_frame, world_frame)
 
-    def __len__(self):
+    def __repr__(self) -> str:
+        frames = [
+            f", {name}={frame!r}"
+            for name, frame in (
+                ("sensor_frame", self.sensor_frame),
+                ("world_frame", self.world_frame),
+            )
+            if frame
+        ]
+        return f"Trajectory({len(self)} poses over {self.duration_s:.3f} s{''.join(frames)})"
+
+    def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def __getitem__(self, index):
-        """A part of the trajectory: any slice, mask or increasing index array."""
-        if isinstance(index, (int, np.integer)):
+    def __getitem__(self, index: slice | NDArray[Any]) -> Self:
+        """Part of the trajectory: a slice, mask or increasing index array."""
+        if isinstance(index, int | np.integer):
             raise TypeError(
-                "index a Trajectory with a slice, mask or index array; single poses are trajectory.poses[i]"
+                "index a Trajectory with a slice, mask or index array; "
+                "single poses are trajectory.poses[i]"
             )
-        return Trajectory(
+        return type(self)(
             self.stamps_ns[index], self.poses[index], self.sensor_frame, self.world_frame
         )
 
     @property
-    def duration_s(self):
+    def duration_s(self) -> float:
         """Seconds from first to last pose; 0 for fewer than two."""
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) > 1 else 0.0
 
@@ -116,38 +141,38 @@ class Trajectory:
         """Median time between two poses in seconds, of at least two poses."""
         return float(np.median(np.diff(self.stamps_ns))) * 1e-9
 
-    def shifted(self, offset_s):
+    def shifted(self, offset_s: float) -> Self:
         """The same poses with ``offset_s`` seconds added to every stamp."""
         shifted = copy.copy(self)  # poses and order have been checked
         object.__setattr__(shifted, "stamps_ns", self.stamps_ns + np.int64(round(offset_s * 1e9)))
         return shifted
 
-    def scaled(self, scale):
+    def scaled(self, scale: float) -> Self:
         """The same rotations with every translation multiplied by ``scale``."""
         poses = self.poses.copy()
         poses[:, :3, 3] *= scale
-        return Trajectory(self.stamps_ns, poses, self.sensor_frame, self.world_frame)
+        return type(self)(self.stamps_ns, poses, self.sensor_frame, self.world_frame)
 
-    def at(self, stamps_ns, extrapolate=False):
-        """Poses at other stamps, along the geodesic of SE(3) between neighbouring poses.
+    def at(self, stamps_ns: IntArray, extrapolate: bool = False) -> FloatArray:
+        """Interpolate poses at other stamps along the geodesic of SE(3) between neighbours.
 
         Parameters
         ----------
         stamps_ns : (M,) int64 array
         extrapolate : bool
-            Extend the first and last segment's twist beyond the ends (as the paper's KITTI
-            experiments do); otherwise a stamp outside the trajectory is an error.
+            Extend the twist of the first and last segment beyond the ends, as the paper's KITTI
+            experiments do. Without it a stamp outside the trajectory is an error.
 
         Returns
         -------
         (M, 4, 4) array
-            A stamp that the trajectory has gives that very pose, bit by bit.
+            A stamp of the trajectory gives its very pose, bit by bit.
 
         Raises
         ------
         InputError
-            With fewer than two poses, or outside the trajectory's time range without
-            ``extrapolate``.
+            If there are fewer than two poses or, without ``extrapolate``, a stamp is outside the
+            trajectory's time range.
         """
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         if len(self) < 2:
@@ -171,11 +196,13 @@ class Trajectory:
         return poses
 
 
-def _check_poses(poses):
+def _check_poses(poses: FloatArray) -> None:
+    """Raise InputError at the first pose (N, 4, 4) that is no rigid transform."""
     finite = np.isfinite(poses).all(axis=(1, 2))
     if not finite.all():
         raise InputError(
-            f"pose {int(np.argmin(finite))} has a value that is not finite; remove it or repair its source"
+            f"pose {int(np.argmin(finite))} has a value that is not finite; "
+            "remove it or repair its source"
         )
     rotation = poses[:, :3, :3]
     deviation = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(
@@ -184,6 +211,6 @@ def _check_poses(poses):
     wrong = (deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotation) < 0)
     if wrong.any():
         raise InputError(
-            f"pose {int(np.argmax(wrong))} is not a rigid transform: its 3x3 part is not a rotation matrix within "
-            f"{ROTATION_TOLERANCE} (scaled or left-handed axes?)"
+            f"pose {int(np.argmax(wrong))} is not a rigid transform: its 3x3 part is not a "
+            f"rotation matrix within {ROTATION_TOLERANCE} (scaled or left-handed axes?)"
         )

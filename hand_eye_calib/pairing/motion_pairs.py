@@ -99,7 +99,8 @@ def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> Mo
     """
     if len(Ts_pw_p) != len(Ts_cw_c):
         raise InputError(
-            f"parent and child need the same number of poses; found {len(Ts_pw_p)} and {len(Ts_cw_c)}"
+            "parent and child need the same number of poses; "
+            f"found {len(Ts_pw_p)} and {len(Ts_cw_c)}"
         )
     return pairs_between(Ts_pw_p, Ts_cw_c, *reference_indices(reference, len(Ts_pw_p)))
 
