@@ -303,7 +303,7 @@ class CalibratorConfig(OptionSet):
         "it), C<n> (each with the first of its segment of n), or auto (chosen by the error that "
         "the noise of these trajectories predicts).",
         pattern=REFERENCE_PATTERN,
-        form="A, B<n> (n >= 1), C<n> (n >= 2) or auto, such as B5",
+        form="auto, A, B<n> such as B5, or C<n> such as C20",
     )
     backend: str = option(
         "fast",

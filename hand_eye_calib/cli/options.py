@@ -13,7 +13,6 @@ from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.cli.spelling import OPTION_FIELDS, did_you_mean, flag
 from hand_eye_calib.config import (
-    REFERENCE_PATTERN,
     CalibratorConfig,
     NodeConfig,
     check_value,
@@ -31,9 +30,6 @@ _PRIOR = "prior."
 
 # What most people set; the other options are shown by --help-all.
 _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
-
-# What stands for a regular expression in messages.
-_IN_WORDS = {REFERENCE_PATTERN: "auto, A, B<n> such as B5, or C<n> such as C20"}
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
@@ -166,11 +162,8 @@ def _value(field: dataclasses.Field[Any], value: Any) -> Any:
     try:
         return check_value(field, _from_text(field, value) if isinstance(value, str) else value)
     except ConfigError as error:
-        meta, text = field.metadata, str(error)
-        if meta["pattern"] in _IN_WORDS:
-            text = text.replace(f"match {meta['pattern']}", f"be {_IN_WORDS[meta['pattern']]}")
-        words = (*(meta["choices"] or ()), *meta["words"])
-        raise ConfigError(text + did_you_mean(str(value), words)) from None
+        words = (*(field.metadata["choices"] or ()), *field.metadata["words"])
+        raise ConfigError(str(error) + did_you_mean(str(value), words)) from None
 
 
 def _from_text(field: dataclasses.Field[Any], text: str) -> Any:

@@ -55,7 +55,7 @@ def test_changes_are_applied_or_rejected_with_the_reason(start_node, peer):
 
     for name, value, reason in [
         ("method", "magic", f"method must be one of {', '.join(METHODS)}"),
-        ("reference", "B0", "reference must be A, B<n>"),
+        ("reference", "B0", "reference must be auto, A, B<n>"),
         ("threshold", -1.0, "threshold out of range"),
         ("threshold", 1, "Wrong parameter type"),
         ("scale", "huge", "scale must be none or "),
