@@ -4,18 +4,21 @@
 >>> parent, child = hec.read_trajectory("lidar.txt"), hec.read_trajectory("camera.txt")
 >>> hec.calibrate(parent, child, method="dnlo", reference="B5").T_parent_child
 
-Names are imported when first used, so that importing the package costs nothing and needs nothing
-but Python.
+Names are imported when they are first used, so that importing the package takes no time and needs
+nothing but Python.
 """
 
 import importlib
+from typing import TYPE_CHECKING, Any
 
+# The home of every public name and, if it differs, its name there.
 _HOMES = {
     "Calibration": "calibration",
-    "SolveStatus": "calibration",
     "Calibrator": "engine.calibrator",
     "CalibratorConfig": "config",
     "HandEyeCalibError": "errors",
+    "Residuals": "calibration",
+    "SolveStatus": "calibration",
     "Trajectory": "geometry.trajectory",
     "calibrate": "engine.offline",
     "load": "io.results",
@@ -25,19 +28,47 @@ _HOMES = {
 }
 _ORIGINAL_NAMES = {"load": "load_result", "save": "save_result"}
 
-__all__ = sorted(_HOMES)
+# Literal, for type checkers.
+__all__ = [
+    "Calibration",
+    "Calibrator",
+    "CalibratorConfig",
+    "HandEyeCalibError",
+    "Residuals",
+    "SolveStatus",
+    "Trajectory",
+    "calibrate",
+    "load",
+    "read_trajectory",
+    "save",
+    "write_trajectory",
+]
+
+if TYPE_CHECKING:
+    # The same for editors and type checkers.
+    from hand_eye_calib.calibration import Calibration, Residuals, SolveStatus
+    from hand_eye_calib.config import CalibratorConfig
+    from hand_eye_calib.engine.calibrator import Calibrator
+    from hand_eye_calib.engine.offline import calibrate
+    from hand_eye_calib.errors import HandEyeCalibError
+    from hand_eye_calib.geometry.trajectory import Trajectory
+    from hand_eye_calib.io.results import load_result as load
+    from hand_eye_calib.io.results import save_result as save
+    from hand_eye_calib.io.trajectory_files import read_trajectory, write_trajectory
+
+    __version__: str
+else:
+
+    def __getattr__(name: str) -> Any:
+        if name == "__version__":
+            from hand_eye_calib.version import package_version
+
+            return package_version()
+        if name not in _HOMES:
+            raise AttributeError(f"module 'hand_eye_calib' has no attribute {name!r}")
+        module = importlib.import_module(f"hand_eye_calib.{_HOMES[name]}")
+        return getattr(module, _ORIGINAL_NAMES.get(name, name))
 
 
-def __getattr__(name):
-    if name == "__version__":
-        from importlib.metadata import version
-
-        return version("hand_eye_calib")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'hand_eye_calib' has no attribute {name!r}")
-    module = importlib.import_module(f"hand_eye_calib.{_HOMES[name]}")
-    return getattr(module, _ORIGINAL_NAMES.get(name, name))
-
-
-def __dir__():
+def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])

@@ -137,9 +137,9 @@ class _Version(argparse.Action):
     """Look the version up only if it is asked for: that takes time."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        from hand_eye_calib import __version__
+        from hand_eye_calib.version import package_version
 
-        print(f"hand_eye_calib {__version__}")
+        print(f"hand_eye_calib {package_version()}")
         parser.exit()
 
 

@@ -20,6 +20,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
 from hand_eye_calib.io.limits import LARGEST_TEXT
 from hand_eye_calib.io.yaml_files import read_yaml
+from hand_eye_calib.version import package_version
 
 FILE_NAME = "extrinsic.yaml"
 XACRO_NAME = "extrinsic.urdf.xacro"
@@ -56,7 +57,7 @@ def save_result(
     other_inputs = dict(inputs or {})
     provenance = {
         "package": "hand_eye_calib",
-        "package_version": _package_version(),
+        "package_version": package_version(),
         "versions": _versions(),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "parameters": other_inputs.pop("options", {}),
@@ -217,7 +218,7 @@ def _remarks(calibration: Calibration) -> list[str]:
     parent, child = calibration.parent_frame, calibration.child_frame
     remarks = [
         f"Pose of {child} in {parent}: maps coordinates of {child} into {parent}.",
-        f"Made by hand_eye_calib {_package_version()}; {FILE_NAME} beside this file has the "
+        f"Made by hand_eye_calib {package_version()}; {FILE_NAME} beside this file has the "
         "covariance and where it came from.",
     ]
     if calibration.status is not SolveStatus.OK:
@@ -242,10 +243,3 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {
         name: metadata.version(name) for name in ("numpy", "scipy")
     }
-
-
-def _package_version() -> str:
-    try:
-        return metadata.version("hand_eye_calib")
-    except metadata.PackageNotFoundError:
-        return "not installed"

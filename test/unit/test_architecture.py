@@ -17,10 +17,11 @@ SOURCE = Path(__file__).resolve().parents[2] / PACKAGE
 
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
 # public Python API. In the engine each room sees only rooms before it.
-GROUND = {"errors", "config", "methods", "arrays"}
+GROUND = {"errors", "config", "methods", "arrays", "version"}
 ENGINE = {
     "errors": set(),
     "arrays": set(),
+    "version": set(),
     "methods": {"errors"},
     "config": {"errors", "methods"},
     "geometry": GROUND,
@@ -34,12 +35,12 @@ ENGINE["alignment"] = ENGINE["solvers"] | {"solvers"}
 ENGINE["checks"] = ENGINE["alignment"] | {"calibration", "assessment", "alignment"}
 ENGINE["engine"] = set(ENGINE)
 ALLOWED = ENGINE | {
-    "io": GROUND | {"root", "geometry", "calibration"},
-    "report": GROUND | {"root", *ENGINE},
+    "io": GROUND | {"geometry", "calibration"},
+    "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
     "root": GROUND | {"geometry", "calibration", "engine", "io"},
-    "ros": {"root", "io", *ENGINE},
-    "cli": {"root", "io", "report", "simulation", "ros", *ENGINE},
+    "ros": {"io", *ENGINE},
+    "cli": {"io", "report", "simulation", "ros", *ENGINE},
     "__main__": {"cli"},
 }
 

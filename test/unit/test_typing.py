@@ -1,0 +1,83 @@
+"""What editors and type checkers see of the Python API."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import hand_eye_calib as hec
+
+pytest.importorskip("mypy", reason="mypy is not installed")
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# A line that says "# wrong" must fail the type check; all others must pass it.
+PROGRAM = """\
+import numpy as np
+import hand_eye_calib as hec
+
+parent: hec.Trajectory = hec.read_trajectory("lidar.txt", format="tum")
+child = hec.Trajectory(np.arange(3), np.repeat(np.eye(4)[None], 3, axis=0))
+result = hec.calibrate(parent, child, method="dnlo", reference="B5", time_offset="estimate")
+result = hec.calibrate(parent, child, prior={"z": (1.85, 0.02)}, keyframe_min_translation=0.1)
+hec.calibrate(parent, child, metod="dnlo")  # wrong
+hec.calibrate(1, 2)  # wrong
+hec.calibrate(parent, child, "dnlo")  # wrong
+hec.calibrate(parent, child, threshold="small")  # wrong
+hec.calibrate(parent, child, prior={"z": 1.85})  # wrong
+hec.calibrat(parent, child)  # wrong
+inliers = int(result.residuals().is_inlier.sum())
+sigma: float = result.sigmas_rpy[2]
+text: str = result.T_parent_child  # wrong
+status: hec.SolveStatus = result.status
+path = hec.save(result, "results")
+again: hec.Calibration = hec.load(path)
+again.T_child_paren  # wrong
+config = hec.CalibratorConfig(method="dnl", max_gap=1.0)
+hec.CalibratorConfig(methd="dnl")  # wrong
+calibrator = hec.Calibrator(config)
+version: str = hec.__version__
+part = parent[:10].shifted(0.5).scaled(2.0).at(np.array([5]))
+"""
+
+
+def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", program],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    failed = {int(line.split(":")[1]) for line in done.stdout.splitlines() if ": error:" in line}
+    wrong = {
+        number
+        for number, line in enumerate(PROGRAM.splitlines(), start=1)
+        if line.endswith("# wrong")
+    }
+    assert failed == wrong, done.stdout + done.stderr
+
+
+def test_type_checkers_see_the_names_that_exist():
+    tree = ast.parse((ROOT / "hand_eye_calib" / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = (
+        node
+        for node in tree.body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    )
+    seen = {
+        alias.asname or alias.name: (node.module, alias.name)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert sorted(seen) == sorted(hec.__all__)
+    for name, (module, original) in seen.items():
+        found = getattr(hec, name)
+        assert (found.__module__, found.__name__) == (module, original)
+    assert set(hec.__all__) <= set(dir(hec))
+    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+        _ = hec.calibrat
