@@ -3,10 +3,11 @@
     OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [ipopt] [soak] [kill] [--seconds 60]
     [--hours 10] [--kills 20]
 
-load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages lost,
-latency of the callbacks, CPU ipopt  the same while CasADi + Ipopt solves soak   10 hours of 2 x 100
-Hz, simulated, through the engine: memory and solve time hour by hour kill   kill -9 of the node at
-random moments, and resuming: what is lost
+load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages
+       lost, latency of the callbacks, CPU
+ipopt  the same while CasADi + Ipopt solves
+soak   10 hours of 2 x 100 Hz, simulated, through the engine: memory and solve time hour by hour
+kill   kill -9 of the node at random moments, and resuming: what is lost
 
 Prints a table per part and fails (exit code 1) where a promise is broken. Latency is from just
 before ``publish()`` in one process to the beginning of the callback in the other.
@@ -17,7 +18,6 @@ import ctypes
 import gc
 import hashlib
 import json
-import multiprocessing
 import os
 import random
 import signal
@@ -84,33 +84,35 @@ def measured_node(report, arguments):
     to end.
     """
     from hand_eye_calib.ros.calibrator_node import CalibratorNode
+    from hand_eye_calib.ros.inputs import PoseInput
     from hand_eye_calib.ros.node import main
 
     latencies, durations, used = [], [], []
-    on_pose = CalibratorNode._on_pose
+    receive = PoseInput.receive
 
-    def stopwatch(self, stream, pose_type, message):
+    def stopwatch(self, pose_type, message, info):
         begun = time.time()
         if not latencies:
             used.append((time.monotonic(), cpu_seconds()))
         latencies.append(begun - message.pose.covariance[0])
-        on_pose(self, stream, pose_type, message)
+        receive(self, pose_type, message, info)
         durations.append(time.time() - begun)
         if len(latencies) % 100 == 0:
             used[1:] = [(time.monotonic(), cpu_seconds())]
 
-    CalibratorNode._on_pose = stopwatch
+    PoseInput.receive = stopwatch
     stop = CalibratorNode.stop
 
     def stop_and_report(self, timeout_s):
         (start_s, start_cpu_s), (end_s, end_cpu_s) = used[0], used[-1]
-        result = self._result
+        result = self._cycle.result
         document = {
             "received": len(latencies),
+            "lost_as_reported": sum(each.monitor.delivery.lost for each in self._inputs),
             "cpu": (end_cpu_s - start_cpu_s) / (end_s - start_s),
             "latency": np.percentile(latencies, [50, 99, 99.9, 100]).tolist(),
             "duration": np.percentile(durations, [50, 99, 99.9, 100]).tolist(),
-            "solves": self._solves,
+            "solves": self._cycle.solves,
             "pairs": result.n_pairs if result else 0,
             "inliers": result.n_inliers if result else 0,
             "error_m": float(np.linalg.norm(result.T_parent_child[:3, 3] - T_PARENT_CHILD[:3, 3]))
@@ -125,8 +127,9 @@ def measured_node(report, arguments):
 
 
 def cpu_seconds():
-    """Of this process and of the solver's, which may run apart."""
-    processes = [os.getpid(), *(process.pid for process in multiprocessing.active_children())]
+    """Of this process and of the one that solves for it."""
+    own = f"/proc/{os.getpid()}/task/{os.getpid()}/children"
+    processes = [os.getpid(), *Path(own).read_text(encoding="ascii").split()]
     stats = [
         Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
         for pid in processes

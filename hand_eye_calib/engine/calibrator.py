@@ -706,11 +706,11 @@ class Calibrator:
     def _kept(self, pose_pairs):
         self._kept_parts = [pose_pairs]
 
-    def adopt(self, snapshot):
-        """Take over the time offset that a snapshot has estimated, to spare the calibrator that
-        work when it needs one.
+    def adopt(self, found: TimeOffset | None) -> None:
+        """Take over the time offset that a snapshot has estimated, if any, to spare the calibrator
+        that work when it needs one.
         """
-        self._proposed_offset = snapshot.found_time_offset or self._proposed_offset
+        self._proposed_offset = found or self._proposed_offset
 
     def _config_with_time_offset(self, estimate):
         """The configuration with a time offset in seconds; None where it is to be estimated and

@@ -1,7 +1,8 @@
-"""Between ROS messages and the numbers of the engine."""
+"""Between ROS messages and the poses of the engine."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -15,7 +16,11 @@ from geometry_msgs.msg import (
 )
 from nav_msgs.msg import Odometry
 
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.geometry import se3
+
+_Triple = TypeVar("_Triple", Point, Vector3)
 
 
 @dataclass(frozen=True)
@@ -29,50 +34,62 @@ class PoseType:
     pose : callable
         message -> (position, orientation), both still messages.
     sensor_frame : callable or None
-        message -> name of the moving frame; None where the type only names the world frame.
+        message -> name of the moving frame; None if the type only names the world frame.
     """
 
-    message: type
-    pose: Callable
-    sensor_frame: Callable | None = None
+    message: type[Any]
+    pose: Callable[[Any], tuple[Any, Any]]
+    sensor_frame: Callable[[Any], str] | None = None
 
-    def position(self, message):
+    def position(self, message: Any) -> tuple[float, float, float]:
         """Translation (x, y, z) in m."""
         point = self.pose(message)[0]
         return point.x, point.y, point.z
 
-    def quat_xyzw(self, message):
+    def quat_xyzw(self, message: Any) -> tuple[float, float, float, float]:
         """Orientation, scalar last."""
         quaternion = self.pose(message)[1]
         return quaternion.x, quaternion.y, quaternion.z, quaternion.w
 
 
+def _pose(pose: Any) -> tuple[Any, Any]:
+    return pose.position, pose.orientation
+
+
+def _transform(transform: Any) -> tuple[Any, Any]:
+    return transform.translation, transform.rotation
+
+
+def _child_frame(message: Any) -> str:
+    return message.child_frame_id
+
+
 POSE_TYPES = {
     "nav_msgs/msg/Odometry": PoseType(
-        Odometry, lambda message: (message.pose.pose.position, message.pose.pose.orientation), lambda message: message.child_frame_id
+        Odometry, lambda message: _pose(message.pose.pose), _child_frame
     ),
-    "geometry_msgs/msg/PoseStamped": PoseType(PoseStamped, lambda message: (message.pose.position, message.pose.orientation)),
+    "geometry_msgs/msg/PoseStamped": PoseType(PoseStamped, lambda message: _pose(message.pose)),
     "geometry_msgs/msg/PoseWithCovarianceStamped": PoseType(
-        PoseWithCovarianceStamped, lambda message: (message.pose.pose.position, message.pose.pose.orientation)
+        PoseWithCovarianceStamped, lambda message: _pose(message.pose.pose)
     ),
     "geometry_msgs/msg/TransformStamped": PoseType(
-        TransformStamped, lambda message: (message.transform.translation, message.transform.rotation), lambda message: message.child_frame_id
+        TransformStamped, lambda message: _transform(message.transform), _child_frame
     ),
-}  # fmt: skip
+}
 
 
-def to_ns(stamp):
+def to_ns(stamp: Time) -> int:
     """Nanoseconds (int) of a builtin_interfaces/Time."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
-def to_time(stamp_ns):
+def to_time(stamp_ns: int) -> Time:
     """builtin_interfaces/Time of nanoseconds (int)."""
     sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
     return Time(sec=sec, nanosec=nanosec)
 
 
-def to_transform(calibration):
+def to_transform(calibration: Calibration) -> TransformStamped:
     """The extrinsic as geometry_msgs/TransformStamped: header.frame_id is the parent sensor,
     child_frame_id the child sensor.
     """
@@ -85,7 +102,7 @@ def to_transform(calibration):
     return message
 
 
-def to_pose_with_covariance(calibration):
+def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamped:
     """The child sensor's pose in the parent sensor's frame as
     geometry_msgs/PoseWithCovarianceStamped (REP-103 covariance).
     """
@@ -99,13 +116,14 @@ def to_pose_with_covariance(calibration):
     return message
 
 
-def covariance_about_parent_axes(T_parent_child, cov_parent_child_in_child):
+def covariance_about_parent_axes(
+    T_parent_child: FloatArray, cov_parent_child_in_child: FloatArray
+) -> FloatArray:
     """Covariance of a pose as ROS messages carry it (REP-103).
 
     The engine's error is ``xi = (rho, phi)`` in ``T_parent_child @ exp(xi)``, in the child's axes.
-    To first order it moves the child's origin by ``R rho`` and turns it by ``R phi`` about the
-    parent's fixed axes through that origin, so both blocks are rotated and nothing else: there is
-    no lever arm.
+    To first order it moves the child's origin by ``R rho`` and rotates the child by ``R phi`` about
+    the parent's axes through that origin. Both blocks are rotated; there is no lever arm.
 
     Parameters
     ----------
@@ -124,11 +142,11 @@ def covariance_about_parent_axes(T_parent_child, cov_parent_child_in_child):
     return rotation @ cov_parent_child_in_child @ rotation.T
 
 
-def _xyz(kind, T_target_source):
+def _xyz(kind: type[_Triple], T_target_source: FloatArray) -> _Triple:
     x, y, z = T_target_source[:3, 3].tolist()
     return kind(x=x, y=y, z=z)
 
 
-def _quaternion(T_target_source):
+def _quaternion(T_target_source: FloatArray) -> Quaternion:
     x, y, z, w = se3.to_quat_xyzw(T_target_source).tolist()
     return Quaternion(x=x, y=y, z=z, w=w)

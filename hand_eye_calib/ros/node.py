@@ -7,7 +7,7 @@ import sys
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-def main(args=None):
+def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM.
 
     Parameters
@@ -18,8 +18,8 @@ def main(args=None):
     Returns
     -------
     int
-        Exit code: 0 stopped by a signal, 1 bad parameter or failure (reported on stderr), 2 wrong
-        usage.
+        Exit code: 0 stopped by a signal; 1 bad parameter, failure, or a result that could not be
+        saved (reported on stderr); 2 wrong usage.
     """
     signals = _signal_pipe()
     # Imported this late so that Ctrl-C while numpy, scipy and rclpy load ends the program quietly
@@ -34,7 +34,7 @@ def main(args=None):
     return code
 
 
-def _signal_pipe():
+def _signal_pipe() -> int:
     """File descriptor that becomes readable on SIGINT or SIGTERM.
 
     The signals do nothing else: no KeyboardInterrupt in the middle of a callback, no context that

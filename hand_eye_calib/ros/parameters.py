@@ -2,6 +2,8 @@
 
 import dataclasses
 import difflib
+from collections.abc import Callable, Collection
+from typing import Any
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -9,14 +11,30 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
-from hand_eye_calib.config import CalibratorConfig, NodeConfig, check_value, option_name
+from hand_eye_calib.config import (
+    CalibratorConfig,
+    NodeConfig,
+    OptionSet,
+    check_value,
+    option_name,
+)
 from hand_eye_calib.errors import ConfigError
 
-FIELDS = {
+_Field = dataclasses.Field[Any]
+_Values = dict[str, Any]
+
+
+def _fields(config: type[Any]) -> tuple[_Field, ...]:
+    return dataclasses.fields(config)
+
+
+FIELDS: dict[str, _Field] = {
     option_name(field): field
     for config in (CalibratorConfig, NodeConfig)
-    for field in dataclasses.fields(config)
+    for field in _fields(config)
 }
 
 # Declared by rclpy itself.
@@ -26,16 +44,16 @@ _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
 class Parameters:
     """Declares the parameters on a node and keeps them as option objects.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides=True``: that
-    is how rclpy shows what a file or the command line sets, unknown names included.
+    The node must have been made with ``automatically_declare_parameters_from_overrides=True``: so
+    rclpy shows what a file or the command line sets, unknown names included.
 
     Parameters
     ----------
     node : rclpy.node.Node
-    qos_names : iterable of str
+    qos_names : collection of str
         Names of the QoS override parameters that the node's subscriptions will declare.
     check : callable
-        ``check(NodeConfig)`` raises ConfigError for options that cannot be had.
+        ``check(NodeConfig)`` raises ConfigError for options that cannot be put in force.
     on_change : callable
         Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the
         new options by then.
@@ -50,10 +68,16 @@ class Parameters:
     Raises
     ------
     ConfigError
-        Where a given value is of the wrong type or out of range.
+        If a given value is of the wrong type or out of range.
     """
 
-    def __init__(self, node, qos_names, on_change, check=lambda options: None):
+    def __init__(
+        self,
+        node: Node,
+        qos_names: Collection[str],
+        on_change: Callable[[], None],
+        check: Callable[[NodeConfig], None] = lambda options: None,
+    ) -> None:
         given = _take_overrides(node)
         self.unknown = [
             _unknown(name) for name in given if name not in FIELDS and name not in qos_names
@@ -73,7 +97,7 @@ class Parameters:
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
 
-    def _proposed(self, parameters):
+    def _proposed(self, parameters: list[Parameter]) -> _Values:
         ours = {
             parameter.name: parameter.value for parameter in parameters if parameter.name in FIELDS
         }
@@ -81,7 +105,7 @@ class Parameters:
             name: check_value(FIELDS[name], value) for name, value in ours.items()
         }
 
-    def _check(self, parameters):
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
             _, node = _configs(self._proposed(parameters))
             self._check_node(node)
@@ -89,27 +113,29 @@ class Parameters:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _apply(self, parameters):
+    def _apply(self, parameters: list[Parameter]) -> None:
         if any(parameter.name in FIELDS for parameter in parameters):
             self._values = self._proposed(parameters)
             self.calibrator, self.node = _configs(self._values)
             self._on_change()
 
 
-def _configs(values):
-    def part(config):
-        return config.from_options(
-            {option_name(field): values[option_name(field)] for field in dataclasses.fields(config)}
-        )
+def _configs(values: _Values) -> tuple[CalibratorConfig, NodeConfig]:
+    def part(config: type[OptionSet]) -> dict[str, Any]:
+        return {option_name(field): values[option_name(field)] for field in _fields(config)}
 
-    return part(CalibratorConfig), part(NodeConfig)
+    return (
+        CalibratorConfig.from_options(part(CalibratorConfig)),
+        NodeConfig.from_options(part(NodeConfig)),
+    )
 
 
-def _take_overrides(node):
+def _take_overrides(node: Node) -> _Values:
     """Mapping of the names and values that file and command line give, undeclared again so that
     they can get descriptors.
     """
-    given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
+    parameters: dict[str, Any] = node.get_parameters_by_prefix("")
+    given = {name: parameter.value for name, parameter in parameters.items()}
     for name in _SYSTEM_PARAMETERS:
         given.pop(name, None)
     for name in given:
@@ -117,14 +143,14 @@ def _take_overrides(node):
     return given
 
 
-def _unknown(name):
+def _unknown(name: str) -> str:
     guesses = difflib.get_close_matches(name, FIELDS, n=1)
     return f"parameter {name} does not exist and is ignored" + (
         f"; did you mean {guesses[0]}?" if guesses else ""
     )
 
 
-def _start_value(field, value):
+def _start_value(field: _Field, value: Any) -> Any:
     # ROS parameters have fixed types: rclpy refuses an integer for a double, and so does `ros2
     # param set`.
     if isinstance(field.default, float) and type(value) is int and not _dynamic(field):
@@ -136,12 +162,12 @@ def _start_value(field, value):
     return check_value(field, value)
 
 
-def _dynamic(field):
+def _dynamic(field: _Field) -> bool:
     """Whether a parameter takes a word as well as a number, and so has no single type."""
     return bool(field.metadata["words"])
 
 
-def _descriptor(field):
+def _descriptor(field: _Field) -> ParameterDescriptor:
     meta = field.metadata
     words = meta["choices"] or (f"{' or '.join(meta['words'])}, or a number",) * _dynamic(field)
     description = (
@@ -156,11 +182,12 @@ def _descriptor(field):
         dynamic_typing=_dynamic(field),
     )
     if meta["minimum"] is not None and meta["maximum"] is not None and not _dynamic(field):
+        kind = float if isinstance(field.default, float) else int
         bounds = dict(
-            from_value=type(field.default)(meta["minimum"]),
-            to_value=type(field.default)(meta["maximum"]),
+            from_value=kind(meta["minimum"]),
+            to_value=kind(meta["maximum"]),
         )
-        if isinstance(field.default, float):
+        if kind is float:
             descriptor.floating_point_range = [FloatingPointRange(**bounds)]
         else:
             descriptor.integer_range = [IntegerRange(**bounds)]

@@ -3,9 +3,10 @@ the middleware.
 """
 
 import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import numpy as np
 import rclpy
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
@@ -14,9 +15,13 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros.conversions import to_ns, to_time
+
+if TYPE_CHECKING:  # what reads bags is not needed to play poses
+    from hand_eye_calib.io.bags import StampedPose
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -32,7 +37,7 @@ class LiveExtrinsic:
     the newest pose used.
     """
 
-    T_parent_child: np.ndarray
+    T_parent_child: FloatArray
     parent_frame: str
     child_frame: str
     stamp_ns: int
@@ -46,7 +51,7 @@ class Player:
     topics : mapping
         "parent" and "child" to the names of their topics.
     check : callable
-        Called while waiting; raises where waiting has become pointless, such as when the node has
+        Called while waiting; raises if waiting has become pointless, such as when the node has
         died.
     patience_s : float
         How long to wait for the node at each step.
@@ -54,10 +59,15 @@ class Player:
     Raises
     ------
     HandEyeCalibError
-        Where ROS cannot start; from the methods, where the node does not do its part in time.
+        If ROS cannot start; from the methods, if the node does not do its part in time.
     """
 
-    def __init__(self, topics, check=lambda: None, patience_s=30.0):
+    def __init__(
+        self,
+        topics: Mapping[str, str],
+        check: Callable[[], None] = lambda: None,
+        patience_s: float = 30.0,
+    ) -> None:
         self._check, self._patience_s = check, patience_s
         self._context = rclpy.Context()
         _init(self._context)
@@ -70,20 +80,20 @@ class Player:
         }
         self._solve = self._node.create_client(Trigger, "calibrator/solve")
         self._answer = "no answer"
-        self._extrinsic = None
+        self._extrinsic: LiveExtrinsic | None = None
         self._node.create_subscription(
             TransformStamped, "calibrator/extrinsic", self._on_extrinsic, _LATCHED
         )
 
-    def __enter__(self):
+    def __enter__(self) -> "Player":
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._executor.shutdown()
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def play(self, poses, speed):
+    def play(self, poses: Iterable["StampedPose"], speed: float) -> None:
         """Publish poses ``speed`` times as fast as they were recorded, once the node listens to
         both topics.
 
@@ -107,7 +117,7 @@ class Player:
             self._publishers[pose.stream].publish(_odometry(pose))
         self._check()
 
-    def wait_for_extrinsic(self, stamp_ns):
+    def wait_for_extrinsic(self, stamp_ns: int) -> LiveExtrinsic:
         """Have the node solve until the newest pose in its result has this stamp or a later one.
 
         Poses and service calls share no order, so one call of ``~/solve`` would not be enough.
@@ -119,7 +129,7 @@ class Player:
         self._wait(self._solve.service_is_ready, "to serve ~/solve")
         pending = None
 
-        def is_covered():
+        def is_covered() -> bool:
             nonlocal pending
             if self._extrinsic is not None and self._extrinsic.stamp_ns >= stamp_ns:
                 return True
@@ -133,9 +143,15 @@ class Player:
             "for a result with all poses",
             lambda: f"; its last answer was: {self._answer}",
         )
+        assert self._extrinsic is not None
         return self._extrinsic
 
-    def _wait(self, condition, purpose, details=lambda: ""):
+    def _wait(
+        self,
+        condition: Callable[[], object],
+        purpose: str,
+        details: Callable[[], str] = lambda: "",
+    ) -> None:
         end = time.monotonic() + self._patience_s
         while not condition():
             self._check()
@@ -145,7 +161,7 @@ class Player:
                 )
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
-    def _on_extrinsic(self, message):
+    def _on_extrinsic(self, message: TransformStamped) -> None:
         t, q = message.transform.translation, message.transform.rotation
         self._extrinsic = LiveExtrinsic(
             se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w]),
@@ -155,14 +171,14 @@ class Player:
         )
 
 
-def _init(context):
+def _init(context: rclpy.Context) -> None:
     try:
         rclpy.init(args=[], context=context)
     except RCLError as error:
         raise HandEyeCalibError(f"cannot start ROS: {' '.join(str(error).split())}") from None
 
 
-def _odometry(pose):
+def _odometry(pose: "StampedPose") -> Odometry:
     message = Odometry()
     message.header.stamp = to_time(pose.stamp_ns)
     message.header.frame_id = pose.world_frame

@@ -20,12 +20,8 @@ from hand_eye_calib.ros.calibrator_node import CalibratorNode
 # How long a running solve may hold up the end of the program.
 SOLVE_GRACE_S = 0.5
 
-# How long the solver may keep the interpreter from a message that waits (s). Python's own 5 ms are
-# asked for several times a message.
-_SWITCH_INTERVAL_S = 0.0005
 
-
-def run(arguments, signals):
+def run(arguments: list[str], signals: int) -> int:
     """Run the node until ``signals``, a file descriptor, becomes readable; returns the exit code."""
     try:
         _init(arguments)
@@ -39,7 +35,7 @@ def run(arguments, signals):
     return _run_node(signals)
 
 
-def _init(arguments):
+def _init(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="calibrator",
         description="The extrinsic between two sensors from their odometry, live.",
@@ -52,10 +48,9 @@ def _init(arguments):
     set_logger_level("rcl", LoggingSeverity.UNSET)
 
 
-def _run_node(signals):
+def _run_node(signals: int) -> int:
     # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
     executor = SingleThreadedExecutor()
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     node = None
     try:
         node = CalibratorNode()
@@ -69,19 +64,15 @@ def _run_node(signals):
         traceback.print_exc()
         code = 1
     executor.shutdown()
-    if node is not None and not _stopped(node):
-        # A solver deep in native code would abort the interpreter's own way out.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
     if node is not None:
+        code = code if _stopped(node) else 1
         node.destroy_node()
     rclpy.try_shutdown()
     return code
 
 
-def _stopped(node):
-    """Whether the node has ended all it does; a failure to save is reported there."""
+def _stopped(node: CalibratorNode) -> bool:
+    """Whether the node has ended with everything saved."""
     try:
         return node.stop(SOLVE_GRACE_S)
     except Exception:
@@ -89,10 +80,10 @@ def _stopped(node):
         return False
 
 
-def _spin(executor, signals):
+def _spin(executor: SingleThreadedExecutor, signals: int) -> None:
     stopping = threading.Event()
 
-    def wait_for_signal():
+    def wait_for_signal() -> None:
         os.read(signals, 1)
         # As a task: executor.wake() alone does not make spin_once() return.
         executor.create_task(stopping.set)

@@ -7,8 +7,13 @@ import os
 import queue
 import threading
 import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.io.journal import (
     JournalWriter,
@@ -31,13 +36,18 @@ _LOCK_NAME = ".calibrator.lock"
 _MOST_WAITING = 240
 
 
-def resume(directory, calibrator):
+# The engine's state as arrays, and what the thread is told to do with what.
+State = dict[str, np.ndarray]
+_Work = Callable[[Any], None]
+
+
+def resume(directory: Path, calibrator: Calibrator) -> int:
     """Bring a calibrator to where the session in a directory ended; returns how many poses it has.
 
     Raises
     ------
     InputError
-        Where there is no session, or it is damaged.
+        If there is no session, or it is damaged.
     """
     checkpoint, events, _ = read_journal(directory)
     calibrator.restore(checkpoint)
@@ -52,18 +62,18 @@ class DirectoryLock:
     Parameters
     ----------
     directory : path
-        Made if it does not exist. Where it cannot be written, nothing is locked: the journal will
-        say so.
+        Made if it does not exist. If it cannot be written, nothing is locked: the journal will say
+        so.
 
     Raises
     ------
     ConfigError
-        Where another node has it.
+        If another node has it.
     """
 
-    def __init__(self, directory):
+    def __init__(self, directory: Path) -> None:
         self.directory = Path(directory)
-        self._descriptor = None
+        self._descriptor: int | None = None
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
             self._descriptor = os.open(self.directory / _LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o644)
@@ -71,16 +81,17 @@ class DirectoryLock:
             os.ftruncate(self._descriptor, 0)
             os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
         except BlockingIOError:
+            assert self._descriptor is not None
             owner = os.pread(self._descriptor, 32, 0).decode(errors="replace")
             self.release()
             raise ConfigError(
-                f"output_directory {self.directory} is in use by another calibrator (process {owner or 'unknown'}): stop that one, or "
-                "choose another directory"
+                f"output_directory {self.directory} is in use by another calibrator "
+                f"(process {owner or 'unknown'}): stop that one, or choose another directory"
             ) from None
         except OSError:
             return  # a disk that takes no lock, or nothing at all
 
-    def release(self):
+    def release(self) -> None:
         """Leave the directory to others."""
         if self._descriptor is not None:
             os.close(self._descriptor)
@@ -88,7 +99,7 @@ class DirectoryLock:
 
 
 class SessionJournal:
-    """Takes note of a session in the executor's thread, writes in its own.
+    """Takes poses and frame names in the executor's thread, writes them in its own.
 
     Parameters
     ----------
@@ -99,32 +110,38 @@ class SessionJournal:
         The state is that of the session in the directory, which need not be kept aside then.
     """
 
-    def __init__(self, directory, state, resumed=False):
+    def __init__(self, directory: Path, state: State, resumed: bool = False) -> None:
         self.directory = Path(directory)
         self.error = ""
-        self._notes = queue.SimpleQueue()
-        self._events = []
-        self._jobs = queue.Queue()
+        self._notes: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
+        self._events: list[tuple[Any, ...]] = []
+        self._jobs: queue.Queue[tuple[_Work, Any] | None] = queue.Queue()
         self._is_full = False
-        self._failed_at = None
+        self._failed_at: float | None = None
         self._broken = False  # in the thread: the segment must not be written to any more
         self._is_ours = resumed
-        self._writer = None
+        self._writer: JournalWriter | None = None
         self._jobs.put((self._open, state))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
-    def add_pose(self, stream, stamp_ns, position, quat_xyzw):
+    def add_pose(
+        self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
+    ) -> None:
         """Note a pose that the engine has taken."""
         self._events.append((stream, stamp_ns, position, quat_xyzw))
 
-    def set_frame(self, stream, sensor_frame):
+    def set_frame(self, stream: str, sensor_frame: str) -> None:
         """Note the name of a stream's sensor frame."""
         self._events.append((stream, sensor_frame))
 
-    def flush(self, make_state):
-        """Hand what was noted to the thread; to be called often. ``make_state()`` gives the
-        engine's state where one is needed.
+    def flush(self, make_state: Callable[[], State]) -> None:
+        """Hand what was noted to the thread; to be called often.
+
+        Parameters
+        ----------
+        make_state : callable
+            Gives the engine's state, for a new segment.
         """
         events, self._events = self._events, []
         if self._failed_at is not None:
@@ -141,19 +158,19 @@ class SessionJournal:
         elif events:
             self._jobs.put((self._write, events))
 
-    def begin(self, state):
+    def begin(self, state: State) -> None:
         """Start a new session; the one so far is kept aside."""
         self._jobs.put((self._write, self._events))
         self._events = []
         self._jobs.put((self._begin, state))
 
-    def notes(self):
+    def notes(self) -> Iterator[tuple[bool, str]]:
         """Lines for the log since the last call, each with whether it is a warning."""
         while not self._notes.empty():
             yield self._notes.get()
 
-    def stop(self, make_state, timeout_s):
-        """Write what is left and end the thread; False where the disk keeps it busy."""
+    def stop(self, make_state: Callable[[], State], timeout_s: float) -> bool:
+        """Write what is left and end the thread; False if the disk keeps it busy."""
         self.flush(make_state)
         self._jobs.put(None)
         self._thread.join(timeout_s)
@@ -161,31 +178,33 @@ class SessionJournal:
 
     # ------------------------------------------------------------ in the thread
 
-    def _run(self):
+    def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             work, argument = job
             try:
                 work(argument)
             except OSError as error:
-                self._broken = True
-                self._failed_at = time.monotonic()
-                self._fail(error.strerror or str(error))
+                self._give_up(error.strerror or str(error))
+            except Exception as error:  # a defect: the node must say so and go on
+                self._give_up(f"{type(error).__name__}: {error}")
         if self._writer is not None and not self._broken:
             try:
                 self._writer.close()
             except OSError as error:
                 self._fail(error.strerror or str(error))
 
-    def _fail(self, reason):
-        self.error = reason
-        self._notes.put(
-            (
-                True,
-                f"cannot write the session journal in {self.directory}: {reason}; going on without it: a crash would lose this session",
-            )
-        )
+    def _give_up(self, reason: str) -> None:
+        """Leave this segment as it is; a new one is begun later."""
+        self._broken = True
+        self._failed_at = time.monotonic()
+        self._fail(reason)
 
-    def _open(self, state):
+    def _fail(self, reason: str) -> None:
+        self.error = reason
+        text = f"cannot write the session journal in {self.directory}: {reason}; "
+        self._notes.put((True, text + "going on without it: a crash would lose this session"))
+
+    def _open(self, state: State) -> None:
         if not self._is_ours:
             self._keep_aside()
         self._is_ours = True
@@ -193,18 +212,17 @@ class SessionJournal:
         self._broken = False
         if self.error:
             self.error = ""
-            self._notes.put(
-                (False, f"the session journal in {self.directory} is being written again")
-            )
+            text = f"the session journal in {self.directory} is being written again"
+            self._notes.put((False, text))
 
-    def _begin(self, state):
+    def _begin(self, state: State) -> None:
         if self._writer is not None and not self._broken:
             self._writer.close()
         self._writer, self._is_ours = None, False
         self._open(state)
 
-    def _keep_aside(self):
-        """Keep a session of before, unless there is nothing in it."""
+    def _keep_aside(self) -> None:
+        """Keep an earlier session, unless there is nothing in it."""
         if not has_session(self.directory):
             return
         poses = count_poses(self.directory)
@@ -214,17 +232,20 @@ class SessionJournal:
         size = (
             "a damaged session" if poses is None else f"the session before this one ({poses} poses)"
         )
-        how = f"stop the node, rename that folder to {self.directory.name} and start with the parameter journal at resume"
+        how = (
+            f"stop the node, rename that folder to {self.directory.name} and start with the "
+            "parameter journal at resume"
+        )
         self._notes.put((False, f"{size} is kept in {aside}; to go on with it, {how}"))
 
-    def _write(self, events):
-        if self._broken:
+    def _write(self, events: list[tuple[Any, ...]]) -> None:
+        if self._broken or self._writer is None:
             return
         for event in events:
             self._writer.add_pose(*event) if len(event) == 4 else self._writer.set_frame(*event)
         self._writer.flush()
         self._is_full = self._writer.is_full
 
-    def _rotate(self, state):
-        if not self._broken:
+    def _rotate(self, state: State) -> None:
+        if not self._broken and self._writer is not None:
             self._writer.rotate(state)

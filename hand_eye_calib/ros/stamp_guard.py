@@ -1,6 +1,7 @@
 """Tells a bag that loops, a clock that was reset and a long pause from a single corrupt stamp."""
 
 from enum import Enum, auto
+from typing import Any
 
 # A stamp this much earlier than the one before is not a late message, one this much later not the
 # next one.
@@ -35,18 +36,20 @@ class StampGuard:
         Messages whose stamps nothing else confirmed.
     """
 
-    def __init__(self):
-        self.last_ns = None
+    def __init__(self) -> None:
+        self.last_ns: int | None = None
         self.discarded = 0
-        self._held = []
-        self._outdated_until_s = None
+        self._held: list[tuple[int, Any]] = []
+        self._outdated_until_s: float | None = None
 
     @property
-    def held(self):
+    def held(self) -> int:
         """Number of messages that wait to be confirmed."""
         return len(self._held)
 
-    def check(self, stamp_ns, message, now_s):
+    def check(
+        self, stamp_ns: int, message: Any, now_s: float
+    ) -> tuple[Verdict, list[tuple[int, Any]]]:
         """Judge the next message.
 
         Parameters
@@ -64,7 +67,11 @@ class StampGuard:
             Otherwise empty.
         """
         if self._outdated_until_s is not None:
-            if now_s < self._outdated_until_s and _follows(stamp_ns, self.last_ns):
+            if (
+                now_s < self._outdated_until_s
+                and self.last_ns is not None
+                and _follows(stamp_ns, self.last_ns)
+            ):
                 return Verdict.OUTDATED, []
             if now_s >= self._outdated_until_s:
                 self._outdated_until_s = None
@@ -81,7 +88,7 @@ class StampGuard:
         self.last_ns = max(stamp for stamp, _ in confirmed)
         return (Verdict.JUMPED_BACK if jumped_back and not followed else Verdict.TAKE), confirmed
 
-    def restart(self, now_s=None):
+    def restart(self, now_s: float | None = None) -> None:
         """Begin a new session; with ``now_s`` (steady time) because another stream has jumped back."""
         if now_s is None:
             self.last_ns, self._outdated_until_s = None, None
@@ -89,16 +96,16 @@ class StampGuard:
         elif self.last_ns is not None:
             self._outdated_until_s = now_s + _OTHERS_FOLLOW_S
 
-    def _expected(self, stamp_ns, message):
+    def _expected(self, stamp_ns: int, message: Any) -> tuple[Verdict, list[tuple[int, Any]]]:
         if self._held:
             self._discard()
         self.last_ns = stamp_ns if self.last_ns is None else max(self.last_ns, stamp_ns)
         return Verdict.TAKE, [(stamp_ns, message)]
 
-    def _discard(self):
+    def _discard(self) -> None:
         self.discarded += len(self._held)
         self._held = []
 
 
-def _follows(stamp_ns, last_ns):
+def _follows(stamp_ns: int, last_ns: int) -> bool:
     return -BACKWARD_JUMP_NS <= stamp_ns - last_ns <= FORWARD_JUMP_NS

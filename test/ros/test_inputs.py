@@ -25,11 +25,15 @@ def test_unusable_messages_are_refused_by_topic_and_the_node_goes_on(start_node,
     np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-6)
 
 
-def test_empty_sensor_frame_is_refused_by_topic(start_node, peer):
+def test_empty_sensor_frame_is_named_by_default_or_by_parameter(start_node, peer):
     node = start_node(*QUIET)
-    peer.feed(peer.publishers(), *drive(3), frames=("", "camera"))
-    node.wait_for_log("/parent_odom: message with stamp", "first pose on /child_odom")
-    assert "first pose on /parent_odom" not in node.log
+    _, extrinsic = peer.solve(peer.publishers(), *drive(), frames=("", "camera"))
+    assert (extrinsic.header.frame_id, extrinsic.child_frame_id) == ("parent_sensor", "camera")
+    node.wait_for_log("name it with parent_frame")
+    assert node.stop()[0] == 0
+    start_node(*QUIET, "-p parent_frame:=lidar")
+    _, extrinsic = peer.solve(peer.publishers(), *drive(), frames=("", "camera"))
+    assert extrinsic.header.frame_id == "lidar"
 
 
 def test_sensor_frame_that_changes_is_refused_by_topic(start_node, peer):
@@ -155,10 +159,11 @@ def test_save_writes_the_result_files(start_node, peer, tmp_path):
 def test_directory_that_cannot_be_written_is_reported(start_node, peer, tmp_path):
     blocked = tmp_path / "a_file"
     blocked.write_text("")
-    start_node(*QUIET, f"-p output_directory:={blocked / 'out'}")
+    node = start_node(*QUIET, f"-p output_directory:={blocked / 'out'}")
     answer, _ = peer.solve(peer.publishers(), *drive())
     assert answer.success
     refused = peer.trigger("save")
     assert not refused.success
     assert str(blocked) in refused.message
     assert peer.trigger("solve").success
+    assert node.stop()[0] == 1

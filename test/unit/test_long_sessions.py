@@ -191,7 +191,7 @@ def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
     feed(calibrator, "child", child)
     snapshot = calibrator.snapshot()
     snapshot.estimate()
-    calibrator.adopt(snapshot)
+    calibrator.adopt(snapshot.found_time_offset)
     monkeypatch.setattr(engine, "estimate_time_offset", None)
     extra = as_trajectory(wandering_poses(900))[400:]
     feed(calibrator, "parent", extra)

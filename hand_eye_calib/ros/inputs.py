@@ -1,0 +1,238 @@
+"""One of the node's two inputs: from a topic to poses in the session."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from hand_eye_calib.engine.calibrator import StreamStatistics
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.ros.conversions import POSE_TYPES, PoseType, to_ns
+from hand_eye_calib.ros.input_monitor import InputMonitor
+from hand_eye_calib.ros.live_session import LiveSession
+from hand_eye_calib.ros.log import NodeLog
+from hand_eye_calib.ros.parameters import Parameters
+from hand_eye_calib.ros.stamp_guard import StampGuard, Verdict
+
+# Best effort hears reliable publishers too; the queue holds seconds of a fast stream while a
+# callback is busy.
+_QOS = QoSProfile(
+    depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
+)
+_QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+
+_BAD_QOS = (
+    ParameterException,
+    InvalidQosOverridesError,
+    RuntimeError,
+    AssertionError,
+    ValueError,
+)
+
+
+class PoseInput:
+    """Subscribes to the poses of one sensor and hands them to the session.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    name : {"parent", "child"}
+    session : LiveSession
+    log : NodeLog
+    on_jump_back : callable
+        Called with this input when its stamps have jumped back: a new session has to begin.
+
+    Attributes
+    ----------
+    topic : str
+        Resolved name.
+    is_enabled : bool
+        Whether poses are taken.
+    monitor : InputMonitor
+    guard : StampGuard
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        session: LiveSession,
+        log: NodeLog,
+        on_jump_back: Callable[["PoseInput"], None],
+    ) -> None:
+        self.name = name
+        self.relative_topic = relative_topic(name)
+        self.topic = node.resolve_topic_name(self.relative_topic)
+        self.is_enabled = True
+        self.monitor = InputMonitor()
+        self.guard = StampGuard()
+        self._node, self._session, self._log = node, session, log
+        self._on_jump_back = on_jump_back
+        self._subscription: Subscription | None = None
+        self._type_name = ""
+        self._sensor_frame = ""
+        self._max_gap_ns = 0.0
+
+    @property
+    def statistics(self) -> StreamStatistics:
+        """What the engine has taken from this input."""
+        return self._session.calibrator.statistics(self.name)
+
+    def configure(self, options: Parameters) -> None:
+        """Follow the parameters."""
+        self._max_gap_ns = options.calibrator.max_gap * 1e9
+
+    def restart(self, because_of: "PoseInput | None") -> None:
+        """Begin a new session: asked for, or because the stamps of an input have jumped back."""
+        self._sensor_frame = ""
+        self.monitor.restart()
+        if because_of is None:
+            self.guard.restart()
+        elif because_of is not self:
+            self.guard.restart(time.monotonic())
+
+    def resume(self) -> None:
+        """Go on where a session on disk has ended."""
+        self.guard.last_ns = self.statistics.last_stamp_ns
+
+    # ---------------------------------------------------------- subscription
+
+    def discover(self, wanted_type: str) -> None:
+        """Subscribe as soon as the type is known, and again if the publisher changes it."""
+        offered = self._offered_types()
+        type_name = self._choose_type(offered) if wanted_type == "auto" else wanted_type
+        if type_name is not None and type_name != self._type_name:
+            self._subscribe(type_name)
+        publishers = self._node.count_publishers(self.relative_topic)
+        self.monitor.delivery.has_one_publisher = publishers == 1
+
+    def describe_silence(self) -> str:
+        """Why nothing has come yet, as far as the graph tells."""
+        publishers = self._node.count_publishers(self.relative_topic)
+        count = f"{publishers or 'no'} publisher{'s' * (publishers != 1)}"
+        return f"no pose yet on {self.topic} ({count})"
+
+    def _offered_types(self) -> list[str]:
+        infos = self._node.get_publishers_info_by_topic(self.relative_topic)
+        return sorted({info.topic_type for info in infos})
+
+    def _choose_type(self, offered: list[str]) -> str | None:
+        """The type of the publishers; None if there is none that can be used."""
+        if self._type_name in offered:
+            return self._type_name
+        usable = [name for name in offered if name in POSE_TYPES]
+        if offered and not usable:
+            self._log.warning(
+                f"{self.topic} has type {', '.join(offered)}; expected {', '.join(POSE_TYPES)}: "
+                f"remap {self.relative_topic} to a topic with poses",
+                ("type", self.name),
+            )
+        return usable[0] if usable else None
+
+    def _subscribe(self, type_name: str) -> None:
+        if self._subscription is not None:
+            self._log.warning(f"{self.topic} has changed its type from {self._type_name}")
+            self._node.destroy_subscription(self._subscription)
+        pose_type = POSE_TYPES[type_name]
+
+        def on_message(message: Any, info: dict[str, Any]) -> None:
+            self.receive(pose_type, message, info)
+
+        # rclpy looks at the signature: with two arguments it passes the info as well, which its
+        # annotations do not know.
+        callback: Any = on_message
+        try:
+            self._subscription = self._node.create_subscription(
+                pose_type.message,
+                self.relative_topic,
+                callback,
+                _QOS,
+                qos_overriding_options=QoSOverridingOptions(_QOS_OVERRIDES),
+            )
+        except _BAD_QOS as error:
+            raise ConfigError(
+                f"cannot subscribe to {self.topic} with the QoS overrides given: {error}"
+            ) from error
+        self._type_name = type_name
+        self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
+
+    # -------------------------------------------------------------- messages
+
+    def receive(self, pose_type: PoseType, message: Any, info: dict[str, Any]) -> None:
+        """Take a message: the callback of the subscription."""
+        waited_ns = time.time_ns() - info["received_timestamp"]
+        self.monitor.delivery.note(info["publication_sequence_number"], waited_ns * 1e-9)
+        if not self.is_enabled:
+            self.monitor.ignored += 1
+            return
+        stamp_ns, steady_s = to_ns(message.header.stamp), time.monotonic()
+        clock_ns = self._node.get_clock().now().nanoseconds
+        self.monitor.note(stamp_ns, clock_ns, steady_s, self._max_gap_ns)
+        last_ns = self.guard.last_ns
+        verdict, messages = self.guard.check(stamp_ns, message, steady_s)
+        if verdict is Verdict.JUMPED_BACK:
+            self._say_jump_back(stamp_ns, last_ns)
+            self._on_jump_back(self)
+        elif verdict is Verdict.HOLD:
+            self._say_held(stamp_ns, last_ns)
+        elif verdict is Verdict.OUTDATED:
+            self.monitor.refused["of the session before"] += 1
+        for held_ns, held in messages:
+            self._take(pose_type, held_ns, held, is_first=last_ns is None)
+
+    def _take(self, pose_type: PoseType, stamp_ns: int, message: Any, is_first: bool) -> None:
+        try:
+            if pose_type.sensor_frame is not None:
+                self._set_frame(pose_type.sensor_frame(message))
+            self._session.add_pose(
+                self.name, stamp_ns, pose_type.position(message), pose_type.quat_xyzw(message)
+            )
+        except InputError as error:
+            self._refuse(stamp_ns, "unusable", str(error))
+            return
+        if is_first:
+            self._log.info(f"first pose on {self.topic}, stamp {stamp_ns * 1e-9:.3f} s")
+
+    def _set_frame(self, sensor_frame: str) -> None:
+        if sensor_frame == self._sensor_frame:  # an empty one too: parameters or a default name it
+            return
+        self._session.set_frame(self.name, sensor_frame)
+        self._sensor_frame = sensor_frame
+
+    def _say_jump_back(self, stamp_ns: int, last_ns: int | None) -> None:
+        jump_s = ((last_ns or 0) - stamp_ns) * 1e-9
+        self._log.warning(
+            f"{self.topic} jumped back by {jump_s:.3f} s (a bag that loops? a clock that was "
+            "reset?): new session, earlier poses forgotten"
+        )
+
+    def _say_held(self, stamp_ns: int, last_ns: int | None) -> None:
+        jump_s = (stamp_ns - (last_ns or 0)) * 1e-9
+        text = f"its stamp is {jump_s:+.3f} s from the one before; held back until others agree"
+        self._refuse(stamp_ns, "jump in time", text)
+
+    def _refuse(self, stamp_ns: int, reason: str, text: str) -> None:
+        self.monitor.note_refused(reason, text, time.monotonic())
+        self._log.warning(
+            f"{self.topic}: message with stamp {stamp_ns * 1e-9:.9f} s refused: {text} "
+            f"({self.monitor.refused.total()} refused so far)",
+            ("refused", self.name),
+        )
+
+
+def relative_topic(name: str) -> str:
+    """The topic of an input before remapping."""
+    return f"{name}_odom"
+
+
+def qos_parameter_names(node: Node) -> Iterator[str]:
+    """The parameters that rclpy declares for the QoS of the inputs."""
+    for name in ("parent", "child"):
+        topic = node.resolve_topic_name(relative_topic(name))
+        for policy in _QOS_OVERRIDES:
+            yield f"qos_overrides.{topic}.subscription.{policy.name.lower()}"

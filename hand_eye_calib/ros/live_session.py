@@ -1,0 +1,183 @@
+"""The session of the node: the engine, the number of the session, and its journal on disk."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hand_eye_calib.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.engine.calibrator import STREAMS, Calibrator
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+from hand_eye_calib.io.journal import has_session
+from hand_eye_calib.ros.log import NodeLog
+from hand_eye_calib.ros.session_journal import DirectoryLock, SessionJournal, resume
+
+# How long a disk may hold up the end of the program.
+_GRACE_S = 0.3
+
+
+class LiveSession:
+    """Every pose that the engine takes is written to the journal as well, if there is one.
+
+    Parameters
+    ----------
+    log : NodeLog
+
+    Attributes
+    ----------
+    calibrator : Calibrator
+    number : int
+        Rises with every new session; a result of another number is out of date.
+    has_new_poses : bool
+        A solve would have something new to go by: poses or options.
+    """
+
+    def __init__(self, log: NodeLog) -> None:
+        self.calibrator = Calibrator()
+        self.number = 0
+        self.has_new_poses = False
+        self._log = log
+        self._journal: SessionJournal | None = None
+        self._lock: DirectoryLock | None = None
+
+    @property
+    def journal_directory(self) -> Path | None:
+        """Where the journal is; None if there is none."""
+        return self._journal.directory if self._journal else None
+
+    @property
+    def journal_error(self) -> str:
+        """Why the journal cannot be written; empty if it can."""
+        return self._journal.error if self._journal else ""
+
+    def add_pose(
+        self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
+    ) -> bool:
+        """Take a pose; see :meth:`Calibrator.add_pose`."""
+        added = self.calibrator.add_pose(stream, stamp_ns, position, quat_xyzw)
+        if added and self._journal is not None:
+            self._journal.add_pose(stream, stamp_ns, position, quat_xyzw)
+        self.has_new_poses |= added
+        return added
+
+    def set_frame(self, stream: str, sensor_frame: str) -> None:
+        """Take the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
+        self.calibrator.set_frame(stream, sensor_frame)
+        if self._journal is not None:
+            self._journal.set_frame(stream, sensor_frame)
+
+    def reconfigure(self, config: CalibratorConfig) -> None:
+        """Put other options in force; the poses stay, and are to be solved again."""
+        self.calibrator.reconfigure(config)
+        received = sum(self.calibrator.statistics(stream).received for stream in STREAMS)
+        self.has_new_poses = received > 0
+
+    def reset(self) -> None:
+        """Forget everything and begin a new session; the journal of the old one is kept aside."""
+        self.calibrator.reset()
+        self.number += 1
+        self.has_new_poses = False
+        if self._journal is not None:
+            self._journal.begin(self.calibrator.state())
+
+    # -------------------------------------------------------------- journal
+
+    def check_journal(self, options: NodeConfig) -> None:
+        """Raise ConfigError if the journal cannot be where these options want it."""
+        if options.journal == "resume" and not options.output_directory:
+            raise ConfigError(
+                "journal resume needs output_directory: that is where the session to resume is"
+            )
+        directory = journal_directory(options)
+        if directory and (self._lock is None or directory.parent != self._lock.directory):
+            DirectoryLock(directory.parent).release()
+
+    def follow_journal(self, options: NodeConfig, resuming: bool = False) -> bool:
+        """Write the journal where the options want it.
+
+        Parameters
+        ----------
+        options : NodeConfig
+        resuming : bool
+            Go on with the session that is there.
+
+        Returns
+        -------
+        bool
+            False if it is there already.
+
+        Raises
+        ------
+        ConfigError
+            If another node writes there.
+        """
+        directory = journal_directory(options)
+        if directory == self.journal_directory:
+            return False
+        self.stop_journal()
+        if directory is not None:
+            self._lock = DirectoryLock(directory.parent)
+            resumed = resuming and self._resume(directory)
+            self._journal = SessionJournal(directory, self.calibrator.state(), resumed)
+        return True
+
+    def flush_journal(self) -> None:
+        """Hand what came in to the disk; to be called often."""
+        if self._journal is not None:
+            self._journal.flush(self.calibrator.state)
+            self._log_notes(self._journal)
+
+    def stop_journal(self) -> bool:
+        """Write what is left; False if the disk keeps it busy."""
+        if self._journal is None:
+            return True
+        ended = self._journal.stop(self.calibrator.state, _GRACE_S)
+        self._log_notes(self._journal)
+        self._journal = None
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+        return ended
+
+    def _resume(self, directory: Path) -> bool:
+        """Whether the session in a directory goes on."""
+        if not has_session(directory):
+            self._log.info(f"no session to resume in {directory}: a new one begins")
+            return False
+        try:
+            poses = resume(directory, self.calibrator)
+        except HandEyeCalibError as error:
+            self._log.error(f"cannot resume: {error}; a new session begins")
+            self.calibrator.reset()
+            return False
+        self.has_new_poses = poses > 0
+        self._log.info(f"session resumed from {directory}: {poses} poses")
+        return True
+
+    def _log_notes(self, journal: SessionJournal) -> None:
+        for is_warning, text in journal.notes():
+            if is_warning:
+                self._log.warning(text, "journal")
+            else:
+                self._log.info(text)
+
+
+def journal_directory(options: NodeConfig) -> Path | None:
+    """Where the options want the journal; None for nowhere."""
+    if not options.output_directory or options.journal == "off":
+        return None
+    return output_path(options.output_directory) / "journal"
+
+
+def output_path(directory: str) -> Path:
+    """The path of an output directory, ``~`` expanded.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such user.
+    """
+    try:
+        return Path(directory).expanduser()
+    except RuntimeError as error:
+        raise ConfigError(
+            f"output_directory {directory!r}: {error}; write the whole path"
+        ) from None

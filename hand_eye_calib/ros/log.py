@@ -1,0 +1,57 @@
+"""The node's log: a message that repeats is written once in a while."""
+
+import time
+from collections.abc import Hashable
+from typing import Protocol
+
+LOG_PERIOD_S = 5.0
+
+
+class Logger(Protocol):
+    """What is used of a ROS logger."""
+
+    def info(self, message: str) -> bool: ...
+
+    def warning(self, message: str) -> bool: ...
+
+    def error(self, message: str) -> bool: ...
+
+
+class NodeLog:
+    """Writes to a ROS logger; rclpy's own throttle cannot tell two topics apart.
+
+    Each method takes the text and, for a message that may repeat, a key: of messages with the same
+    key only one is written per period.
+
+    Parameters
+    ----------
+    logger : rclpy logger
+    """
+
+    def __init__(self, logger: Logger) -> None:
+        self._logger = logger
+        self._written_at_s: dict[Hashable, float] = {}
+
+    def info(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
+        """Write what a person may want to know."""
+        if self._is_due(key, period_s):
+            self._logger.info(text)
+
+    def warning(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
+        """Write what a person should look at."""
+        if self._is_due(key, period_s):
+            self._logger.warning(text)
+
+    def error(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
+        """Write what went wrong."""
+        if self._is_due(key, period_s):
+            self._logger.error(text)
+
+    def _is_due(self, key: Hashable, period_s: float) -> bool:
+        if key is None:
+            return True
+        now_s = time.monotonic()
+        if now_s - self._written_at_s.get(key, -float("inf")) < period_s:
+            return False
+        self._written_at_s[key] = now_s
+        return True

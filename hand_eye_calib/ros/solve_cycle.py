@@ -1,0 +1,186 @@
+"""When the node solves, what came of it, and who waits for the answer."""
+
+import time
+from collections.abc import Callable
+
+from rclpy.task import Future
+
+from hand_eye_calib.assessment.excitation import Excitation
+from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.ros.check_monitor import CheckMonitor
+from hand_eye_calib.ros.live_session import LiveSession
+from hand_eye_calib.ros.log import NodeLog
+from hand_eye_calib.ros.results import describe
+from hand_eye_calib.ros.solving import Checked, Failure, FailureKind, Job, Solved
+from hand_eye_calib.ros.solving_process import SolvingProcess
+
+
+class SolveCycle:
+    """Sends snapshots of the session to the solving process and takes the answers.
+
+    At most one job is under way; a result of an older session is dropped.
+
+    Parameters
+    ----------
+    session : LiveSession
+    checks : CheckMonitor
+    log : NodeLog
+    wake : callable
+        Called in another thread when :meth:`take_answers` has something to do.
+    publish : callable
+        Called with each usable Calibration.
+
+    Attributes
+    ----------
+    solves : int
+        Solves of this node so far.
+    seconds : float
+        Duration of the last one.
+    is_solving : bool
+    result : Calibration or None
+        Newest usable result of the session, found at ``solved_at_s`` (steady time).
+    seen : Excitation or None
+        How the sensors have moved, as of the last solve.
+    failure : Failure or None
+        Of the last solve.
+    """
+
+    def __init__(
+        self,
+        session: LiveSession,
+        checks: CheckMonitor,
+        log: NodeLog,
+        wake: Callable[[], None],
+        publish: Callable[[Calibration], None],
+    ) -> None:
+        self.solves = 0
+        self.seconds = 0.0
+        self.is_solving = False
+        self._session, self._checks, self._log = session, checks, log
+        self._publish = publish
+        self._rest_until_s = 0.0
+        self._asked: list[Future] = []
+        self._asked_in_flight: list[Future] = []
+        self._process = SolvingProcess(wake)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new session: no result yet."""
+        self.result: Calibration | None = None
+        self.solved_at_s: float | None = None
+        self.seen: Excitation | None = None
+        self.failure: Failure | None = None
+
+    @property
+    def has_valid_result(self) -> bool:
+        """Whether there is a result with all six degrees of freedom."""
+        return self.result is not None and self.result.status is SolveStatus.OK
+
+    def ask(self) -> Future:
+        """Solve as soon as possible; the future's result is (success, text)."""
+        answer = Future()
+        self._asked.append(answer)
+        if not self.is_solving:
+            self._start()
+        return answer
+
+    def start_if_due(self) -> None:
+        """Solve if there is something new and the last solve has left the processor a rest."""
+        now_s = time.monotonic()
+        has_work = self._session.has_new_poses or self._checks.is_due(now_s)
+        if has_work and not self.is_solving and now_s >= self._rest_until_s:
+            self._start()
+
+    def take_answers(self) -> None:
+        """Take what the solving process has sent."""
+        for note in self._process.notes():
+            self._log.warning(note)
+        for answer in self._process.answers():
+            if isinstance(answer, Checked):
+                self._take_check(answer)
+            else:
+                self._take_solve(answer)
+
+    def stop(self, timeout_s: float) -> bool:
+        """Wait for the solve under way, take its result, and end the process; False if it took
+        longer than ``timeout_s``.
+        """
+        in_time = self._process.stop(timeout_s)
+        for answer in self._process.answers():
+            if isinstance(answer, Solved):
+                self._conclude(answer)
+        return in_time
+
+    def _start(self) -> None:
+        self.is_solving = True
+        self._checks.has_new_poses |= self._session.has_new_poses
+        self._session.has_new_poses = False
+        self._asked_in_flight, self._asked = self._asked, []
+        now_s = time.monotonic()
+        check = self._checks.is_due(now_s)
+        if check:
+            self._checks.begin(now_s)
+        snapshot = self._session.calibrator.snapshot()
+        self._process.submit(Job(self._session.number, snapshot, check))
+
+    def _take_check(self, checked: Checked) -> None:
+        if checked.session != self._session.number:
+            return
+        now_s = time.monotonic()
+        self._rest_until_s = max(self._rest_until_s, now_s + checked.seconds)
+        if checked.failure is not None:
+            text = f"the streams cannot be checked: {checked.failure.what}"
+            self._log.warning(text, "unchecked")
+            return
+        new, gone = self._checks.take(checked.result, now_s)
+        for line in new:
+            self._log.warning(line)
+        for line in gone:
+            self._log.info(line)
+
+    def _take_solve(self, solved: Solved) -> None:
+        good, text = self._conclude(solved)
+        self.is_solving = False
+        for answer in self._asked_in_flight:
+            answer.set_result((good, text))
+        self._asked_in_flight = []
+        if self._asked:
+            self._start()
+
+    def _conclude(self, solved: Solved) -> tuple[bool, str]:
+        """Take an answer; whether it is good, and a line about it."""
+        if solved.session != self._session.number:
+            return False, "the session was reset during the solve: its result is dropped"
+        self.solves += 1
+        self.seconds = solved.seconds
+        # Solves that take longer than their period leave the processor free for half the time.
+        self._rest_until_s = time.monotonic() + solved.seconds
+        self.seen, self.failure = solved.seen, solved.failure
+        self._session.calibrator.adopt(solved.time_offset)
+        if solved.calibration is None:
+            assert solved.failure is not None
+            return False, self._report_failure(solved.failure)
+        return self._report_result(solved.calibration)
+
+    def _report_result(self, calibration: Calibration) -> tuple[bool, str]:
+        if calibration.status is not SolveStatus.NOT_CONVERGED:
+            self.result, self.solved_at_s = calibration, time.monotonic()
+            self._publish(calibration)
+        text = describe(calibration, self.seen)
+        self._log.info(text, "result", 1.0)
+        for warning in calibration.warnings:
+            self._log.warning(warning, warning)
+        good = calibration.status is SolveStatus.OK
+        return good, "; ".join((text, *calibration.warnings))
+
+    def _report_failure(self, failure: Failure) -> str:
+        if failure.kind is FailureKind.NOT_ENOUGH_DATA:
+            self._log.info(f"cannot solve yet: {failure.what}", "not enough data")
+            return failure.what
+        if failure.kind is FailureKind.UNUSABLE:
+            self._log.warning(f"cannot solve: {failure.what}", "failed")
+            return failure.what
+        details = f"\n{failure.details}" if failure.details else ""
+        text = f"the solve failed unexpectedly: {failure.what}"
+        self._log.error(f"{text}{details}", "unexpected")
+        return f"{text}; see the log"

@@ -1,0 +1,162 @@
+"""The process that solves: reads jobs from its standard input, writes answers to its standard output.
+
+It imports the engine and nothing of ROS. Messages are pickles: both ends are the same program, and
+nobody else has the pipes.
+"""
+
+import os
+import pickle
+import queue
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import BinaryIO
+
+from hand_eye_calib.alignment.time_offset import TimeOffset
+from hand_eye_calib.assessment.excitation import Excitation, excitation
+from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.checks.check import CheckResult, can_check
+from hand_eye_calib.engine.calibrator import Snapshot
+from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
+
+# Every other program goes first, the node's callbacks above all.
+_NICENESS = 10
+
+
+class FailureKind(Enum):
+    """Why there is no result: too little data, unusable input or options, or a defect."""
+
+    NOT_ENOUGH_DATA = auto()
+    UNUSABLE = auto()
+    UNEXPECTED = auto()
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An error as text: ``what`` in one line, ``details`` for the log."""
+
+    kind: FailureKind
+    what: str
+    details: str = ""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A snapshot to solve, and whether to check its streams as well. The answers carry the number
+    of its session.
+    """
+
+    session: int
+    snapshot: Snapshot
+    check: bool = False
+
+
+@dataclass(frozen=True)
+class Solved:
+    """How a solve ended, after how many seconds: with a calibration or with a failure.
+
+    Attributes
+    ----------
+    seen : Excitation or None
+        How the sensors have moved.
+    time_offset : TimeOffset or None
+        The time offset, if it was estimated.
+    """
+
+    session: int
+    seconds: float
+    seen: Excitation | None = None
+    calibration: Calibration | None = None
+    time_offset: TimeOffset | None = None
+    failure: Failure | None = None
+
+
+@dataclass(frozen=True)
+class Checked:
+    """How a stream check ended, after how many seconds: with neither findings nor a failure if the
+    motion is too short or has too little rotation to tell.
+    """
+
+    session: int
+    seconds: float
+    result: CheckResult | None = None
+    failure: Failure | None = None
+
+
+Answer = Solved | Checked
+
+
+def answers(job: Job) -> Iterator[Answer]:
+    """Solve, then check if the job asks for it."""
+    solved = _solve(job)
+    yield solved
+    if job.check:
+        yield _check(job, solved.calibration)
+
+
+def _solve(job: Job) -> Solved:
+    start, snapshot = time.monotonic(), job.snapshot
+    seen = calibration = failure = None
+    try:
+        seen = excitation(snapshot.pose_pairs())
+        calibration = snapshot.estimate()
+    except Exception as error:  # the node reports it
+        failure = _failure(error)
+    seconds = time.monotonic() - start
+    return Solved(
+        job.session, seconds, seen, calibration, snapshot.found_time_offset, failure=failure
+    )
+
+
+def _check(job: Job, calibration: Calibration | None) -> Checked:
+    """Check the streams with the time offset and the scale that the solve found."""
+    start, result, failure = time.monotonic(), None, None
+    try:
+        if can_check(*job.snapshot.streams):
+            result = job.snapshot.check(calibration)
+    except Exception as error:  # the node reports it
+        failure = _failure(error)
+    return Checked(job.session, time.monotonic() - start, result, failure)
+
+
+def _failure(error: Exception) -> Failure:
+    if isinstance(error, NotEnoughDataError):
+        return Failure(FailureKind.NOT_ENOUGH_DATA, str(error))
+    if isinstance(error, HandEyeCalibError):
+        return Failure(FailureKind.UNUSABLE, str(error))
+    details = "".join(traceback.format_exception(error))
+    return Failure(FailureKind.UNEXPECTED, f"{type(error).__name__}: {error}", details)
+
+
+def main() -> None:
+    """Answer jobs until the standard input ends, which it does with the node, however that ends."""
+    os.nice(_NICENESS)
+    incoming, outgoing = _private_pipes()
+    jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
+    threading.Thread(target=_receive, args=(incoming, jobs), daemon=True).start()
+    while True:
+        for answer in answers(jobs.get()):
+            pickle.dump(answer, outgoing, pickle.HIGHEST_PROTOCOL)
+            outgoing.flush()
+
+
+def _private_pipes() -> tuple[BinaryIO, BinaryIO]:
+    """The pipes to the node; what a library prints goes to standard error instead."""
+    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    with open(os.devnull, "rb") as nothing:
+        os.dup2(nothing.fileno(), 0)
+    os.dup2(sys.stderr.fileno(), 1)
+    return incoming, outgoing
+
+
+def _receive(incoming: BinaryIO, jobs: "queue.SimpleQueue[Job]") -> None:
+    """Read jobs in a thread: the end of the node must be noticed during a long solve too."""
+    try:
+        while True:
+            jobs.put(pickle.load(incoming))
+    finally:
+        os._exit(0)
