@@ -144,6 +144,7 @@ class Peer:
     """Publishes poses to the node, hears its results, calls its services."""
 
     def __init__(self, domain):
+        self.target = "calibrator"  # the node's name, with its namespace
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=domain)
         self.node = rclpy.create_node("peer", context=self._context)
@@ -195,13 +196,13 @@ class Peer:
     def listen(self, kind, name):
         """List that fills with the node's messages on a latched topic."""
         heard = []
-        self.node.create_subscription(kind, f"calibrator/{name}", heard.append, LATCHED)
+        self.node.create_subscription(kind, f"{self.target}/{name}", heard.append, LATCHED)
         return heard
 
     def ask(self, kind, name, request=None):
         """Future of a service's answer."""
         if name not in self._clients:
-            self._clients[name] = self.node.create_client(kind, f"calibrator/{name}")
+            self._clients[name] = self.node.create_client(kind, f"{self.target}/{name}")
         client = self._clients[name]
         self.spin_until(client.service_is_ready, f"service {name}")
         return client.call_async(request or kind.Request())

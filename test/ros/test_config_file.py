@@ -4,7 +4,6 @@
 option has changed.
 """
 
-import ast
 import dataclasses
 import textwrap
 from pathlib import Path
@@ -86,37 +85,6 @@ def test_config_file_has_every_parameter_with_its_default_and_type():
 
 def test_config_file_comments_follow_the_options():
     assert (PROJECT / "config" / "calibrator.yaml").read_text(encoding="utf-8") == expected_file()
-
-
-def test_launch_file_starts_the_node_with_the_topics_remapped():
-    path = PROJECT / "launch" / "calibrator.launch.py"
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    (node,) = [
-        call
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Node"
-    ]
-    arguments = {keyword.arg: keyword.value for keyword in node.keywords}
-    assert [ast.literal_eval(arguments[name]) for name in ("package", "executable", "name")] == [
-        "hand_eye_calib",
-        "calibrator",
-        "calibrator",
-    ]
-    remapped = {
-        ast.literal_eval(pair.elts[0]): pair.elts[1].args[0].value
-        for pair in arguments["remappings"].elts
-    }
-    assert remapped == {"parent_odom": "parent_topic", "child_odom": "child_topic"}
-
-
-def test_launch_arguments_that_set_parameters_name_parameters():
-    tree = ast.parse((PROJECT / "launch" / "calibrator.launch.py").read_text(encoding="utf-8"))
-    (parameters,) = [
-        ast.literal_eval(statement.value)
-        for statement in tree.body
-        if isinstance(statement, ast.Assign) and statement.targets[0].id == "PARAMETERS"
-    ]
-    assert set(parameters) <= {option_name(field) for field in fields()}
 
 
 if __name__ == "__main__":
