@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from hand_eye_calib.cli.console import note
@@ -15,7 +16,7 @@ from hand_eye_calib.errors import ConfigError
 from reproduction.coverage import study
 from reproduction.coverage.measures import worsened
 from reproduction.coverage.page import page
-from reproduction.coverage.real_sets import Rig, real_rigs
+from reproduction.coverage.real_sets import real_rigs
 from reproduction.coverage.scores import METHODS
 
 _METHODS = tuple(name for name in METHODS if name in KNOWN_METHODS)
@@ -43,6 +44,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "--methods", default=",".join(_METHODS), help=f"Default: {','.join(_METHODS)}"
     )
     parser.add_argument(
+        "--tables", default=",".join(study.TABLES), help=f"Default: {','.join(study.TABLES)}"
+    )
+    parser.add_argument(
         "--seeds", type=int, default=_SEEDS, help=f"recordings per class. Default: {_SEEDS}"
     )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
@@ -55,10 +59,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the study; returns the exit code."""
-    methods = arguments.methods.split(",")
-    _check(arguments, methods)
-    rigs, absent = _rigs(arguments.data_folder)
-    rows = study.measure(rigs, methods, arguments.seeds, arguments.jobs)
+    plan, absent = _plan(arguments)
+    rows = study.measure(plan, arguments.jobs)
     text = page(rows, study.load(study.VERSION_0_1), absent, arguments.seeds)
     print(text)
     if arguments.page:
@@ -74,19 +76,29 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if worse else 0
 
 
-def _check(arguments: argparse.Namespace, methods: Sequence[str]) -> None:
-    unknown = [method for method in methods if method not in _METHODS]
-    if unknown:
-        raise ConfigError(f"--methods must be of {', '.join(_METHODS)}; got {unknown[0]}")
+def _plan(arguments: argparse.Namespace) -> tuple[study.Plan, list[str]]:
+    """What to measure, and the folders of recordings that are absent."""
+    methods = _chosen("--methods", arguments.methods, _METHODS)
+    tables = _chosen("--tables", arguments.tables, study.TABLES)
     if arguments.seeds < 1 or arguments.jobs < 1:
         raise ConfigError("--seeds and --jobs must be at least 1")
-    if arguments.update_baseline and set(methods) != set(_METHODS):
-        raise ConfigError("--update-baseline stores all methods; leave out --methods")
+    if arguments.update_baseline and (methods, tables) != (_METHODS, study.TABLES):
+        raise ConfigError("--update-baseline stores all; leave out --methods and --tables")
+    given = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
+    plan = study.Plan(methods=methods, tables=tables, seeds=arguments.seeds)
+    if not given:
+        return plan, ["every real recording"]
+    rigs, absent = real_rigs(Path(given))
+    published = None if "valimaki2023" in absent else Path(given) / "valimaki2023"
+    return replace(plan, rigs=tuple(rigs), published=published), absent
 
 
-def _rigs(folder: Path | None) -> tuple[list[Rig], list[str]]:
-    given = folder or os.environ.get("HAND_EYE_CALIB_DATA")
-    return real_rigs(Path(given)) if given else ([], ["every real recording"])
+def _chosen(option: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    chosen = tuple(text.split(","))
+    unknown = [name for name in chosen if name not in known]
+    if unknown:
+        raise ConfigError(f"{option} must be of {', '.join(known)}; got {unknown[0]}")
+    return chosen
 
 
 if __name__ == "__main__":

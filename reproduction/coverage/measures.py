@@ -24,6 +24,9 @@ POOLED = {
     "parts": "all parts",
 }
 
+# Errors below these are rounding.
+LEAST = {"mm": 0.01, "deg": 0.001}
+
 _RESAMPLES = 400
 _CONFIDENCE = 0.95
 
@@ -88,8 +91,8 @@ KINDS = {
         "with the truth's own sigma", _mean, lambda value: max(COVERAGE - value, 0.0), 0.03
     ),
     "scatter": Kind("scatter / sigma", _root_mean, _log_distance(1.0), np.log(1.10)),
-    "mm": Kind("error (mm)", _median, _log_above(0.1), np.log(1.10)),
-    "deg": Kind("error (deg)", _median, _log_above(0.001), np.log(1.10)),
+    "mm": Kind("error (mm)", _median, _log_above(LEAST["mm"]), np.log(1.10)),
+    "deg": Kind("error (deg)", _median, _log_above(LEAST["deg"]), np.log(1.10)),
     "mm_truth": Kind("truth known to (mm)", _median, lambda value: 0.0, 0.0),
     "deg_truth": Kind("truth known to (deg)", _median, lambda value: 0.0, 0.0),
     "z": Kind("largest error / sigma", _median, _log_above(1.0), np.log(1.15)),

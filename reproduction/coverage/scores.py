@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.stats import norm
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.covariance import AXES
-from hand_eye_calib.assessment.metrics import deviation
+from hand_eye_calib.assessment.metrics import absolute_errors, deviation
 from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError
@@ -21,6 +22,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.coverage import classes, mixed
 from reproduction.coverage.measures import COVERAGE, Row
 from reproduction.coverage.real_sets import CYCLE, Rig, Truth
+from reproduction.published import load_simulated
 from reproduction.recordings import PARTS, Recording
 from reproduction.repeats import spread_and_sigma
 
@@ -91,6 +93,35 @@ def _class_case(
         return case
     within = np.abs(xi) < _REACH * np.sqrt(np.diag(found.covariance))
     return case | {"nees": _squared(xi, found.covariance), "covers": float(within.mean())}
+
+
+def level_row(folder: Path, dataset: str, level: float | None, method: str) -> Row:
+    """Errors on the published trajectories of a level."""
+    cases: dict[str, dict[str, float]] = {}
+    seconds = []
+    for case in load_simulated(folder, [dataset], None if level is None else [level]):
+        found = answer(case.parent, case.child, METHODS[method])
+        seconds.append(found.seconds)
+        for kind, value in _level_case(case.T_parent_child, found.calibration).items():
+            cases.setdefault(kind, {})[case.name] = value
+    name = dataset if level is None else f"{dataset} {level:g}"
+    return Row("levels", name, method, cases, float(np.median(seconds)))
+
+
+def _level_case(truth: FloatArray, found: Calibration | None) -> dict[str, float]:
+    if found is None:
+        return {"answered": 0.0}
+    xi = se3.log(se3.inverse(found.T_parent_child) @ truth)
+    e_at, e_aR = absolute_errors(found.T_parent_child, truth)
+    case = {
+        "answered": float(found.status is SolveStatus.OK),
+        "mm": 1e3 * e_at,
+        "deg": float(np.degrees(e_aR)),
+    }
+    if not np.isfinite(found.covariance).all():
+        return case
+    within = np.abs(xi) < _REACH * np.sqrt(np.diag(found.covariance))
+    return case | {"covers": float(within.mean())}
 
 
 def _squared(xi: FloatArray, covariance: FloatArray) -> float:

@@ -3,49 +3,94 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hand_eye_calib.errors import InputError
 from reproduction.coverage.classes import CLASSES
 from reproduction.coverage.measures import POOLED, Row, pooled
 from reproduction.coverage.mixed import MIXED
 from reproduction.coverage.real_sets import CYCLE, Rig
-from reproduction.coverage.scores import class_row, cycle_row, parts_row, scatter_row, truth_row
+from reproduction.coverage.scores import (
+    class_row,
+    cycle_row,
+    level_row,
+    parts_row,
+    scatter_row,
+    truth_row,
+)
+from reproduction.published import LEVELS, SIMULATED
 from reproduction.runner import in_parallel
 
 HERE = Path(__file__).parent
 BASELINE, VERSION_0_1 = HERE / "baseline.json", HERE / "version_0_1.json"
 
+TABLES = ("simulated", "mixed", "levels", "known answer", "rig", "parts", "cycle")
+
 # Digits that are kept of a case: more than noise, less than rounding.
 _DIGITS = 5
 
 
-def measure(rigs: Sequence[Rig], methods: Sequence[str], seeds: int, jobs: int) -> list[Row]:
-    """Rows of every class, rig and cycle for every method, then the pooled ones."""
-    tasks = [task for method in methods for task in _tasks(rigs, method, seeds)]
-    rows = in_parallel(_measured, tasks, jobs)
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What to measure.
+
+    Attributes
+    ----------
+    methods : tuple of str
+    tables : tuple of str
+        Of :data:`TABLES`.
+    rigs : tuple of Rig
+    published : pathlib.Path, optional
+        Folder of the paper's data.
+    seeds : int
+        Recordings per simulated class.
+    """
+
+    methods: tuple[str, ...]
+    tables: tuple[str, ...] = TABLES
+    rigs: tuple[Rig, ...] = ()
+    published: Path | None = None
+    seeds: int = 10
+
+
+def measure(plan: Plan, jobs: int) -> list[Row]:
+    """Rows of every class, level, rig and cycle for every method, then the pooled ones."""
+    tasks = [task for method in plan.methods for task in _tasks(plan, method)]
+    rows = in_parallel(_measured, [rest for table, *rest in tasks if table in plan.tables], jobs)
     together = [
-        pooled(table, name, method, rows) for method in methods for table, name in POOLED.items()
+        pooled(table, name, method, rows)
+        for method in plan.methods
+        for table, name in POOLED.items()
     ]
     return [row for row in rows + together if row.cases]
 
 
-def _tasks(rigs: Sequence[Rig], method: str, seeds: int) -> list[tuple[object, ...]]:
-    tasks: list[tuple[object, ...]] = [
-        (class_row, name, method, seeds) for name in (*CLASSES, *MIXED)
+def _tasks(plan: Plan, method: str) -> list[tuple[Any, ...]]:
+    """Table, function and its arguments of every row."""
+    tasks: list[tuple[Any, ...]] = [
+        ("simulated", class_row, name, method, plan.seeds) for name in CLASSES
     ]
-    for rig in rigs:
+    tasks += [("mixed", class_row, name, method, plan.seeds) for name in MIXED]
+    if plan.published is not None:
+        tasks += [
+            ("levels", level_row, plan.published, dataset, level, method)
+            for dataset in SIMULATED
+            for level in LEVELS[dataset]
+        ]
+    for rig in plan.rigs:
         names = list(rig.recordings)
         if rig.truth is not None:
-            tasks += [(truth_row, rig, name, method) for name in names]
+            tasks += [("known answer", truth_row, rig, name, method) for name in names]
         if len(names) > 1:
-            tasks.append((scatter_row, rig, method))
+            tasks.append(("rig", scatter_row, rig, method))
         if rig.is_cut:
-            tasks += [(parts_row, rig, name, method) for name in names]
-    by_name = {rig.name: rig for rig in rigs}
+            tasks += [("parts", parts_row, rig, name, method) for name in names]
+    by_name = {rig.name: rig for rig in plan.rigs}
     if set(CYCLE) <= set(by_name):
-        tasks.append((cycle_row, {name: by_name[name] for name in CYCLE}, method))
+        tasks.append(("cycle", cycle_row, {name: by_name[name] for name in CYCLE}, method))
     return tasks
 
 

@@ -257,7 +257,7 @@ def _calibration(T_parent_child, covariance, scale):
 def test_one_class_from_end_to_end(monkeypatch):
     monkeypatch.setattr(study, "CLASSES", ("hand_white", "flat_agv"))
     monkeypatch.setattr(study, "MIXED", ("mixed_arm",))
-    rows = study.measure([], ["dnlo"], 2, 1)
+    rows = study.measure(study.Plan(methods=("dnlo",), seeds=2), 1)
     found = {one.name: one for one in rows}
     assert 0.3 < found["hand_white"].value("bound") < 3.0
     assert found["flat_agv"].value("refused") == 1.0
