@@ -2,7 +2,6 @@
 continues.
 """
 
-import dataclasses
 import hashlib
 import importlib.metadata
 import json
@@ -76,7 +75,7 @@ class Store:
 
     def save(self, cell, rows):
         """Store the rows of a cell."""
-        _write(self._path(cell), [dataclasses.asdict(row) for row in rows])
+        _write(self._path(cell), [vars(row) for row in rows])
 
     def _path(self, cell):
         return self._folder / f"{cell.name}.json"
