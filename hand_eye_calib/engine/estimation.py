@@ -92,7 +92,7 @@ def estimate_extrinsic(
     spread = _spread_by_alignment(scale.estimate, time_offset)
     assessment = widened(evaluation.assessment, solution.T_parent_child[:3, :3], spread)
     fused = fuse(solution.T_parent_child, assessment, config.prior())
-    offset_s = time_offset.seconds if time_offset else _in_seconds(config.time_offset)
+    offset_s = time_offset.seconds if time_offset else fixed_time_offset(config)
     residuals = _residuals(evaluation, pose_pairs.stamps_ns, fused.T_parent_child)
     return Calibration(
         T_parent_child=fused.T_parent_child,
@@ -137,12 +137,17 @@ def _residuals(
     )
 
 
-def _in_seconds(time_offset: float | str) -> float:
-    if isinstance(time_offset, str):
-        raise ConfigError(
-            f"time_offset {time_offset!r} must be settled before the poses are solved"
-        )
-    return time_offset
+def fixed_time_offset(config: CalibratorConfig) -> float:
+    """The time offset of options that have it in seconds.
+
+    Raises
+    ------
+    ConfigError
+        If it is still to be estimated.
+    """
+    if isinstance(config.time_offset, str):
+        raise ConfigError(f"time_offset {config.time_offset!r} must be estimated before solving")
+    return config.time_offset
 
 
 def _solve_pairs(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:

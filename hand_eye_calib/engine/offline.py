@@ -5,7 +5,7 @@ from typing import Any
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig, Prior, prior_fields
-from hand_eye_calib.engine.calibrator import Snapshot, name_frames
+from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
 
@@ -71,10 +71,19 @@ def offline_config(
 
 def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajectory) -> Snapshot:
     """The Snapshot of two whole trajectories."""
-    frames, warnings = name_frames(
+    parent_frame, child_frame, warnings = name_frames(
         config, {"parent": parent.sensor_frame, "child": child.sensor_frame}
     )
-    return Snapshot(config, PosePairs.empty(), parent, child, None, *frames, warnings)
+    return Snapshot(
+        config=config,
+        kept=PosePairs.empty(),
+        buffered_parent=parent,
+        buffered_child=child,
+        paired_at=None,
+        parent_frame=parent_frame,
+        child_frame=child_frame,
+        warnings=warnings,
+    )
 
 
 def _no_limit(parent: Trajectory, child: Trajectory) -> dict[str, Any]:

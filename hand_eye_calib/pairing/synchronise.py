@@ -52,18 +52,16 @@ class PosePairs:
         )
 
 
-def slower_stream(parent: Trajectory, child: Trajectory) -> str:
+def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
     """Choose the stream at whose stamps to pair: "parent" or "child".
 
     The slower one; the child if both are about equally fast. The typical interval is the median, so
     that a gap or a late start does not make a stream slow.
     """
-    if len(parent) < 2 or len(child) < 2:
+    if len(parent_stamps_ns) < 2 or len(child_stamps_ns) < 2:
         return "child"
-    interval_parent, interval_child = (
-        np.median(np.diff(parent.stamps_ns)),
-        np.median(np.diff(child.stamps_ns)),
-    )
+    interval_parent = np.median(np.diff(parent_stamps_ns))
+    interval_child = np.median(np.diff(child_stamps_ns))
     return "parent" if interval_parent > _EQUALLY_FAST * interval_child else "child"
 
 
@@ -87,7 +85,7 @@ def synchronise(
     """
     if len(parent) == 0 or len(child) == 0:
         return PosePairs.empty()
-    at = at or slower_stream(parent, child)
+    at = at or slower_stream(parent.stamps_ns, child.stamps_ns)
     slow, fast = (parent, child) if at == "parent" else (child, parent)
     keep = _interpolable(fast.stamps_ns, slow.stamps_ns, max_gap_s)
     stamps_ns = slow.stamps_ns[keep]

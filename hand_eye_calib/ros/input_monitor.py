@@ -5,7 +5,7 @@ from collections import Counter, deque
 
 import numpy as np
 
-from hand_eye_calib.engine.calibrator import StreamStatistics
+from hand_eye_calib.engine.pose_buffer import StreamStatistics
 from hand_eye_calib.ros.delivery import Delivery, DeliveryReport
 from hand_eye_calib.ros.status import ERROR, OK, WARN, Report
 

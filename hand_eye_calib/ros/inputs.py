@@ -10,7 +10,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from hand_eye_calib.engine.calibrator import StreamStatistics
+from hand_eye_calib.engine.pose_buffer import StreamStatistics
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.ros.conversions import POSE_TYPES, PoseType, to_ns
 from hand_eye_calib.ros.input_monitor import InputMonitor

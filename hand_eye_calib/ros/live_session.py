@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.engine.calibrator import STREAMS, Calibrator
+from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.journal import has_session
 from hand_eye_calib.ros.log import NodeLog

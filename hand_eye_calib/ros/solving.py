@@ -20,7 +20,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.check import CheckResult, can_check
-from hand_eye_calib.engine.calibrator import Snapshot
+from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 
 # Every other program goes first, the node's callbacks above all.
@@ -102,14 +102,13 @@ def _solve(job: Job) -> Solved:
     start, snapshot = time.monotonic(), job.snapshot
     seen = calibration = failure = None
     try:
+        snapshot = snapshot.resolved()
         seen = excitation(snapshot.pose_pairs())
         calibration = snapshot.estimate()
     except Exception as error:  # the node reports it
         failure = _failure(error)
     seconds = time.monotonic() - start
-    return Solved(
-        job.session, seconds, seen, calibration, snapshot.found_time_offset, failure=failure
-    )
+    return Solved(job.session, seconds, seen, calibration, snapshot.time_offset, failure=failure)
 
 
 def _check(job: Job, calibration: Calibration | None) -> Checked:

@@ -15,9 +15,9 @@ from motions import (
 import hand_eye_calib as hec
 from hand_eye_calib.calibration import SolveStatus
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine import calibrator as engine
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.offline import calibrate
+from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 
 IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
@@ -238,11 +238,9 @@ class TestMissingData:
 
 
 class TestLongSessions:
-    """The waiting room made small, so that a short drive fills it many times."""
+    """With small buffers, so that a short drive fills them many times."""
 
-    @pytest.fixture(autouse=True)
-    def small_waiting_room(self, monkeypatch):
-        monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 100)
+    LIMITS = BufferLimits(capacity=100)
 
     @staticmethod
     def interleaved(calibrator, parent, child):
@@ -261,25 +259,25 @@ class TestLongSessions:
         for stamp_ns, stream, position, quat in sorted(messages, key=lambda message: message[:2]):
             calibrator.add_pose(stream, stamp_ns, position, quat)
 
-    def test_every_pose_is_paired_once_however_often_the_room_was_cleared(self):
+    def test_every_pose_is_paired_once_however_often_the_buffers_were_full(self):
         parent, child = drive(400)
-        calibrator = Calibrator(CalibratorConfig(reference="B3"))
+        calibrator = Calibrator(CalibratorConfig(reference="B3"), self.LIMITS)
         self.interleaved(calibrator, parent, child)
         pairs = calibrator.snapshot().pose_pairs()
         inside = parent.stamps_ns <= child.stamps_ns[-1]
         assert np.array_equal(pairs.stamps_ns, parent.stamps_ns[inside])
         np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
-    def test_latecomers_are_counted(self):
+    def test_late_arrivals_are_counted(self):
         parent, child = drive(400)
-        calibrator = Calibrator()
+        calibrator = Calibrator(limits=self.LIMITS)
         self.interleaved(calibrator, parent, child)
         assert not calibrator.add_pose("parent", int(parent.stamps_ns[0]) + 1, *IDENTITY)
         assert calibrator.statistics("parent").refused_late == 1
 
-    def test_pairs_are_bounded_and_turns_survive(self):
+    def test_pairs_are_bounded_and_curves_survive(self):
         parent, child = drive(400)
-        calibrator = Calibrator(CalibratorConfig(max_pairs=100, reference="B3"))
+        calibrator = Calibrator(CalibratorConfig(max_pairs=100, reference="B3"), self.LIMITS)
         self.interleaved(calibrator, parent, child)
         pairs = calibrator.snapshot().pose_pairs()
         assert 50 <= len(pairs) <= 100
@@ -290,7 +288,7 @@ class TestLongSessions:
 
     def test_a_stream_on_its_own_does_not_fill_the_memory(self):
         parent, child = drive(400)
-        calibrator = Calibrator(CalibratorConfig(reference="B3"))
+        calibrator = Calibrator(CalibratorConfig(reference="B3"), self.LIMITS)
         feed(calibrator, "parent", parent)
         assert calibrator.statistics("parent").dropped_unpaired > 0
         assert len(calibrator.snapshot().parent) <= 100
@@ -299,7 +297,7 @@ class TestLongSessions:
 
     def test_reset_forgets_and_reconfigure_keeps(self):
         parent, child = drive(400)
-        calibrator = Calibrator(CalibratorConfig(reference="B3"))
+        calibrator = Calibrator(CalibratorConfig(reference="B3"), self.LIMITS)
         self.interleaved(calibrator, parent, child)
         calibrator.reconfigure(dataclasses.replace(calibrator.config, reference="B5"))
         assert calibrator.estimate().reference == "B5"

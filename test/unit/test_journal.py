@@ -8,8 +8,8 @@ import pytest
 from motions import as_trajectory, child_of, wandering_poses
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine import calibrator as engine
 from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import JournalWriter, has_session, read_journal
@@ -62,13 +62,13 @@ def test_a_resumed_session_is_the_session(tmp_path):
     assert again.statistics("child") == calibrator.statistics("child")
 
 
-def test_the_engine_state_goes_round_after_pairs_were_made(monkeypatch):
-    monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 50)
-    calibrator = Calibrator(CONFIG)
+def test_the_engine_state_goes_round_after_pairs_were_made():
+    limits = BufferLimits(capacity=50)
+    calibrator = Calibrator(CONFIG, limits)
     sequence = list(messages(150))
     for message in sequence[:200]:
         calibrator.add_pose(*message)
-    again = Calibrator(CONFIG)
+    again = Calibrator(CONFIG, limits)
     again.restore(calibrator.state())
     for each in (calibrator, again):
         for message in sequence[200:]:
@@ -154,6 +154,7 @@ import sys
 sys.path[:0] = sys.argv[3:]
 from test_journal import CONFIG, messages
 from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.io.journal import JournalWriter
 calibrator = Calibrator(CONFIG)
 writer = JournalWriter(sys.argv[1], calibrator.state(), segment_bytes=30_000)

@@ -1,5 +1,5 @@
-"""The engine over sessions that outgrow its waiting room: every pose is used, whatever the order,
-rates and gaps.
+"""The engine over sessions that outgrow its buffers: every pose is used, whatever the order, rates
+and gaps.
 """
 
 import dataclasses
@@ -18,22 +18,16 @@ from motions import (
 )
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine import calibrator as engine
-from hand_eye_calib.engine.calibrator import Calibrator, thin
+from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.pose_buffer import BufferLimits
+from hand_eye_calib.engine.snapshot import downsample
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
 
-
-@pytest.fixture(autouse=True)
-def small_waiting_room(monkeypatch):
-    """10 s at 10 Hz, so that a short drive outgrows it many times; latecomers are waited for for
-    half a second.
-    """
-    for name, value in {
-        "_MAX_WAITING_POSES": 500, "_CROWDED_POSES": 100, "_POSES_AT_A_TIME": 16, "_POSES_BETWEEN": 4, "_LATECOMERS_NS": 500_000_000,
-    }.items():  # fmt: skip
-        monkeypatch.setattr(engine, name, value)
+# 10 s at 10 Hz, so that a short drive outgrows the buffers many times; half a second for late
+# arrivals.
+SMALL = BufferLimits(capacity=500, pairing_starts=100, batch=16, batch_every=4, late_ns=500_000_000)
 
 
 def messages(stream, trajectory):
@@ -46,8 +40,8 @@ def messages(stream, trajectory):
     ]
 
 
-def play(sequence, **options):
-    calibrator = Calibrator(CalibratorConfig(reference="B3", **options))
+def play(sequence, limits=SMALL, **options):
+    calibrator = Calibrator(CalibratorConfig(reference="B3", **options), limits)
     for stamp_ns, stream, position, quat in sequence:
         calibrator.add_pose(stream, stamp_ns, position, quat)
     return calibrator
@@ -77,12 +71,11 @@ def test_every_pose_is_paired_once_and_memory_stays_small(child_every):
     np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
 
-def test_the_answer_is_that_of_all_poses_at_once(monkeypatch):
+def test_the_answer_is_that_of_all_poses_at_once():
     sequence = by_stamp(*drive())
     in_parts = play(sequence).estimate()
-    monkeypatch.setattr(engine, "_CROWDED_POSES", 500)
-    monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 5000)
-    at_once = play(sequence).estimate()
+    large = dataclasses.replace(SMALL, capacity=5000, pairing_starts=500)
+    at_once = play(sequence, large).estimate()
     assert np.array_equal(in_parts.T_parent_child, at_once.T_parent_child)
     assert in_parts.n_pairs == at_once.n_pairs
 
@@ -105,7 +98,7 @@ def test_late_and_swapped_messages_within_the_horizon_change_nothing(seed):
     )
 
 
-def test_latecomers_beyond_the_horizon_are_counted():
+def test_late_arrivals_beyond_the_horizon_are_counted():
     sequence = by_stamp(*drive())
     calibrator = play(sequence[1:])
     stamp_ns, stream, position, quat = sequence[0]
@@ -156,11 +149,11 @@ def test_the_informative_pairs_are_kept_not_the_newest():
     np.testing.assert_allclose(result.T_parent_child[:3, 3], T_PARENT_CHILD[:3, 3], atol=2e-3)
 
 
-def test_thinning_keeps_both_ends_and_the_limit():
+def test_downsampling_keeps_both_ends_and_the_limit():
     poses = planar_poses(3000)
     pairs = PosePairs(np.arange(3000), poses, child_of(poses))
     for limit in (10, 100, 2999, 3000):
-        left = thin(pairs, limit)
+        left = downsample(pairs, limit)
         assert len(left) <= limit
         assert (left.stamps_ns[0], left.stamps_ns[-1]) == (0, 2999)
         assert (np.diff(left.stamps_ns) > 0).all()
@@ -186,16 +179,15 @@ def test_an_estimated_time_offset_is_part_of_the_state():
 
 def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
     parent, child = drive(400)
-    calibrator = Calibrator(CalibratorConfig(reference="B3", time_offset="estimate"))
+    calibrator = Calibrator(CalibratorConfig(reference="B3", time_offset="estimate"), SMALL)
     feed(calibrator, "parent", parent)
     feed(calibrator, "child", child)
-    snapshot = calibrator.snapshot()
-    snapshot.estimate()
-    calibrator.adopt(snapshot.found_time_offset)
-    monkeypatch.setattr(engine, "estimate_time_offset", None)
+    snapshot = calibrator.snapshot().resolved()
+    calibrator.adopt(snapshot.time_offset)
+    monkeypatch.setattr("hand_eye_calib.engine.calibrator.estimate_time_offset", None)
     extra = as_trajectory(wandering_poses(900))[400:]
     feed(calibrator, "parent", extra)
-    assert calibrator.estimate().time_offset_s == snapshot.found_time_offset.seconds
+    assert calibrator.estimate().time_offset_s == snapshot.time_offset.seconds
 
 
 @pytest.mark.parametrize("max_pairs", [5000, 300])

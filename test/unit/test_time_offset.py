@@ -19,9 +19,9 @@ from motions import (
 from hand_eye_calib.alignment.angular_rates import correlate_rates
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine import calibrator as engine
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.offline import calibrate
+from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -154,10 +154,11 @@ class TestInTheEngine:
             for one, other in zip(estimated.observability, given.observability, strict=True)
         )
 
-    def test_long_sessions_settle_it_when_the_waiting_room_is_full(self, monkeypatch):
-        monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 900)
+    def test_long_sessions_settle_it_when_a_buffer_is_full(self):
         parent, child = drive(seconds=120, shift_s=0.2)
-        calibrator = Calibrator(CalibratorConfig(time_offset="estimate", reference="B5"))
+        calibrator = Calibrator(
+            CalibratorConfig(time_offset="estimate", reference="B5"), BufferLimits(capacity=900)
+        )
         for part in range(8):
             for stream, trajectory in (("parent", parent), ("child", child)):
                 feed(
@@ -172,9 +173,10 @@ class TestInTheEngine:
         assert result.time_offset_s == snapshot.time_offset.seconds
         np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.02)
 
-    def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self, monkeypatch):
-        monkeypatch.setattr(engine, "_MAX_WAITING_POSES", 300)
-        calibrator = Calibrator(CalibratorConfig(time_offset="estimate"))
+    def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self):
+        calibrator = Calibrator(
+            CalibratorConfig(time_offset="estimate"), BufferLimits(capacity=300)
+        )
         for stream, trajectory in zip(
             ("parent", "child"), (drive(1)[0], drive(77)[1]), strict=True
         ):

@@ -1,0 +1,266 @@
+"""The poses of one stream that are not paired yet: in order of their stamps, in bounded memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.geometry.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class BufferLimits:
+    """Limits of the buffers, and when poses are made into pairs.
+
+    Attributes
+    ----------
+    capacity : int
+        Most poses of a stream. A buffer fills up if the other stream lags behind, or if the time
+        offset is still to be estimated.
+    pairing_starts : int
+        Number of poses from which on the oldest are made into pairs. Until then, messages may come
+        in any order: 20 s at 100 Hz.
+    batch, batch_every : int
+        Most poses that are made into pairs at once, and how many new poses come between two
+        batches. Small batches keep the time of a single pose below a few milliseconds.
+    late_ns : int
+        Poses closer than this to the newest of their stream are not paired yet, in case others
+        arrive late.
+    share_kept : float
+        Share of the newest poses that are not paired if a buffer is full.
+    """
+
+    capacity: int = 20_000
+    pairing_starts: int = 2_000
+    batch: int = 256
+    batch_every: int = 32
+    late_ns: int = 1_000_000_000
+    share_kept: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamStatistics:
+    """What a stream has delivered in this session.
+
+    Attributes
+    ----------
+    received : int
+        Poses taken.
+    refused_duplicate : int
+        Poses with a stamp that the stream already had.
+    refused_late : int
+        Late arrivals: poses older than those that were already paired and dropped.
+    dropped_unpaired : int
+        Poses dropped because the other stream had none at their time.
+    first_stamp_ns, last_stamp_ns : int or None
+        Range of the stamps taken.
+    """
+
+    received: int = 0
+    refused_duplicate: int = 0
+    refused_late: int = 0
+    dropped_unpaired: int = 0
+    first_stamp_ns: int | None = None
+    last_stamp_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class RawPoses:
+    """Poses as they came in, in order of time.
+
+    Attributes
+    ----------
+    stamps_ns : (N,) int64 array
+    poses : (N, 7) array
+        x y z qx qy qz qw.
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The same as a Trajectory. This is the expensive part."""
+        return Trajectory.from_quat_xyzw(self.stamps_ns, self.poses[:, :3], self.poses[:, 3:])
+
+
+class PoseBuffer:
+    """Poses of one sensor, in order of their stamps.
+
+    Parameters
+    ----------
+    limits : BufferLimits
+
+    Attributes
+    ----------
+    frame : str
+        Name of the sensor frame; empty until it is known.
+    """
+
+    def __init__(self, limits: BufferLimits) -> None:
+        self._limits = limits
+        self._stamps_ns = np.empty(limits.capacity, dtype=np.int64)
+        self._poses = np.empty((limits.capacity, 7))  # x y z qx qy qz qw
+        self._count = 0
+        self._dropped_until_ns: int | None = None
+        self.frame = ""
+        self._received = self._refused_duplicate = self._refused_late = self._dropped_unpaired = 0
+        # Of all stamps taken.
+        self._first_ns: int | None = None
+        self._last_ns: int | None = None
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def stamps_ns(self) -> IntArray:
+        """(N,) int64 array: the stamps, valid until the buffer changes."""
+        return self._stamps_ns[: self._count]
+
+    @property
+    def statistics(self) -> StreamStatistics:
+        """StreamStatistics so far."""
+        return StreamStatistics(
+            received=self._received,
+            refused_duplicate=self._refused_duplicate,
+            refused_late=self._refused_late,
+            dropped_unpaired=self._dropped_unpaired,
+            first_stamp_ns=self._first_ns,
+            last_stamp_ns=self._last_ns,
+        )
+
+    def add(self, stamp_ns: int, position: Any, quat_xyzw: Any) -> bool:
+        """Take a pose; False if the stamp is a duplicate or too late."""
+        if self._dropped_until_ns is not None and stamp_ns <= self._dropped_until_ns:
+            self._refused_late += 1
+            return False
+        index = self._count
+        if self._first_ns is None or self._last_ns is None:
+            self._first_ns = self._last_ns = stamp_ns
+        elif stamp_ns > self._last_ns:
+            self._last_ns = stamp_ns
+        else:
+            index = int(np.searchsorted(self.stamps_ns, stamp_ns))
+            if index < self._count and self._stamps_ns[index] == stamp_ns:
+                self._refused_duplicate += 1
+                return False
+            self._stamps_ns[index + 1 : self._count + 1] = self._stamps_ns[index : self._count]
+            self._poses[index + 1 : self._count + 1] = self._poses[index : self._count]
+            self._first_ns = min(self._first_ns, stamp_ns)
+        self._stamps_ns[index] = stamp_ns
+        row = self._poses[index]
+        row[0], row[1], row[2] = position
+        row[3], row[4], row[5], row[6] = quat_xyzw
+        self._count += 1
+        self._received += 1
+        return True
+
+    def extend(self, stamps_ns: IntArray, poses: FloatArray) -> None:
+        """Take poses (N, 7), each newer than all before; there must be room for them."""
+        end = self._count + len(stamps_ns)
+        self._stamps_ns[self._count : end] = stamps_ns
+        self._poses[self._count : end] = poses
+        self._last_ns = int(stamps_ns[-1])
+        if self._first_ns is None:
+            self._first_ns = int(stamps_ns[0])
+        self._count = end
+        self._received += len(stamps_ns)
+
+    def are_newer(self, stamps_ns: IntArray) -> BoolArray:
+        """(N,) whether each stamp is newer than all before it."""
+        last_ns = np.iinfo(np.int64).min if self._last_ns is None else self._last_ns
+        return stamps_ns > np.maximum.accumulate(np.concatenate([[last_ns], stamps_ns]))[:-1]
+
+    @property
+    def room_until_pairing(self) -> int:
+        """Number of newer poses that :meth:`extend` may take before the buffer is full or pairs are
+        due.
+        """
+        until_start = max(self._limits.pairing_starts + 1 - self._count, 0)
+        until_due = until_start + -(self._received + until_start) % self._limits.batch_every
+        return min(until_due, self._limits.capacity - self._count)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for another pose."""
+        return self._count == self._limits.capacity
+
+    @property
+    def pairing_is_due(self) -> bool:
+        """Whether it is time to make a batch of pairs."""
+        return (
+            self._count > self._limits.pairing_starts
+            and self._received % self._limits.batch_every == 0
+        )
+
+    def stamp_at(self, share: float) -> int:
+        """Stamp below which this share of the poses lies."""
+        return self.stamp_of(int(share * (self._count - 1)))
+
+    def stamp_of(self, index: int) -> int:
+        """Stamp of a pose, or of the newest if there are not so many."""
+        return int(self._stamps_ns[min(index, self._count - 1)])
+
+    def poses(self, until_ns: int | None = None) -> RawPoses:
+        """The poses, copied: all, or those up to a stamp and the next one."""
+        end = self._count
+        if until_ns is not None:
+            after = int(np.searchsorted(self.stamps_ns, until_ns, side="right"))
+            end = min(after + 1, self._count)
+        return RawPoses(self._stamps_ns[:end].copy(), self._poses[:end].copy())
+
+    def drop(self, until_ns: int, unpaired: bool = False) -> None:
+        """Drop poses up to and including a stamp, except the last of them: interpolation up to the
+        next pose starts from it.
+        """
+        after = int(np.searchsorted(self.stamps_ns, until_ns, side="right"))
+        split = max(after - 1, 0)
+        if unpaired:
+            self._dropped_unpaired += split
+        rest = self._count - split
+        self._stamps_ns[:rest] = self._stamps_ns[split : self._count].copy()
+        self._poses[:rest] = self._poses[split : self._count].copy()
+        self._count = rest
+        self._dropped_until_ns = until_ns
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The whole buffer as arrays, for :meth:`from_state`."""
+        statistics = dataclasses.astuple(self.statistics)
+        dropped_until = [] if self._dropped_until_ns is None else [self._dropped_until_ns]
+        return {
+            "stamps_ns": self._stamps_ns[: self._count].copy(),
+            "poses": self._poses[: self._count].copy(),
+            "frame": np.array(self.frame),
+            "statistics": np.array([-1 if value is None else value for value in statistics]),
+            "dropped_until_ns": np.array(dropped_until, dtype=np.int64),
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, np.ndarray], limits: BufferLimits) -> PoseBuffer:
+        """The buffer that gave this state, of this or an earlier version."""
+        buffer = cls(limits)
+        buffer._count = len(state["stamps_ns"])
+        buffer._stamps_ns[: buffer._count] = state["stamps_ns"]
+        buffer._poses[: buffer._count] = state["poses"]
+        buffer.frame = str(state["frame"])
+        *counts, first_ns, last_ns = state["statistics"].tolist()
+        (
+            buffer._received,
+            buffer._refused_duplicate,
+            buffer._refused_late,
+            buffer._dropped_unpaired,
+        ) = counts
+        if buffer._received:
+            buffer._first_ns, buffer._last_ns = first_ns, last_ns
+        name = "dropped_until_ns" if "dropped_until_ns" in state else "let_go_until_ns"
+        buffer._dropped_until_ns = int(state[name][0]) if len(state[name]) else None
+        return buffer

@@ -1,0 +1,278 @@
+"""A snapshot of the engine: all that an estimate needs, independent of the poses that follow."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
+from hand_eye_calib.calibration import Calibration, DofVerdict
+from hand_eye_calib.checks.check import CheckResult, check_streams
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
+from hand_eye_calib.engine.pose_buffer import RawPoses
+from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.keyframes import select_keyframes
+from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+
+STREAMS = ("parent", "child")
+
+# Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
+# were downsampled are farther apart than poses.
+_GAP_INTERVALS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """All that an estimate needs. It can be estimated in any thread or process, while poses keep
+    coming in.
+
+    Attributes
+    ----------
+    config : CalibratorConfig
+    kept : PosePairs
+        Pairs that were made before.
+    buffered_parent, buffered_child : RawPoses or Trajectory
+        Poses that are not paired yet.
+    paired_at : {"parent", "child"} or None
+        Stream whose stamps the pairs have; the slower one if None.
+    parent_frame, child_frame : str
+    warnings : tuple of str
+    time_offset : TimeOffset or None
+        The offset of the kept pairs if it was estimated.
+    """
+
+    config: CalibratorConfig
+    kept: PosePairs
+    buffered_parent: RawPoses | Trajectory
+    buffered_child: RawPoses | Trajectory
+    paired_at: str | None
+    parent_frame: str
+    child_frame: str
+    warnings: tuple[str, ...] = ()
+    time_offset: TimeOffset | None = None
+
+    @property
+    def parent(self) -> Trajectory:
+        """Trajectory of the parent's poses that are not paired yet."""
+        return _as_trajectory(self.buffered_parent)
+
+    @property
+    def child(self) -> Trajectory:
+        """Trajectory of the child's poses that are not paired yet."""
+        return _as_trajectory(self.buffered_child)
+
+    def resolved(self) -> "Snapshot":
+        """The snapshot with its time offset in seconds, estimated if the options ask for that: from
+        the buffered poses, unless pairs were made with an estimate before.
+
+        Raises
+        ------
+        NotEnoughDataError
+            If the offset cannot be estimated.
+        """
+        return self._resolved
+
+    @cached_property
+    def _resolved(self) -> "Snapshot":
+        if not isinstance(self.config.time_offset, str):
+            return self
+        found = self.time_offset or estimate_time_offset(
+            self.parent, self.child, self.config.max_gap
+        )
+        config = replace(self.config, time_offset=found.seconds)
+        return replace(self, config=config, time_offset=found)
+
+    def pose_pairs(self) -> PosePairs:
+        """Synchronised pose pairs: the kept ones, and those of the buffered poses.
+
+        Raises
+        ------
+        NotEnoughDataError
+            If the time offset cannot be estimated.
+        """
+        return self.resolved()._pose_pairs
+
+    @cached_property
+    def _pose_pairs(self) -> PosePairs:
+        made = pair_poses(self.config, self.parent, self.child, self.paired_at, self.kept)
+        return downsample(PosePairs.concatenate(self.kept, made), self.config.max_pairs)
+
+    def estimate(self) -> Calibration:
+        """Estimate the extrinsic.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        NotEnoughDataError
+            If fewer than ``min_pairs`` poses can be paired; the message says what is missing.
+        InputError
+            If both streams have the same sensor frame.
+        """
+        if self.parent_frame == self.child_frame:
+            raise InputError(
+                f"both streams name {self.parent_frame!r} as their sensor frame, so there is "
+                "nothing to calibrate between; give parent_frame and child_frame"
+            )
+        return self.resolved()._estimate()
+
+    def _estimate(self) -> Calibration:
+        if len(self._pose_pairs) < self.config.min_pairs:
+            raise NotEnoughDataError(self._what_is_missing(len(self._pose_pairs)))
+        result = estimate_extrinsic(self._pose_pairs, self.config, self.time_offset)
+        return replace(
+            result,
+            parent_frame=self.parent_frame,
+            child_frame=self.child_frame,
+            warnings=self.warnings + result.warnings,
+        )
+
+    @cached_property
+    def streams(self) -> tuple[Trajectory, Trajectory]:
+        """Trajectories of the whole session, each on its own clock: as they came in, or at the
+        stamps of the pairs if some were made.
+        """
+        if not len(self.kept):
+            return self.parent, self.child
+        resolved = self.resolved()
+        pairs, offset_s = resolved._pose_pairs, fixed_time_offset(resolved.config)
+        parent = Trajectory(pairs.stamps_ns, pairs.Ts_pw_p)
+        child = Trajectory(pairs.stamps_ns, pairs.Ts_cw_c)
+        return parent, child.shifted(-offset_s)
+
+    def check(self, calibration: Calibration | None = None) -> CheckResult:
+        """Check the streams.
+
+        Parameters
+        ----------
+        calibration : Calibration, optional
+            Result from them. Its time offset and scale count as known; without one, those of the
+            options, if they are given in numbers.
+
+        Returns
+        -------
+        CheckResult
+        """
+        offset_s = calibration.time_offset_s if calibration else self.config.time_offset
+        scale = calibration.scale if calibration else self.config.scale
+        max_gap_s = self.config.max_gap
+        if len(self.kept):
+            max_gap_s = max(max_gap_s, _GAP_INTERVALS * self.streams[0].interval_s)
+        result = check_streams(
+            *self.streams,
+            time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
+            scale=1.0 if isinstance(scale, str) else scale,
+            max_gap_s=max_gap_s,
+        )
+        obsolete = set()
+        if len(self.kept):
+            obsolete.add("gaps")  # pairs may have gaps where the streams have none
+        if calibration and not _hides_a_translation(calibration):
+            obsolete.add("one_axis")  # the result has shown otherwise
+        findings = tuple(found for found in result.findings if found.code not in obsolete)
+        return replace(result, findings=findings)
+
+    def _what_is_missing(self, n_pairs: int) -> str:
+        needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
+        for name, stream in (("parent", self.parent), ("child", self.child)):
+            if len(stream) == 0 and len(self.kept) == 0:
+                return f"{needed}: no poses on the {name} stream"
+        if len(self.kept):
+            return needed
+        child = self.child.shifted(fixed_time_offset(self.config))
+        start_ns = max(self.parent.stamps_ns[0], child.stamps_ns[0])
+        end_ns = min(self.parent.stamps_ns[-1], child.stamps_ns[-1])
+        counts = f"{len(self.parent)} parent and {len(child)} child poses"
+        if end_ns < start_ns:
+            return (
+                f"{needed}: the streams do not overlap in time ({counts}, "
+                f"{(start_ns - end_ns) * 1e-9:.3f} s apart); if their clocks differ, set "
+                "time_offset to estimate or to the seconds between them"
+            )
+        return (
+            f"{needed} from {counts} that overlap for {(end_ns - start_ns) * 1e-9:.2f} s; "
+            "record longer, or raise max_gap if a stream is slower than that"
+        )
+
+
+def _hides_a_translation(calibration: Calibration) -> bool:
+    return any(
+        dof.verdict in (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
+        for dof in calibration.observability[:3]
+    )
+
+
+def _as_trajectory(poses: RawPoses | Trajectory) -> Trajectory:
+    return poses if isinstance(poses, Trajectory) else poses.trajectory
+
+
+def name_frames(
+    config: CalibratorConfig, known: Mapping[str, str]
+) -> tuple[str, str, tuple[str, ...]]:
+    """Names of the parent's and the child's sensor frame, and a warning for each without a name.
+
+    Parameters
+    ----------
+    config : CalibratorConfig
+        Its names override those of the streams.
+    known : mapping
+        "parent" and "child" to the name that the stream gives; empty if it gives none.
+    """
+    names, warnings = [], []
+    for stream in STREAMS:
+        name = getattr(config, f"{stream}_frame") or known[stream]
+        if not name:
+            name = f"{stream}_sensor"
+            warnings.append(
+                f"the {stream} stream does not name its sensor's frame; it is called {name!r} "
+                f"here (name it with {stream}_frame)"
+            )
+        names.append(name)
+    parent, child = names
+    return parent, child, tuple(warnings)
+
+
+def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
+    """At most ``max_pairs`` of the pose pairs: of every second one, those with the least rotation
+    of the parent around them are dropped first.
+    """
+    while len(pose_pairs) > max_pairs:
+        candidates = np.arange(1, len(pose_pairs) - 1, 2)
+        rotations = pose_pairs.Ts_pw_p[:, :3, :3]
+        # Trace of the rotation between both neighbours: 1 + 2 cos(angle).
+        traces = np.einsum("kij,kij->k", rotations[candidates - 1], rotations[candidates + 1])
+        n_drop = min(len(pose_pairs) - max_pairs + max_pairs // 10, (len(candidates) + 1) // 2)
+        drop = candidates[np.argsort(-traces, kind="stable")[:n_drop]]
+        keep = np.ones(len(pose_pairs), dtype=bool)
+        keep[drop] = False
+        pose_pairs = pose_pairs[keep]
+    return pose_pairs
+
+
+def pair_poses(
+    config: CalibratorConfig,
+    parent: Trajectory,
+    child: Trajectory,
+    at: str | None,
+    kept: PosePairs,
+) -> PosePairs:
+    """Pose pairs of two trajectories that are keyframes, after the last pair of ``kept``."""
+    if len(parent) == 0 or len(child) == 0:
+        return PosePairs.empty()
+    made = synchronise(parent, child.shifted(fixed_time_offset(config)), config.max_gap, at)
+    if len(kept):
+        made = made[made.stamps_ns > kept.stamps_ns[-1]]
+    return made[
+        select_keyframes(
+            made,
+            config.keyframe_min_translation,
+            config.keyframe_min_rotation,
+            config.keyframe_min_interval,
+            previous=kept[-1:],
+        )
+    ]
