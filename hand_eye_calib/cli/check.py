@@ -78,7 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.cli.reporting import write_check
 
         corrected = child.shifted(offset_s).scaled(scale)
-        named = [f"{stream}: {source}" for stream, source in sources.items()]
+        is_bag = len(arguments.inputs) == 1
+        named = [f"{name}: {each if is_bag else Path(each).name}" for name, each in sources.items()]
         write_check(arguments.out, parent, corrected, agreement, findings, named, config.max_gap)
     if all(finding.severity is Severity.NOTE for finding in findings):
         return 0

@@ -11,7 +11,7 @@ from hand_eye_calib.cli.spelling import as_typed, flag
 from hand_eye_calib.report.words import printable
 
 if TYPE_CHECKING:
-    from hand_eye_calib.engine.calibrator import Snapshot
+    from hand_eye_calib.engine.snapshot import Snapshot
 
 _MARKS = {Severity.ERROR: "ERROR", Severity.WARNING: "WARNING", Severity.NOTE: "note"}
 _WIDTH = 100

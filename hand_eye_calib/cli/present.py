@@ -15,7 +15,7 @@ from hand_eye_calib.cli.spelling import as_typed
 from hand_eye_calib.report.words import given_or_estimated, listing, printable, with_sigma
 
 if TYPE_CHECKING:
-    from hand_eye_calib.engine.calibrator import Snapshot
+    from hand_eye_calib.engine.snapshot import Snapshot
 
 EXIT_CODES = {SolveStatus.OK: 0, SolveStatus.NOT_CONVERGED: 1, SolveStatus.UNOBSERVABLE: 3}
 

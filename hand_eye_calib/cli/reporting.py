@@ -17,8 +17,8 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.methods import METHODS
 
 if TYPE_CHECKING:
-    from hand_eye_calib.engine.calibrator import Snapshot
     from hand_eye_calib.engine.evidence import Evidence
+    from hand_eye_calib.engine.snapshot import Snapshot
 
 REPORT, CHECK = "report.html", "check.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")

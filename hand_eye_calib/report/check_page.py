@@ -1,20 +1,41 @@
-"""``check.html``: what the stream checks found, and what they saw."""
+"""``check.html``: the findings of the stream checks, and a figure of both streams."""
 
-from hand_eye_calib.checks.findings import Severity
+from collections.abc import Sequence
+
+from hand_eye_calib.checks.check import CheckResult
+from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import see_streams
-from hand_eye_calib.report.report import environment, said_of_streams
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.report.captions import TITLES, of_streams
+from hand_eye_calib.report.report import environment
 from hand_eye_calib.report.report_figures import draw_streams
 
+# A smaller time offset (s) is not mentioned.
+_SHOWN_S = 5e-4
 
-def render_check(parent, child, agreement, findings, inputs, max_gap_s=CalibratorConfig.max_gap):
+_VERDICTS = {
+    "good": ("✓", "Nothing speaks against calibrating with these streams"),
+    "warn": ("!", "Calibrate with these streams with care"),
+    "bad": ("✗", "Do not calibrate with these streams as they are"),
+}
+
+
+def render_check(
+    parent: Trajectory,
+    child: Trajectory,
+    checked: CheckResult,
+    findings: Sequence[Finding],
+    inputs: Sequence[str],
+    max_gap_s: float = CalibratorConfig.max_gap,
+) -> str:
     """The page as HTML.
 
     Parameters
     ----------
     parent, child : Trajectory
         With the time offset and the scale that are known already.
-    agreement : Agreement
+    checked : CheckResult
     findings : sequence of Finding
         Its findings, and what else there is to say of the files.
     inputs : sequence of str
@@ -26,23 +47,32 @@ def render_check(parent, child, agreement, findings, inputs, max_gap_s=Calibrato
     str
     """
     svg = said = aligned = ""
-    # Without any correlation the streams were not looked at: too short, or their stamps are in
-    # doubt.
-    if agreement.correlation.overlap_s:
-        offset_s = agreement.correlation.offset_s if agreement.correlation.is_clear else 0.0
-        if offset_s:
-            aligned = f" For the picture {offset_s:.3f} s were added to the child's stamps: that is where both turn together."
+    # Without any correlation the streams were not looked at: they are too short, or their stamps
+    # are in doubt.
+    if checked.correlation.overlap_s:
+        offset_s = checked.correlation.offset_s if checked.correlation.is_clear else 0.0
+        if abs(offset_s) >= _SHOWN_S:
+            aligned = (
+                f" In the figure {offset_s:.3f} s are added to the child's stamps: with that "
+                "offset both have the same angular rate."
+            )
         seen = see_streams(parent, child.shifted(offset_s), max_gap_s)
-        svg, said = draw_streams(seen, ("parent", "child")), said_of_streams(seen)
+        svg, said = draw_streams(seen, ("parent", "child")), of_streams(seen)
+    severities = {finding.severity for finding in findings}
+    tone = "bad" if Severity.ERROR in severities else "good"
+    if tone == "good" and Severity.WARNING in severities:
+        tone = "warn"
+    mark, verdict = _VERDICTS[tone]
     return (
         environment()
         .get_template("check.html")
         .render(
             inputs=inputs,
             findings=findings,
-            tone="good"
-            if all(finding.severity is Severity.NOTE for finding in findings)
-            else "bad",
+            tone=tone,
+            mark=mark,
+            verdict=verdict,
+            title=TITLES["streams"],
             svg=svg,
             said=said,
             aligned=aligned,

@@ -6,6 +6,7 @@ import dataclasses
 import re
 import sys
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.report.report import render
+from hand_eye_calib.report.words import with_sigma
 from hand_eye_calib.simulation.drive import simulate_drive
 
 FIGURES = ("trajectories", "residuals", "convergence", "excitation", "methods", "halves", "streams")
@@ -153,9 +155,14 @@ def test_every_section_and_figure_is_there_verdict_first(hilly):
 @pytest.mark.parametrize("drive", ["hilly", "planar"])
 def test_numbers_are_the_calibrations(drive, request):
     _, calibration, _, page = request.getfixturevalue(drive)
-    for T in (calibration.T_parent_child, calibration.T_child_parent):
-        for value in [*T[:3, 3], *se3.to_quat_xyzw(T)]:
+    document = calibration.to_dict()
+    for transform in (document["T_parent_child"], document["T_child_parent"]):
+        for value in transform["quat_xyzw"]:
             assert f"{round(value, 4) + 0.0:.4f}" in page.text
+        sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
+        values = [*transform["translation"], *transform["rpy_deg"]]
+        for value, sigma, decimals in zip(values, sigmas, (3, 3, 3, 2, 2, 2), strict=True):
+            assert with_sigma(value, sigma, decimals).replace("+/-", "±") in page.text
     for dof in calibration.observability:
         if dof.verdict is DofVerdict.UNOBSERVABLE:
             continue
@@ -180,9 +187,9 @@ def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
     _, calibration, _, page = planar
     assert calibration.status is SolveStatus.UNOBSERVABLE
     assert calibration.unobservable() == ["z"]
-    verdict = page.text[: page.text.index("Pose of camera in lidar")]
+    verdict = page.text[: page.text.index("Pose of camera in lidar Maps")]
     assert "Status: unobservable" in verdict
-    assert "does not reveal z" in verdict
+    assert "does not determine z" in verdict
     assert "What to do: rotation about z is fine" in verdict
     assert "static_transform_publisher" not in page.text
     assert "z: unknown, unobservable" in {a.get("aria-label") for a in page.all("div")}
@@ -348,7 +355,9 @@ def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
     saved = hec.load(tmp_path / "out")
     assert (static_transform_command(saved) in page.text) == (saved.status == "ok")
     assert list(saved.consistency) == [dof.name for dof in saved.observability]
-    assert all(file in page.text for file in files)
+    # Names of the files, not of the folders: the page goes to customers.
+    assert all(Path(file).name in page.text for file in files)
+    assert str(tmp_path) not in page.text
 
 
 @pytest.mark.parametrize("library", ["jinja2", "matplotlib"])
@@ -381,3 +390,19 @@ def test_streams_are_shown_on_one_clock_and_in_one_unit():
     assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
     holed = evidence.see_streams(drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5)
     assert [len(spans) for spans in holed.spans_s] == [1, 2]
+
+
+def test_both_inputs_of_one_name_are_listed(hilly):
+    snapshot, calibration, *_ = hilly
+    files = [{"file": f"/{n}/poses.txt", "bytes": n, "sha256": f"{n}" * 64} for n in (1, 2)]
+    _, page = page_of(snapshot, calibration, inputs={"files": files})
+    assert page.text.count("File poses.txt") == 2
+
+
+def test_warnings_are_part_of_the_verdict(hilly):
+    snapshot, calibration, *_ = hilly
+    warned = dataclasses.replace(calibration, warnings=("look \x1b[2J here",))
+    _, page = page_of(snapshot, warned)
+    verdict = page.text[: page.text.index("Pose of camera in lidar Maps")]
+    assert "look \\x1b[2J here" in verdict
+    assert "with 1 warning" in verdict or "weak" in verdict
