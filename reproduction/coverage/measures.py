@@ -22,6 +22,7 @@ POOLED = {
     "known answer": "all known answers",
     "rig": "all rigs",
     "parts": "all parts",
+    "refused": "all that leave something open",
 }
 
 # Errors below these are rounding.

@@ -27,6 +27,7 @@ _ASL_COLUMNS, _ZXL19_COLUMNS = "t,x,y,z,qx,qy,qz,qw", "t,x,y,z,qw,qx,qy,qz"
 # A user who knows neither clock nor scale.
 _FOUND = {"time_offset": "estimate", "scale": "auto"}
 _CLOCK_FOUND = {"time_offset": "estimate"}
+_SCALE_FOUND = {"time_offset": "estimate", "scale": "estimate"}
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,8 @@ class Rig:
     truth : Truth, optional
     is_cut : bool
         Whether halves and thirds of each recording are repeats, too.
+    is_refused : bool
+        Whether the motion leaves something open, so that no answer may be called good.
     """
 
     name: str
@@ -72,6 +75,7 @@ class Rig:
     options: Mapping[str, Any] = field(default_factory=dict)
     truth: Truth | None = None
     is_cut: bool = True
+    is_refused: bool = False
 
 
 def real_rigs(folder: Path) -> tuple[list[Rig], list[str]]:
@@ -173,18 +177,23 @@ def _zxl19(folder: Path) -> list[Rig]:
             for bag in (1, 2, 3)
         }
 
+    lidars, cameras = recordings("LO"), recordings("VO")
+    both = {bag: Recording(lidars[bag].child, cameras[bag].child) for bag in lidars}
     # The road is flat: heights are a matter for a tape measure.
     lidar = {**_FOUND, "prior": {"z": (0.0, 0.3)}}
-    camera = {"time_offset": "estimate", "scale": "estimate", "prior": {"z": (-0.3, 0.3)}}
+    camera = {**_SCALE_FOUND, "prior": {"z": (-0.3, 0.3)}}
     return [
         Rig(
             name="zxl19_lidar",
-            recordings=recordings("LO"),
+            recordings=lidars,
             options=lidar,
             truth=_ZXL19,
             is_cut=False,
         ),
-        Rig(name="zxl19_camera", recordings=recordings("VO"), options=camera, is_cut=False),
+        Rig(name="zxl19_camera", recordings=cameras, options=camera, is_cut=False),
+        _refused("zxl19_lidar without z", lidars, _FOUND),
+        _refused("zxl19_camera without z", cameras, _SCALE_FOUND),
+        _refused("zxl19_lidar_camera", both, _SCALE_FOUND),
     ]
 
 
@@ -233,8 +242,17 @@ def _primesense(folder: Path) -> list[Rig]:
 def _robot_arm(folder: Path) -> list[Rig]:
     stem = "robot_arm_complete_bag_color_and_ir"
     names = (f"{stem}_base_link_sr300_hinge", f"{stem}_target_ir")
-    recording = Recording(*(_read(folder / f"{name}.csv", _ASL_COLUMNS) for name in names))
-    return [_single("robot_arm", recording, _ARM)]
+    real = Recording(*(_read(folder / f"{name}.csv", _ASL_COLUMNS) for name in names))
+    names = ("robot_arm_sim_hand", "robot_arm_sim_camera")
+    one_axis = Recording(*(_read(folder / f"{name}.csv", _ASL_COLUMNS) for name in names))
+    return [
+        _single("robot_arm", real, _ARM),
+        _refused("robot_arm about one axis", {"whole": one_axis}, {}),
+    ]
+
+
+def _refused(name: str, recordings: Mapping[str, Recording], options: Mapping[str, Any]) -> Rig:
+    return Rig(name=name, recordings=recordings, options=options, is_cut=False, is_refused=True)
 
 
 def _single(name: str, recording: Recording, truth: Truth) -> Rig:

@@ -176,6 +176,15 @@ def _by_axis(values: BoolArray, known: BoolArray) -> dict[str, float]:
     return {axis: float(values[k]) for k, axis in enumerate(AXES) if known[k]}
 
 
+def refused_row(rig: Rig, name: str, method: str) -> Row:
+    """Whether a recording that leaves something open is refused: no answer, or not an OK one."""
+    recording = rig.recordings[name]
+    found = answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
+    is_good = found.calibration is not None and found.calibration.status is SolveStatus.OK
+    row_name = f"{rig.name} {name}".removesuffix(" whole")
+    return Row("refused", row_name, method, {"refused": {"": float(not is_good)}}, found.seconds)
+
+
 def scatter_row(rig: Rig, method: str) -> Row:
     """Scatter between the recordings of a rig over their stated sigmas."""
     found = [

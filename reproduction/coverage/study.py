@@ -18,6 +18,7 @@ from reproduction.coverage.scores import (
     cycle_row,
     level_row,
     parts_row,
+    refused_row,
     scatter_row,
     truth_row,
 )
@@ -27,10 +28,10 @@ from reproduction.runner import in_parallel
 HERE = Path(__file__).parent
 BASELINE, VERSION_0_1 = HERE / "baseline.json", HERE / "version_0_1.json"
 
-TABLES = ("simulated", "mixed", "levels", "known answer", "rig", "parts", "cycle")
+TABLES = ("simulated", "mixed", "levels", "known answer", "rig", "parts", "cycle", "refused")
 
 # Digits that are kept of a case: more than noise, less than rounding.
-_DIGITS = 5
+_DIGITS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +83,9 @@ def _tasks(plan: Plan, method: str) -> list[tuple[Any, ...]]:
         ]
     for rig in plan.rigs:
         names = list(rig.recordings)
+        if rig.is_refused:
+            tasks += [("refused", refused_row, rig, name, method) for name in names]
+            continue
         if rig.truth is not None:
             tasks += [("known answer", truth_row, rig, name, method) for name in names]
         if len(names) > 1:
@@ -100,7 +104,7 @@ def _measured(function, *arguments) -> Row:  # type: ignore[no-untyped-def]
 
 def save(rows: Iterable[Row], path: Path) -> None:
     """Keep the rows, one per line."""
-    lines = [json.dumps(_document(row), allow_nan=False) for row in rows]
+    lines = [json.dumps(_document(row), allow_nan=False, separators=(",", ":")) for row in rows]
     path.write_text('{"rows": [\n' + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
 
 
