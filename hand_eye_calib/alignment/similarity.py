@@ -167,7 +167,7 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     )
     ranked = _in_units(ranked, parent_unit, child_unit)
     candidates = _candidates(ranked)
-    coefficients = quadratic_form.numbers(ranked)
+    coefficients = quadratic_form.coefficients(ranked)
     # In the smaller unit of length: otherwise a scale of zero would cost least.
     costs = [
         np.median(quadratic_form.costs(coefficients * _child_lengths(scale), T))

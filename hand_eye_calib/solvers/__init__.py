@@ -1,1 +1,1 @@
-"""AX = XB solvers: motion pairs in, X = T_parent_child out."""
+"""Solvers of AX = XB: motion pairs in, X = T_parent_child out."""

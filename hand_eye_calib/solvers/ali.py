@@ -3,20 +3,22 @@
 Cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E. R. Morales, *Methods for simultaneous
 robot-world-hand-eye calibration: a comparative study*, Sensors 19(12), 2019, as its authors'
 program computes it: the rotation residual of a motion pair enters only as the norm of a unit
-quaternion, a constant (Välimäki et al. 2023, section 2). What is left is the translation of AX -
-XB, a quadratic form in the same thirteen numbers as dnl's cost, and minimised the same way over
+quaternion, a constant (Välimäki et al. 2023, section 2). The rest is the translation of AX - XB, a
+quadratic form in the same thirteen variables as dnl's cost. It is minimised in the same way over
 proper rotations.
 """
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import quadratic_form
 from hand_eye_calib.solvers.dnl import start_rotations
 from hand_eye_calib.solvers.separable import squared_translation_residual
 from hand_eye_calib.solvers.solution import Solution
 
 
-def solve(pairs):
+def solve(pairs: MotionPairs) -> Solution:
     """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X.
 
     Parameters
@@ -42,9 +44,9 @@ def solve(pairs):
     )
 
 
-def residual_rows(pairs):
-    """Matrix (3 K, 13) that turns ``x = (vec R, t, 1)``, vec row-major, into the residuals ``R_A t
-    + t_A - R t_B - t``.
+def residual_rows(pairs: MotionPairs) -> FloatArray:
+    """Matrix (3 K, 13) that maps ``x = (vec R, t, 1)``, vec row-major, to the residuals
+    ``R_A t + t_A - R t_B - t``.
     """
     rows = np.zeros((len(pairs), 3, quadratic_form.DIMENSION))
     for axis in range(3):

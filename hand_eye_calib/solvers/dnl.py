@@ -2,11 +2,18 @@
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import quadratic_form
 from hand_eye_calib.solvers.solution import Solution
 
+# Rotations by pi about each axis, after none.
+_HALF_TURNS = np.array(
+    [np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])], dtype=float
+)
 
-def solve(pairs):
+
+def solve(pairs: MotionPairs) -> Solution:
     """Minimise ``sum |A X - X B|_F^2`` over X.
 
     Parameters
@@ -18,46 +25,46 @@ def solve(pairs):
     -------
     Solution
     """
-    numbers, weights = quadratic_form.numbers(pairs), np.ones(len(pairs))
+    coefficients, weights = quadratic_form.coefficients(pairs), np.ones(len(pairs))
     minimum = quadratic_form.minimise(
-        quadratic_form.weighted_sum(numbers, weights), start_rotations(pairs)
+        quadratic_form.weighted_sum(coefficients, weights), start_rotations(pairs)
     )
     best = int(np.argmin(minimum.value))
     T_parent_child = minimum.T_parent_child[best]
     return Solution(
         T_parent_child,
-        float(quadratic_form.costs(numbers, T_parent_child).sum()),
+        float(quadratic_form.costs(coefficients, T_parent_child).sum()),
         bool(minimum.converged[best]),
         minimum.iterations,
         weights,
     )
 
 
-def solve_without(pairs, solution, left_out):
-    """Answers (B, 4, 4) near a given one when the pairs of each row of ``left_out`` (B, K) are left
-    out, for resampling.
+def solve_without(pairs: MotionPairs, solution: Solution, left_out: BoolArray) -> FloatArray:
+    """Solve again near a solution without the pairs of each row of ``left_out`` (B, K), for
+    resampling; returns the transforms (B, 4, 4).
     """
-    numbers = quadratic_form.numbers(pairs)
+    coefficients = quadratic_form.coefficients(pairs)
     forms = np.stack(
-        [quadratic_form.weighted_sum(numbers, kept) for kept in (~left_out).astype(float)]
+        [quadratic_form.weighted_sum(coefficients, kept) for kept in (~left_out).astype(float)]
     )
     starts = np.repeat(solution.T_parent_child[None, :3, :3], len(left_out), axis=0)
     return quadratic_form.minimise(forms, starts).T_parent_child
 
 
-def pair_costs(pairs, T_parent_child):
-    """Costs ``|A X - X B|_F^2`` (K,) straight from the matrices: exact to the last digit where the
-    condensed forms cancel.
+def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
+    """Costs ``|A X - X B|_F^2`` (K,) from the matrices themselves, which cancel less than the
+    condensed forms.
     """
-    return quadratic_form.costs(quadratic_form.numbers(pairs), T_parent_child)
+    return quadratic_form.costs(quadratic_form.coefficients(pairs), T_parent_child)
 
 
-def start_rotations(pairs):
+def start_rotations(pairs: MotionPairs) -> FloatArray:
     """Rotations (4, 3, 3) to start from.
 
-    The first turns the child's rotation axes onto the parent's as well as it can: close to the
-    answer whenever the motion turns at all. The others do so after half a turn about one of the
-    child's axes, for motion that hardly turns.
+    The first aligns the child's rotation axes with the parent's: it is close to the answer if there
+    is rotation at all. The others do so after a rotation by pi about an axis of the child, for
+    motion with hardly any rotation.
     """
     axes_parent = _axial(pairs.Ts_parenti_parentj)
     axes_child = _axial(pairs.Ts_childi_childj)
@@ -66,14 +73,9 @@ def start_rotations(pairs):
     return aligned @ _HALF_TURNS
 
 
-_HALF_TURNS = np.array(
-    [np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])], dtype=float
-)
-
-
-def _axial(transforms):
-    """Rotation axes times twice the sine of the angle (K, 3): as good as a rotation vector for
-    aligning axes, and cheaper.
+def _axial(transforms: FloatArray) -> FloatArray:
+    """Rotation axes times twice the sine of the angle (K, 3): as good as rotation vectors for
+    aligning axes, and faster.
     """
     rotation = transforms[:, :3, :3]
     return np.stack(

@@ -1,62 +1,66 @@
 """DNLO: direct non-linear optimisation with outlier rejection (Välimäki et al. 2023, eq. 5).
 
-For a fixed X the weights have a closed form: a pair counts where its cost is below c, and where
-that keeps fewer than d pairs, the d cheapest count. DNLO is thus truncated least squares with a
-floor on the inliers. Weights and X are improved in turn until nothing changes. Since that ends in
-one of many local minima, a search comes first:
+For a fixed X the weights have a closed form: a pair counts if its cost is below c; if those are
+fewer than d, the d pairs of the smallest cost count. DNLO is thus truncated least squares with a
+minimum number of inliers. Weights and X are improved in turn until nothing changes. That ends in
+one of many local minima, so a search comes first:
 
-1. Graduated non-convexity (Yang, Antonante, Tzoumas, Carlone, *Graduated non-convexity for robust spatial perception*, RA-L
-   2020): from the minimum over all pairs, the truncation is switched on by degrees.
-2. Rivals: minima over random parts of its inliers and over small random subsets of all pairs. As in FAST-LTS (Rousseeuw, Van
-   Driessen, *Computing LTS regression for large data sets*, 2006) many are started, and only the
-   most promising followed to the end. One from the answer's own inliers replaces it where it is
-   better. One from anywhere may lie far away and must be decisively better: between distant minima
-   of nearly the same height, the annealed one is the more trustworthy. A new answer has new rivals.
+1. Graduated non-convexity (Yang, Antonante, Tzoumas, Carlone, *Graduated non-convexity for robust
+   spatial perception*, RA-L 2020): from the minimum over all pairs, the truncation is sharpened in
+   rounds.
+2. Rivals: minima over random parts of the inliers and over small random subsets of all pairs. As in
+   FAST-LTS (Rousseeuw, Van Driessen, *Computing LTS regression for large data sets*, 2006) many are
+   started, and only the most promising are followed to the end. One from the inliers replaces the
+   answer if it is better. One from any subset may be far away and must be clearly better: of
+   distant minima of nearly the same height, the annealed one is more reliable. A new answer gets
+   new rivals.
 
-Many pairs are searched by an even sample of them; the answer is then improved on all. The random
-subsets come from a fixed seed: the same pairs in the same order give the same answer.
+Of many pairs an even sample is searched; the answer is then improved on all. The random subsets
+come from a fixed seed: the same pairs in the same order give the same answer.
 """
 
 import math
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, quadratic_form
 from hand_eye_calib.solvers.solution import Solution
 
-# The most pairs that are searched.
+# Largest number of pairs that is searched.
 _MAX_SEARCHED = 512
 
-# Graduated non-convexity: Gauss-Newton steps to the minimum over all pairs, how much sharper the
-# truncation gets each round, and where it counts as sharp.
+# Graduated non-convexity: Gauss-Newton steps to the minimum over all pairs, factor of the sharpness
+# from round to round, and the sharpness of the last round.
 _STEPS_OVER_ALL = 4
 _SHARPENING = 2.5
 _SHARP = 30.0
 
-# Rivals: shares of the inliers for those near an answer; sizes for those anywhere (small ones
-# escape outliers, large ones resist noise). Of each kind as many are started as make up so many
-# pairs in all: fifty where there are a hundred pairs.
+# Rivals: shares of the inliers, and sizes of the subsets of all pairs (small ones escape outliers,
+# large ones resist noise). As many of each kind are started as have this many pairs in all: fifty
+# if there are a hundred pairs.
 _INLIER_SHARES = (0.2, 0.5)
 _SUBSET_SIZES = (4, 8, 16, 32)
 _STARTED_PAIRS = 5000
 _FIRST_ROUNDS, _FOLLOWED, _MAX_GENERATIONS = 3, 3, 3
 
-# A rival from anywhere replaces the answer when its objective is below this share of it. A new
-# answer that is hardly lower ends the search.
+# A rival from any subset replaces the answer if its objective is below this share of it. A new
+# answer that is lower by less than the second share ends the search.
 _DECISIVE = 0.99
 _HARDLY = 1e-6
 
-# Rounds of weights and X in turn, and the share by which the objective falls when they end: in the
-# search, and on all pairs.
+# Rounds of weights and X in turn, and the share by which the objective falls in the last one: in
+# the search, and on all pairs.
 _MAX_ROUNDS = 100
 _SETTLED, _CONVERGED = 1e-4, 1e-9
 
-# The cost of a pair that is left out: finite, and never an inlier's.
+# Cost of a pair that is left out: finite, and never that of an inlier.
 _NEVER = 1e100
 
 
-def solve(pairs, threshold, min_inlier_fraction):
+def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
     """Minimise ``sum alpha e + (1 - alpha) c`` over X and the weights alpha.
 
     Parameters
@@ -66,7 +70,7 @@ def solve(pairs, threshold, min_inlier_fraction):
     threshold : float
         c: cost above which a pair is an outlier, m^2.
     min_inlier_fraction : float
-        d / K: share of the pairs whose weights must add up to at least that.
+        d / K: the weights add up to at least this share of the pairs.
 
     Returns
     -------
@@ -78,19 +82,25 @@ def solve(pairs, threshold, min_inlier_fraction):
     return _finish(pairs, T_found, threshold, min_inlier_fraction * len(pairs))
 
 
-def solve_without(pairs, solution, left_out, threshold, min_inlier_fraction):
-    """Answers when some pairs are left out, for resampling.
+def solve_without(
+    pairs: MotionPairs,
+    solution: Solution,
+    left_out: BoolArray,
+    threshold: float,
+    min_inlier_fraction: float,
+) -> FloatArray:
+    """Solve again without some of the pairs, for resampling.
 
-    A few pairs less may tip the choice of the inliers, and the answer with it: the search starts at
-    the full answer, and by annealing. As in :func:`solve`, an even sample of many pairs is
-    searched, and the answers are then improved on all.
+    A few pairs less may change the choice of the inliers and with it the answer. So the search
+    starts both at the full answer and by annealing. As in :func:`solve`, an even sample of many
+    pairs is searched, and the answers are then improved on all.
 
     Parameters
     ----------
     pairs : MotionPairs
         K pairs.
     solution : Solution
-        The answer for all of them.
+        The solution with all of them.
     left_out : (B, K) bool array
         Pairs to leave out, for each of B answers.
     threshold, min_inlier_fraction : float
@@ -100,35 +110,42 @@ def solve_without(pairs, solution, left_out, threshold, min_inlier_fraction):
     -------
     (B, 4, 4) array
     """
-    condensed = quadratic_form.condense(pairs)
-    fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
-    some = _searched(len(pairs))
-    condensed_some, left_out_some = condensed[some], left_out[:, some]
-    fewest_of_some = min_inlier_fraction * float((~left_out_some).sum(axis=1).min())
     near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
-    everything = near
-    for _ in range(_STEPS_OVER_ALL):
-        everything = _refit(condensed_some, (~left_out_some).astype(float), everything)
-    annealed = _anneal(condensed_some, everything, threshold, fewest_of_some, left_out_some)
-    twice = np.tile(left_out_some, (2, 1))
-    candidates, _ = _settle(
-        condensed_some, np.concatenate([near, annealed]), threshold, fewest_of_some, _SETTLED, twice
-    )
-    # An answer for some of the pairs may be better for others than what was found from there.
-    costs = _costs(condensed_some, candidates)
-    best = [
-        np.argmin(truncate(costs[:, ~row], threshold, fewest_of_some)[1]) for row in left_out_some
-    ]
-    # The sample may be wrong about which of two minima is the lower one: all pairs decide between
-    # the best and the one nearby.
-    rivals, twice = np.concatenate([near, candidates[best]]), np.tile(left_out, (2, 1))
+    condensed, some = quadratic_form.condense(pairs), _searched(len(pairs))
+    rival = _rival_without(condensed[some], near, left_out[:, some], threshold, min_inlier_fraction)
+    # The sample may be wrong about which of two minima is lower: all pairs decide between the best
+    # and the one nearby.
+    fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    rivals, twice = np.concatenate([near, rival]), np.tile(left_out, (2, 1))
     answers, objectives = _settle(condensed, rivals, threshold, fewest, _CONVERGED, twice)
     nearby, other = np.split(answers, 2)
     return np.where(np.less(*np.split(objectives, 2))[:, None, None], nearby, other)
 
 
-def truncate(costs, threshold, floor):
-    """Best weights for given costs, and the objective they give.
+def _rival_without(
+    condensed: FloatArray,
+    near: FloatArray,
+    left_out: BoolArray,
+    threshold: float,
+    min_inlier_fraction: float,
+) -> FloatArray:
+    """The best answer (B, 4, 4) for each row of pairs that are left out, of all that are found near
+    the full answer and by annealing: one row's answer may suit another row better than its own.
+    """
+    fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    everything = near
+    for _ in range(_STEPS_OVER_ALL):
+        everything = _refit(condensed, (~left_out).astype(float), everything)
+    annealed = _anneal(condensed, everything, threshold, fewest, left_out)
+    starts, twice = np.concatenate([near, annealed]), np.tile(left_out, (2, 1))
+    candidates, _ = _settle(condensed, starts, threshold, fewest, _SETTLED, twice)
+    costs = _costs(condensed, candidates)
+    best = [np.argmin(truncate(costs[:, ~row], threshold, fewest)[1]) for row in left_out]
+    return candidates[best]
+
+
+def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatArray, FloatArray]:
+    """Find the best weights for given costs, and their objective.
 
     Parameters
     ----------
@@ -137,7 +154,7 @@ def truncate(costs, threshold, floor):
     threshold : float
         c, in the unit of the costs.
     floor : float
-        d: the weights add up to at least this; pairs that cost the same share what the cheaper ones
+        d: the weights add up to at least this. Pairs of equal cost share what those of smaller cost
         leave of it.
 
     Returns
@@ -152,20 +169,20 @@ def truncate(costs, threshold, floor):
         weights = counted.astype(float)
     else:
         last = math.ceil(floor) - 1
-        dearest = np.partition(costs, last, axis=-1)[..., last, None]
-        counted |= costs <= dearest  # where they are not too few, these count already
+        largest = np.partition(costs, last, axis=-1)[..., last, None]
+        counted |= costs <= largest  # these count already if there are enough
         weights = counted.astype(float)
         excess = too_few * (counted.sum(axis=-1) - floor)
         if excess.any():
-            tied = costs == dearest
+            tied = costs == largest
             weights -= tied * (excess / np.maximum(tied.sum(axis=-1), 1))[..., None]
     return weights, np.einsum("...k,...k", weights, costs) + threshold * (
         costs.shape[-1] - weights.sum(axis=-1)
     )
 
 
-def _searched(n_pairs):
-    """What of so many pairs is searched: all, or an even sample."""
+def _searched(n_pairs: int) -> slice | IntArray:
+    """Index of the pairs that are searched: all, or an even sample."""
     return (
         slice(None)
         if n_pairs <= _MAX_SEARCHED
@@ -173,8 +190,8 @@ def _searched(n_pairs):
     )
 
 
-def _search(pairs, threshold, floor):
-    """The annealed answer (4, 4), or a rival that beats it."""
+def _search(pairs: MotionPairs, threshold: float, floor: float) -> FloatArray:
+    """The annealed answer (4, 4), or a better rival."""
     condensed = quadratic_form.condense(pairs)
     T_annealed = _anneal(condensed, _minimum_over_all(condensed, pairs), threshold, floor)
     best, objective = _settle(condensed, T_annealed, threshold, floor)
@@ -192,9 +209,15 @@ def _search(pairs, threshold, floor):
     return best[0]
 
 
-def _rivals(condensed, T, threshold, floor, random):
-    """The most promising minima over random parts of the inliers of T (1, 4, 4), then over small
-    random subsets: (6, 4, 4).
+def _rivals(
+    condensed: FloatArray,
+    T: FloatArray,
+    threshold: float,
+    floor: float,
+    random: np.random.Generator,
+) -> FloatArray:
+    """The most promising minima (6, 4, 4): three over random parts of the inliers of T (1, 4, 4),
+    then three over small random subsets.
     """
     n_pairs = len(condensed)
     started = 4 * (1 + _STARTED_PAIRS // (4 * n_pairs))
@@ -214,7 +237,7 @@ def _rivals(condensed, T, threshold, floor, random):
     return Ts[promising.ravel()]
 
 
-def _minimum_over_all(condensed, pairs):
+def _minimum_over_all(condensed: FloatArray, pairs: MotionPairs) -> FloatArray:
     """X (1, 4, 4) near the minimum over all pairs, where annealing starts."""
     total = condensed.sum(axis=0)
     Ts = se3.from_rotation_translation(dnl.start_rotations(pairs), np.zeros(3))
@@ -223,17 +246,23 @@ def _minimum_over_all(condensed, pairs):
     return Ts[[int(np.argmin(_costs(total[None], Ts)))]]
 
 
-def _anneal(condensed, Ts, threshold, floor, left_out=None):
-    """Graduated non-convexity from a batch of starts (S, 4, 4), with the truncation at c or at the
-    d-th smallest cost, whichever is larger.
+def _anneal(
+    condensed: FloatArray,
+    Ts: FloatArray,
+    threshold: float,
+    floor: float,
+    left_out: BoolArray | None = None,
+) -> FloatArray:
+    """Graduated non-convexity from each start (S, 4, 4), with the truncation at c or at the d-th
+    smallest cost, whichever is larger.
     """
     last = max(math.ceil(floor) - 1, 0)
 
-    def judge(Ts):
+    def costs_and_cut(Ts: FloatArray) -> tuple[FloatArray, FloatArray]:
         costs = _costs(condensed, Ts, left_out)
         return costs, np.maximum(threshold, np.partition(costs, last)[:, last])
 
-    costs, cut = judge(Ts)
+    costs, cut = costs_and_cut(Ts)
     largest = np.max(costs, axis=1, initial=0.0, where=costs < _NEVER)
     sharpness = np.maximum(cut / np.maximum(2 * largest - cut, cut), 1e-4)
     while sharpness.min() < _SHARP:
@@ -242,25 +271,36 @@ def _anneal(condensed, Ts, threshold, floor, left_out=None):
             - sharpness[:, None]
         )
         Ts = _refit(condensed, ratio.clip(0.0, 1.0), Ts)
-        costs, cut = judge(Ts)
+        costs, cut = costs_and_cut(Ts)
         sharpness = sharpness * _SHARPENING
     return Ts
 
 
-def _costs(condensed, Ts_parent_child, left_out=None):
-    costs = quadratic_form.monomials(Ts_parent_child) @ condensed.T
+def _costs(
+    condensed: FloatArray, Ts_parent_child: FloatArray, left_out: BoolArray | None = None
+) -> FloatArray:
+    """Costs (S, K) of all pairs at each transform (S, 4, 4)."""
+    costs: FloatArray = quadratic_form.monomials(Ts_parent_child) @ condensed.T
     if left_out is not None:
         costs[left_out] = _NEVER
     return costs
 
 
-def _refit(condensed, weights, Ts):
+def _refit(condensed: FloatArray, weights: FloatArray, Ts: FloatArray) -> FloatArray:
+    """Gauss-Newton step (S, 4, 4) from each transform with its weights (S, K)."""
     return quadratic_form.gauss_newton_step(quadratic_form.expand(weights @ condensed), Ts)
 
 
-def _settle(condensed, Ts, threshold, floor, tolerance=_SETTLED, left_out=None):
-    """A Gauss-Newton step and new weights in turn until no objective of a batch falls: the best X
-    (S, 4, 4) of each, and its objective.
+def _settle(
+    condensed: FloatArray,
+    Ts: FloatArray,
+    threshold: float,
+    floor: float,
+    tolerance: float = _SETTLED,
+    left_out: BoolArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Take Gauss-Newton steps and new weights in turn until no objective falls; returns the best
+    transforms (S, 4, 4) and their objectives (S,).
     """
     weights, objectives = truncate(_costs(condensed, Ts, left_out), threshold, floor)
     for _ in range(_MAX_ROUNDS):
@@ -275,30 +315,30 @@ def _settle(condensed, Ts, threshold, floor, tolerance=_SETTLED, left_out=None):
     return Ts, objectives
 
 
-def _finish(pairs, T_start, threshold, floor):
-    """Weights and X in turn on all pairs until the objective falls no more. The costs come from the
-    matrices, which cancel least.
+def _finish(pairs: MotionPairs, T_start: FloatArray, threshold: float, floor: float) -> Solution:
+    """Improve weights and X in turn on all pairs until the objective falls no more. The costs come
+    from the matrices, which cancel least.
     """
-    numbers = quadratic_form.numbers(pairs)
+    coefficients = quadratic_form.coefficients(pairs)
     T = T_start
-    weights, objective = truncate(quadratic_form.costs(numbers, T), threshold, floor)
-    Q = quadratic_form.weighted_sum(numbers, weights)
+    weights, objective = truncate(quadratic_form.costs(coefficients, T), threshold, floor)
+    Q = quadratic_form.weighted_sum(coefficients, weights)
     converged, iterations = False, 0
     while not converged and iterations < _MAX_ROUNDS:
         iterations += 1
         T_new = quadratic_form.gauss_newton_step(Q, T[None])[0]
-        # A step that promises nothing needs no pass over the pairs.
-        converged = bool(quadratic_form.fall(Q, T, T_new) < _CONVERGED * objective)
+        # Without a predicted decrease, no pass over the pairs is needed.
+        converged = bool(quadratic_form.decrease(Q, T, T_new) < _CONVERGED * objective)
         if converged:
             break
         weights_new, objective_new = truncate(
-            quadratic_form.costs(numbers, T_new), threshold, floor
+            quadratic_form.costs(coefficients, T_new), threshold, floor
         )
         converged = bool(objective_new >= objective * (1 - _CONVERGED))
         if objective_new <= objective:
             changed = np.flatnonzero(weights_new != weights)
             Q = Q + quadratic_form.weighted_sum(
-                numbers[changed], weights_new[changed] - weights[changed]
+                coefficients[changed], weights_new[changed] - weights[changed]
             )
             T, weights, objective = T_new, weights_new, objective_new
     return Solution(T, float(objective), converged, iterations, weights)

@@ -1,14 +1,18 @@
 """DNL and DNLO as the paper states them: CasADi expressions minimised by Ipopt (Välimäki et al.
 2023, section 3.2).
 
-The reference that the fast solvers are tested against. Unknowns are the rotation vector, the
-translation and, for DNLO, one weight per pair.
+The fast solvers are tested against these. Unknowns are the rotation vector, the translation and,
+for DNLO, one weight per pair.
 """
+
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import MissingDependencyError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, dnlo
 from hand_eye_calib.solvers.solution import Solution
 
@@ -19,11 +23,15 @@ except ImportError as error:
         "backend ipopt needs CasADi, which is not installed: pip install casadi"
     ) from error
 
+# CasADi has no annotations.
+_Expression: TypeAlias = Any
+
 _IPOPT_OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-_IDENTITY_START = 1e-6  # rad; at exactly zero the derivative of the rotation angle does not exist
+# Rotation vector to start from (rad); at zero the rotation angle has no derivative.
+_IDENTITY_START = 1e-6
 
 
-def solve_dnl(pairs):
+def solve_dnl(pairs: MotionPairs) -> Solution:
     """Minimise eq. (4) from the identity; see :func:`hand_eye_calib.solvers.dnl.solve`."""
     pose = casadi.MX.sym("pose", 6)
     solver = casadi.nlpsol(
@@ -38,7 +46,7 @@ def solve_dnl(pairs):
     return _solution(solver, T_parent_child, objective, np.ones(len(pairs)))
 
 
-def solve_dnlo(pairs, threshold, min_inlier_fraction):
+def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
     """Minimise eq. (5) from the identity with all weights 1; see
     :func:`hand_eye_calib.solvers.dnlo.solve`.
     """
@@ -64,8 +72,8 @@ def solve_dnlo(pairs, threshold, min_inlier_fraction):
     return _solution(solver, T_parent_child, float(objective), weights)
 
 
-def _cost_expressions(pairs, pose):
-    """(1, K) expression: each pair's ``|A X - X B|_F^2``, mapped over the pairs so that the
+def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
+    """(1, K) expression of ``|A X - X B|_F^2`` of each pair, mapped over the pairs so that the
     expression graph stays small.
     """
     motion_a, motion_b = casadi.SX.sym("A", 3, 4), casadi.SX.sym("B", 3, 4)
@@ -83,23 +91,27 @@ def _cost_expressions(pairs, pose):
     )
 
 
-def _columns(transforms):
+def _columns(transforms: FloatArray) -> FloatArray:
     """(12, K) array: the top three rows of each transform, column-major as CasADi stores them."""
     return np.ascontiguousarray(np.swapaxes(transforms[:, :3], 1, 2).reshape(len(transforms), 12).T)
 
 
-def _rodrigues(rotation_vector):
+def _rodrigues(rotation_vector: _Expression) -> _Expression:
+    """(3, 3) expression of the rotation matrix of a rotation vector."""
     angle = casadi.norm_2(rotation_vector)
     cross = casadi.skew(rotation_vector / angle)
     return casadi.SX.eye(3) + casadi.sin(angle) * cross + (1 - casadi.cos(angle)) * cross @ cross
 
 
-def _transform(x):
+def _transform(x: _Expression) -> FloatArray:
+    """X (4, 4) of the unknowns."""
     pose = np.array(x).ravel()[:6]
     return se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
 
 
-def _solution(solver, T_parent_child, objective, weights):
+def _solution(
+    solver: _Expression, T_parent_child: FloatArray, objective: float, weights: FloatArray
+) -> Solution:
     statistics = solver.stats()
     return Solution(
         T_parent_child,

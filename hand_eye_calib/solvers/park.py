@@ -5,10 +5,12 @@ camera-LiDAR calibration: a targetless and structureless approach*, IEEE Robotic
 Letters 5(2), 2020.
 """
 
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import separable
+from hand_eye_calib.solvers.solution import Solution
 
 
-def solve(pairs):
+def solve(pairs: MotionPairs) -> Solution:
     """Solve AX = XB in two closed-form stages.
 
     Parameters

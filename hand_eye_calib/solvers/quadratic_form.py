@@ -1,16 +1,16 @@
 """The cost of a motion pair as a fixed quadratic form, and its minimum over SE(3).
 
-``A X - X B`` is linear in ``x = (vec R, t, 1)``, thirteen numbers (vec is row-major). The cost of
-pair k,
+``A X - X B`` is linear in the thirteen variables ``x = (vec R, t, 1)`` (vec is row-major). The cost
+of pair k,
 
     e_k(X) = | A X - X B |_F^2  (top three rows)  =  x^T Q_k x,
 
 is therefore a quadratic form with a constant symmetric 13 x 13 matrix, and so is every weighted sum
-of pairs, whose minimum takes a three-variable Newton iteration however many pairs went in.
+of pairs. Its minimum takes a Newton iteration in three variables, for any number of pairs.
 
-Both ends of the residual are linear: it is ``(A - I) X - X (B - I)``, where a pair enters with the
-24 numbers u of ``A - I`` and ``B - I``. Residuals, forms and sums of forms are thus plain matrix
-products of u with a constant array. Taking the identity off first keeps the digits of small
+The residual is linear in the pair, too: it is ``(A - I) X - X (B - I)``, where a pair enters with
+the 24 coefficients u of ``A - I`` and ``B - I``. Residuals, forms and sums of forms are thus matrix
+products of u with a constant array. Subtracting the identity first keeps the digits of small
 motions.
 """
 
@@ -18,7 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 
 DIMENSION = 13
 _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
@@ -27,13 +29,13 @@ _TRIANGLE_OF_SQUARE = np.empty((DIMENSION, DIMENSION), dtype=int)
 _TRIANGLE_OF_SQUARE[_ROWS, _COLUMNS] = _TRIANGLE_OF_SQUARE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
 _ROTATION, _TRANSLATION, _ONE = slice(0, 9), slice(9, 12), 12
 
-# Where x lies in the sixteen numbers of X: x = X.ravel()[_X_IN_T].
+# Positions of x in the sixteen entries of X: x = X.ravel()[_X_IN_T].
 _X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
 # X[i, j] = _ENTRY[i, j] @ x
-_ENTRY = np.zeros((16, DIMENSION))
+_ENTRY: FloatArray = np.zeros((16, DIMENSION))
 _ENTRY[_X_IN_T, np.arange(DIMENSION)] = 1.0
 _ENTRY = _ENTRY.reshape(4, 4, DIMENSION)
-# (24, 12, 13): number u of a pair times number m of x adds this share to residual (i, j).
+# (24, 12, 13): factor of coefficient u of a pair times variable m of x in residual (i, j).
 _RESIDUAL = np.concatenate(
     [
         np.einsum("il,kjm->ikljm", np.eye(3), _ENTRY).reshape(12, 12, DIMENSION),
@@ -41,11 +43,11 @@ _RESIDUAL = np.concatenate(
     ]
 )
 
-# Pairs handled at a time: keeps the intermediate arrays in the processor's cache.
+# Pairs per block, so that the intermediate arrays stay in the cache of the processor.
 _BLOCK, _SUMMED_BLOCK = 128, 1024
 
-# Eigenvalues of the translation block below this share of the largest count as zero: rounding, not
-# motion.
+# Eigenvalues of the translation block below this share of the largest are rounding: they count as
+# zero.
 _RANK_TOLERANCE = 1e-10
 
 _MAX_NEWTON_STEPS = 60
@@ -53,7 +55,7 @@ _STEP_TOLERANCE = 1e-12
 _GENERATORS = se3.skew(np.eye(3))
 
 
-def condense(pairs):
+def condense(pairs: MotionPairs) -> FloatArray:
     """Upper triangles of every pair's Q_k.
 
     Parameters
@@ -67,14 +69,14 @@ def condense(pairs):
         In the order of ``numpy.triu_indices(13)``; ``condensed @ monomials(X)`` gives all costs.
     """
     condensed = np.empty((len(pairs), len(_UPPER)))
-    # New large arrays are slow to get from the system: these are used for every block.
+    # New large arrays take time to allocate: these are used for every block.
     residuals, forms = np.empty((_BLOCK, 12, DIMENSION)), np.empty((_BLOCK, DIMENSION, DIMENSION))
-    pair_numbers = numbers(pairs)
+    u = coefficients(pairs)
     for start in range(0, len(pairs), _BLOCK):
         block = slice(start, min(start + _BLOCK, len(pairs)))
         part = slice(block.stop - start)
         np.matmul(
-            pair_numbers[block],
+            u[block],
             _RESIDUAL.reshape(24, -1),
             out=residuals[part].reshape(-1, 12 * DIMENSION),
         )
@@ -85,13 +87,13 @@ def condense(pairs):
     return condensed
 
 
-def numbers(pairs):
-    """What the residual is linear in, (K, 24): the top three rows of A - I, then of B - I, of every
-    pair.
+def coefficients(pairs: MotionPairs) -> FloatArray:
+    """Coefficients (K, 24) that the residuals are linear in: the top three rows of A - I, then of
+    B - I, of each pair.
     """
     rows = [Ts.reshape(-1, 16)[:, :12] for Ts in (pairs.Ts_parenti_parentj, pairs.Ts_childi_childj)]
     found = np.concatenate(rows, axis=1)
-    for one in _ONES:  # column by column: numpy is slow at many short rows
+    for one in _ONES:  # by column: numpy is slow with many short rows
         found[:, one] -= 1.0
     return found
 
@@ -99,40 +101,42 @@ def numbers(pairs):
 _ONES = np.flatnonzero(np.tile(np.eye(4)[:3].ravel(), 2))
 
 
-def costs(numbers, T_parent_child):
-    """Costs ``|A X - X B|_F^2`` (K,) at one X, from the :func:`numbers` of the pairs."""
+def costs(coefficients: FloatArray, T_parent_child: FloatArray) -> FloatArray:
+    """Costs ``|A X - X B|_F^2`` (K,) at one X, from the :func:`coefficients` of the pairs."""
     residual = _RESIDUAL @ T_parent_child.ravel()[_X_IN_T]
-    found = np.empty(len(numbers))
-    for start in range(0, len(numbers), _SUMMED_BLOCK):
+    found = np.empty(len(coefficients))
+    for start in range(0, len(coefficients), _SUMMED_BLOCK):
         block = slice(start, start + _SUMMED_BLOCK)
-        residuals = numbers[block] @ residual
+        residuals = coefficients[block] @ residual
         np.einsum("ki,ki->k", residuals, residuals, out=found[block])
     return found
 
 
-def weighted_sum(numbers, weights):
-    """Sum (13, 13) of the forms, each with its weight (K,), from the :func:`numbers` of the pairs:
-    the forms are not made for it.
+def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
+    """Sum (13, 13) of the forms with weights (K,), from the :func:`coefficients` of the pairs,
+    without making the forms.
     """
     moments = np.zeros((24, 24))
-    for start in range(0, len(numbers), _SUMMED_BLOCK):
+    for start in range(0, len(coefficients), _SUMMED_BLOCK):
         block = slice(start, start + _SUMMED_BLOCK)
-        moments += (numbers[block] * weights[block, None]).T @ numbers[block]
+        moments += (coefficients[block] * weights[block, None]).T @ coefficients[block]
     return _RESIDUAL.reshape(-1, DIMENSION).T @ (moments @ _RESIDUAL.reshape(24, -1)).reshape(
         -1, DIMENSION
     )
 
 
-def fall(Q, T_parent_child, T_parent_child_new):
-    """By how much ``x^T Q x`` of one form (13, 13) falls from one transform (4, 4) to another;
-    keeps the digits of small steps.
+def decrease(
+    Q: FloatArray, T_parent_child: FloatArray, T_parent_child_new: FloatArray
+) -> np.float64:
+    """Decrease of ``x^T Q x`` of one form (13, 13) from one transform (4, 4) to another, accurate
+    for small steps.
     """
     x, x_new = T_parent_child.ravel()[_X_IN_T], T_parent_child_new.ravel()[_X_IN_T]
-    return (x - x_new) @ Q @ (x + x_new)
+    return np.float64((x - x_new) @ Q @ (x + x_new))
 
 
-def monomials(T_parent_child):
-    """The 91 products that turn condensed forms into costs.
+def monomials(T_parent_child: FloatArray) -> FloatArray:
+    """Products of two variables, which map condensed forms to costs.
 
     Parameters
     ----------
@@ -143,21 +147,22 @@ def monomials(T_parent_child):
     (..., 91) array
         ``x_i x_j``, doubled off the diagonal.
     """
-    numbers = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,))
-    return numbers.take(_X_IN_T[_ROWS], axis=-1) * (
-        numbers.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY
+    entries = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,))
+    return entries.take(_X_IN_T[_ROWS], axis=-1) * (
+        entries.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY
     )
 
 
 _MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 
 
-def expand(condensed):
+def expand(condensed: FloatArray) -> FloatArray:
     """Symmetric (..., 13, 13) matrices from upper triangles (..., 91)."""
     return condensed.take(_TRIANGLE_OF_SQUARE, axis=-1)
 
 
-def _pseudo_inverse(matrices):
+def _pseudo_inverse(matrices: FloatArray) -> FloatArray:
+    """Inverses (B, n, n) of symmetric matrices on the directions that are more than rounding."""
     values, vectors = np.linalg.eigh(matrices)
     seen = values > _RANK_TOLERANCE * np.maximum(values[..., -1:], np.finfo(float).tiny)
     inverse_values = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
@@ -166,21 +171,32 @@ def _pseudo_inverse(matrices):
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where forms are smallest: B transforms (B, 4, 4), their values (B,) and whether Newton
-    converged (B,).
+    """Minima of B forms.
+
+    Attributes
+    ----------
+    T_parent_child : (B, 4, 4) array
+    value : (B,) array
+        Of the forms, there.
+    converged : (B,) bool array
+        Whether Newton's iteration settled.
+    iterations : int
+        Of the one that took longest.
     """
 
-    T_parent_child: np.ndarray
-    value: np.ndarray
-    converged: np.ndarray
+    T_parent_child: FloatArray
+    value: FloatArray
+    converged: BoolArray
     iterations: int
 
 
-def minimise(Q, rotation_start, max_steps=_MAX_NEWTON_STEPS):
+def minimise(
+    Q: FloatArray, rotation_start: FloatArray, max_steps: int = _MAX_NEWTON_STEPS
+) -> Minimum:
     """Minimise ``x^T Q x`` over SE(3), from several rotations or for several forms at once.
 
-    The translation is eliminated exactly; what is left is a quadratic in the nine entries of R,
-    minimised by damped Newton steps ``R <- R Exp(phi)``.
+    The translation is eliminated exactly. The rest is a quadratic function of the nine entries of
+    R, minimised by damped Newton steps ``R <- R Exp(phi)``.
 
     Parameters
     ----------
@@ -193,49 +209,22 @@ def minimise(Q, rotation_start, max_steps=_MAX_NEWTON_STEPS):
     Minimum
     """
     rotation = np.array(rotation_start, dtype=float)
-    Q = np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION))
-    gain = _pseudo_inverse(Q[:, _TRANSLATION, _TRANSLATION])
-    Q_translation_rest = np.concatenate(
-        [Q[:, _TRANSLATION, _ROTATION], Q[:, _TRANSLATION, _ONE, None]], axis=2
-    )
-    reduced = np.empty((len(rotation), 10, 10))
-    reduced[:, :9, :9] = Q[:, _ROTATION, _ROTATION]
-    reduced[:, :9, 9] = reduced[:, 9, :9] = Q[:, _ROTATION, _ONE]
-    reduced[:, 9, 9] = Q[:, _ONE, _ONE]
-    reduced -= np.swapaxes(Q_translation_rest, 1, 2) @ gain @ Q_translation_rest
-    S, linear, constant = reduced[:, :9, :9], reduced[:, :9, 9], reduced[:, 9, 9]
-
-    value, gradient, hessian = _derivatives(S, linear, rotation)
+    reduced = _eliminate_translation(np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION)))
+    value, gradient, hessian = _derivatives(reduced, rotation)
     damping = np.zeros(len(rotation))
     converged = np.zeros(len(rotation), dtype=bool)
     iterations = 0
     while iterations < max_steps and not converged.all():
         iterations += 1
-        curvature, axes = np.linalg.eigh(hessian)
-        # Follow negative curvature downhill too, and never divide by a curvature that is only
-        # rounding.
-        size = np.maximum(
-            np.abs(curvature),
-            1e-14 * np.maximum(np.abs(curvature).max(axis=1, keepdims=True), 1e-300),
-        )
-        step = -(
-            axes
-            @ (
-                (np.swapaxes(axes, 1, 2) @ gradient[:, :, None])
-                / (size + damping[:, None])[:, :, None]
-            )
-        )[:, :, 0]
-        length = np.linalg.norm(step, axis=1)
-        step *= np.minimum(1.0, 1.0 / np.maximum(length, 1e-300))[:, None]
+        step, length, scale = _newton_step(gradient, hessian, damping)
         trial = rotation @ se3.rotation_exp(step)
-        trial_value, trial_gradient, trial_hessian = _derivatives(S, linear, trial)
-        small = length < _STEP_TOLERANCE
+        trial_value, trial_gradient, trial_hessian = _derivatives(reduced, trial)
         better = (trial_value < value) & ~converged
-        scale = np.abs(curvature).max(axis=1)
-        # At the rounding level the value no longer falls; a tiny step that does not raise it
-        # noticeably is the end.
-        stalled = ~better & (0.5 * scale * length**2 <= 1e-15 * (np.abs(value) + np.abs(constant)))
-        converged |= small | stalled
+        # At the rounding level the value falls no more. A tiny step that hardly raises it is the
+        # last.
+        rounding = 1e-15 * (np.abs(value) + np.abs(reduced.constant))
+        stalled = ~better & (0.5 * scale * length**2 <= rounding)
+        converged |= (length < _STEP_TOLERANCE) | stalled
         damping = np.where(
             better, 0.25 * damping * (damping > 1e-9 * scale), np.maximum(4 * damping, 1e-3 * scale)
         )
@@ -244,24 +233,78 @@ def minimise(Q, rotation_start, max_steps=_MAX_NEWTON_STEPS):
         hessian = np.where(pick, trial_hessian, hessian)
         gradient = np.where(better[:, None], trial_gradient, gradient)
         value = np.where(better, trial_value, value)
-    rotation_vec = np.concatenate([rotation.reshape(-1, 9), np.ones((len(rotation), 1))], axis=1)
-    translation = -(gain @ Q_translation_rest @ rotation_vec[:, :, None])[:, :, 0]
     return Minimum(
-        se3.from_rotation_translation(rotation, translation),
-        value + constant,
+        se3.from_rotation_translation(rotation, reduced.translation(rotation)),
+        value + reduced.constant,
         converged,
         iterations,
     )
 
 
-def gauss_newton_step(Q, Ts_parent_child):
-    """One Gauss-Newton step of every form from its own transform: cheap, for searches that are
-    polished afterwards.
+@dataclass(frozen=True)
+class _Reduced:
+    """Forms without the translation: ``r^T S r + 2 linear^T r + constant`` with r = vec R.
+
+    ``to_translation`` (B, 3, 10) times ``(r, 1)`` is minus the best translation.
+    """
+
+    S: FloatArray
+    linear: FloatArray
+    constant: FloatArray
+    to_translation: FloatArray
+
+    def translation(self, rotation: FloatArray) -> FloatArray:
+        """Best translations (B, 3), m, for rotations (B, 3, 3)."""
+        ones = np.ones((len(rotation), 1))
+        vectors = np.concatenate([rotation.reshape(-1, 9), ones], axis=1)
+        return -(self.to_translation @ vectors[:, :, None])[:, :, 0]
+
+
+def _eliminate_translation(Q: FloatArray) -> _Reduced:
+    """The forms (B, 13, 13) at the best translation for each rotation."""
+    gain = _pseudo_inverse(Q[:, _TRANSLATION, _TRANSLATION])
+    Q_translation_rest = np.concatenate(
+        [Q[:, _TRANSLATION, _ROTATION], Q[:, _TRANSLATION, _ONE, None]], axis=2
+    )
+    reduced = np.empty((len(Q), 10, 10))
+    reduced[:, :9, :9] = Q[:, _ROTATION, _ROTATION]
+    reduced[:, :9, 9] = reduced[:, 9, :9] = Q[:, _ROTATION, _ONE]
+    reduced[:, 9, 9] = Q[:, _ONE, _ONE]
+    reduced -= np.swapaxes(Q_translation_rest, 1, 2) @ gain @ Q_translation_rest
+    return _Reduced(
+        reduced[:, :9, :9], reduced[:, :9, 9], reduced[:, 9, 9], gain @ Q_translation_rest
+    )
+
+
+def _newton_step(
+    gradient: FloatArray, hessian: FloatArray, damping: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Damped Newton steps (B, 3), rad, of at most 1 rad; their lengths (B,) before that limit, and
+    the largest curvatures (B,).
+    """
+    curvature, axes = np.linalg.eigh(hessian)
+    # The absolute value follows negative curvature downhill, too; the limit avoids a division by
+    # rounding.
+    size = np.maximum(
+        np.abs(curvature),
+        1e-14 * np.maximum(np.abs(curvature).max(axis=1, keepdims=True), 1e-300),
+    )
+    along = np.swapaxes(axes, 1, 2) @ gradient[:, :, None]
+    step = -(axes @ (along / (size + damping[:, None])[:, :, None]))[:, :, 0]
+    length = np.linalg.norm(step, axis=1)
+    step *= np.minimum(1.0, 1.0 / np.maximum(length, 1e-300))[:, None]
+    return step, length, np.abs(curvature).max(axis=1)
+
+
+def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
+    """Take one Gauss-Newton step of each form from its own transform.
+
+    It is fast, for searches whose result is refined afterwards.
 
     Parameters
     ----------
     Q : (B, 13, 13) array
-        Sums of pair forms with weights that are not negative.
+        Sums of the forms of pairs, with weights that are not negative.
     Ts_parent_child : (B, 4, 4) array
 
     Returns
@@ -272,33 +315,33 @@ def gauss_newton_step(Q, Ts_parent_child):
     # The derivatives of x along the six tangents at X, and x itself, are linear in X.
     tangents = (Ts_parent_child.reshape(n_forms, 16) @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
     normal = tangents @ Q @ tangents.transpose(0, 2, 1)
-    # Enough damping to keep directions that the pairs do not see where they are, too little to slow
+    # Enough damping to leave directions unchanged that the pairs do not reveal, too little to slow
     # down the others.
     diagonal = normal.reshape(n_forms, 49)[:, :48:8]
     diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-300
     step = np.linalg.solve(normal[:, :6, :6], -normal[:, :6, 6:])
-    # Cayley's map: a rotation, equal to the exponential up to second order, and cheaper.
+    # Cayley's map: a rotation, equal to the exponential up to second order, and faster.
     twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
     shrink = 1 / (1 + 0.25 * (step[:, 3:] ** 2).sum(axis=1, keepdims=True))
     return Ts_parent_child @ (_IDENTITY + shrink * (twist + 0.5 * twist @ twist))
 
 
 _IDENTITY = np.eye(4)
-# (6, 16): a tangent (rho, phi) times it gives the matrix D of ``X D``, the derivative of X along
-# it.
-_TWISTS = np.zeros((6, 4, 4))
+# (6, 16): a tangent (rho, phi) times this gives D of ``X D``, the derivative of X along it.
+_TWISTS: FloatArray = np.zeros((6, 4, 4))
 _TWISTS[[0, 1, 2], [0, 1, 2], 3] = 1.0
 _TWISTS[3:, :3, :3] = _GENERATORS
-# (16, 91): X.ravel() times it gives x of X D for all six, then x of X.
+# (16, 91): X.ravel() times this gives x of X D for all six tangents, then x of X.
 _TANGENTS = np.einsum("in,dkl->nkdil", np.eye(4), np.concatenate([_TWISTS, np.eye(4)[None]]))
 _TANGENTS = _TANGENTS.reshape(16, 7, 16)[:, :, _X_IN_T].reshape(16, 7 * DIMENSION)
 _TWISTS = _TWISTS.reshape(6, 16)
 
 
-def _derivatives(S, linear, rotation):
-    """Value, gradient (B, 3) and Hessian (B, 3, 3) of ``r^T S r + 2 linear^T r`` under ``R
-    Exp(phi)`` at phi = 0.
+def _derivatives(form: _Reduced, rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Value (B,) without the constant, gradient (B, 3) and Hessian (B, 3, 3) under
+    ``R Exp(phi)`` at phi = 0.
     """
+    S, linear = form.S, form.linear
     flat = rotation.reshape(-1, 9)
     S_flat = (S @ flat[:, :, None])[:, :, 0]
     value = ((S_flat + 2 * linear) * flat).sum(axis=1)

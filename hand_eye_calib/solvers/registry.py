@@ -69,7 +69,7 @@ class Method:
 
     @property
     def rejection(self) -> tuple[float, ...]:
-        """``threshold`` and ``min_inlier_fraction`` of a method that rejects outliers, else empty."""
+        """``threshold`` and ``min_inlier_fraction``; empty if the method rejects no outliers."""
         return (self.threshold, self.min_inlier_fraction) if self.record.rejects_outliers else ()
 
     def solve(self, pairs: MotionPairs) -> Solution:
@@ -121,4 +121,8 @@ def _ipopt_solve(name: str) -> Callable[..., Solution]:
     """The solver of a method with CasADi and Ipopt, which take a second to import."""
     from hand_eye_calib.solvers import ipopt
 
-    return {"dnl": ipopt.solve_dnl, "dnlo": ipopt.solve_dnlo}[name]
+    solvers: dict[str, Callable[..., Solution]] = {
+        "dnl": ipopt.solve_dnl,
+        "dnlo": ipopt.solve_dnlo,
+    }
+    return solvers[name]

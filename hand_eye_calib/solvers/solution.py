@@ -1,32 +1,31 @@
-"""What every solver returns."""
+"""Solutions of AX = XB."""
 
 from dataclasses import dataclass
 
-import numpy as np
+from hand_eye_calib.arrays import FloatArray
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A solver's answer to AX = XB.
+    """Solution of AX = XB for K motion pairs.
 
     Attributes
     ----------
     T_parent_child : (4, 4) array
-        X. Directions that the motion does not excite at all are left at zero translation or at the
-        start's rotation.
+        X. Directions that the motion does not excite at all keep zero translation or the rotation
+        of the start.
     objective : float
         The method's own cost at X.
     converged : bool
-        False is an answer too: the iteration ended before it settled, and X is only the best point
-        seen.
+        Whether the iteration settled. If not, X is the best point it reached.
     iterations : int
         Iterations of the method's main loop.
     weights : (K,) array
-        Weight of each motion pair, 1 for all pairs of methods without outlier rejection.
+        Weight of each motion pair; 1 for all with methods that do not reject outliers.
     """
 
-    T_parent_child: np.ndarray
+    T_parent_child: FloatArray
     objective: float
     converged: bool
     iterations: int
-    weights: np.ndarray
+    weights: FloatArray

@@ -1,16 +1,18 @@
 """Taylor: Kabsch on rotation vectors, then translation by linear least squares.
 
 The coarse stage of Z. Taylor, J. Nieto, *Motion-based calibration of multimodal sensor arrays*,
-IEEE International Conference on Robotics and Automation, 2015, with all readings of equal weight.
-So reduced it is the same pair of least-squares problems as
-:mod:`~hand_eye_calib.solvers.park`, and the published results of the two differ by rounding only; it keeps its own name because the
+IEEE International Conference on Robotics and Automation, 2015, with equal weights for all readings.
+In this form it solves the same two least-squares problems as :mod:`~hand_eye_calib.solvers.park`,
+and the published results of the two differ by rounding only. It has a name of its own because the
 comparison of Välimäki et al. (2023) lists both.
 """
 
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import separable
+from hand_eye_calib.solvers.solution import Solution
 
 
-def solve(pairs):
+def solve(pairs: MotionPairs) -> Solution:
     """Solve AX = XB in two closed-form stages.
 
     Parameters

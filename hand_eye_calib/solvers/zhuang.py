@@ -9,37 +9,38 @@ With ``z = tan(w/2) k`` for the rotation by w about k, Cayley's formula ``R = (I
     f = [k_A + k_B] z + k_A - k_B                              (rotation axes: k_A = R k_B)
     g = (I - [z]) ((R_A - I) t + t_A) - (I + [z]) t_B          (translations)
 
-Both are linear in the sixteen products of (1, z) with (1, t), so the pairs are condensed once, by a
-QR decomposition, and an iteration costs the same however many there are.
+Both are linear in the sixteen products of (1, z) with (1, t). So the pairs are condensed once, by a
+QR decomposition, and an iteration takes the same time for any number of pairs.
 
-The axes enter with unit length however small the turn, and g grows with X's own rotation: where
-rotations are noisy or X turns far, the answer is biased. Half a turn between the sensors has no
-finite z. From the identity the iteration may also settle in a false minimum, the more often the
-farther X turns (from about 1.8 rad on): in the published results 33 rows of one simulated
-trajectory with an X of 3.13 rad, three noise-free ones among them. The answer stays the published
-one, but it is not called converged where the cost is lower next to park's answer.
+The axes enter with unit length even for the smallest angle, and g grows with the rotation of X:
+with noisy rotations or a large rotation of X the answer is biased. A rotation of X by pi has no
+finite z. From the identity the iteration may also settle in a false minimum, more often for larger
+rotations of X (from about 1.8 rad on): in the published results 33 rows of one simulated trajectory
+with an X of 3.13 rad, three noise-free ones among them. The answer is still the published one, but
+it does not count as converged if the cost is lower near park's answer.
 """
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import park
 from hand_eye_calib.solvers.solution import Solution
 
 _MAX_ITERATIONS = 500
 _STEP_TOLERANCE = 1e-8
 
-# Singular values of the Jacobian below this share of the largest are directions the motion does not
-# show: left where they are.
+# Singular values of the Jacobian below this share of the largest are directions that the motion
+# does not reveal; they are not changed.
 _RANK_TOLERANCE = 1e-12
 
-# By how much a cost must be lower to be a lower minimum: a share of the cost, and residuals as a
-# share of the data.
+# A minimum is lower by at least this share of the cost, and by residuals of this share of the data.
 _LOWER = 1e-6
 _ROUNDING = 1e-12
 
 
-def solve(pairs):
+def solve(pairs: MotionPairs) -> Solution:
     """Solve AX = XB by Gauss-Newton from the identity.
 
     Parameters
@@ -50,8 +51,8 @@ def solve(pairs):
     Returns
     -------
     Solution
-        ``objective`` is the sum of ``|f|^2 + |g|^2``. ``converged`` is false where the iteration
-        did not settle, or settled in a false minimum.
+        ``objective`` is the sum of ``|f|^2 + |g|^2``. ``converged`` is False if the iteration did
+        not settle or settled in a false minimum.
     """
     residual_of_products = _condense(pairs)
     parameters, objective, settled, iterations = _gauss_newton(residual_of_products, np.zeros(6))
@@ -64,9 +65,11 @@ def solve(pairs):
     return Solution(T_parent_child, objective, settled and lowest, iterations, np.ones(len(pairs)))
 
 
-def _gauss_newton(residual_of_products, parameters):
-    """Where the iteration ends: (z, t) (6,), the cost there, whether it settled, and the number of
-    iterations.
+def _gauss_newton(
+    residual_of_products: FloatArray, parameters: FloatArray
+) -> tuple[FloatArray, float, bool, int]:
+    """Iterate from (z, t) (6,): the last (z, t), its cost, whether the iteration settled, and its
+    number of steps.
     """
     settled, iterations = False, 0
     while iterations < _MAX_ITERATIONS and not settled:
@@ -83,9 +86,9 @@ def _gauss_newton(residual_of_products, parameters):
     return parameters, float(residuals @ residuals), settled, iterations
 
 
-def _condense(pairs):
-    """Matrix (at most 20, 16) that turns the products into residuals with the same squared length
-    as all f and g together.
+def _condense(pairs: MotionPairs) -> FloatArray:
+    """Matrix (at most 20, 16) that maps the products to residuals of the same squared length as all
+    f and g together.
     """
     rotation_parent, translation_parent = (
         pairs.Ts_parenti_parentj[:, :3, :3],
@@ -105,8 +108,8 @@ def _condense(pairs):
     return np.concatenate([f_of_products, np.linalg.qr(g.reshape(-1, 16), mode="r")])
 
 
-def _products(parameters):
-    """The products (16,) of (1, z) and (1, t), z slowest, and their derivatives (16, 6) by (z, t)."""
+def _products(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Products (16,) of (1, z) and (1, t), z slowest, and their derivatives (16, 6) by (z, t)."""
     one_z, one_t = np.append(1.0, parameters[:3]), np.append(1.0, parameters[3:])
     derivative = np.zeros((4, 4, 6))
     derivative[1:, :, :3] = one_t[:, None] * np.eye(3)[:, None]
@@ -114,20 +117,20 @@ def _products(parameters):
     return np.outer(one_z, one_t).ravel(), derivative.reshape(16, 6)
 
 
-def _axes(rotation):
-    """Unit rotation axes (K, 3); (0, 0, 1) where there is no rotation."""
+def _axes(rotation: FloatArray) -> FloatArray:
+    """Unit rotation axes (K, 3); (0, 0, 1) without rotation."""
     rotvec = se3.rotation_log(rotation)
     angle = np.linalg.norm(rotvec, axis=1, keepdims=True)
     return np.where(angle > 0.0, rotvec / np.where(angle > 0.0, angle, 1.0), [0.0, 0.0, 1.0])
 
 
-def _rotation(z):
+def _rotation(z: FloatArray) -> FloatArray:
     """Rotation matrix (3, 3) of ``z = tan(w/2) k``."""
     length = np.linalg.norm(z)
     return se3.rotation_exp(z * (2 * np.arctan(length) / length if length > 0.0 else 2.0))
 
 
-def _parameters(T_parent_child):
+def _parameters(T_parent_child: FloatArray) -> FloatArray:
     """(z, t) (6,) of a transform, the inverse of ``_rotation`` for z."""
     rotvec = se3.rotation_log(T_parent_child[:3, :3])
     angle = np.linalg.norm(rotvec)
