@@ -1,3 +1,1 @@
-"""Drives with known truth: trajectories of two sensors on one vehicle, and the noise of the
-odometry that measured them.
-"""
+"""Simulated drives: two sensors on one vehicle with known truth, and the noise of odometry."""

@@ -1,23 +1,25 @@
 """A ground vehicle with two sensors drives over hills (Välimäki et al. 2023, section 4.1)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.simulation.noise import add_noise
-from hand_eye_calib.simulation.options import PUBLISHED_DRIVE, NoiseConfig
+from hand_eye_calib.simulation.options import PUBLISHED_DRIVE, DriveConfig, NoiseConfig
 from hand_eye_calib.simulation.terrain import surface
 
-# Where the published drives begin, heading along x; in units of the surface's arguments.
+# Start of the published drives, heading along x; in units of the surface's arguments.
 _START = np.array([0.0, 0.5])
 
 
 @dataclass(frozen=True)
 class SimulatedDrive:
-    """What both sensors report, and the truth.
+    """Trajectories as both sensors report them, and the truth.
 
     Attributes
     ----------
@@ -26,22 +28,26 @@ class SimulatedDrive:
     T_parent_child : (4, 4) array
         The extrinsic.
     T_pw_cw : (4, 4) array
-        The child's world in the parent's.
+        Pose of the child's world in the parent's world.
     """
 
     parent: Trajectory
     child: Trajectory
-    T_parent_child: np.ndarray
-    T_pw_cw: np.ndarray
+    T_parent_child: FloatArray
+    T_pw_cw: FloatArray
 
 
-def simulate_drive(seed, config=PUBLISHED_DRIVE, noise=NoiseConfig()):  # noqa: B008 - frozen
+def simulate_drive(
+    seed: int | Sequence[int],
+    config: DriveConfig = PUBLISHED_DRIVE,
+    noise: NoiseConfig = NoiseConfig(),  # noqa: B008 - frozen
+) -> SimulatedDrive:
     """Simulate one drive.
 
     Parameters
     ----------
     seed : int or sequence of int
-        The same seed gives the same drive, whatever the noise, and the same noise.
+        The same seed gives the same drive, with any noise, and the same noise.
     config : DriveConfig
     noise : NoiseConfig
 
@@ -79,24 +85,28 @@ def simulate_drive(seed, config=PUBLISHED_DRIVE, noise=NoiseConfig()):  # noqa: 
     )
 
 
-def _stamps_ns(config, times_s):
+def _stamps_ns(config: DriveConfig, times_s: FloatArray) -> IntArray:
     return round(config.start_time * 1e9) + np.round(times_s * 1e9).astype(np.int64)
 
 
-def _random_extrinsic(rng, max_offset):
+def _random_extrinsic(rng: np.random.Generator, max_offset: float) -> FloatArray:
     rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
     return se3.from_rotation_translation(rotation, rng.uniform(-max_offset, max_offset, 3))
 
 
-def _random_world(rng):
-    """Euler angles (rad) and translation (m), each the difference of two uniforms between 0 and 1."""
+def _random_world(rng: np.random.Generator) -> FloatArray:
+    """Transform whose Euler angles (rad) and translation (m) are differences of two uniform numbers
+    between 0 and 1.
+    """
     angles, translation = rng.uniform(size=(2, 3)) - rng.uniform(size=(2, 3))
     return se3.from_rotation_translation(
         Rotation.from_euler("ZYX", angles).as_matrix(), translation
     )
 
 
-def _vehicle_poses(config, rng, *times_s):
+def _vehicle_poses(
+    config: DriveConfig, rng: np.random.Generator, *times_s: FloatArray
+) -> list[FloatArray]:
     """Poses (N, 4, 4) of the vehicle on one drive, for each of several arrays of times since its
     start.
     """
@@ -110,9 +120,11 @@ def _vehicle_poses(config, rng, *times_s):
     ]
 
 
-def _ground_track(config, yaw_rates, holds, times_s):
-    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time; each yaw rate is
-    held for its time.
+def _ground_track(
+    config: DriveConfig, yaw_rates: FloatArray, holds: FloatArray, times_s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time; each yaw rate
+    lasts for its hold time.
     """
     starts = _sums_before(holds)
     headings = _sums_before(yaw_rates * holds)
@@ -121,18 +133,20 @@ def _ground_track(config, yaw_rates, holds, times_s):
     )
     k = np.searchsorted(starts, times_s, side="right") - 1
     elapsed = times_s - starts[k]
-    return corners[k] + _arc(config.speed, headings[k], yaw_rates[k], elapsed), headings[
-        k
-    ] + yaw_rates[k] * elapsed
+    positions = corners[k] + _arc(config.speed, headings[k], yaw_rates[k], elapsed)
+    return positions, headings[k] + yaw_rates[k] * elapsed
 
 
-def _sums_before(values):
-    """For each value the sum of those before it."""
-    return np.cumsum(values, axis=0) - values
+def _sums_before(values: FloatArray) -> FloatArray:
+    """Sums of all values before each."""
+    sums: FloatArray = np.cumsum(values, axis=0) - values
+    return sums
 
 
-def _arc(speed, heading, yaw_rate, duration):
-    """Displacement (N, 2) along an arc: its chord points half-way between the headings at its ends."""
+def _arc(
+    speed: float, heading: FloatArray, yaw_rate: FloatArray, duration: FloatArray
+) -> FloatArray:
+    """Displacements (N, 2) along arcs; the chord has the mean of the headings at both ends."""
     half_turn = 0.5 * yaw_rate * duration
     chord = speed * duration * np.sinc(half_turn / np.pi)
     return np.stack(
@@ -140,7 +154,10 @@ def _arc(speed, heading, yaw_rate, duration):
     )
 
 
-def _poses_on_terrain(config, positions, headings):
+def _poses_on_terrain(
+    config: DriveConfig, positions: FloatArray, headings: FloatArray
+) -> FloatArray:
+    """Poses (N, 4, 4) of the vehicle on the ground at positions (N, 2) with headings (N,)."""
     z, slope_x, slope_y = surface(
         positions[:, 0],
         positions[:, 1],
@@ -156,8 +173,8 @@ def _poses_on_terrain(config, positions, headings):
     )
 
 
-def _vehicle_attitude(headings, normals):
-    """z along the normal, x in the vertical plane of the heading."""
+def _vehicle_attitude(headings: FloatArray, normals: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) with z along the normal and x in the vertical plane of the heading."""
     left = np.cross(
         normals, np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1)
     )
@@ -165,11 +182,11 @@ def _vehicle_attitude(headings, normals):
     return np.stack([np.cross(left, normals), left, normals], axis=-1)
 
 
-def _published_attitude(headings, normals):
-    """The published trajectories' orientation, found by fitting it to their noise-free poses (to
+def _published_attitude(headings: FloatArray, normals: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) of the published trajectories, from a fit to their noise-free poses (to
     0.01 rad, heading exactly).
 
-    Yaw is the heading, pitch and roll are the arc sines of the normal's x and y in the world, and
+    Yaw is the heading, pitch and roll are the arc sines of x and y of the normal in the world, and
     the matrix is transposed.
     """
     angles = np.stack([headings, np.arcsin(normals[:, 0]), np.arcsin(normals[:, 1])], axis=-1)

@@ -1,33 +1,37 @@
-"""What odometry and SLAM do to a trajectory (Välimäki et al. 2023, section 4.1).
+"""Errors of odometry and SLAM in a trajectory (Välimäki et al. 2023, section 4.1).
 
-Where the article's text and its published trajectories differ, this follows the trajectories: the
-number called sigma^2 is a standard deviation, jumps last until the end, drift affects the child
+If the article's text and its published trajectories differ, this follows the trajectories: the
+value called sigma^2 is a standard deviation, jumps last until the end, drift affects the child
 sensor only.
 """
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.simulation.options import NoiseConfig
 
+# Variance of a jump per axis, m^2.
 JUMP_VARIANCE = 0.02
 
 
-def add_noise(Ts_pw_p, Ts_cw_c, noise, rng):
-    """Both sensors' trajectories with Gaussian noise, then drift (child only), then jumps.
+def add_noise(
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, noise: NoiseConfig, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Add Gaussian noise, then drift (child only), then jumps to the trajectories of both sensors.
 
     Parameters
     ----------
     Ts_pw_p, Ts_cw_c : (N, 4, 4) and (M, 4, 4) arrays
     noise : NoiseConfig
     rng : numpy.random.Generator
-        Each kind of noise draws from a stream of its own: raising one leaves the others as they
-        were.
+        Each kind of noise draws from a stream of its own: a change of one does not change the
+        others.
 
     Returns
     -------
-    Ts_pw_p, Ts_cw_c : arrays like the given ones
+    Ts_pw_p, Ts_cw_c : arrays of the same shapes
     """
     gaussian, drift, jumps = rng.spawn(3)
     Ts_pw_p, Ts_cw_c = (
@@ -39,14 +43,19 @@ def add_noise(Ts_pw_p, Ts_cw_c, noise, rng):
     return Ts_pw_p, Ts_cw_c
 
 
-def add_gaussian(Ts_world_sensor, level, rng, rotation_per_metre=NoiseConfig.rotation_per_metre):
-    """Independent errors of every pose, in the sensor's frame.
+def add_gaussian(
+    Ts_world_sensor: FloatArray,
+    level: float,
+    rng: np.random.Generator,
+    rotation_per_metre: float = NoiseConfig.rotation_per_metre,
+) -> FloatArray:
+    """Add an independent error to every pose, in the frame of the sensor.
 
     Parameters
     ----------
     Ts_world_sensor : (N, 4, 4) array
     level : float
-        Standard deviation a of each translation component, m.
+        Standard deviation of each translation component, m.
     rng : numpy.random.Generator
     rotation_per_metre : float
         ZYX Euler angles have standard deviation ``level * rotation_per_metre`` rad.
@@ -58,9 +67,8 @@ def add_gaussian(Ts_world_sensor, level, rng, rotation_per_metre=NoiseConfig.rot
     )
 
 
-def add_drift(Ts_world_sensor, rate, rng):
-    """Every step's translation grows by ``rate`` times its length along one axis of the sensor's
-    frame, drawn once.
+def add_drift(Ts_world_sensor: FloatArray, rate: float, rng: np.random.Generator) -> FloatArray:
+    """Add ``rate`` times the length of each step to it, along one axis of the sensor drawn once.
 
     Parameters
     ----------
@@ -78,9 +86,13 @@ def add_drift(Ts_world_sensor, rate, rng):
     return drifted
 
 
-def add_jumps(Ts_world_sensor, share, rng, variance=JUMP_VARIANCE):
-    """At a share of the poses the rest of the trajectory is shifted, along the world's axes, for
-    good.
+def add_jumps(
+    Ts_world_sensor: FloatArray,
+    share: float,
+    rng: np.random.Generator,
+    variance: float = JUMP_VARIANCE,
+) -> FloatArray:
+    """Shift the rest of the trajectory, along the axes of the world, at a share of the poses.
 
     Parameters
     ----------

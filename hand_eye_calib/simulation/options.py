@@ -1,14 +1,14 @@
-"""What can be chosen about a simulated drive and its noise (Välimäki et al. 2023, section 4.1)."""
+"""Options of simulated drives and their noise (Välimäki et al. 2023, section 4.1)."""
 
 from dataclasses import dataclass
 
 from hand_eye_calib.config import OptionSet, option
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DriveConfig(OptionSet):
-    """Vehicle, terrain and sensors; the defaults are the published trajectories' but for the
-    attitude.
+    """Vehicle, terrain and sensors; all defaults but the attitude are those of the published
+    trajectories.
     """
 
     poses: int = option(100, "Number of poses of the parent sensor.", minimum=2, maximum=10_000_000)
@@ -20,7 +20,7 @@ class DriveConfig(OptionSet):
     )
     child_delay: float = option(
         0.0,
-        "Time from the first pose of the parent to that of the child.",
+        "Time from the first pose of the parent to the first of the child.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -67,13 +67,14 @@ class DriveConfig(OptionSet):
     )
     attitude: str = option(
         "vehicle",
-        "vehicle: x ahead, z along the surface's normal. published: as in the published trajectories, whose orientations are "
-        "those of no vehicle (transposed, slopes not turned with the heading).",
+        "vehicle: x ahead, z along the normal of the surface. published: the orientations of the "
+        "published trajectories, which no vehicle has (transposed, slopes not rotated with the "
+        "heading).",
         choices=("published", "vehicle"),
     )
     max_offset: float = option(
         0.5,
-        "Offset of the child sensor along each axis of the parent, at most.",
+        "Largest offset of the child sensor along each axis of the parent.",
         unit="m",
         minimum=0.0,
         maximum=100.0,
@@ -82,20 +83,29 @@ class DriveConfig(OptionSet):
     child_frame: str = option("child", "Frame of the child sensor.")
 
 
-# The article's drives, as published.
+# Drives of the article, as published.
 PUBLISHED_DRIVE = DriveConfig(attitude="published")
 
 # Two minutes of a robot or forklift outdoors: hills steep enough to reveal all six degrees of
-# freedom, sensors at different rates that never share a stamp.
+# freedom, sensors at different rates without a common stamp.
 HILLY_DRIVE = DriveConfig(
-    poses=1200, parent_rate=10.0, child_rate=20.0, child_delay=0.0137, start_time=1.7e9, speed=1.5, max_yaw_rate=1.0, hold_time=1.5,
-    terrain_height=0.15, terrain_scale=2.5, terrain_limit=3.0,
-)  # fmt: skip
+    poses=1200,
+    parent_rate=10.0,
+    child_rate=20.0,
+    child_delay=0.0137,
+    start_time=1.7e9,
+    speed=1.5,
+    max_yaw_rate=1.0,
+    hold_time=1.5,
+    terrain_height=0.15,
+    terrain_scale=2.5,
+    terrain_limit=3.0,
+)
 
 
 @dataclass(frozen=True)
 class NoiseConfig(OptionSet):
-    """How strong each kind of noise is; the default is none."""
+    """Level of each kind of noise; the default is none."""
 
     gaussian: float = option(
         0.0,
@@ -126,5 +136,5 @@ class NoiseConfig(OptionSet):
     )
 
 
-# The article's mixture: the middle of each range.
+# Mixture of the article: the middle of each range.
 MIXTURE = NoiseConfig(gaussian=0.005, outliers=0.05, drift=0.025)

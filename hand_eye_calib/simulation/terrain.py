@@ -1,20 +1,23 @@
-"""The ground the simulated vehicle drives on: MATLAB's ``peaks`` surface."""
+"""Ground of the simulated drives: MATLAB's ``peaks`` surface."""
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray
 
-def peaks(x, y):
-    """Three hills and three hollows around the origin, flat beyond about 3.5; arrays of one shape,
-    no unit.
+
+def peaks(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Height of three hills and three hollows around the origin, flat beyond about 3.5; arrays of
+    one shape, no unit.
     """
-    return (
+    total: FloatArray = (
         3.0 * (1.0 - x) ** 2 * np.exp(-(x**2) - (y + 1.0) ** 2)
         - 10.0 * (x / 5.0 - x**3 - y**5) * np.exp(-(x**2) - y**2)
         - np.exp(-((x + 1.0) ** 2) - y**2) / 3.0
     )
+    return total
 
 
-def peaks_gradient(x, y):
+def peaks_gradient(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Derivatives of :func:`peaks` with respect to x and y."""
     hill = 3.0 * np.exp(-(x**2) - (y + 1.0) ** 2)
     middle, polynomial = 10.0 * np.exp(-(x**2) - y**2), x / 5.0 - x**3 - y**5
@@ -26,7 +29,9 @@ def peaks_gradient(x, y):
     return along_x, along_y
 
 
-def surface(x, y, height, scale, limit):
+def surface(
+    x: FloatArray, y: FloatArray, height: float, scale: float, limit: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Height and slopes of the ground.
 
     Parameters
@@ -38,8 +43,8 @@ def surface(x, y, height, scale, limit):
     scale : float
         m per unit of the arguments of ``peaks``.
     limit : float
-        Arguments of ``peaks`` beyond +/- limit are mirrored back, so that a long drive does not
-        leave the hills.
+        Arguments of ``peaks`` beyond +/- limit are mirrored back, so that a long drive stays on the
+        hills.
 
     Returns
     -------
@@ -55,7 +60,7 @@ def surface(x, y, height, scale, limit):
     )
 
 
-def _mirrored(values, limit):
+def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
     """Triangle wave, equal to its argument within +/- limit, and its slope."""
     phase = np.mod(values + limit, 4.0 * limit)
     falling = phase > 2.0 * limit
