@@ -156,10 +156,29 @@ def test_topics_may_be_left_out_where_there_are_only_two(run, new_bag):
     code, out, err = run("replay", new_bag(), "--json")
     assert code == 0
     assert err == (
-        f"hand_eye_calib: note: parent is {CHILD_TOPIC}, child is {PARENT_TOPIC}; "
+        f"hand_eye_calib: note: parent is {PARENT_TOPIC}, child is {CHILD_TOPIC}; "
         "to change that, give --parent-topic and --child-topic\n"
     )
-    np.testing.assert_allclose(json.loads(out)["T_child_parent"]["matrix"], TRUTH, atol=1e-6)
+    np.testing.assert_allclose(json.loads(out)["T_parent_child"]["matrix"], TRUTH, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("parent", "child"),
+    [
+        ("/parent/odometry", "/child/odometry"),
+        ("/base_link/odom", "/a"),
+        ("/front/lidar/odom", "/camera/odom"),
+        ("/wheel_odom", "/child/a"),
+        ("/a", "/b"),
+    ],
+)
+def test_the_likelier_parent_is_chosen_by_its_name(run, tmp_path, parent, child):
+    first, second = drive()
+    bag = tmp_path / "named"
+    write_bag(bag, {child: (second, ODOMETRY), parent: (first, ODOMETRY)}, "mcap")
+    code, out, err = run("check", bag)
+    assert code == 0
+    assert out.startswith(f"parent is {parent}\nchild is {child}\n")
 
 
 def test_pose_stamped_takes_its_frames_from_the_options(run, new_bag):

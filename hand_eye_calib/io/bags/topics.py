@@ -1,5 +1,6 @@
 """Topics of bags: what is on them, and which of them are meant."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -206,5 +207,19 @@ def select_sources(
             "name the topics of poses with --parent-topic and --child-topic, or frames with "
             f"--parent-tf and --child-tf. {listing(topics, bag)}"
         )
-    chosen = sorted(choices[0])[::-1] if wanted else []
+    chosen = sorted(choices[0], key=_parent_first)[::-1] if wanted else []
     return parent or chosen.pop(), child or chosen.pop()
+
+
+# Words of a topic's name that say which stream it is, the likeliest parent first.
+_PARENT_WORDS = ("parent", "base", "lidar")
+_CHILD_WORD = "child"
+
+
+def _parent_first(topic: str) -> tuple[int, str]:
+    """Sorts the likelier parent first: by name, then alphabetically."""
+    words = re.split(r"[/_]+", topic.lower())
+    if _CHILD_WORD in words:
+        return len(_PARENT_WORDS) + 1, topic
+    ranks = [rank for rank, word in enumerate(_PARENT_WORDS) if word in words]
+    return min(ranks, default=len(_PARENT_WORDS)), topic
