@@ -17,7 +17,6 @@ from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.ros.check_monitor import CheckMonitor
-from hand_eye_calib.ros.conversions import to_transform
 from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
 from hand_eye_calib.ros.inputs import PoseInput, qos_parameter_names
 from hand_eye_calib.ros.live_session import LiveSession
@@ -26,7 +25,7 @@ from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.results import ResultFiles, ResultTopics
 from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S
 from hand_eye_calib.ros.solve_cycle import SolveCycle
-from hand_eye_calib.ros.tf import StaticBroadcaster, check_available
+from hand_eye_calib.ros.tf import TfBroadcaster, message_type
 
 _DISCOVERY_PERIOD_S = 0.2
 _DIAGNOSTICS_PERIOD_S = 1.0
@@ -65,7 +64,8 @@ class CalibratorNode(Node):
         self._inputs = self._make_input("parent"), self._make_input("child")
         self._open_journal()
         self._topics = ResultTopics(self)
-        self._broadcaster = StaticBroadcaster(self) if self._options.node.publish_tf else None
+        self._tf = TfBroadcaster(self, self._log)
+        self._tf.switch(self._options.node.publish_tf)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._answered = self.create_guard_condition(self._take_answers)
         self._cycle = SolveCycle(
@@ -73,7 +73,7 @@ class CalibratorNode(Node):
         )
         self._parts = NodeParts(
             self.get_fully_qualified_name(), self._options, self._session, self._inputs,
-            self._cycle, self._checks,
+            self._cycle, self._checks, self._tf,
         )  # fmt: skip
         self._serve()
         self._start_timers()
@@ -150,14 +150,10 @@ class CalibratorNode(Node):
 
     def _publish_result(self, calibration: Calibration) -> None:
         self._topics.publish(calibration)
-        self._broadcast()
-
-    def _broadcast(self) -> None:
-        result = self._cycle.result
-        if self._broadcaster is not None and result is not None and self._cycle.has_valid_result:
-            self._broadcaster.send(to_transform(result))
+        self._tf.add(calibration, self._checks.faults())
 
     def _publish_diagnostics(self) -> None:
+        self._tf.look()
         clock_ns = self.get_clock().now().nanoseconds
         self._diagnostics.publish(diagnostics(self._parts, time.monotonic(), clock_ns))
 
@@ -168,6 +164,8 @@ class CalibratorNode(Node):
         self._session.reset()
         self._cycle.restart()
         self._checks.restart()
+        self._topics.clear()
+        self._tf.restart()
         for each in self._inputs:
             each.restart(because_of)
 
@@ -191,7 +189,6 @@ class CalibratorNode(Node):
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._begin_session()
-        self._topics.clear()
         response.success, response.message = True, "all poses forgotten, new session"
         self._log.info(response.message)
         return response
@@ -217,7 +214,7 @@ class CalibratorNode(Node):
     def _check_options(self, options: NodeConfig) -> None:
         """Raise ConfigError if options cannot be had together, or not on this machine."""
         if options.publish_tf:
-            check_available()
+            message_type()
         self._session.check_journal(options)
 
     def _follow_parameters(self) -> None:
@@ -228,17 +225,8 @@ class CalibratorNode(Node):
         for each in self._inputs:
             each.configure(options)
         self._session.follow_journal(options.node)
-        if options.node.publish_tf != (self._broadcaster is not None):
-            self._switch_broadcaster()
+        self._tf.switch(options.node.publish_tf)
         period_ns = round(options.node.solve_period * 1e9)
         if period_ns != self._solve_timer.timer_period_ns:
             self._solve_timer.timer_period_ns = period_ns
             self._solve_timer.reset()
-
-    def _switch_broadcaster(self) -> None:
-        if self._broadcaster is not None:
-            self._broadcaster.close()
-            self._broadcaster = None
-            return
-        self._broadcaster = StaticBroadcaster(self)
-        self._broadcast()

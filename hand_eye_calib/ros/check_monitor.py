@@ -85,11 +85,13 @@ class CheckMonitor:
         """Findings of the last check."""
         if self._result is None:
             rotation = f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
-            text = f"not checked yet: that takes {MIN_DURATION_S:g} s of motion with rotations of {rotation}"
+            text = f"not checked yet: that takes {MIN_DURATION_S:g} s of motion"
+            text += f" with rotations of {rotation}"
             return Report(WARN, text, {"checked": "not yet"})
         faults = self.faults()
         values = {
-            "checked": f"{steady_s - self._checked_at_s:.0f} s ago, again after {CHECK_PERIOD_S:g} s",
+            "checked": f"{steady_s - self._checked_at_s:.0f} s ago",
+            "checked again after (s)": f"{CHECK_PERIOD_S:g}",
             "correlation of the angular rates": f"{self._result.correlation.correlation:.3f}",
             **{
                 f"{each.severity.value} {each.code} ({each.stream})": in_parameters(each)

@@ -25,6 +25,7 @@ from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.solve_cycle import SolveCycle
 from hand_eye_calib.ros.solving import FailureKind
 from hand_eye_calib.ros.status import ERROR, OK, WARN, Report, to_status
+from hand_eye_calib.ros.tf import TfBroadcaster
 
 # If poses wait that no result contains, the result is stale when it is older than this many solve
 # periods, and than so many seconds.
@@ -45,6 +46,7 @@ class NodeParts:
     inputs: tuple[PoseInput, PoseInput]
     cycle: SolveCycle
     checks: CheckMonitor
+    tf: TfBroadcaster
 
 
 def diagnostics(parts: NodeParts, steady_s: float, clock_ns: int) -> DiagnosticArray:
@@ -88,6 +90,7 @@ def extrinsic_report(parts: NodeParts, steady_s: float, clock_ns: int) -> Report
         "last solve took (s)": f"{cycle.seconds:.3f}",
         "last failure": cycle.failure.what if cycle.failure else "none",
         **(_motion_values(cycle.seen) if cycle.seen is not None else {}),
+        "broadcast on /tf_static": parts.tf.state,
         "missing": missing or ("nothing" if cycle.result else "-"),
     }
     if cycle.result is not None and age_s is not None:
@@ -150,6 +153,8 @@ def _judge(parts: NodeParts, age_s: float | None, missing: str) -> tuple[bytes, 
         return WARN, "; ".join(filter(None, (said, missing))) or "no result yet"
     if result.status is not SolveStatus.OK:
         return WARN, missing or "; ".join(result.warnings) or result.status.value
+    if parts.tf.refused:
+        return WARN, f"publish_tf is refused: {parts.tf.refused}"
     if _is_stale(parts, age_s):
         return WARN, ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
     if missing:
@@ -203,7 +208,7 @@ def _clock_offset(parent: InputMonitor, child: InputMonitor) -> float | None:
 
 
 def with_clock_offset(report: Report, seen_s: float | None, used_s: float | str) -> Report:
-    """An input's report with the clock offset seen, and a warning if it is far from the one used."""
+    """An input's report with the clock offset seen; a warning if it is far from the one used."""
     values = {
         **report.values,
         "clock offset to the other input seen (s)": "-" if seen_s is None else f"{seen_s:.4f}",

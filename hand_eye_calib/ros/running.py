@@ -22,7 +22,7 @@ SOLVE_GRACE_S = 0.5
 
 
 def run(arguments: list[str], signals: int) -> int:
-    """Run the node until ``signals``, a file descriptor, becomes readable; returns the exit code."""
+    """Run the node until ``signals``, a file descriptor, is readable; returns the exit code."""
     try:
         _init(arguments)
     except UnknownROSArgsError as error:

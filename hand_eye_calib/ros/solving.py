@@ -1,4 +1,4 @@
-"""The process that solves: reads jobs from its standard input, writes answers to its standard output.
+"""The process that solves: reads jobs from standard input, writes answers to standard output.
 
 It imports the engine and nothing of ROS. Messages are pickles: both ends are the same program, and
 nobody else has the pipes.

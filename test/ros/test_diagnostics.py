@@ -70,6 +70,14 @@ def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are
     )
 
 
+def test_two_nodes_are_told_apart(start_node, peer, heard):
+    start_node("-r __ns:=/robot1")
+    start_node("-r __node:=other")
+    names = lambda: {name for statuses in heard for name in statuses}  # noqa: E731
+    peer.spin_until(lambda: len(names()) == 2 * len(NAMES), "both nodes")
+    assert {name.rpartition(": ")[0] for name in names()} == {"/robot1/calibrator", "/other"}
+
+
 def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, heard, tmp_path):
     start_node("-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS)
     publishers = peer.publishers()

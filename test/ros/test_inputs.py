@@ -1,7 +1,14 @@
 """Messages that cannot be used, bags that loop, services that steer the session."""
 
+import signal
+import time
+
 import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_harness import RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix, message
 from std_srvs.srv import Trigger
 
@@ -167,3 +174,107 @@ def test_directory_that_cannot_be_written_is_reported(start_node, peer, tmp_path
     assert str(blocked) in refused.message
     assert peer.trigger("solve").success
     assert node.stop()[0] == 1
+
+
+def test_a_publisher_that_restarts_with_another_type_is_heard(start_node, peer):
+    node = start_node(*QUIET)
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
+    before = peer.publishers(Odometry, Odometry)
+    peer.feed(before, stamps_ns[:60], Ts_pw_p[:60], Ts_cw_c[:60])
+    node.wait_for_log("first pose on /child_odom")
+    peer.node.destroy_publisher(before[1])
+    after = before[0], peer.publisher(TransformStamped, "child_odom")
+    _, extrinsic = peer.solve(after, stamps_ns[60:], Ts_pw_p[60:], Ts_cw_c[60:])
+    node.wait_for_log("/child_odom has changed its type from nav_msgs/msg/Odometry")
+    np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-6)
+
+
+def test_a_reset_withdraws_the_result_of_the_forgotten_session(start_node, peer):
+    start_node(*QUIET)
+    peer.solve(peer.publishers(), *drive())
+    assert peer.trigger("reset").success
+    late = peer.listen(TransformStamped, "extrinsic")
+    peer.spin_until(lambda: peer.node.count_publishers("/calibrator/extrinsic") == 1, "one topic")
+    time.sleep(0.5)
+    assert not peer.trigger("solve").success
+    assert not late
+
+
+def test_a_hundred_calls_of_solve_at_once_have_a_hundred_answers(start_node, peer):
+    start_node(*QUIET)
+    peer.solve(peer.publishers(), *drive())
+    answers = [peer.ask(Trigger, "solve") for _ in range(100)]
+    peer.spin_until(lambda: all(each.done() for each in answers), "all answers")
+    assert all(each.result().success for each in answers)
+
+
+def test_a_directory_of_nobody_is_refused_as_a_parameter(start_node, peer):
+    node = start_node(*QUIET)
+    refused = peer.set_parameter("output_directory", "~nosuchuser/x")
+    assert not refused.successful
+    assert "~nosuchuser/x" in refused.reason
+    assert peer.parameter("output_directory") == ""
+    assert node.process.poll() is None
+
+
+def test_a_directory_of_nobody_at_the_start_is_one_line_and_code_1(start_node):
+    node = start_node("-p output_directory:=~nosuchuser/x")
+    assert node.wait() == 1
+    assert node.log.startswith("calibrator: output_directory '~nosuchuser/x'")
+    assert node.log.count("\n") == 1
+
+
+def test_a_position_beyond_the_world_is_refused_and_poisons_nothing(start_node, peer):
+    node, publishers = start_node(*QUIET), peer.publishers()
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
+    far = Ts_pw_p[:1].copy()
+    far[0, 0, 3] = 1e154
+    peer.feed(publishers, stamps_ns[:1] - 1, far, Ts_cw_c[:1])
+    node.wait_for_log("is more than 1e+08 m from the origin")
+    _, extrinsic = peer.solve(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
+    np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-6)
+
+
+class TestLoss:
+    """Messages that are lost on the way are counted, to within two in a hundred."""
+
+    @pytest.fixture
+    def counted(self, peer):
+        """Values of the inputs' newest statuses."""
+        newest = {}
+
+        def take(array):
+            for each in array.status:
+                values = {pair.key: pair.value for pair in each.values}
+                newest[each.name.rpartition(": ")[2]] = values | {"said": each.message}
+
+        peer.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
+        return newest
+
+    def test_a_node_that_does_not_keep_up(self, start_node, peer, counted):
+        node = start_node("-p solve_period:=1000.0")
+        qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        publishers = [
+            peer.node.create_publisher(Odometry, f"{stream}_odom", qos)
+            for stream in ("parent", "child")
+        ]
+        stamps_ns, Ts_pw_p, Ts_cw_c = drive(4000, period_ns=2_500_000)
+        peer.feed(publishers, stamps_ns[:100], Ts_pw_p[:100], Ts_cw_c[:100])
+        node.process.send_signal(signal.SIGSTOP)
+        peer.feed(publishers, stamps_ns[100:3900], Ts_pw_p[100:3900], Ts_cw_c[100:3900])
+        node.process.send_signal(signal.SIGCONT)
+        time.sleep(1.0)
+        peer.feed(publishers, stamps_ns[3900:], Ts_pw_p[3900:], Ts_cw_c[3900:])
+        for name in ("parent input", "child input"):
+            # The last message has come, so everything lost has a later one after it.
+            peer.spin_until(
+                lambda name=name: (
+                    counted.get(name, {}).get("lost messages", "0") not in ("0", "unknown")
+                ),
+                "lost messages",
+            )
+            time.sleep(2.5)
+            peer.spin_until(lambda: True, "nothing")
+            received, lost = (int(counted[name][key]) for key in ("messages", "lost messages"))
+            assert lost > 500
+            assert abs(received + lost - 4000) <= 0.02 * lost
