@@ -22,7 +22,7 @@ from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import BufferLimits, PoseBuffer, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS, Snapshot, downsample, name_frames, pair_poses
 from hand_eye_calib.errors import InputError, NotEnoughDataError
-from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE
+from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
 
 # Bounds of a quaternion's squared length.
@@ -425,8 +425,9 @@ class _Column:
 def _is_pose(x: Any, y: Any, z: Any, qx: Any, qy: Any, qz: Any, qw: Any) -> Any:
     """Whether these values are a pose; of arrays, each row of them."""
     norm2 = qx * qx + qy * qy + qz * qz + qw * qw
-    # A sum is finite only if all its terms are. NaN fails every comparison.
-    return (abs(x + y + z) < np.inf) & (norm2 >= _MIN_NORM2) & (norm2 <= _MAX_NORM2)
+    # NaN fails every comparison.
+    is_near = (abs(x) <= FARTHEST_M) & (abs(y) <= FARTHEST_M) & (abs(z) <= FARTHEST_M)
+    return is_near & (norm2 >= _MIN_NORM2) & (norm2 <= _MAX_NORM2)
 
 
 def _what_is_wrong(position: Sequence[float], quat_xyzw: Sequence[float]) -> InputError:
@@ -434,6 +435,10 @@ def _what_is_wrong(position: Sequence[float], quat_xyzw: Sequence[float]) -> Inp
     x, y, z = position
     if not abs(x + y + z) < np.inf:
         return InputError(f"position ({x}, {y}, {z}) is not finite")
+    if max(abs(x), abs(y), abs(z)) > FARTHEST_M:
+        return InputError(
+            f"position ({x:.4g}, {y:.4g}, {z:.4g}) is more than {FARTHEST_M:g} m from the origin"
+        )
     qx, qy, qz, qw = quat_xyzw
     length = (qx * qx + qy * qy + qz * qz + qw * qw) ** 0.5
     return InputError(

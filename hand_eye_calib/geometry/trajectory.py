@@ -15,6 +15,9 @@ from hand_eye_calib.geometry import se3
 # bound).
 QUATERNION_NORM_TOLERANCE = 1e-2
 
+# A sensor's position in its own world (m) is never so large: the Earth's centre is 6.4e6 m away.
+FARTHEST_M = 1e8
+
 # Tolerance for rotation matrices: a file with six digits passes, a scaled matrix does not.
 ROTATION_TOLERANCE = 1e-3
 

@@ -24,7 +24,7 @@ from hand_eye_calib.ros.log import LOG_PERIOD_S, NodeLog
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.results import ResultFiles, ResultTopics
 from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S
-from hand_eye_calib.ros.solve_cycle import SolveCycle
+from hand_eye_calib.ros.solve_cycle import ANSWER_PERIOD_S, SolveCycle
 from hand_eye_calib.ros.tf import TfBroadcaster, message_type
 
 _DISCOVERY_PERIOD_S = 0.2
@@ -130,6 +130,7 @@ class CalibratorNode(Node):
         self._solve_timer = self.create_timer(period_s, self._on_solve_timer, clock=steady)
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=steady)
         self.create_timer(_DIAGNOSTICS_PERIOD_S, self._publish_diagnostics, clock=steady)
+        self._answer_timer = self.create_timer(ANSWER_PERIOD_S, self._answer_some, clock=steady)
         self.create_timer(FLUSH_PERIOD_S, self._session.flush_journal, clock=steady)
 
     # ---------------------------------------------------------------- timers
@@ -147,6 +148,13 @@ class CalibratorNode(Node):
 
     def _take_answers(self) -> None:
         self._cycle.take_answers()
+        self._answer_some()
+
+    def _answer_some(self) -> None:
+        if self._cycle.answer_some():
+            self._answer_timer.reset()
+        else:
+            self._answer_timer.cancel()
 
     def _publish_result(self, calibration: Calibration) -> None:
         self._topics.publish(calibration)

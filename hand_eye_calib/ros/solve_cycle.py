@@ -1,6 +1,7 @@
 """When the node solves, what came of it, and who waits for the answer."""
 
 import time
+from collections import deque
 from collections.abc import Callable
 
 from rclpy.task import Future
@@ -13,6 +14,11 @@ from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.results import describe
 from hand_eye_calib.ros.solving import Checked, Failure, FailureKind, Job, Solved
 from hand_eye_calib.ros.solving_process import SolvingProcess
+
+# Answers to many calls are sent a few at a time: a client keeps ten that it has not taken yet, and
+# loses the others.
+_ANSWERS_AT_ONCE = 4
+ANSWER_PERIOD_S = 0.02
 
 
 class SolveCycle:
@@ -61,6 +67,7 @@ class SolveCycle:
         self._rest_until_s = 0.0
         self._asked: list[Future] = []
         self._asked_in_flight: list[Future] = []
+        self._due_answers: deque[tuple[Future, tuple[bool, str]]] = deque()
         self._process = SolvingProcess(wake)
         self.restart()
 
@@ -100,6 +107,15 @@ class SolveCycle:
                 self._take_check(answer)
             else:
                 self._take_solve(answer)
+
+    def answer_some(self) -> bool:
+        """Answer the next of those who asked; whether there are more, to be answered after
+        :data:`ANSWER_PERIOD_S`.
+        """
+        for _ in range(min(_ANSWERS_AT_ONCE, len(self._due_answers))):
+            future, answer = self._due_answers.popleft()
+            future.set_result(answer)
+        return bool(self._due_answers)
 
     def stop(self, timeout_s: float) -> bool:
         """Wait for the solve under way, take its result, and end the process; False if it took
@@ -141,8 +157,7 @@ class SolveCycle:
     def _take_solve(self, solved: Solved) -> None:
         good, text = self._conclude(solved)
         self.is_solving = False
-        for answer in self._asked_in_flight:
-            answer.set_result((good, text))
+        self._due_answers += [(answer, (good, text)) for answer in self._asked_in_flight]
         self._asked_in_flight = []
         if self._asked:
             self._start()
