@@ -155,8 +155,8 @@ def test_many_poses_at_once_are_the_same_as_one_by_one(data):
 
 
 def test_many_poses_of_a_long_session_are_the_same_as_one_by_one():
-    """Far beyond the size of the waiting room, where poses are made into pairs and let go, at last
-    without a partner.
+    """Far beyond the capacity of the buffers: poses are paired and dropped, in the end without a
+    partner.
     """
     random = np.random.default_rng(4)
     names = np.where(random.random(60_000) < np.linspace(0.2, 1.8, 60_000), "parent", "child")

@@ -12,15 +12,18 @@ import pytest
 
 from hand_eye_calib.cli.main import COMMANDS, main
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.io import limits
 
 ROOT = Path(__file__).resolve().parents[2]
-README, NODE_PAGE = ROOT / "README.md", ROOT / "docs" / "node.md"
+NODE_PAGE, LIMITS_PAGE = ROOT / "docs" / "node.md", ROOT / "docs" / "limits.md"
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
     for page in (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md")))
 }
 HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
 FEWEST_WORDS, MOST_WORDS = 700, 900
+LIMITS = ROOT / "hand_eye_calib" / "io" / "limits.py"
+HINT = "PYTHONPATH=. python test/unit/test_readme.py writes it"
 
 
 def parameter_table(config):
@@ -76,8 +79,7 @@ def meaning(meta):
 @pytest.mark.parametrize("config", [CalibratorConfig, NodeConfig])
 def test_parameter_table_is_that_of_the_code(config):
     table = parameter_table(config)
-    hint = "PYTHONPATH=. python test/unit/test_readme.py writes it"
-    assert table in PAGES["docs/node.md"], f"docs/node.md must have this table; {hint}:\n{table}"
+    assert table in PAGES["docs/node.md"], f"docs/node.md must have this table; {HINT}:\n{table}"
 
 
 def test_parameter_tables_have_no_other_rows():
@@ -87,6 +89,33 @@ def test_parameter_tables_have_no_other_rows():
         for config in (CalibratorConfig, NodeConfig)
         for field in dataclasses.fields(config)
     ]
+
+
+def limits_table():
+    """The Markdown table of ``io/limits.py``: its sections, comments and values."""
+    lines, section, text = ["| Of | What | Limit |", "| --- | --- | ---: |"], "", []
+    for line in LIMITS.read_text(encoding="utf-8").splitlines():
+        if line.startswith("# ---- "):
+            section = line.removeprefix("# ---- ")
+        elif line.startswith("#:"):
+            text.append(line.removeprefix("#:").strip())
+        elif found := re.match(r"([A-Z][A-Z_]*) = ", line):
+            what = " ".join(text).rstrip(".")
+            lines.append(f"| {section} | {what} | {readable(what, getattr(limits, found[1]))} |")
+            text = []
+    return "\n".join(lines)
+
+
+def readable(what, value):
+    """A limit with its unit: bytes in MiB."""
+    if what.startswith("Bytes") and value % (1 << 20) == 0:
+        return f"{value >> 20:,} MiB"
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}"
+
+
+def test_limits_are_those_of_the_code():
+    assert limits_table().count("\n") > 10
+    assert limits_table() in PAGES["docs/limits.md"], f"docs/limits.md must have this table; {HINT}"
 
 
 def test_readme_is_short():
@@ -249,3 +278,6 @@ def with_tables_of_the_code(text):
 
 if __name__ == "__main__":
     NODE_PAGE.write_text(with_tables_of_the_code(PAGES["docs/node.md"]), encoding="utf-8")
+    table = re.compile(r"^\| Of \| What \| Limit \|\n(\|.*\n)*", re.MULTILINE)
+    page = table.sub(lambda _: limits_table() + "\n", PAGES["docs/limits.md"])
+    LIMITS_PAGE.write_text(page, encoding="utf-8")
