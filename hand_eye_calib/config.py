@@ -73,19 +73,8 @@ def option(
     parse
         For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
     """
-    metadata = dict(
-        doc=doc,
-        unit=unit,
-        minimum=minimum,
-        maximum=maximum,
-        choices=choices,
-        pattern=pattern,
-        form=form,
-        words=words,
-        name=name,
-        read_only=read_only,
-        parse=parse,
-    )
+    metadata = dict(locals())
+    del metadata["default"]
     return dataclasses.field(default=default, metadata=metadata)
 
 

@@ -19,7 +19,7 @@ def printable(text: str) -> str:
 
 
 class HandEyeCalibError(Exception):
-    """Base of every error a caller is expected to handle."""
+    """Base of all errors that a caller is expected to handle."""
 
     def __str__(self) -> str:
         return printable(super().__str__())
@@ -34,7 +34,7 @@ class InputError(HandEyeCalibError, ValueError):
 
 
 class NotEnoughDataError(InputError):
-    """The data is sound, but there is too little of it to solve."""
+    """There is too little data to solve; what there is can be used."""
 
 
 class MissingDependencyError(HandEyeCalibError, ImportError):

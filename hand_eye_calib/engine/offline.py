@@ -6,6 +6,7 @@ from typing import Any
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig, Prior, prior_fields
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
 
@@ -33,31 +34,43 @@ def calibrate(
 ) -> Calibration:
     """Estimate the pose of the child sensor in the parent sensor's frame from two trajectories.
 
-    Every keyword is the option of :class:`~hand_eye_calib.config.CalibratorConfig` of that name,
-    which has its meaning, unit, range and default; None takes the default. ``max_pairs`` is without
-    limit unless given.
+    Each keyword is the option of :class:`~hand_eye_calib.config.CalibratorConfig` of that name,
+    which has its meaning, unit, range and default; None stands for the default. All pose pairs are
+    used unless ``max_pairs`` is given.
 
     Parameters
     ----------
     parent, child : Trajectory
         Poses of each sensor in its own world.
     prior : mapping of str to (float, float) or str, optional
-        What is known beforehand, as value and standard deviation in m or rad, such as
+        Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.config.Prior`.
 
     Raises
     ------
     ConfigError
-        If an option has a value it cannot have.
+        If an option has a value that is not allowed.
+    InputError
+        If an argument is no Trajectory or both are of one sensor frame.
     NotEnoughDataError
         If too few poses can be paired.
     """
     options = dict(locals())
+    _require_trajectories(parent, child)
     for name in ("parent", "child", "prior"):
         del options[name]
     options = {name: value for name, value in options.items() if value is not None}
     config = CalibratorConfig(**(_no_limit(parent, child) | options | prior_fields(prior or {})))
     return whole_snapshot(config, parent, child).estimate()
+
+
+def _require_trajectories(parent: object, child: object) -> None:
+    for name, given in (("parent", parent), ("child", child)):
+        if not isinstance(given, Trajectory):
+            raise InputError(
+                f"{name} must be a Trajectory; found {type(given).__name__}: build one with "
+                "hec.Trajectory(stamps_ns, poses) or hec.read_trajectory(path)"
+            )
 
 
 def offline_config(

@@ -26,12 +26,8 @@ def select_keyframes(
     Parameters
     ----------
     pose_pairs : PosePairs
-    min_translation : float
-        Metres.
-    min_rotation : float
-        Radians.
-    min_interval_s : float
-        Seconds.
+    min_translation, min_rotation, min_interval_s : float
+        In m, rad and s.
     previous : PosePairs, optional
         The last one kept before these, of length 1 (0 for none).
 

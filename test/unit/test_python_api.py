@@ -93,6 +93,11 @@ class TestOptionsOfCalibrate:
         assert result.n_poses <= 20
         assert offline_config(parent, child, {}).max_pairs == 60
 
+    def test_other_objects_are_refused_by_name(self):
+        parent, child = streams()
+        with pytest.raises(InputError, match="child must be a Trajectory; found ndarray: build"):
+            hec.calibrate(parent, child.poses)
+
     def test_a_typing_error_is_an_error(self):
         with pytest.raises(TypeError, match="unexpected keyword argument 'metod'"):
             hec.calibrate(*streams(), metod="dnlo")

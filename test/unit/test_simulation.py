@@ -405,7 +405,7 @@ def test_command_writes_the_published_layout(tmp_path, capsys):
         "--drift",
         0,
     )
-    assert (code, output) == (0, f"3 drives written to {tmp_path / 'sims'}\n")
+    assert (code, output) == (0, f"3 recordings written to {tmp_path / 'sims'}\n")
     assert sorted(path.name for path in (tmp_path / "sims").iterdir()) == [
         "run_01",
         "run_02",
