@@ -216,8 +216,11 @@ def publish(domain, rate_hz, n_poses):
 def start(domain, *words):
     """Another process of this file, or of the package."""
     environment = os.environ | {
-        "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1",
-    }  # fmt: skip
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "OMP_NUM_THREADS": "1",
+        "PYTHONUNBUFFERED": "1",
+    }
     return subprocess.Popen(
         [sys.executable, *map(str, words)], env=environment, cwd=PROJECT, stderr=subprocess.STDOUT
     )
@@ -227,8 +230,14 @@ def load(folder, seconds, backend):
     """Rows (what, value, promise, kept) of the node under load."""
     rate_hz, domain = 400, random.randint(1, 100)
     report = folder / f"{backend}.json"
-    options = {"method": "dnlo", "reference": "B5", "backend": backend, "solve_period": 1.0, "max_pairs": 5005,
-               "output_directory": folder / backend}  # fmt: skip
+    options = {
+        "method": "dnlo",
+        "reference": "B5",
+        "backend": backend,
+        "solve_period": 1.0,
+        "max_pairs": 5005,
+        "output_directory": folder / backend,
+    }
     parameters = [word for name, value in options.items() for word in ("-p", f"{name}:={value}")]
     node = start(
         domain, __file__, "--node", report, "--ros-args", "--log-level", "warn", *parameters
@@ -297,15 +306,30 @@ def soak(hours):
         del poses
         history.append((resident_mb(), solve_s, p99, result))
         error = np.linalg.norm(result.T_parent_child[:3, 3] - T_PARENT_CHILD[:3, 3])
-        print(f"hour {hour + 1}: {history[-1][0]:.1f} MB, solve {solve_s * 1e3:.0f} ms, per pose p99 {p99 * 1e6:.1f} us, {result.n_poses} poses, error {error * 1e3:.2f} mm", flush=True)  # fmt: skip
+        print(
+            f"hour {hour + 1}: {history[-1][0]:.1f} MB, solve {solve_s * 1e3:.0f} ms, per "
+            f"pose p99 {p99 * 1e6:.1f} us, {result.n_poses} poses, error "
+            f"{error * 1e3:.2f} mm",
+            flush=True,
+        )
     (first_mb, first_solve, _, _), (last_mb, last_solve, _, result) = history[0], history[-1]
     growth, slowdown = last_mb / first_mb - 1, last_solve / first_solve
     return [
-        (f"memory after 1 h, {hours} h (MB)", f"{first_mb:.1f}, {last_mb:.1f}", "within 10 %", growth < MOST_GROWTH),
-        ("solve after the first, last hour (ms)", f"{first_solve * 1e3:.0f}, {last_solve * 1e3:.0f}", "flat", slowdown < MOST_SLOWDOWN),
+        (
+            f"memory after 1 h, {hours} h (MB)",
+            f"{first_mb:.1f}, {last_mb:.1f}",
+            "within 10 %",
+            growth < MOST_GROWTH,
+        ),
+        (
+            "solve after the first, last hour (ms)",
+            f"{first_solve * 1e3:.0f}, {last_solve * 1e3:.0f}",
+            "flat",
+            slowdown < MOST_SLOWDOWN,
+        ),
         ("per pose p99, worst hour (us)", f"{worst * 1e6:.1f}", "< 50", worst < 50e-6),
         ("poses kept", str(result.n_poses), "<= 5000", result.n_poses <= 5000),
-    ]  # fmt: skip
+    ]
 
 
 def _timed(work):
@@ -416,10 +440,26 @@ def fingerprints(folder):
 def start_logged(domain, output, log, journal):
     with log.open("wb") as file:
         return subprocess.Popen(
-            [sys.executable, "-m", "hand_eye_calib", "calibrator", "--ros-args",
-             *("-p", f"output_directory:={output}", "-p", f"journal:={journal}", "-p", "solve_period:=0.5")],
-            env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}, cwd=PROJECT, stdout=file, stderr=file,
-        ), log  # fmt: skip
+            [
+                sys.executable,
+                "-m",
+                "hand_eye_calib",
+                "calibrator",
+                "--ros-args",
+                *(
+                    "-p",
+                    f"output_directory:={output}",
+                    "-p",
+                    f"journal:={journal}",
+                    "-p",
+                    "solve_period:=0.5",
+                ),
+            ],
+            env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"},
+            cwd=PROJECT,
+            stdout=file,
+            stderr=file,
+        ), log
 
 
 def wait_for(log, text):

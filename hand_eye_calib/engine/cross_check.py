@@ -61,7 +61,8 @@ class Consistency:
             ("the two halves of the drive disagree", self.of_halves, self.excess_of_halves),
         )
         return tuple(
-            f"{what} by more than the stated standard deviations allow, in {', '.join(self._told(spread, far))}: trust the larger number"
+            f"{what} by more than the stated standard deviations allow, in "
+            f"{', '.join(self._told(spread, far))}: trust the larger number"
             for what, spread, excess in found
             if (far := np.flatnonzero(excess > _TOO_FAR)).size
         )
@@ -80,7 +81,10 @@ class Consistency:
     def _told(self, spread, far):
         for k in far:
             unit, factor = ("m", 1.0) if k < 3 else ("deg", np.degrees(1.0))
-            yield f"{self.axes[k]} ({factor * spread[k]:.2g} {unit} against {factor * self.sigma[k]:.2g})"
+            yield (
+                f"{self.axes[k]} ({factor * spread[k]:.2g} {unit} against "
+                f"{factor * self.sigma[k]:.2g})"
+            )
 
 
 def consistency(calibration, others=(), halves=()):

@@ -50,8 +50,8 @@ def _of_trajectories(calibration: Calibration, evidence: Evidence) -> str:
     factor, unit = time_axis(tracks.times_s[-1])
     return (
         f"The path of {calibration.parent_frame}, {length(path_m)} long, and the same path "
-        f"computed from the poses of {calibration.child_frame} and the result. Half of the time they are "
-        f"within {length(float(np.median(apart)))} of each other, and at most "
+        f"computed from the poses of {calibration.child_frame} and the result. Half of the time "
+        f"they are within {length(float(np.median(apart)))} of each other, and at most "
         f"{length(apart[farthest])} apart, at {tracks.times_s[farthest] * factor:.1f} {unit}. "
         "That includes drift and jumps of both odometries."
     )

@@ -89,7 +89,7 @@ class StampGuard:
         return (Verdict.JUMPED_BACK if jumped_back and not followed else Verdict.TAKE), confirmed
 
     def restart(self, now_s: float | None = None) -> None:
-        """Begin a new session; with ``now_s`` (steady time) because another stream has jumped back."""
+        """Begin a new session; ``now_s`` (steady time) if another stream has jumped back."""
         if now_s is None:
             self.last_ns, self._outdated_until_s = None, None
             self._discard()

@@ -168,9 +168,9 @@ class PoseBag:
         """Choose the sources of the parent's and the child's poses.
 
         What is not named is chosen if there is only one way to do it: with neither named, the bag
-        has exactly two topics of poses. The parent is the one whose name has the word parent, base or
-        lidar, or the first in alphabetical order.
-        Topics of paths count if there are not enough others.
+        has exactly two topics of poses. The parent is the one whose name has the word parent, base
+        or lidar, or the first in alphabetical order. Topics of paths count if there are not enough
+        others.
 
         Parameters
         ----------
