@@ -1,1 +1,1 @@
-"""The command line: thin commands over the engine that the node uses too."""
+"""The command line: one command per file, over the same engine as the node."""

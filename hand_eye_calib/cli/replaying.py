@@ -99,12 +99,7 @@ def replay(
     calibrator = Calibrator(config)
     convergence = Convergence(calibrator, every_s) if every_s else None
     with PoseBag(*paths) as bag:
-        sources = dict(zip(_STREAMS, bag.select_topics(parent, child), strict=True))
-        if not (parent and child):
-            output.note(
-                f"parent is {sources['parent']}, child is {sources['child']}; to change that, give "
-                "--parent-topic and --child-topic"
-            )
+        sources = _sources(bag, parent, child, output)
         warnings = _read(bag, sources, calibrator, convergence, output)
         files = bag.files()
     for text in warnings:
@@ -112,11 +107,34 @@ def replay(
     with output.waiting_for("solving"):
         calibration = calibrator.estimate()
     calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *warnings))
-    inputs: dict[str, Any] = {"bag": str(bag), "options": calibrator.config.to_options()}
-    for stream, source in sources.items():
-        inputs[stream] = {"topic": str(source), **_counts(calibrator.statistics(stream))}
+    inputs = {"bag": str(bag), **_inputs(calibrator, sources)}
     history = convergence.history if convergence else []
     return Replayed(calibration, inputs, files, calibrator, history)
+
+
+def _sources(
+    bag: "PoseBag",
+    parent: "str | TfSource | None",
+    child: "str | TfSource | None",
+    output: _Output,
+) -> dict[str, Any]:
+    """Topic or frames of each stream; a note if the bag left no choice."""
+    sources = dict(zip(_STREAMS, bag.select_topics(parent, child), strict=True))
+    if not (parent and child):
+        output.note(
+            f"parent is {sources['parent']}, child is {sources['child']}; to change that, give "
+            "--parent-topic and --child-topic"
+        )
+    return sources
+
+
+def _inputs(calibrator: Calibrator, sources: Mapping[str, Any]) -> dict[str, Any]:
+    """Options and streams in plain values."""
+    streams = {
+        stream: {"topic": str(source), **_counts(calibrator.statistics(stream))}
+        for stream, source in sources.items()
+    }
+    return {"options": calibrator.config.to_options(), **streams}
 
 
 def _read(

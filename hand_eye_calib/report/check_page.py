@@ -46,22 +46,11 @@ def render_check(
     -------
     str
     """
-    svg = said = aligned = ""
     # Without any correlation the streams were not looked at: they are too short, or their stamps
     # are in doubt.
-    if checked.correlation.overlap_s:
-        offset_s = checked.correlation.offset_s if checked.correlation.is_clear else 0.0
-        if abs(offset_s) >= _SHOWN_S:
-            aligned = (
-                f" In the figure {offset_s:.3f} s are added to the child's stamps: with that "
-                "offset both have the same angular rate."
-            )
-        seen = see_streams(parent, child.shifted(offset_s), max_gap_s)
-        svg, said = draw_streams(seen, ("parent", "child")), of_streams(seen)
-    severities = {finding.severity for finding in findings}
-    tone = "bad" if Severity.ERROR in severities else "good"
-    if tone == "good" and Severity.WARNING in severities:
-        tone = "warn"
+    is_seen = bool(checked.correlation.overlap_s)
+    svg, said = _figure(parent, child, checked, max_gap_s) if is_seen else ("", "")
+    tone = _tone(findings)
     mark, verdict = _VERDICTS[tone]
     return (
         environment()
@@ -75,6 +64,27 @@ def render_check(
             title=TITLES["streams"],
             svg=svg,
             said=said,
-            aligned=aligned,
         )
     )
+
+
+def _figure(
+    parent: Trajectory, child: Trajectory, checked: CheckResult, max_gap_s: float
+) -> tuple[str, str]:
+    """SVG and caption of both streams, with the time offset that was found."""
+    offset_s = checked.correlation.offset_s if checked.correlation.is_clear else 0.0
+    seen = see_streams(parent, child.shifted(offset_s), max_gap_s)
+    caption = of_streams(seen)
+    if abs(offset_s) >= _SHOWN_S:
+        caption += (
+            f" In the figure {offset_s:.3f} s are added to the child's stamps: with that offset "
+            "both have the same angular rate."
+        )
+    return draw_streams(seen, ("parent", "child")), caption
+
+
+def _tone(findings: Sequence[Finding]) -> str:
+    severities = {finding.severity for finding in findings}
+    if Severity.ERROR in severities:
+        return "bad"
+    return "warn" if Severity.WARNING in severities else "good"

@@ -79,28 +79,15 @@ def render(
     -------
     str
     """
-    svgs = draw_all(calibration, evidence)
-    texts = captions(calibration, evidence)
-    document = calibration.to_dict()
     inputs = inputs or {}
     return (
         environment()
         .get_template("report.html")
         .render(
-            calibration=calibration,
-            parent=printable(calibration.parent_frame),
-            child=printable(calibration.child_frame),
-            document=document,
-            verdict=_verdict(calibration),
-            badge=_badge(calibration),
-            directions=[_direction(document[key]) for key in ("T_parent_child", "T_child_parent")],
-            axes=_axes(calibration),
+            **_result(calibration),
             advice=what_is_missing(evidence.excitation, calibration),
             command=command,
-            figures=[
-                {"name": name, "title": title, "said": texts[name], "svg": svgs.get(name)}
-                for name, title in TITLES.items()
-            ],
+            figures=_figures(calibration, evidence),
             findings=list(findings),
             summary=_summary(calibration, evidence),
             streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
@@ -108,6 +95,30 @@ def render(
             options={name: value for name, value in config.to_options().items() if value != ""},
         )
     )
+
+
+def _result(calibration: Calibration) -> dict[str, Any]:
+    """What the page says of the result alone."""
+    document = calibration.to_dict()
+    return {
+        "calibration": calibration,
+        "parent": printable(calibration.parent_frame),
+        "child": printable(calibration.child_frame),
+        "document": document,
+        "verdict": _verdict(calibration),
+        "badge": _badge(calibration),
+        "directions": [_direction(document[key]) for key in ("T_parent_child", "T_child_parent")],
+        "axes": _axes(calibration),
+    }
+
+
+def _figures(calibration: Calibration, evidence: Evidence) -> list[dict[str, Any]]:
+    svgs = draw_all(calibration, evidence)
+    texts = captions(calibration, evidence)
+    return [
+        {"name": name, "title": title, "said": texts[name], "svg": svgs.get(name)}
+        for name, title in TITLES.items()
+    ]
 
 
 def environment() -> jinja2.Environment:
