@@ -21,6 +21,7 @@ _HOMES = {
     "SolveStatus": "calibration",
     "Trajectory": "geometry.trajectory",
     "calibrate": "engine.offline",
+    "cross_check": "engine.cross_check",
     "load": "io.results",
     "read_trajectory": "io.trajectory_files",
     "save": "io.results",
@@ -38,6 +39,7 @@ __all__ = [
     "SolveStatus",
     "Trajectory",
     "calibrate",
+    "cross_check",
     "load",
     "read_trajectory",
     "save",
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.calibration import Calibration, Residuals, SolveStatus
     from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.engine.calibrator import Calibrator
+    from hand_eye_calib.engine.cross_check import cross_check
     from hand_eye_calib.engine.offline import calibrate
     from hand_eye_calib.errors import HandEyeCalibError
     from hand_eye_calib.geometry.trajectory import Trajectory

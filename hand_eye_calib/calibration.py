@@ -42,7 +42,7 @@ _PLAIN_LATER = (
     "scale_sigma",
     "reference_reason",
     "noise",
-    "consistency",
+    "cross_check",
 )
 
 # Motion pairs with more weight than this count as inliers.
@@ -166,9 +166,9 @@ class Calibration:
         Why ``auto`` chose the reference; empty if it was given.
     noise : dict or None
         Noise of the trajectories as the adaptive estimator found it; None with other methods.
-    consistency : dict or None
-        Per axis, how far the answers of other methods and references and of the two halves of the
-        recording lie from this one (:class:`~hand_eye_calib.engine.cross_check.Consistency`); None
+    cross_check : dict or None
+        Per axis, the scatter of the answers of other methods and references and of both halves of
+        the recording about this one (:class:`~hand_eye_calib.engine.cross_check.CrossCheck`); None
         without that cross-check.
     stamp_ns : int
         Stamp of the newest pose used, parent clock.
@@ -197,7 +197,7 @@ class Calibration:
     scale_sigma: float = 0.0
     reference_reason: str = ""
     noise: dict[str, Any] | None = None
-    consistency: dict[str, Any] | None = None
+    cross_check: dict[str, Any] | None = None
     stamp_ns: int = 0
     parent_frame: str = "parent"
     child_frame: str = "child"
@@ -327,6 +327,8 @@ class Calibration:
                 f"expected format {_FORMAT}, version {_VERSION}; "
                 f"found format {found[0]}, version {found[1]}"
             )
+        # Version 0.1 had another name for it.
+        later: dict[str, Any] = {"cross_check": data.get("consistency")} | dict(data)
         try:
             return cls(
                 T_parent_child=_matrix(data["T_parent_child"], 4),
@@ -341,7 +343,7 @@ class Calibration:
                 ),
                 warnings=tuple(data["warnings"]),
                 **{name: data[name] for name in _PLAIN},
-                **{name: data[name] for name in _PLAIN_LATER if name in data},
+                **{name: later[name] for name in _PLAIN_LATER if name in later},
             )
         except KeyError as error:
             raise InputError(f"the calibration has no {error}: restore or repeat it") from None

@@ -39,7 +39,7 @@ from hand_eye_calib.cli.findings import with_findings
 from hand_eye_calib.cli.listing import print_table
 from hand_eye_calib.cli.options import Options, options_from, read_yaml
 from hand_eye_calib.cli.replaying import fingerprints, replay
-from hand_eye_calib.cli.reporting import REPORT, can_draw, rendered, save_page, with_consistency
+from hand_eye_calib.cli.reporting import REPORT, can_draw, rendered, save_page, with_cross_check
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.report.words import with_sigma
@@ -286,7 +286,7 @@ def _calibrated(task: Task) -> Outcome:
         replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
     snapshot = replayed.calibrator.snapshot()
     calibration, findings = with_findings(replayed.calibration, snapshot)
-    calibration, evidence = with_consistency(calibration, snapshot)
+    calibration, evidence = with_cross_check(calibration, snapshot)
     found: Outcome = {
         "calibration": calibration.to_dict(),
         "findings": findings,

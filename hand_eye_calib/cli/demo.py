@@ -96,13 +96,13 @@ def run(arguments: argparse.Namespace) -> int:
 def _write_report(
     out: Path, bag_path: Path, calibrator: "Calibrator", offline: "Calibration"
 ) -> None:
-    from hand_eye_calib.cli.reporting import with_consistency, write_report
+    from hand_eye_calib.cli.reporting import with_cross_check, write_report
 
     inputs: dict[str, Any] = {"bag": str(bag_path)}
     inputs |= {stream: {"topic": topic} for stream, topic in TOPICS.items()}
     snapshot = calibrator.snapshot()
     with waiting_for("cross-checks with other methods and halves of the recording"):
-        calibration, evidence = with_consistency(offline, snapshot)
+        calibration, evidence = with_cross_check(offline, snapshot)
     write_report(out, calibration, evidence, snapshot.config, inputs)
 
 

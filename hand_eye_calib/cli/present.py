@@ -10,7 +10,7 @@ import numpy as np
 from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
-from hand_eye_calib.cli.reporting import with_consistency, write_report
+from hand_eye_calib.cli.reporting import with_cross_check, write_report
 from hand_eye_calib.cli.spelling import as_typed
 from hand_eye_calib.report.words import given_or_estimated, listing, printable, with_sigma
 
@@ -62,7 +62,7 @@ def deliver(
 
         if snapshot is not None:
             with waiting_for("cross-checks with other methods and halves of the recording"):
-                calibration, evidence = with_consistency(calibration, snapshot)
+                calibration, evidence = with_cross_check(calibration, snapshot)
         keep_earlier_results(arguments.out)
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
     print(as_json(calibration, inputs=inputs, **more) if arguments.json else as_text(calibration))
@@ -93,7 +93,7 @@ def as_text(calibration: Calibration) -> str:
         f"Pose of {parent} (parent) in {child} (child): maps coordinates of {parent} into {child}",
         *_transform_lines(document["T_child_parent"]),
         f"Along and about the axes of {parent}: {_observability(calibration)}",
-        *_scatter_lines(calibration.consistency),
+        *_scatter_lines(calibration.cross_check),
         *_solution_lines(calibration),
         *_publishing_lines(calibration),
     ]
@@ -144,14 +144,14 @@ def _observability(calibration: Calibration) -> str:
     return "; ".join(texts)
 
 
-def _scatter_lines(consistency: Mapping[str, Mapping[str, Any]] | None) -> Iterator[str]:
+def _scatter_lines(cross_check: Mapping[str, Mapping[str, Any]] | None) -> Iterator[str]:
     """How far other answers to the same question scatter about the result."""
-    for kind, title in _SCATTER.items() if consistency else ():
+    for kind, title in _SCATTER.items() if cross_check else ():
         told = [
             f"{axis} {np.degrees(row[kind]):.2g} deg"
             if axis in _ROTATIONS
             else f"{axis} {row[kind]:.2g} m"
-            for axis, row in (consistency or {}).items()
+            for axis, row in (cross_check or {}).items()
             if row[kind] is not None
         ]
         if told:

@@ -11,10 +11,7 @@ from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.cross_check import consistency
-from hand_eye_calib.engine.estimation import estimate_extrinsic
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.methods import METHODS
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.evidence import Evidence
@@ -24,7 +21,7 @@ REPORT, CHECK = "report.html", "check.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 
 
-def with_consistency(
+def with_cross_check(
     calibration: Calibration, snapshot: "Snapshot"
 ) -> "tuple[Calibration, Evidence]":
     """Cross-check a calibration with other methods, other references and the two halves of the
@@ -49,15 +46,10 @@ def with_consistency(
     config = dataclasses.replace(snapshot.config, time_offset=calibration.time_offset_s)
     pose_pairs = dataclasses.replace(snapshot, config=config).pose_pairs()
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True))
-    evidence = gather(calibration, snapshot.config, pose_pairs, estimate_extrinsic, streams)
-    others = [one.calibration for one in evidence.comparison]
-    halves = [one.calibration for one in evidence.halves]
-    # If there are jumps, methods that use every pair disagree for a reason that says nothing about
-    # the result.
-    robust = [other for other in others if METHODS[other.method].rejects_outliers]
-    found = consistency(calibration, robust, halves)
+    evidence = gather(calibration, snapshot.config, pose_pairs, streams)
+    found = evidence.cross_check
     warnings = (*calibration.warnings, *found.warnings())
-    checked = dataclasses.replace(calibration, consistency=found.to_dict(), warnings=warnings)
+    checked = dataclasses.replace(calibration, cross_check=found.to_dict(), warnings=warnings)
     return checked, evidence
 
 
@@ -137,7 +129,7 @@ def rendered(
     Parameters
     ----------
     calibration, evidence
-        As :func:`with_consistency` returns them.
+        As :func:`with_cross_check` returns them.
     config : CalibratorConfig
         The options that gave the result.
     inputs : dict

@@ -8,7 +8,8 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.engine.evidence import Estimate, Evidence, StreamsSeen
+from hand_eye_calib.engine.answers import Answer
+from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.words import counted, length, listing, share, size
 
@@ -106,7 +107,7 @@ def _of_convergence(calibration: Calibration, evidence: Evidence) -> str:
     )
 
 
-def _settled_from(calibration: Calibration, estimates: Sequence[Estimate], known: BoolArray) -> int:
+def _settled_from(calibration: Calibration, estimates: Sequence[Answer], known: BoolArray) -> int:
     """Index of the estimate from which on all lie near the result."""
     moved = np.array(
         [deviation(one.calibration.T_parent_child, calibration.T_parent_child) for one in estimates]
@@ -116,7 +117,7 @@ def _settled_from(calibration: Calibration, estimates: Sequence[Estimate], known
     return 0 if near.all() else len(near) - int(np.argmin(near[::-1]))
 
 
-def _last_change(calibration: Calibration, estimates: Sequence[Estimate], known: BoolArray) -> str:
+def _last_change(calibration: Calibration, estimates: Sequence[Answer], known: BoolArray) -> str:
     late = estimates[max(len(estimates) * 7 // 10 - 1, 0)]
     moved = deviation(late.calibration.T_parent_child, calibration.T_parent_child)
     rest = 1 - late.until_s / estimates[-1].until_s
@@ -124,14 +125,14 @@ def _last_change(calibration: Calibration, estimates: Sequence[Estimate], known:
 
 
 def _of_excitation(calibration: Calibration, evidence: Evidence) -> str:
-    seen, turning = evidence.excitation, evidence.turning
-    if not len(turning.times_s):
+    seen, rotations = evidence.excitation, evidence.rotations
+    if not len(rotations.times_s):
         return "The poses are too far apart to show the rotations."
-    over = np.degrees(np.percentile(np.abs(turning.vectors), 95, axis=0))
+    over = np.degrees(np.percentile(np.abs(rotations.vectors), 95, axis=0))
     angles = [f"{angle:.1f}° in {name}" for angle, name in zip(over, AXES[3:], strict=True)]
     least = "xyz"[int(np.argmax(np.abs(seen.worst)))]
     return (
-        f"Rotation within {turning.span_s:.1f} s: up to {listing(angles)} (95 % of the time less). "
+        f"Rotation within {rotations.span_s:.1f} s: up to {listing(angles)} (95 % of the time less). "
         f"The lever arm along {least} is observed least: an error of 1 cm in it moves a motion by "
         f"{seen.worst_gain:.2g} cm, an error of 1 cm along the best observed axis by "
         f"{seen.gain.max():.2g} cm. Rotations inside the grey band say little about a lever arm."
@@ -185,7 +186,7 @@ def _of_halves(calibration: Calibration, evidence: Evidence) -> str:
     missing = f" Half of the recording does not determine {listing(less)}." if less else ""
     return (
         f"From each half alone, without priors: they differ by {_largest(apart, known)}, "
-        f"{_judged(apart[known], joint[known], np.array(AXES)[known])}.{missing}"
+        f"{_judged(apart[known], joint[known], np.array(AXES)[known].tolist())}.{missing}"
         f"{_downsampled(evidence.halves)}"
     )
 
@@ -205,7 +206,7 @@ def _judged(apart: FloatArray, joint: FloatArray, names: Sequence[str]) -> str:
     )
 
 
-def of_streams(seen: StreamsSeen) -> str:
+def of_streams(seen: StreamView) -> str:
     """Caption of the figure of both streams."""
     text = (
         "Two sensors on one rigid body have the same angular rate at every moment. Each motion "
@@ -220,8 +221,8 @@ def of_streams(seen: StreamsSeen) -> str:
         f"Here half of the {len(seen.angles)} motions over {seen.lag_s:g} s differ by less than "
         f"{size(float(np.median(apart)), 'yaw')}"
     )
-    if len(seen.slides):
-        text += f" and {size(float(np.median(np.abs(np.diff(seen.slides, axis=1)))), 'x')}"
+    if len(seen.along_axis):
+        text += f" and {size(float(np.median(np.abs(np.diff(seen.along_axis, axis=1)))), 'x')}"
     gaps = [counted(len(spans) - 1, "gap") for spans in seen.spans_s]
     return (
         f"{text}. The bars below the curves show when there are poses: {gaps[0]} in the parent "
@@ -240,7 +241,7 @@ _CAPTIONS: dict[str, Caption] = {
 }
 
 
-def _downsampled(estimates: Sequence[Estimate]) -> str:
+def _downsampled(estimates: Sequence[Answer]) -> str:
     """A remark if not all poses were used."""
     stride = max(one.stride for one in estimates)
     if stride == 1:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.evidence import see_streams
+from hand_eye_calib.engine.evidence import view_streams
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, of_streams
 from hand_eye_calib.report.report import environment
@@ -73,7 +73,7 @@ def _figure(
 ) -> tuple[str, str]:
     """SVG and caption of both streams, with the time offset that was found."""
     offset_s = checked.correlation.offset_s if checked.correlation.is_clear else 0.0
-    seen = see_streams(parent, child.shifted(offset_s), max_gap_s)
+    seen = view_streams(parent, child.shifted(offset_s), max_gap_s)
     caption = of_streams(seen)
     if abs(offset_s) >= _SHOWN_S:
         caption += (

@@ -18,7 +18,7 @@ from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import MIN_ROTATION
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.engine.evidence import Evidence, StreamsSeen
+from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.report.captions import time_axis
 from hand_eye_calib.report.style import drawing_style, house_style, plain_decades
 from hand_eye_calib.report.words import printable
@@ -87,12 +87,12 @@ def draw_all(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         return {name: _svg(figure, name) for name, figure in drawn.items() if figure}
 
 
-def draw_streams(seen: StreamsSeen, names: tuple[str, str]) -> str:
+def draw_streams(seen: StreamView, names: tuple[str, str]) -> str:
     """SVG of both streams before any solve.
 
     Parameters
     ----------
-    seen : StreamsSeen
+    seen : StreamView
     names : (str, str)
         Of the parent and the child.
     """
@@ -255,17 +255,17 @@ def _draw_convergence(
 
 
 def _excitation(calibration: Calibration, evidence: Evidence) -> Figure | None:
-    turning = evidence.turning
-    if not len(turning.times_s):
+    rotations = evidence.rotations
+    if not len(rotations.times_s):
         return None
     factor, unit = time_axis(evidence.tracks.times_s[-1])
-    shown = _downsample(len(turning.times_s), _MOST_ON_A_LINE)
+    shown = _downsample(len(rotations.times_s), _MOST_ON_A_LINE)
     figure, panels = _figure(4.2, 3, 1, left=0.8, bottom=0.5, between=0.15, top=0.1, sharex=True)
     enough = np.degrees(MIN_ROTATION)
     for index, panel in enumerate(panels):
-        values = np.degrees(turning.vectors[shown, index])
+        values = np.degrees(rotations.vectors[shown, index])
         panel.axhspan(-enough, enough, color=MUTED, alpha=0.16, lw=0)
-        panel.plot(turning.times_s[shown] * factor, values, color=PARENT, lw=1.2)
+        panel.plot(rotations.times_s[shown] * factor, values, color=PARENT, lw=1.2)
         limit = 1.1 * max(np.abs(values).max(), 1.3 * enough)
         panel.set(ylim=(-limit, limit), ylabel=f"{AXES[3 + index]}\nabout {'xyz'[index]} (deg)")
     panels[2].set_xlabel(f"time ({unit})")
@@ -348,7 +348,7 @@ def _relative_to(
     return np.array(moved) * _FACTORS, np.array(sigmas) * _FACTORS
 
 
-def _streams(seen: StreamsSeen, names: tuple[str, str]) -> Figure:
+def _streams(seen: StreamView, names: tuple[str, str]) -> Figure:
     factor, unit = time_axis(max(times[-1] if len(times) else 0.0 for times, _ in seen.rates))
     height = 6.6
     figure = Figure(figsize=(WIDTH, height))
@@ -363,21 +363,23 @@ def _streams(seen: StreamsSeen, names: tuple[str, str]) -> Figure:
     _draw_rates(rate, strip, seen, names, factor)
     strip.set_xlabel(f"time ({unit})")
     half = (across - 0.75) / 2
-    angles, slides = (panel(0.8 + n * (half + 0.75), 0.55, half, 2.9) for n in range(2))
+    angles, along_axis = (panel(0.8 + n * (half + 0.75), 0.55, half, 2.9) for n in range(2))
     angles.set(
         title=f"Rotation angle of motions over {seen.lag_s:g} s",
         xlabel="parent (deg)",
         ylabel="child (deg)",
     )
-    slides.set(title="Translation along the rotation axis", xlabel="parent (m)", ylabel="child (m)")
+    along_axis.set(
+        title="Translation along the rotation axis", xlabel="parent (m)", ylabel="child (m)"
+    )
     _identity(angles, np.degrees(seen.angles))
     # On flat ground nothing moves along the axis, and noise should not look like motion.
-    _identity(slides, seen.slides, _NOISE_SHARE * seen.moved_m)
+    _identity(along_axis, seen.along_axis, _NOISE_SHARE * seen.rms_translation)
     return figure
 
 
 def _draw_rates(
-    rate: Axes, strip: Axes, seen: StreamsSeen, names: tuple[str, str], factor: float
+    rate: Axes, strip: Axes, seen: StreamView, names: tuple[str, str], factor: float
 ) -> None:
     """Angular rates of both streams, and below them when there are poses."""
     looks = ((PARENT, 2.6), (CHILD, 1.0))

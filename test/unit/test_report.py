@@ -20,9 +20,8 @@ from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE, NOISE
 from hand_eye_calib.cli.present import static_transform_command
-from hand_eye_calib.cli.reporting import with_consistency, write_report
-from hand_eye_calib.engine import evidence
-from hand_eye_calib.engine.estimation import estimate_extrinsic
+from hand_eye_calib.cli.reporting import with_cross_check, write_report
+from hand_eye_calib.engine import answers, evidence
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -87,9 +86,7 @@ def page_of(snapshot, calibration, **more):
     if calibration.status is SolveStatus.OK:
         more.setdefault("command", static_transform_command(calibration))
     streams = more.pop("streams", None)
-    found = evidence.gather(
-        calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic, streams
-    )
+    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), streams)
     text = render(calibration, snapshot.config, found, **more)
     return text, Page(text)
 
@@ -238,7 +235,7 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
         offline_config(drive.parent, drive.child, options), drive.parent, drive.child
     )
     calibration = snapshot.estimate()
-    write_report(tmp_path, *with_consistency(calibration, snapshot), snapshot.config, {})
+    write_report(tmp_path, *with_cross_check(calibration, snapshot), snapshot.config, {})
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
     assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]
@@ -248,7 +245,7 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
 
 def test_outliers_shown_are_those_the_solver_left_out(hilly):
     snapshot, calibration, _, _ = hilly
-    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic)
+    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs())
     assert found.residuals.is_outlier.sum() == calibration.n_pairs - calibration.n_inliers > 0
     cost = found.residuals.translation_m**2 + 4 * (1 - np.cos(found.residuals.rotation_rad))
     assert cost[found.residuals.is_outlier].min() > snapshot.config.threshold
@@ -258,7 +255,7 @@ def test_outliers_shown_are_those_the_solver_left_out(hilly):
 def test_evidence_ends_at_the_result_and_halves_are_halves(hilly):
     snapshot, calibration, _, _ = hilly
     pose_pairs = snapshot.pose_pairs()
-    found = evidence.gather(calibration, snapshot.config, pose_pairs, estimate_extrinsic)
+    found = evidence.gather(calibration, snapshot.config, pose_pairs)
     assert found.convergence[-1].calibration is calibration
     parts = [one.calibration.n_poses for one in found.convergence]
     assert parts == sorted(parts)
@@ -299,21 +296,19 @@ def test_tracks_of_perfect_odometry_coincide():
     )
     calibration = hec.calibrate(parent, child, parent_frame="a", child_frame="b", reference="B1")
     config = offline_config(parent, child, {"reference": "B1"})
-    found = evidence.gather(
-        calibration, config, synchronise(parent, child, 0.5), estimate_extrinsic
-    )
+    found = evidence.gather(calibration, config, synchronise(parent, child, 0.5))
     np.testing.assert_allclose(found.tracks.child, found.tracks.parent, atol=1e-7)
     np.testing.assert_allclose(found.residuals.translation_m, 0, atol=1e-7)
     np.testing.assert_allclose(deviation(calibration.T_parent_child, X), 0, atol=1e-6)
 
 
-def test_long_drives_are_thinned(monkeypatch):
+def test_long_recordings_are_downsampled(monkeypatch):
     snapshot, calibration = simulated(poses=400, reference="B10")
     for name, many, few in (("dnlo", 50, 100), ("adaptive", 60, 60)):
         smaller = dict(most_poses_of_many=many, most_poses_of_few=few)
         monkeypatch.setitem(METHODS, name, dataclasses.replace(METHODS[name], **smaller))
-    monkeypatch.setattr(evidence, "_MOST_POSES_OF_OTHERS", 100)
-    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), estimate_extrinsic)
+    monkeypatch.setattr(answers, "_MAX_POSES_OF_OTHERS", 100)
+    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs())
     assert max(one.calibration.n_poses for one in found.convergence[:-1]) <= 50
     assert max(one.calibration.n_poses for one in (*found.halves, *found.comparison)) <= 100
     assert [half.calibration.reference for half in found.halves] == [
@@ -354,7 +349,7 @@ def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
     page = Page((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     saved = hec.load(tmp_path / "out")
     assert (static_transform_command(saved) in page.text) == (saved.status == "ok")
-    assert list(saved.consistency) == [dof.name for dof in saved.observability]
+    assert list(saved.cross_check) == [dof.name for dof in saved.observability]
     # Names of the files, not of the folders: the page goes to customers.
     assert all(Path(file).name in page.text for file in files)
     assert str(tmp_path) not in page.text
@@ -381,14 +376,14 @@ def test_without_out_nothing_is_drawn(files, capsys, monkeypatch):
 
 def test_streams_are_shown_on_one_clock_and_in_one_unit():
     drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=200))
-    seen = evidence.see_streams(drive.parent, drive.child, 0.5)
+    seen = evidence.view_streams(drive.parent, drive.child, 0.5)
     assert np.median(np.abs(np.diff(seen.angles, axis=1))) < 1e-3
-    assert np.median(np.abs(np.diff(seen.slides, axis=1))) < 5e-3
-    assert np.ptp(seen.slides) > 0.1
+    assert np.median(np.abs(np.diff(seen.along_axis, axis=1))) < 5e-3
+    assert np.ptp(seen.along_axis) > 0.1
     (times_p, rates_p), (times_c, rates_c) = seen.rates
     assert np.median(np.abs(np.interp(times_p, times_c, rates_c) - rates_p)) < 0.01 < rates_p.max()
     assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
-    holed = evidence.see_streams(drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5)
+    holed = evidence.view_streams(drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5)
     assert [len(spans) for spans in holed.spans_s] == [1, 2]
 
 

@@ -1,0 +1,173 @@
+"""Other answers to the same question: from parts of the recording, and from other methods and
+references.
+
+Long recordings are downsampled before they are solved again, so that all answers together take
+seconds.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.estimation import estimate_extrinsic
+from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.methods import METHODS
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+# Methods that a result is compared with, at these baselines and with at most so many poses; and the
+# method without a reference.
+_COMPARED_METHODS = ("dnlo", "dnl", "park")
+_COMPARED_BASELINES = (1, 5, 10, 20)
+_MAX_POSES_OF_OTHERS = 3_000
+_COMPARED_ESTIMATOR = "adaptive"
+
+_MIN_POSES = 20
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Another answer to the same question.
+
+    Attributes
+    ----------
+    label : str
+        Method and reference, or part of the recording.
+    until_s : float
+        Seconds from the first pose of the recording to the last one used.
+    calibration : Calibration
+    stride : int
+        One pose in so many was used.
+    """
+
+    label: str
+    until_s: float
+    calibration: Calibration
+    stride: int = 1
+
+
+@dataclass(frozen=True)
+class _Question:
+    label: str
+    part: slice
+    config: CalibratorConfig
+
+
+class OtherAnswers:
+    """Solves the same question again. Answers with too few data are left out.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The result. Its time offset and scale are used in every other answer.
+    config : CalibratorConfig
+        The options that gave it.
+    pose_pairs : PosePairs
+        The poses that gave it, on one clock, each stream in its own unit of length.
+    """
+
+    def __init__(
+        self, calibration: Calibration, config: CalibratorConfig, pose_pairs: PosePairs
+    ) -> None:
+        self._calibration, self._poses = calibration, pose_pairs
+        self._config = replace(
+            config,
+            time_offset=calibration.time_offset_s,
+            scale=calibration.scale,
+            backend="fast",
+        )
+        no_prior: dict[str, Any] = {name: "" for name in vars(config) if name.startswith("prior_")}
+        self._without_prior = replace(self._config, **no_prior)
+
+    def growing(self) -> tuple[Answer, ...]:
+        """From the first part of the recording, the first two ... to all of it, with the prior."""
+        method = METHODS[self._config.method]
+        ends = np.linspace(0, len(self._poses), method.parts + 1).astype(int)[1:-1]
+        questions = [_Question(str(end), slice(0, end), self._config) for end in ends]
+        last_s = self._seconds(self._poses)
+        return (
+            *self._same_method(questions, method.most_poses_of_many),
+            Answer("all", last_s, self._calibration),
+        )
+
+    def halves(self) -> tuple[Answer, ...]:
+        """From each half alone, without priors."""
+        half = len(self._poses) // 2
+        questions = [
+            _Question("first half", slice(0, half), self._without_prior),
+            _Question("second half", slice(half, None), self._without_prior),
+        ]
+        return self._same_method(questions, METHODS[self._config.method].most_poses_of_few)
+
+    def other_methods(self) -> tuple[Answer, ...]:
+        """From other methods and references, without priors."""
+        stride = _stride(len(self._poses), _MAX_POSES_OF_OTHERS)
+        own_label = f"{self._calibration.method} {self._calibration.reference}"
+        questions = [
+            _Question(
+                f"{method} B{n * stride}",
+                slice(None, None, stride),
+                replace(self._without_prior, method=method, reference=f"B{n}"),
+            )
+            for method in _COMPARED_METHODS
+            for n in _COMPARED_BASELINES
+            if n * stride * 4 < len(self._poses)
+        ]
+        questions = [question for question in questions if question.label != own_label]
+        if self._calibration.method != _COMPARED_ESTIMATOR:
+            questions.append(self._estimator_question())
+        return self._answers(questions)
+
+    def _estimator_question(self) -> _Question:
+        label = _COMPARED_ESTIMATOR
+        stride = _stride(len(self._poses), METHODS[label].most_poses_of_few)
+        config = replace(self._without_prior, method=label, reference="auto")
+        if stride > 1:
+            label = f"{label} (1 in {stride})"
+        return _Question(label, slice(None, None, stride), config)
+
+    def _same_method(self, questions: Iterable[_Question], max_poses: int) -> tuple[Answer, ...]:
+        """Answers of the result's own method, with its reference, from at most so many poses."""
+        return self._answers(self._downsampled(question, max_poses) for question in questions)
+
+    def _downsampled(self, question: _Question, max_poses: int) -> _Question:
+        start, end, _ = question.part.indices(len(self._poses))
+        stride = _stride(end - start, max_poses)
+        reference = "auto"
+        if METHODS[question.config.method].uses_reference:
+            reference = _coarser(self._calibration.reference, stride)
+        config = replace(question.config, reference=reference)
+        return replace(question, part=slice(start, end, stride), config=config)
+
+    def _answers(self, questions: Iterable[_Question]) -> tuple[Answer, ...]:
+        return tuple(filter(None, map(self._answer, questions)))
+
+    def _answer(self, question: _Question) -> Answer | None:
+        poses = self._poses[question.part]
+        if len(poses) < _MIN_POSES:
+            return None
+        try:
+            calibration = estimate_extrinsic(poses, question.config)
+        except HandEyeCalibError:
+            return None
+        stride = question.part.step or 1
+        return Answer(question.label, self._seconds(poses), calibration, stride)
+
+    def _seconds(self, poses: PosePairs) -> float:
+        """Seconds from the first pose of the recording to the last of these."""
+        return float((poses.stamps_ns[-1] - self._poses.stamps_ns[0]) * 1e-9)
+
+
+def _stride(count: int, max_count: int) -> int:
+    return max(-(-count // max_count), 1)
+
+
+def _coarser(reference: str, stride: int) -> str:
+    """The reference with about the same pairs of every ``stride``-th pose."""
+    kind, step = reference[0], reference[1:]
+    if kind not in "BC" or not step.isdecimal():
+        return reference
+    return f"{kind}{max(round(int(step) / stride), 1 if kind == 'B' else 2)}"

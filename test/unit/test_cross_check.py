@@ -1,0 +1,134 @@
+"""Cross-checks: the scatter of other answers about a result."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
+
+import hand_eye_calib as hec
+from hand_eye_calib import calibrate
+from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict
+from hand_eye_calib.engine.cross_check import compare_answers, cross_check
+from hand_eye_calib.geometry import se3
+
+
+@pytest.fixture(scope="module")
+def answers():
+    """A result, other references' answers, and its halves'."""
+    parent = wandering_poses(300)
+    child = disturbed(child_of(parent), 1, 0.003, 0.003)
+    whole = as_trajectory(parent), as_trajectory(child)
+    halves = [
+        (as_trajectory(parent[part]), as_trajectory(child[part]))
+        for part in (slice(150), slice(150, None))
+    ]
+    return (
+        calibrate(*whole, reference="B5"),
+        [calibrate(*whole, reference=reference) for reference in ("B3", "B10", "B20")],
+        [calibrate(*half, reference="B5") for half in halves],
+    )
+
+
+def moved(calibration, metres):
+    T = calibration.T_parent_child.copy()
+    T[0, 3] += metres
+    return dataclasses.replace(calibration, T_parent_child=T)
+
+
+def test_answers_to_good_data_agree(answers):
+    found = compare_answers(*answers)
+    assert found.warnings() == ()
+    assert (found.of_methods < 4 * found.sigma).all()
+    assert (found.of_halves < 4 * found.sigma).all()
+    assert (found.of_methods > 0).all()
+
+
+def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(answers):
+    calibration, others, _ = answers
+    warnings = compare_answers(calibration, [moved(other, 0.3) for other in others]).warnings()
+    assert len(warnings) == 1
+    assert "methods and references disagree" in warnings[0]
+    assert "in x (0.4" in warnings[0]  # 0.3 m is the median: 0.44 m for a normal variable
+    assert " y " not in warnings[0]
+
+
+def test_halves_that_lie_apart_are_named(answers):
+    calibration, others, (first, second) = answers
+    found = compare_answers(calibration, others, (moved(first, -0.2), moved(second, 0.2)))
+    assert found.of_halves[0] == pytest.approx(0.2, abs=0.02)
+    assert "the two halves of the recording disagree" in found.warnings()[0]
+
+
+def test_one_odd_answer_among_several_is_not_a_disagreement(answers):
+    calibration, others, _ = answers
+    assert compare_answers(calibration, [*others, moved(others[0], 5.0)]).warnings() == ()
+
+
+def test_axes_that_an_answer_does_not_know_are_not_compared():
+    parent = planar_poses(200)
+    child = disturbed(child_of(parent), 1, 1e-3, 1e-3)
+    answers = [
+        calibrate(as_trajectory(parent), as_trajectory(child), reference=reference)
+        for reference in ("B10", "B5", "B15", "B20")
+    ]
+    found = compare_answers(answers[0], answers[1:], answers[1:3])
+    assert np.isnan(found.of_methods[2])
+    assert np.isnan(found.of_halves[2])
+    assert np.isinf(found.sigma[2])
+    assert np.isfinite(found.of_methods[:2]).all()
+    assert found.to_dict()["z"] == {"sigma": None, "of_methods": None, "of_halves": None}
+
+
+def test_two_other_answers_are_too_few(answers):
+    calibration, others, _ = answers
+    assert np.isnan(compare_answers(calibration, others[:2]).of_methods).all()
+
+
+def test_an_axis_known_by_a_prior_alone_counts_with_its_sigma(answers):
+    calibration, others, _ = answers
+    known = dataclasses.replace(
+        calibration,
+        observability=(
+            DofObservability("x", DofVerdict.PRIOR, 1.0),
+            *calibration.observability[1:],
+        ),
+    )
+    assert compare_answers(known, [moved(other, 0.3) for other in others]).warnings() == ()
+
+
+def test_methods_that_use_outliers_do_not_count(answers):
+    calibration, others, _ = answers
+    plain = [dataclasses.replace(moved(other, 0.3), method="park") for other in others]
+    assert compare_answers(calibration, [*others, *plain]).warnings() == ()
+
+
+def test_the_result_keeps_it_when_written_and_read(answers):
+    calibration, others, halves = answers
+    found = compare_answers(calibration, others, halves).to_dict()
+    kept = dataclasses.replace(calibration, cross_check=found)
+    document = json.loads(json.dumps(kept.to_dict()))
+    assert Calibration.from_dict(document).cross_check == found
+    assert Calibration.from_dict(calibration.to_dict()).cross_check is None
+    # Version 0.1 called it otherwise.
+    document["consistency"] = document.pop("cross_check")
+    assert Calibration.from_dict(document).cross_check == found
+
+
+def test_from_python():
+    parent = wandering_poses(300)
+    child = disturbed(child_of(parent), 1, 0.003, 0.003)
+    streams = as_trajectory(parent), as_trajectory(child)
+    result = calibrate(*streams, reference="B5")
+    found = hec.cross_check(result, *streams)
+    assert found.axes == ("x", "y", "z", "roll", "pitch", "yaw")
+    assert (found.of_methods > 0).all()
+    assert (found.of_halves >= 0).all()
+    assert found.warnings() == ()
+    assert hec.cross_check is cross_check
+    loosened = child.copy()
+    loosened[150:] = loosened[150:] @ se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1]))
+    streams = as_trajectory(parent), as_trajectory(loosened)
+    found = hec.cross_check(calibrate(*streams, reference="B5"), *streams)
+    assert any("halves of the recording disagree" in warning for warning in found.warnings())
