@@ -123,6 +123,91 @@ def test_imports_go_one_way_and_libraries_stay_in_their_rooms():
     assert breaches(SOURCE) == []
 
 
+def modules_of(package_root):
+    """Dotted name to path of every file, without the package's name; "" is its __init__.py."""
+    names = {}
+    for path in sorted(package_root.rglob("*.py")):
+        parts = path.relative_to(package_root).with_suffix("").parts
+        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return names
+
+
+def file_imports(package_root):
+    """File to the files of the package that it imports, both as dotted names."""
+    modules = modules_of(package_root)
+    graph = {}
+    for module, path in modules.items():
+        targets = set()
+        for name in imports_of(path, package_root):
+            top, _, rest = name.partition(".")
+            if top != PACKAGE:
+                continue
+            while rest and rest not in modules:  # a name in a file rather than a file
+                rest = rest.rpartition(".")[0]
+            targets.add(rest)
+        graph[module] = targets - {module}
+    return graph
+
+
+def circles(graph):
+    """Groups of files that import each other, directly or by way of others, each sorted."""
+    reachable = {}
+
+    def reach(start):
+        seen, todo = set(), [start]
+        while todo:
+            for target in graph[todo.pop()] - seen:
+                seen.add(target)
+                todo.append(target)
+        return seen
+
+    for module in graph:
+        reachable[module] = reach(module)
+    groups = {
+        tuple(sorted(one for one in graph if one in reachable[module] and module in reachable[one]))
+        for module in graph
+        if module in reachable[module]
+    }
+    return sorted(groups)
+
+
+def test_no_files_import_each_other_in_a_circle():
+    graph = file_imports(SOURCE)
+    assert "engine.snapshot" in graph["engine.calibrator"]
+    # The public API names the homes of its names, and nothing below it imports it.
+    assert circles(graph) == []
+
+
+@pytest.mark.parametrize(
+    ("files", "circle"),
+    [
+        ({"a": "from hand_eye_calib.geometry import b", "b": "import math"}, None),
+        (
+            {
+                "a": "from hand_eye_calib.geometry import b",
+                "b": "def late():\n    from hand_eye_calib.geometry.a import x",
+            },
+            ("geometry.a", "geometry.b"),
+        ),
+        (
+            {
+                "a": "from . import b",
+                "b": "from .c import x",
+                "c": "import hand_eye_calib.geometry.a",
+            },
+            ("geometry.a", "geometry.b", "geometry.c"),
+        ),
+    ],
+)
+def test_a_circle_of_files_is_caught(tmp_path, files, circle):
+    (tmp_path / "geometry").mkdir()
+    (tmp_path / "geometry" / "__init__.py").touch()
+    (tmp_path / "__init__.py").touch()
+    for name, text in files.items():
+        (tmp_path / "geometry" / f"{name}.py").write_text(text + "\n")
+    assert circles(file_imports(tmp_path)) == ([circle] if circle else [])
+
+
 def test_order_itself_has_no_cycle_in_the_engine():
     order = list(ENGINE)
     assert all(
