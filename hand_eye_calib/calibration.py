@@ -388,7 +388,7 @@ def _transform_dict(
         "matrix": T_target_source.tolist(),
     }
     if is_near_gimbal_lock(rotation, covariance):
-        # Here roll and yaw mean nothing one by one.
+        # Roll and yaw have no meaning of their own here.
         printed = printed_rotation(T_target_source, covariance)
         document["rotation_vector_deg"] = np.degrees(printed.values).tolist()
         document["sigma_rotation_vector_deg"] = _degrees(printed.sigmas)

@@ -1,4 +1,4 @@
-"""Standard deviations of the numbers that are printed of a transform.
+"""Standard deviations of the translation and the angles that are printed of a transform.
 
 A covariance is about axes of a frame; roll, pitch and yaw are not. For a camera that looks ahead
 on a vehicle, roll is -90 deg, and a rotation error about the x axis of the parent shows in roll,
@@ -15,18 +15,18 @@ from hand_eye_calib.geometry import se3
 ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
 ROTATION_VECTOR = ("rx", "ry", "rz")
 
-# Rotation errors above this (rad) say "unknown"; the derivative means nothing there.
+# Standard deviations above this (rad) count as unknown: the derivative does not hold that far.
 _UNKNOWN_ANGLE = 0.3
 
-# Roll and yaw cannot be told apart where the cosine of the pitch is less than so many standard
-# deviations of the rotation: their own would be 10 deg and more, and far from normal.
+# Roll and yaw cannot be separated if the cosine of the pitch is below this many standard deviations
+# of the rotation: their own would be 10 deg and more, and far from normal.
 _LOCKED_SIGMAS = 5.0
 _LOCKED_COSINE = 1e-4
 
 
 @dataclass(frozen=True)
 class PrintedRotation:
-    """A rotation as three numbers for people, each with its standard deviation.
+    """A rotation as three printed values, each with its standard deviation.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
     Returns
     -------
     (3,) array
-        Infinite where an angle is unknown; near gimbal lock roll and yaw are.
+        Infinite if an angle is unknown; near gimbal lock roll and yaw are.
     """
     rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
     roll, pitch, _ = se3.rotation_to_rpy(rotation)

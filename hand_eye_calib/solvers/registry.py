@@ -13,7 +13,7 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import ali, dnl, dnlo, park, taylor, zhuang
 from hand_eye_calib.solvers.solution import Solution
 
-# ``solve(pairs, *rejection)``; what rejection is, Method.rejection says.
+# ``solve(pairs, *rejection)``; for rejection see Method.rejection.
 _SOLVE: dict[str, Callable[..., Solution]] = {
     "dnlo": dnlo.solve,
     "dnl": dnl.solve,
