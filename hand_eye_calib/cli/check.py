@@ -54,36 +54,42 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import Severity
     from hand_eye_calib.checks.streams import summarise
+    from hand_eye_calib.cli.findings import verdict, with_options_set
 
     if len(arguments.inputs) > 2:
         raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.inputs)}")
     config = config_from(arguments)
-    trajectories, sources, findings = (_read_bag if len(arguments.inputs) == 1 else _read_files)(
-        arguments
-    )
+    read = _read_bag if len(arguments.inputs) == 1 else _read_files
+    trajectories, sources, of_files = read(arguments)
     parent, child = (trajectories[stream] for stream in STREAMS)
     # What is to be estimated is not known yet: the checks say what it is.
     offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
     scale = config.scale if isinstance(config.scale, float) else 1.0
     with waiting_for("checking the streams"):
-        agreement = check_streams(parent, child, offset_s, scale, config.max_gap)
-    findings = [*agreement.findings, *findings]
+        checked = check_streams(parent, child, offset_s, scale, config.max_gap)
+    findings = with_options_set([*checked.findings, *of_files], config)
     streams = {name: summarise(one) for name, one in trajectories.items() if len(one) > 1}
     if arguments.json:
-        document = _document(sources, streams, findings, agreement)
+        document = _document(sources, streams, findings, checked)
         print(json.dumps(document, indent=2, allow_nan=False))
     else:
-        print(_text(sources, streams, findings, agreement))
+        print(_text(sources, streams, findings, checked))
     if arguments.out:
         from hand_eye_calib.cli.reporting import write_check
 
+        named = _named(sources, is_bag=len(arguments.inputs) == 1)
         corrected = child.shifted(offset_s).scaled(scale)
-        is_bag = len(arguments.inputs) == 1
-        named = [f"{name}: {each if is_bag else Path(each).name}" for name, each in sources.items()]
-        write_check(arguments.out, parent, corrected, agreement, findings, named, config.max_gap)
-    if all(finding.severity is Severity.NOTE for finding in findings):
-        return 0
-    return fail(f"{findings[0].what}; {findings[0].advice}", 1)
+        said = (findings, named, verdict(findings))
+        write_check(arguments.out, parent, corrected, checked, *said, config.max_gap)
+    serious = [finding for finding in findings if finding.severity is not Severity.NOTE]
+    return fail(f"{serious[0].what}; {serious[0].advice}", 1) if serious else 0
+
+
+def _named(sources: Mapping[str, str], is_bag: bool) -> list[str]:
+    """Streams with their topics, or with the names of their files."""
+    return [
+        f"{stream}: {source if is_bag else Path(source).name}" for stream, source in sources.items()
+    ]
 
 
 _Read = tuple[dict[str, "Trajectory"], dict[str, str], "list[Finding]"]
@@ -133,17 +139,17 @@ def _document(
     sources: Mapping[str, str],
     streams: "Mapping[str, StreamSummary]",
     findings: "Sequence[Finding]",
-    agreement: "CheckResult",
+    checked: "CheckResult",
 ) -> dict[str, Any]:
     return {
         "streams": {
             name: {"source": sources[name], **vars(summary)} for name, summary in streams.items()
         },
         "turning": {
-            "time_offset_s": agreement.correlation.offset_s,
-            "correlation": agreement.correlation.correlation,
-            "distinctness": agreement.correlation.distinctness,
-            "rms_rad_in_3_s": agreement.rms_rotation,
+            "time_offset_s": checked.correlation.offset_s,
+            "correlation": checked.correlation.correlation,
+            "distinctness": checked.correlation.distinctness,
+            "rms_rad_in_3_s": checked.rms_rotation,
         },
         "findings": [finding.to_dict() for finding in findings],
     }
@@ -153,9 +159,9 @@ def _text(
     sources: Mapping[str, str],
     streams: "Mapping[str, StreamSummary]",
     findings: "Sequence[Finding]",
-    agreement: "CheckResult",
+    checked: "CheckResult",
 ) -> str:
-    from hand_eye_calib.cli.findings import table
+    from hand_eye_calib.cli.findings import table, verdict
 
     lines = [f"{stream} is {printable(source)}" for stream, source in sources.items()]
     lines.append("{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS))
@@ -165,11 +171,11 @@ def _text(
             f"{summary.longest_interval_s:10.3f} s {summary.path_m:10.1f} m "
             f"{math.degrees(summary.rotation_rad):6.0f} deg"
         )
-    if agreement.rms_rotation:
+    if checked.rms_rotation:
         turned = "  ".join(
-            f"{axis} {math.degrees(angle):.2f}" for axis, angle in agreement.rms_rotation.items()
+            f"{axis} {math.degrees(angle):.2f}" for axis, angle in checked.rms_rotation.items()
         )
         lines.append(
             f"Rotation of the parent in 3 s about its axes, root mean square: {turned} deg"
         )
-    return "\n".join([*lines, "", table(findings)])
+    return "\n".join([*lines, "", table(findings), f"Verdict: {verdict(findings)}"])

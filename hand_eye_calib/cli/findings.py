@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.cli.spelling import as_typed, flag
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.report.words import printable
 
 if TYPE_CHECKING:
@@ -35,10 +36,33 @@ def with_findings(
     return calibration, [finding.to_dict() for finding in findings]
 
 
+def with_options_set(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
+    """The same findings; those that the options answer already are notes."""
+    given = config.to_options()
+    return [
+        dataclasses.replace(finding, severity=Severity.NOTE)
+        if finding.options and all(given[name] == value for name, value in finding.options)
+        else finding
+        for finding in findings
+    ]
+
+
+def verdict(findings: Sequence[Finding]) -> str:
+    """What the findings mean for a calibration with these streams, in one sentence."""
+    serious = [finding for finding in findings if finding.severity is not Severity.NOTE]
+    if not serious:
+        return "nothing speaks against calibrating with these streams."
+    if all(finding.options for finding in serious):
+        options = "".join(_typed_options(finding) for finding in serious).replace(":", "")
+        return f"calibrate with{options}, not without it."
+    codes = ", ".join(finding.code for finding in serious if not finding.options)
+    return f"do not calibrate with these streams as they are ({codes})."
+
+
 def table(findings: Sequence[Finding]) -> str:
     """Findings as text for a terminal, in their order."""
     if not findings:
-        return "No findings: nothing speaks against calibrating with these streams."
+        return "No findings."
     lines = []
     for finding in findings:
         head = f"{_MARKS[finding.severity]:<8} {finding.code:<17} {finding.stream:<7} "

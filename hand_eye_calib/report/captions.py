@@ -132,9 +132,9 @@ def _of_excitation(calibration: Calibration, evidence: Evidence) -> str:
     angles = [f"{angle:.1f}° in {name}" for angle, name in zip(over, AXES[3:], strict=True)]
     least = "xyz"[int(np.argmax(np.abs(seen.worst)))]
     return (
-        f"Rotation within {rotations.span_s:.1f} s: up to {listing(angles)} (95 % of the "
-        "time less). "
-        f"The lever arm along {least} is observed least: an error of 1 cm in it moves a motion by "
+        f"Rotation within {rotations.span_s:.1f} s: up to {listing(angles)} (95 % of the time "
+        f"less). The lever arm along {least} is observed least: an error of 1 cm in it moves a "
+        f"motion by "
         f"{seen.worst_gain:.2g} cm, an error of 1 cm along the best observed axis by "
         f"{seen.gain.max():.2g} cm. Rotations inside the grey band say little about a lever arm."
     )

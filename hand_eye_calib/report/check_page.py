@@ -14,11 +14,7 @@ from hand_eye_calib.report.report_figures import draw_streams
 # A smaller time offset (s) is not mentioned.
 _SHOWN_S = 5e-4
 
-_VERDICTS = {
-    "good": ("✓", "Nothing speaks against calibrating with these streams"),
-    "warn": ("!", "Calibrate with these streams with care"),
-    "bad": ("✗", "Do not calibrate with these streams as they are"),
-}
+_MARKS = {"good": "✓", "warn": "!", "bad": "✗"}
 
 
 def render_check(
@@ -27,6 +23,7 @@ def render_check(
     checked: CheckResult,
     findings: Sequence[Finding],
     inputs: Sequence[str],
+    verdict: str,
     max_gap_s: float = CalibratorConfig.max_gap,
 ) -> str:
     """The page as HTML.
@@ -40,6 +37,8 @@ def render_check(
         Its findings, and what else there is to say of the files.
     inputs : sequence of str
         Where the streams came from.
+    verdict : str
+        What the findings mean, in a sentence.
     max_gap_s : float
 
     Returns
@@ -51,7 +50,6 @@ def render_check(
     is_seen = bool(checked.correlation.overlap_s)
     svg, said = _figure(parent, child, checked, max_gap_s) if is_seen else ("", "")
     tone = _tone(findings)
-    mark, verdict = _VERDICTS[tone]
     return (
         environment()
         .get_template("check.html")
@@ -59,7 +57,7 @@ def render_check(
             inputs=inputs,
             findings=findings,
             tone=tone,
-            mark=mark,
+            mark=_MARKS[tone],
             verdict=verdict,
             title=TITLES["streams"],
             svg=svg,
@@ -84,7 +82,7 @@ def _figure(
 
 
 def _tone(findings: Sequence[Finding]) -> str:
-    severities = {finding.severity for finding in findings}
-    if Severity.ERROR in severities:
-        return "bad"
-    return "warn" if Severity.WARNING in severities else "good"
+    serious = [finding for finding in findings if finding.severity is not Severity.NOTE]
+    if not serious:
+        return "good"
+    return "warn" if all(finding.options for finding in serious) else "bad"

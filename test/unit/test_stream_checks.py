@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import tracemalloc
 
 import numpy as np
@@ -242,7 +243,7 @@ class TestCommand:
     def test_good_streams(self, files, capsys):
         assert main(["check", *files(*drive())]) == 0
         out, err = capsys.readouterr()
-        assert "nothing speaks against" in out
+        assert out.endswith("nothing speaks against calibrating with these streams.\n")
         assert "500" in out
         assert err == ""
 
@@ -252,8 +253,23 @@ class TestCommand:
         out, err = capsys.readouterr()
         assert "--time-offset 2.0" in out
         assert "WARNING  time_offset" in out
+        assert out.endswith("Verdict: calibrate with --time-offset 2.0, not without it.\n")
         assert len(err.splitlines()) == 1
         assert main(["check", *files(parent, child.shifted(-2.0)), "--time-offset", "2"]) == 0
+
+    def test_a_finding_that_the_options_answer_is_a_note(self, files, capsys):
+        parent, child = drive()
+        poses = child.poses.copy()
+        poses[250:, :3, 3] += 0.7
+        poses[330:, :3, 3] -= 0.9
+        jumping = files(parent, dataclasses.replace(child, poses=poses))
+        assert main(["check", *jumping]) == 0
+        out, err = capsys.readouterr()
+        assert re.search(r"^note +jumps", out, re.MULTILINE)
+        assert "nothing speaks against" in out
+        assert err == ""
+        assert main(["check", *jumping, "--method", "park"]) == 1
+        assert "calibrate with --method dnlo" in capsys.readouterr().out
 
     def test_json(self, files, capsys):
         parent, child = drive()
@@ -298,7 +314,7 @@ class TestCommand:
         )
         assert f"wrote {out / 'check.html'}" in capsys.readouterr().err
         page = (out / "check.html").read_text(encoding="utf-8")
-        assert "Not as they are" in page
+        assert "Do not calibrate with these streams as they are (quaternion_order)" in page
         assert "<code>quaternion_order</code> (child, likely)" in page
         assert "100.0" in page.split("<figcaption>")[1].split("added to the child")[0]
         assert page.count("<svg") == 1
