@@ -24,6 +24,9 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 # Library imported: (requirement in setup.py, key in package.xml); None where that side has no say,
 # as with pip and launch.
 DECLARED_AS = {
+    "backports": (None, None),  # zstd before Python 3.14; rosbags requires it, and lz4
+    "compression": (None, None),  # the standard library of Python 3.14
+    "lz4": (None, None),
     "dask": ("distributed", None),  # optional, for replay --batch --dask alone
     "casadi": ("casadi", "casadi-pip"),
     "jinja2": ("jinja2", "python3-jinja2"),
