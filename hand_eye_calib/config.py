@@ -5,9 +5,10 @@ the documentation are made from these dataclasses or tested against them.
 """
 
 import dataclasses
+import difflib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self, TypeAlias
 
@@ -84,6 +85,12 @@ def option_name(field: OptionField) -> str:
     return name
 
 
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """``; did you mean X?`` for a misspelt word; empty if no known word is close."""
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
 def check_value(field: OptionField, value: object) -> OptionValue:
     """Check a value of an option and give it the option's own type.
 
@@ -116,7 +123,10 @@ def _number(name: str, value: Any, meta: Mapping[str, Any]) -> float:
             return float(value)
     except (TypeError, ValueError):
         pass
-    raise ConfigError(f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}")
+    raise ConfigError(
+        f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}"
+        f"{did_you_mean(str(value), meta['words'])}"
+    )
 
 
 def _in_range(name: str, value: float, meta: Mapping[str, Any]) -> float:
@@ -130,7 +140,10 @@ def _in_range(name: str, value: float, meta: Mapping[str, Any]) -> float:
 
 def _allowed(name: str, value: str, meta: Mapping[str, Any]) -> str:
     if meta["choices"] is not None and value not in meta["choices"]:
-        raise ConfigError(f"{name} must be one of {', '.join(meta['choices'])}; got {value!r}")
+        raise ConfigError(
+            f"{name} must be one of {', '.join(meta['choices'])}; got {value!r}"
+            f"{did_you_mean(value, meta['choices'])}"
+        )
     if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
         raise ConfigError(f"{name} must be {meta['form']}; got {value!r}")
     if meta["parse"] is not None:
@@ -158,7 +171,8 @@ class OptionSet:
         unknown = [name for name in options if name not in known]
         if unknown:
             raise ConfigError(
-                f"unknown option {unknown[0]!r}; known are {', '.join(sorted(known))}"
+                f"unknown option {unknown[0]!r}{did_you_mean(unknown[0], known)}; known are "
+                f"{', '.join(sorted(known))}"
             )
         return cls(**{known[name]: value for name, value in options.items()})
 

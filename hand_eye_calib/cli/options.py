@@ -11,11 +11,12 @@ from typing import Any
 
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.parser import advanced
-from hand_eye_calib.cli.spelling import OPTION_FIELDS, did_you_mean, flag
+from hand_eye_calib.cli.spelling import OPTION_FIELDS, flag
 from hand_eye_calib.config import (
     CalibratorConfig,
     NodeConfig,
     check_value,
+    did_you_mean,
     option_name,
 )
 from hand_eye_calib.errors import ConfigError, InputError
@@ -156,14 +157,8 @@ def _argument_type(field: dataclasses.Field[Any]) -> Callable[[str], Any]:
 
 
 def _value(field: dataclasses.Field[Any], value: Any) -> Any:
-    """The value of an option, from text or as YAML has it; the error of a misspelt one says what it
-    may have been.
-    """
-    try:
-        return check_value(field, _from_text(field, value) if isinstance(value, str) else value)
-    except ConfigError as error:
-        words = (*(field.metadata["choices"] or ()), *field.metadata["words"])
-        raise ConfigError(str(error) + did_you_mean(str(value), words)) from None
+    """The value of an option, from text or as YAML has it."""
+    return check_value(field, _from_text(field, value) if isinstance(value, str) else value)
 
 
 def _from_text(field: dataclasses.Field[Any], text: str) -> Any:

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
-from hand_eye_calib.cli.spelling import as_typed, did_you_mean
+from hand_eye_calib.cli.spelling import as_typed
+from hand_eye_calib.config import did_you_mean
 
 EXIT_USAGE = 2
 _HELP_ALL = "--help-all"

@@ -1,9 +1,7 @@
-"""How the command line spells options, and what a person who misspelt one may have meant."""
+"""How the command line spells options."""
 
 import dataclasses
-import difflib
 import re
-from collections.abc import Iterable
 
 from hand_eye_calib.config import CalibratorConfig, option_name
 
@@ -33,9 +31,3 @@ def as_typed(text: str) -> str:
     ``raise --max-gap``.
     """
     return _NAMES.sub(lambda match: f"--{flag(match[1])}", text)
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """``; did you mean X?`` for a misspelt word, empty if nothing is close."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]}?" if close else ""

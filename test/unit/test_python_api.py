@@ -237,3 +237,17 @@ class TestAnswerOfTheMethod:
         np.testing.assert_array_equal(loaded.T_method, result.T_method)
         del document["T_method"]
         assert hec.Calibration.from_dict(document).T_method is None
+
+
+@pytest.mark.parametrize(
+    ("option", "guess"),
+    [({"method": "dlno"}, "dnlo"), ({"backend": "ipotp"}, "ipopt"), ({"scale": "atuo"}, "auto")],
+)
+def test_a_misspelt_value_is_answered_with_a_guess(option, guess):
+    with pytest.raises(ConfigError, match=rf"did you mean {guess}\?"):
+        CalibratorConfig.from_options(option)
+
+
+def test_a_misspelt_option_is_answered_with_a_guess():
+    with pytest.raises(ConfigError, match=r"unknown option 'max_gp'; did you mean max_gap\?"):
+        CalibratorConfig.from_options({"max_gp": 1.0})
