@@ -17,6 +17,7 @@ from hand_eye_calib.geometry.printed_angles import (
     sigmas_rpy,
     sigmas_translation,
 )
+from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
 
 # Format and version of to_dict. A change that an older reader cannot understand raises the version.
 _FORMAT = "hand_eye_calib/extrinsic"
@@ -43,6 +44,14 @@ _PLAIN_LATER = (
     "reference_reason",
     "noise",
     "cross_check",
+)
+
+# Of other values than numbers.
+_KINDS: dict[str, Any] = (
+    dict.fromkeys(("method", "reference", "backend", "parent_frame", "child_frame"), str)
+    | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
+    | {"reference_reason": str}
+    | dict.fromkeys(("noise", "cross_check"), (dict, type(None)))
 )
 
 # Motion pairs with more weight than this count as inliers.
@@ -330,9 +339,10 @@ class Calibration:
         # Version 0.1 had another name for it.
         later: dict[str, Any] = {"cross_check": data.get("consistency")} | dict(data)
         try:
+            _check_values(later)
             return cls(
-                T_parent_child=_matrix(data["T_parent_child"], 4),
-                T_method=_matrix(data["T_method"], 4) if "T_method" in data else None,
+                T_parent_child=_transform(data["T_parent_child"]),
+                T_method=_transform(data["T_method"]) if "T_method" in data else None,
                 covariance=_matrix(data["covariance"], 6),
                 status=SolveStatus(data["status"]),
                 observability=tuple(
@@ -351,6 +361,41 @@ class Calibration:
             raise InputError(
                 f"the calibration was changed after it was written: {error}; restore or repeat it"
             ) from None
+
+
+def _check_values(data: Mapping[str, Any]) -> None:
+    """Refuse values of a document that are not of the kind that was written.
+
+    Raises
+    ------
+    TypeError
+    """
+    for name in (*_PLAIN, *_PLAIN_LATER):
+        kind = _KINDS.get(name, (int, float))
+        value = data.get(name)
+        if name in data and (not isinstance(value, kind) or isinstance(value, bool)):
+            raise TypeError(f"{name} is {type(value).__name__}")
+    if len(data["observability"]) != 6:
+        raise TypeError(f"observability has {len(data['observability'])} axes, not 6")
+    words = (data.get("noise") or {}).get("in_words", [])
+    texts = [dof["name"] for dof in data["observability"]]
+    for name, values in (("noise", words), ("warnings", data["warnings"]), ("an axis", texts)):
+        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+            raise TypeError(f"{name} is not text")
+    for row in (data["cross_check"] or {}).values():
+        if not {*row} >= {"sigma", "of_methods", "of_halves"}:
+            raise TypeError("cross_check lacks values")
+        _infinite(row.values())
+
+
+def _transform(data: Mapping[str, Any]) -> FloatArray:
+    """Transform of a document."""
+    matrix = _matrix(data, 4)
+    rotation = matrix[:3, :3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE)
+    if not (is_rotation and np.isfinite(matrix).all() and np.linalg.det(rotation) > 0):
+        raise ValueError("a matrix is not a transform")
+    return matrix
 
 
 def _matrix(data: Mapping[str, Any], size: int) -> FloatArray:

@@ -15,7 +15,10 @@ from typing import Any, Self, TypeAlias
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.methods import BACKENDS, METHODS
 
-REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]*|C([2-9]|[1-9][0-9]+)"
+# Characters of a value that a message shows.
+_MOST_SHOWN = 80
+
+REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})"
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (
@@ -91,6 +94,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
+def _shown(value: object) -> str:
+    """A value for a message, which must not grow with it."""
+    text = repr(value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+
+
 def check_value(field: OptionField, value: object) -> OptionValue:
     """Check a value of an option and give it the option's own type.
 
@@ -112,7 +121,7 @@ def check_value(field: OptionField, value: object) -> OptionValue:
             raise ConfigError(f"{name} must be a finite number; got {number}")
         return _in_range(name, number, meta)
     if type(value) is not kind or not isinstance(value, bool | int | float | str):
-        raise ConfigError(f"{name} must be {_TYPE_NAMES[kind]}; got {value!r}")
+        raise ConfigError(f"{name} must be {_TYPE_NAMES[kind]}; got {_shown(value)}")
     return _allowed(name, value, meta) if isinstance(value, str) else _in_range(name, value, meta)
 
 
@@ -124,7 +133,7 @@ def _number(name: str, value: Any, meta: Mapping[str, Any]) -> float:
     except (TypeError, ValueError):
         pass
     raise ConfigError(
-        f"{name} must be {' or '.join(meta['words'])} or a number; got {value!r}"
+        f"{name} must be {' or '.join(meta['words'])} or a number; got {_shown(value)}"
         f"{did_you_mean(str(value), meta['words'])}"
     )
 
@@ -141,11 +150,11 @@ def _in_range(name: str, value: float, meta: Mapping[str, Any]) -> float:
 def _allowed(name: str, value: str, meta: Mapping[str, Any]) -> str:
     if meta["choices"] is not None and value not in meta["choices"]:
         raise ConfigError(
-            f"{name} must be one of {', '.join(meta['choices'])}; got {value!r}"
+            f"{name} must be one of {', '.join(meta['choices'])}; got {_shown(value)}"
             f"{did_you_mean(value, meta['choices'])}"
         )
     if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
-        raise ConfigError(f"{name} must be {meta['form']}; got {value!r}")
+        raise ConfigError(f"{name} must be {meta['form']}; got {_shown(value)}")
     if meta["parse"] is not None:
         meta["parse"](name, value)
     return value
@@ -265,7 +274,7 @@ def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
             raise ConfigError(f"{name} needs a standard deviation above 0; got {text!r}")
         if unit == "rad" and abs(prior[axis][0]) > 2 * math.pi:
             raise ConfigError(
-                f"{name} is in radians unless it says deg; got {value!r}: write {value}deg"
+                f"{name} is in radians unless it says deg; got {_shown(value)}: write {value}deg"
             )
     return prior
 

@@ -29,7 +29,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from glob import glob
+from glob import glob, has_magic
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.cli.console import note, with_progress
 from hand_eye_calib.cli.findings import with_findings
 from hand_eye_calib.cli.listing import print_table
-from hand_eye_calib.cli.options import Options, options_from, read_yaml
+from hand_eye_calib.cli.options import Options, options_from
 from hand_eye_calib.cli.replaying import fingerprints, replay
 from hand_eye_calib.cli.reporting import REPORT, can_draw, rendered, save_page, with_cross_check
 from hand_eye_calib.config import CalibratorConfig
@@ -48,6 +48,8 @@ _SOURCES = ("parent_topic", "child_topic", "parent_tf", "child_tf")
 _KEYS = ("bag", "name", "options", *_SOURCES)
 _STATE = "batch.json"
 _SUMMARY = "summary.json"
+# Bytes of the name of a folder.
+_LONGEST_NAME = 200
 
 _HEADINGS = ("x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg", "poses", "warnings")
 
@@ -171,6 +173,8 @@ def read_batch(
     ConfigError
         If it says something that cannot be.
     """
+    from hand_eye_calib.io.yaml_files import read_yaml
+
     document = read_yaml(path)
     if isinstance(document, list):
         document = {"bags": document}
@@ -217,15 +221,20 @@ def _other(name: str) -> str | None:
 def _expanded(path: Path, entry: Mapping[str, Any], where: str) -> list[list[str]]:
     """Bags of each recording: one recording, or several if a pattern stands for many."""
     bags = entry.get("bag")
-    named = bags if isinstance(bags, list) else [bags]
+    named: list[Any] = bags if isinstance(bags, list) else [bags]
     if not named or not all(isinstance(bag, str) and bag for bag in named):
         raise ConfigError(
             f"{path}, {where}: expected a bag's path or a list of paths; got {bags!r}"
         )
+    if any("\0" in bag for bag in named):
+        raise ConfigError(f"{path}, {where}: a bag's path has a zero byte")
     places = [str(path.parent / str(bag)) for bag in named]
-    if len(places) > 1 or glob(places[0]) in ([], places):
+    if len(places) > 1 or Path(places[0]).exists() or not has_magic(places[0]):
         return [places]
-    return [[place] for place in sorted(glob(places[0]))]
+    found = sorted(glob(places[0]))
+    if not found:
+        raise ConfigError(f"{path}, {where}: no bag matches {named[0]}")
+    return [[place] for place in found]
 
 
 def _task(
@@ -244,7 +253,7 @@ def _task(
                 TfSource.parse(str(entry[name]))
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-    base = name = str(entry.get("name") or Path(bags[0]).stem).replace("/", "_")
+    base = name = _name(where, entry.get("name"), bags)
     while name in taken:
         name = (
             f"{base}_{1 + sum(other.startswith(base) for other in taken)}"
@@ -255,6 +264,19 @@ def _task(
     return Task(
         name=name, bags=tuple(bags), options=dict(entry["options"]), sources=sources, **wanted
     )
+
+
+def _name(where: str, given: Any, bags: Sequence[str]) -> str:
+    """Name of a recording, and of its folder in ``--out``."""
+    if not isinstance(given, (str, int, float, type(None))):
+        raise ConfigError(f"{where}: expected a name; got {given!r}")
+    name = str(given or Path(bags[0]).stem).replace("/", "_")
+    is_file_name = name.isprintable() and len(name.encode()) <= _LONGEST_NAME
+    if not is_file_name or name.strip(". ") == "" or name.lower() in (_SUMMARY, _STATE):
+        raise ConfigError(
+            f"{where}: {name[:_LONGEST_NAME]!r} cannot name a folder of results; give another name"
+        )
+    return name
 
 
 def work(task: Task) -> Outcome:
@@ -405,7 +427,16 @@ def _files(bag: str) -> list[str]:
 
 
 def _stored_outcomes(tasks: Sequence[Task], directory: Path) -> dict[str, Outcome]:
-    """Outcomes of an earlier run, by the tasks' names."""
+    """Outcomes of an earlier run, by the tasks' names.
+
+    Raises
+    ------
+    InputError
+        If the folder of a task is a link that leads out of the directory.
+    """
+    for task in tasks:
+        if not (directory / task.name).resolve().is_relative_to(directory.resolve()):
+            raise InputError(f"{directory / task.name} is a link out of {directory}; remove it")
     stored = {task.name: _stored(task, directory) for task in tasks}
     return {name: outcome for name, outcome in stored.items() if outcome}
 
@@ -416,9 +447,11 @@ def _stored(task: Task, directory: Path) -> Outcome | None:
     """
     try:
         state = json.loads((directory / task.name / _STATE).read_text(encoding="utf-8"))
-        if state["key"] == task.key() and not state["outcome"]["error"]:
-            return state["outcome"]
-    except (OSError, ValueError, LookupError, TypeError):
+        outcome = state["outcome"]
+        if state["key"] == task.key() and not outcome["error"]:
+            Calibration.from_dict(outcome["calibration"])
+            return dict(outcome)
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None  # to be done again, whatever is wrong with it
     return None
 

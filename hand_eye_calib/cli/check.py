@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.cli.calibrate import STREAMS, add_file_arguments, read_files
 from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
 from hand_eye_calib.cli.options import add_config_arguments, add_json_argument, config_from
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.report.words import printable
+from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
     from hand_eye_calib.checks.check import CheckResult

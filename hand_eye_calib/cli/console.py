@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from hand_eye_calib.cli.spelling import as_typed
-from hand_eye_calib.report.words import printable
+from hand_eye_calib.errors import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress

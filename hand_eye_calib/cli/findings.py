@@ -9,7 +9,7 @@ from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.cli.spelling import as_typed, flag
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.report.words import printable
+from hand_eye_calib.errors import printable
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot

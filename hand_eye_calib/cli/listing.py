@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, waiting_for
-from hand_eye_calib.report.words import printable
+from hand_eye_calib.errors import printable
 
 if TYPE_CHECKING:
     from rich.table import Table

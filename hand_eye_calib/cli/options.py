@@ -19,7 +19,7 @@ from hand_eye_calib.config import (
     did_you_mean,
     option_name,
 )
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError
 
 Options = dict[str, Any]
 
@@ -170,25 +170,9 @@ def _from_text(field: dataclasses.Field[Any], text: str) -> Any:
         return text
 
 
-def read_yaml(path: Path) -> Any:
-    """What a YAML file holds.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is not YAML.
-    """
-    import yaml
-
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
-
-
 def _read_config(path: Path) -> Options:
+    from hand_eye_calib.io.yaml_files import read_yaml
+
     document = read_yaml(path)
     if document is None:
         return {}
@@ -223,7 +207,10 @@ def _checked(path: Path, name: str, value: Any) -> Any:
 
 def _parameters(path: Path, document: Mapping[str, Any]) -> Mapping[str, Any]:
     """Of a ROS parameter file what is meant for the node ``calibrator``, of any other file all."""
-    sections = dict(_ros_sections(document))
+    try:
+        sections = dict(_ros_sections(document))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     if not sections:
         return document
     ours = [
@@ -243,8 +230,12 @@ def _ros_sections(
     mapping: Mapping[str, Any], node: str = ""
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
     for name, value in mapping.items():
-        if name == "ros__parameters":
+        if name == "ros__parameters" and isinstance(value, (dict, type(None))):
             yield node, value or {}
+        elif name == "ros__parameters":
+            raise ConfigError(
+                f"{node or '/'}: ros__parameters must be a mapping of names to values"
+            )
         elif isinstance(value, dict):
             yield from _ros_sections(value, f"{node}/{str(name).strip('/')}")
 

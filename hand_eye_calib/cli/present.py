@@ -12,7 +12,8 @@ from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.cli.reporting import with_cross_check, write_report
 from hand_eye_calib.cli.spelling import as_typed
-from hand_eye_calib.report.words import given_or_estimated, listing, printable, with_sigma
+from hand_eye_calib.errors import printable
+from hand_eye_calib.report.words import given_or_estimated, listing, with_sigma
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot

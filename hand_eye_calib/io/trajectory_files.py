@@ -63,7 +63,7 @@ _LONGEST_INTERVAL_S = 10
 # Characters of a line or value that a message shows.
 _MOST_SHOWN = 120
 # Columns that a message lists.
-_MOST_LISTED = 40
+_MOST_LISTED = 15
 
 # Last parts of column names, lower case, words joined by underscores; exports of bags have whole
 # paths such as .pose.pose.position.x.
@@ -360,7 +360,7 @@ def _matching(plain: list[str], aliases: Sequence[str]) -> list[int]:
 
 def _listed(names: list[str]) -> str:
     """Names of columns for a message, which must not grow with the file."""
-    text = ", ".join(names[:_MOST_LISTED])
+    text = ", ".join(name[:_MOST_SHOWN] for name in names[:_MOST_LISTED])
     return text if len(names) <= _MOST_LISTED else f"{text} and {len(names) - _MOST_LISTED} more"
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.errors import ConfigError
 
-_PATTERN = re.compile(r"A|([BC])([1-9][0-9]*)")
+_PATTERN = re.compile(r"A|([BC])([1-9][0-9]{0,8})")
 
 
 def parse_reference(reference: str) -> tuple[str, int]:
@@ -24,7 +24,8 @@ def parse_reference(reference: str) -> tuple[str, int]:
     if match and (match[1] == "B" or int(match[2]) >= 2):
         return match[1], int(match[2])
     raise ConfigError(
-        f"reference {reference!r} is not one of A, B<n> (n >= 1) or C<n> (n >= 2), for example B5"
+        f"reference {str(reference)[:40]!r} is not one of A, B<n> (n >= 1) or C<n> (n >= 2), "
+        "for example B5"
     )
 
 

@@ -17,6 +17,7 @@ from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.checks.streams import summarise
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import Evidence
+from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, captions
 from hand_eye_calib.report.report_figures import draw_all
@@ -28,7 +29,6 @@ from hand_eye_calib.report.words import (
     length,
     listing,
     plain,
-    printable,
     size,
     with_sigma,
 )

@@ -7,13 +7,6 @@ _SECONDS_BELOW = 120.0
 _MOST_DECIMALS = 6
 
 
-def printable(text: str) -> str:
-    """A name from outside without control characters, which could move a terminal's cursor or break
-    a line; they are shown as ``\\x1b``.
-    """
-    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in text)
-
-
 def with_sigma(value: float, sigma: float | None, least_decimals: int = 2) -> str:
     """A number and its standard deviation, with two digits of the latter.
 

@@ -1,0 +1,487 @@
+"""Text files, YAML, results and journals that are not what they should be: one line, never a
+traceback, never a hang, and nothing outside the directory of the results.
+"""
+
+import os
+import struct
+import xml.dom.minidom
+import zipfile
+import zlib
+from io import BytesIO
+
+import numpy as np
+import pytest
+import yaml
+from motions import as_trajectory, child_of, wandering_poses
+from result_making import calibration
+
+from hand_eye_calib.cli import batch
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
+from hand_eye_calib.io.results import keep_earlier_results, load_result, save_result
+from hand_eye_calib.io.trajectory_files import read_trajectory_file, write_trajectory
+
+PARENT = as_trajectory(wandering_poses(30), sensor_frame="lidar")
+CHILD = as_trajectory(child_of(wandering_poses(30)), sensor_frame="camera")
+
+
+@pytest.fixture
+def run(capsys):
+    """Runs a command; returns exit code, stdout and stderr."""
+
+    def call(*arguments):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def one_line(error):
+    text = str(error.value)
+    assert len(text) < 2000
+    assert "\n" not in text
+    return text
+
+
+# ---- YAML
+
+
+def merge_bomb(depth=12, width=9):
+    lines = ["a0: &a0 {x: 1}"]
+    for level in range(1, depth):
+        lines.append(f"a{level}: &a{level} {{<<: [{', '.join([f'*a{level - 1}'] * width)}]}}")
+    return "\n".join(lines)
+
+
+def alias_bomb(depth=12, width=9):
+    lines = ["a0: &a0 [x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * width)}]" for k in range(1, depth)]
+    return "\n".join(lines)
+
+
+HOSTILE_YAML = {
+    "merge keys": (merge_bomb(), "expand to more than"),
+    "aliases": (alias_bomb(), "expand to more than"),
+    "deep flow": ("[" * 100_000, "nested more than"),
+    "deep blocks": ("\n".join(" " * k + "a:" for k in range(500)), "nested more than"),
+    "itself": ("a: &a {b: *a}", "an alias leads to the value it is part of"),
+    "long integer": ("n: " + "9" * 5000, "a number has 5000 characters"),
+    "large integer": ("n: 99999999999999999999", "an integer does not fit into 64 bits"),
+    "float": ("n: !!float abc", "is not YAML"),
+    "empty integer": ("n: !!int ''", "is not YAML"),
+    "empty date": ("n: !!timestamp ''", "has the tag"),
+    "object": ("n: !!python/object/apply:os.system ['true']", "has the tag"),
+    "binary": ("n: !!binary '='", "has the tag"),
+    "set": ("n: !!set {a, b}", "has the tag"),
+    "twice": ("a: 1\nb: 2\na: 3", "the key 'a' appears twice, line 3"),
+    "list as a key": ("? [a, b]\n: 1", "a key is not a single value"),
+    "too many values": ("[" + "1," * 100_001 + "]", "it has more than 100000 values"),
+    "two documents": ("a: 1\n---\nb: 2", "is not YAML"),
+    "control characters": ("a: \x01", "is not YAML"),
+    "too large": ("# " + "x" * (1 << 20), "larger than 1048576 bytes"),
+}
+
+
+@pytest.mark.parametrize("command", ["info", "config", "batch"])
+@pytest.mark.parametrize(("text", "message"), HOSTILE_YAML.values(), ids=HOSTILE_YAML)
+def test_yaml_that_is_hostile_is_refused_in_one_line(run, tmp_path, command, text, message):
+    path = tmp_path / "file.yaml"
+    path.write_text(text)
+    arguments = {
+        "info": ["info", path],
+        "config": ["replay", tmp_path, "--config", path],
+        "batch": ["replay", "--batch", path],
+    }[command]
+    code, out, err = run(*arguments)
+    assert (code in (1, 2), out) == (True, "")
+    (line,) = err.splitlines()
+    assert message in line
+    assert len(line) < 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("ros__parameters: 5", "ros__parameters must be a mapping"),
+        ("/calibrator: {ros__parameters: [1]}", "ros__parameters must be a mapping"),
+        ("reference: B" + "9" * 3000, "reference"),
+        ("max_gap: 2024-13-45", "max_gap"),
+        ("prior.x: .inf", "prior.x"),
+        ("5: 6", "unknown option '5'"),
+    ],
+)
+def test_config_files_that_are_wrong_are_named(run, tmp_path, text, message):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    code, out, err = run("replay", tmp_path, "--config", path)
+    assert (code in (1, 2), out) == (True, "")
+    (line,) = err.splitlines()
+    assert message in line
+    assert len(line) < 1000
+
+
+def test_dates_are_read_as_text(run, tmp_path):
+    """A value that YAML takes for a date, impossible ones included, is like any other text."""
+    path = tmp_path / "fleet.yaml"
+    path.write_text("[{bag: absent, name: 2024-02-30}]")
+    assert [task.name for task in batch.read_batch(path, {}, {})] == ["2024-02-30"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"consistency": 5},
+        {"consistency": {"x": "far"}},
+        {"consistency": {"B10": {"translation_m": "x"}}},
+        {"consistency": [1, 2]},
+        {"cross_check": 5},
+        {"cross_check": {"x": "far"}},
+        {"cross_check": {"B10": {"translation_m": "x"}}},
+        {"cross_check": {"x": {"sigma": "a", "of_methods": 1, "of_halves": 1}}},
+        {"noise": 3},
+        {"noise": {"in_words": 3}},
+        {"warnings": 7},
+        {"warnings": {"a": 1}},
+        {"warnings": [5]},
+        {"observability": [5]},
+        {"observability": []},
+        {"observability": None},
+        {"covariance": {"matrix": [[1]]}},
+        {"covariance": {"matrix": "abc"}},
+        {"T_parent_child": {"matrix": [[1, 0, 0, 0]] * 4}},
+        {"T_parent_child": {"matrix": [[float("nan")] * 4] * 4}},
+        {"T_parent_child": []},
+        {"time_offset_s": "soon"},
+        {"scale": None},
+        {"n_poses": [1]},
+        {"stamp_ns": 1e300},
+        {"parent_frame": 5},
+        {"objective": {}},
+        {"status": ["ok"]},
+        {"reference_reason": [1]},
+        {"time_offset_sigma_s": "x"},
+    ],
+    ids=repr,
+)
+def test_altered_results_are_refused_or_shown(run, tmp_path, change):
+    save_result(calibration(), tmp_path)
+    path = tmp_path / "extrinsic.yaml"
+    document = yaml.safe_load(path.read_text())
+    if "consistency" in change:  # the older name
+        del document["cross_check"]
+    path.write_text(yaml.safe_dump(document | change))
+    for command in (["info", tmp_path], ["info", tmp_path, "--json"]):
+        code, out, err = run(*command)
+        assert code in (0, 1, 3)
+        assert (code == 1) == (len(err.splitlines()) == 1 and not out)
+
+
+# ---- batches
+
+
+@pytest.fixture
+def bag(tmp_path):
+    write_bag(
+        tmp_path / "bag",
+        {"/a": (PARENT, "nav_msgs/msg/Odometry"), "/b": (CHILD, "nav_msgs/msg/Odometry")},
+    )
+    return tmp_path / "bag"
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        "{bag: bag, name: '..'}",
+        "{bag: bag, name: '.'}",
+        "{bag: bag, name: ' '}",
+        "{bag: '..'}",
+        "{bag: bag/..}",
+        "{bag: bag, name: summary.json}",
+        '{bag: bag, name: "a\\0b"}',
+        '{bag: bag, name: "a\\e[2Jb"}',
+        "{bag: bag, name: {a: b}}",
+        "{bag: bag, name: " + "n" * 300 + "}",
+        '{bag: "a\\0b"}',
+        "{bag: ['bag', \"a\\0b\"]}",
+        "'no*where'",
+    ],
+)
+def test_batches_write_nothing_outside_their_directory(run, tmp_path, bag, entry):
+    (tmp_path / "extrinsic.yaml").write_text("mine")
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text(f"[{entry}]")
+    before = sorted(tmp_path.rglob("*"))
+    code, out, err = run("replay", "--batch", fleet, "--out", tmp_path / "out", "--jobs", "1")
+    assert (code, out) == (2, "")
+    assert "fleet.yaml, entry 1: " in err
+    assert len(err.splitlines()) == 1
+    assert sorted(tmp_path.rglob("*")) == before
+    assert (tmp_path / "extrinsic.yaml").read_text() == "mine"
+
+
+def test_a_folder_that_is_a_link_out_of_the_directory_is_refused(run, tmp_path, bag):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "bag").symlink_to(tmp_path / "elsewhere")
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text("[bag]")
+    code, _, err = run("replay", "--batch", fleet, "--out", tmp_path / "out", "--jobs", "1")
+    assert (code, "is a link out of" in err) == (1, True)
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_a_name_with_slashes_is_one_folder(tmp_path):
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text("[{bag: bag, name: ../../x}]")
+    assert [task.name for task in batch.read_batch(fleet, {}, {})] == [".._.._x"]
+
+
+@pytest.mark.parametrize(
+    "state", ["5", "[" * 100_000, '{"key": 1}', '{"key": "K", "outcome": {"error": null}}',
+              '{"key": "K", "outcome": {"error": null, "calibration": {"status": 5}}}']
+)  # fmt: skip
+def test_a_damaged_state_of_a_batch_is_done_again(tmp_path, state):
+    task = batch.Task(name="a", bags=("absent",))
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "batch.json").write_text(state.replace("K", task.key()))
+    assert batch._stored(task, tmp_path) is None
+
+
+# ---- trajectories as text
+
+
+def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
+    path = tmp_path / "parent.tum"
+    os.mkfifo(path)
+    for format in ("tum", "csv", "euroc"):
+        with pytest.raises(InputError, match="is not a regular file") as caught:
+            read_trajectory_file(path, format)
+        one_line(caught)
+    with pytest.raises(InputError, match="is not a regular file"):
+        load_result(path)
+
+
+def test_a_csv_cell_of_any_length_is_one_line(tmp_path):
+    path = tmp_path / "parent.csv"
+    for text in (
+        "t,x,y,z,qx,qy,qz,qw\n" + "1" * 200_000 + ",0,0,0,0,0,0,1\n",
+        't,x,y,z,qx,qy,qz,qw\n"' + "\n1" * 200_000,
+        "c," * 1_000_000 + "\n",
+        ",".join(["x"] * 30_000) + "\n",
+        "t,x,y,z,qx,qy,qz," + "w" * 60_000 + "\n",
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError) as caught:
+            read_trajectory_file(path, "csv")
+        one_line(caught)
+
+
+@pytest.mark.parametrize("format", ["tum", "kitti", "euroc", "csv"])
+@pytest.mark.parametrize("value", ["1e154", "-1e200", "1.7e308", "1e9", "1e999", "nan", "0x10"])
+def test_a_position_out_of_this_world_is_named(tmp_path, format, value):
+    rows = {
+        "tum": "{t} {x} 0 0 0 0 0 1",
+        "kitti": "1 0 0 {x} 0 1 0 0 0 0 1 0",
+        "euroc": "{t}000000000,{x},0,0,1,0,0,0",
+        "csv": "{t},{x},0,0,0,0,0,1",
+    }
+    lines = ["t,x,y,z,qx,qy,qz,qw"] if format == "csv" else []
+    lines += [rows[format].format(t=t, x=value if t == 3 else t) for t in range(1, 9)]
+    path, times = tmp_path / "parent", tmp_path / "times"
+    path.write_text("\n".join(lines))
+    times.write_text("\n".join(map(str, range(1, 9))))
+    options = {"times": times} if format == "kitti" else {}
+    with pytest.raises(InputError, match=f"parent, line {3 + (format == 'csv')}: ") as caught:
+        read_trajectory_file(path, format, **options)
+    one_line(caught)
+
+
+@pytest.mark.parametrize("value", ["1e154", "1e308", "-1e200", "1e60"])
+def test_rotations_out_of_this_world_are_named(tmp_path, value):
+    path, times = tmp_path / "parent", tmp_path / "times"
+    times.write_text("1\n2\n")
+    path.write_text(f"1 0 0 0 0 1 0 0 0 0 1 0\n{value} 0 0 0 0 {value} 0 0 0 0 1 0\n")
+    with pytest.raises(InputError, match="parent, line 2: the 3x3 part is not a rotation matrix"):
+        read_trajectory_file(path, "kitti", times=times)
+    path.write_text(f"1 0 0 0 0 0 0 1\n2 0 0 0 {value} 0 0 {value}\n")
+    with pytest.raises(InputError, match="parent, line 2: found a quaternion of length"):
+        read_trajectory_file(path, "tum")
+
+
+# ---- results
+
+
+def test_earlier_results_are_kept_whatever_they_hold(tmp_path):
+    (tmp_path / "extrinsic.yaml").write_bytes(b"\xff\xfe\x00not text")
+    keep_earlier_results(tmp_path)
+    save_result(calibration(), tmp_path)
+    assert (tmp_path / "previous" / "extrinsic.yaml").read_bytes() == b"\xff\xfe\x00not text"
+
+
+def test_calibrate_keeps_earlier_results(run, tmp_path):
+    for name, trajectory in (("parent.tum", PARENT), ("child.tum", CHILD)):
+        write_trajectory(tmp_path / name, trajectory)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "extrinsic.yaml").write_bytes(b"\xff earlier")
+    files = (tmp_path / "parent.tum", tmp_path / "child.tum")
+    code, _, _ = run("calibrate", *files, "--method", "park", "--out", tmp_path / "out")
+    assert code == 0
+    assert (tmp_path / "out" / "previous" / "extrinsic.yaml").read_bytes() == b"\xff earlier"
+    assert load_result(tmp_path / "out").method == "park"
+
+
+def test_links_are_replaced_and_not_followed(run, tmp_path):
+    for name, trajectory in (("parent.tum", PARENT), ("child.tum", CHILD)):
+        write_trajectory(tmp_path / name, trajectory)
+    names = ("extrinsic.yaml", "extrinsic.urdf.xacro", "static_transform.launch.py", "report.html")
+    (tmp_path / "out").mkdir()
+    for name in names:
+        (tmp_path / f"mine_{name}").write_text("mine")
+        (tmp_path / "out" / name).symlink_to(tmp_path / f"mine_{name}")
+    files = (tmp_path / "parent.tum", tmp_path / "child.tum")
+    assert run("calibrate", *files, "--method", "park", "--out", tmp_path / "out")[0] == 0
+    for name in names:
+        assert (tmp_path / f"mine_{name}").read_text() == "mine"
+        assert not (tmp_path / "out" / name).is_symlink()
+        assert (tmp_path / "out" / name).read_text() != "mine"
+    leftovers = {path.name for path in (tmp_path / "out").iterdir()} - {*names, "previous"}
+    assert leftovers == set()
+
+
+@pytest.mark.parametrize(
+    "frame", ["a--->b", "---", "-->", "a\x1b[2Jb", "a\nb", "a\x00b", "<&>\"'", "$(arg x)", "\u2028"]
+)
+def test_saved_files_are_well_formed_for_any_name_of_a_frame(tmp_path, frame):
+    save_result(calibration(parent_frame=frame, child_frame=frame + "x"), tmp_path)
+    root = xml.dom.minidom.parse(str(tmp_path / "extrinsic.urdf.xacro")).documentElement
+    assert root.tagName == "robot"
+    text = (tmp_path / "static_transform.launch.py").read_text()
+    compile(text, "static_transform.launch.py", "exec")
+    for name in ("extrinsic.urdf.xacro", "static_transform.launch.py"):
+        content = (tmp_path / name).read_text()
+        assert all(letter.isprintable() or letter == "\n" for letter in content)
+    assert load_result(tmp_path).parent_frame == frame
+
+
+def test_control_characters_do_not_reach_the_terminal(run, tmp_path):
+    save_result(calibration(parent_frame="a\x1b[2J\nb", warnings=("w\x1b[31m",)), tmp_path)
+    code, out, err = run("info", tmp_path)
+    assert code in (0, 3)
+    assert "\x1b" not in out + err
+    assert "a\\x1b[2J\\nb" in out
+    error = InputError("frame 'a\x1b[2J\nb'")
+    assert str(error) == "frame 'a\\x1b[2J\\nb'"
+
+
+# ---- journals
+
+
+def record_of(kind, payload):
+    return struct.pack("<cII", kind, len(payload), zlib.crc32(payload, zlib.crc32(kind))) + payload
+
+
+@pytest.fixture
+def journal(tmp_path):
+    """A journal of ten poses."""
+    calibrator = Calibrator(CalibratorConfig(reference="B3"))
+    writer = JournalWriter(tmp_path / "journal", calibrator.state())
+    for k in range(10):
+        writer.add_pose("parent", 10**9 + k, (k, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    writer.close()
+    return tmp_path / "journal"
+
+
+def test_stray_files_in_the_journals_directory_are_left_alone(journal):
+    data = (journal / "session-000001.journal").read_bytes()
+    strays = ("session-000001 (copy).journal", "session-.journal", "session--1.journal",
+              "session-x.journal", "session-1e3.journal", "notes.journal")  # fmt: skip
+    for name in strays:
+        (journal / name).write_bytes(data[:100])
+    assert has_session(journal)
+    assert len(read_journal(journal)[1]) == 10
+    assert count_poses(journal) == 10
+    calibrator = Calibrator(CalibratorConfig(reference="B3"))
+    writer = JournalWriter(journal, calibrator.state())
+    writer.add_pose("parent", 5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    writer.rotate(calibrator.state())
+    writer.close()
+    names = {path.name for path in journal.iterdir()}
+    assert names == {*strays, "session-000003.journal"}
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        record_of(b"P", b"short"),
+        record_of(b"P", struct.pack("<Bq7d", 7, 5, *range(7))),
+        record_of(b"F", b""),
+        record_of(b"F", b"\x09lidar"),
+        record_of(b"F", b"\x00\xff\xfe"),
+        record_of(b"F", b"\x00" + b"x" * 5000),
+        record_of(b"X", b"new"),
+    ],
+)
+def test_records_with_right_checksums_and_wrong_content_are_one_line(journal, bad):
+    path = journal / "session-000001.journal"
+    path.write_bytes(path.read_bytes() + bad)
+    with pytest.raises(InputError, match="cannot use the session journal") as caught:
+        read_journal(journal)
+    one_line(caught)
+    assert count_poses(journal) is None
+
+
+ARRAY = "{'descr': '%s', 'fortran_order': False, 'shape': (%s)}"
+
+
+def archive(compression=zipfile.ZIP_STORED, **members):
+    packed = BytesIO()
+    with zipfile.ZipFile(packed, "w", compression) as file:
+        for name, data in members.items():
+            file.writestr(name + ".npy", data)
+    return packed.getvalue()
+
+
+def array_file(header, data=b""):
+    text = header.encode() + b" " * (117 - len(header)) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
+
+
+@pytest.mark.parametrize(
+    "checkpoint",
+    [
+        b"",
+        b"PK\x03\x04 nothing",
+        archive(zipfile.ZIP_DEFLATED, a=array_file(ARRAY % ("<f8", "99,"), bytes(792))),
+        archive(a=array_file(ARRAY % ("<f8", "99999999999,"))),
+        archive(a=array_file(ARRAY % ("|O", "1,"), bytes(8))),
+        archive(a=array_file(ARRAY % ("<f8", "-1,"), bytes(9))),
+        archive(a=array_file("__import__('os').system('true')")),
+        archive(a=b"nothing"),
+    ],
+    ids=range(8),
+)  # fmt: skip
+def test_checkpoints_with_right_checksums_and_wrong_content_are_one_line(tmp_path, checkpoint):
+    path = tmp_path / "session-000001.journal"
+    path.write_bytes(b"hand_eye_calib journal 1\n" + record_of(b"C", checkpoint))
+    with pytest.raises(InputError, match="its checkpoint cannot be right") as caught:
+        read_journal(tmp_path)
+    one_line(caught)
+    assert count_poses(tmp_path) is None
+
+
+def test_a_checkpoint_comes_back_as_it_was(tmp_path):
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array(["x", "yz"]), "c": np.array(True)}
+    writer = JournalWriter(tmp_path, arrays)
+    writer.close()
+    found, _, _ = read_journal(tmp_path)
+    assert found.keys() == arrays.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == array.dtype
