@@ -64,6 +64,9 @@ _NOISE_SHARE = 0.3
 
 _SMALLEST_CM, _SMALLEST_DEG = 1e-4, 1e-5
 
+# A path is flat if it extends less than this share of its second extent along the third.
+_FLAT = 0.5
+
 # From metres and radians, for translations and rotations.
 _TO_CM, _TO_DEG = 100.0, 180 / np.pi
 
@@ -163,24 +166,41 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Figure | None
     tracks = evidence.tracks
     shown = _downsample(len(tracks.times_s), _MOST_ON_A_LINE)
     factor, unit = time_axis(tracks.times_s[-1])
-    figure, (above, height) = _figure(4.1, 1, 2, left=0.7, bottom=0.85, gap=0.7)
-    for points, colour, dashes, width, label in (
-        (tracks.parent, PARENT, "-", 3.2, calibration.parent_frame),
-        (tracks.child, CHILD, "-", 1.1, f"{calibration.child_frame}, through the result"),
+    first, second, across = _plane_of_motion(tracks.parent)
+    figure, (plane, side) = _figure(4.1, 1, 2, left=0.7, bottom=0.85, gap=0.7)
+    for points, colour, width, label in (
+        (tracks.parent, PARENT, 3.2, calibration.parent_frame),
+        (tracks.child, CHILD, 1.1, f"{calibration.child_frame}, through the result"),
     ):
-        drawn = dict(color=colour, ls=dashes, lw=width)
-        above.plot(*points[shown, :2].T, label=_plain(label), **drawn)
-        height.plot(tracks.times_s[shown] * factor, points[shown, 2], **drawn)
-    above.plot(*tracks.parent[0, :2], "o", color=INK, ms=6, label="start")
-    above.set(
-        title="From above", xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim"
-    )
-    height.set(title="Height", xlabel=f"time ({unit})", ylabel="z (m)")
-    low, high = height.get_ylim()
+        look: dict[str, Any] = {"color": colour, "ls": "-", "lw": width}
+        plane.plot(points[shown, first], points[shown, second], label=_plain(label), **look)
+        side.plot(tracks.times_s[shown] * factor, points[shown, across], **look)
+    plane.plot(*tracks.parent[0, [first, second]], "o", color=INK, ms=6, label="start")
+    names = [f"{axis} (m)" for axis in "xyz"]
+    is_level = across == 2
+    plane.set(title="From above" if is_level else "In the plane of motion")
+    plane.set(xlabel=names[first], ylabel=names[second], aspect="equal", adjustable="datalim")
+    side.set(title="Height" if is_level else "Across the plane of motion")
+    side.set(xlabel=f"time ({unit})", ylabel=names[across])
+    low, high = side.get_ylim()
     if high - low < 0.5:  # rounding is no relief
-        height.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)
-    figure.legend(*above.get_legend_handles_labels(), loc="lower center", ncols=3, borderaxespad=0)
+        side.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)
+    figure.legend(*plane.get_legend_handles_labels(), loc="lower center", ncols=3, borderaxespad=0)
     return figure
+
+
+def _plane_of_motion(points: FloatArray) -> tuple[int, int, int]:
+    """Axes to draw a path by: two in the plane of motion, and the one across it.
+
+    A camera moves in its x and z; for it, x and y would be a view from the side. A path that fills
+    all three axes is drawn from above.
+    """
+    extents = np.ptp(points, axis=0)
+    across = int(np.argmin(extents))
+    if extents[across] > _FLAT * np.sort(extents)[1]:
+        across = 2
+    first, second = (axis for axis in range(3) if axis != across)
+    return first, second, across
 
 
 def _residuals(calibration: Calibration, evidence: Evidence) -> Figure | None:

@@ -401,3 +401,17 @@ def test_warnings_are_part_of_the_verdict(hilly):
     verdict = page.text[: page.text.index("Pose of camera in lidar Maps")]
     assert "look \\x1b[2J here" in verdict
     assert "with 1 warning" in verdict or "weak" in verdict
+
+
+@pytest.mark.parametrize(
+    ("order", "plane"),
+    [((0, 1, 2), (0, 1, 2)), ((0, 2, 1), (0, 2, 1)), ((2, 1, 0), (1, 2, 0))],
+    ids=["vehicle", "camera", "x up"],
+)
+def test_the_path_is_drawn_in_the_plane_of_motion(order, plane):
+    from hand_eye_calib.report.report_figures import _plane_of_motion
+
+    time = np.linspace(0, 6, 100)
+    path = np.stack([30 * np.sin(time), 20 * np.cos(time), 0.5 * np.sin(9 * time)], axis=1)
+    assert _plane_of_motion(path[:, list(order)]) == plane
+    assert _plane_of_motion(path * [1, 1, 60])[2] == 2  # a flight: from above
