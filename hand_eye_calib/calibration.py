@@ -62,11 +62,27 @@ _UNKNOWN_M = 0.9
 
 
 class SolveStatus(str, Enum):
-    """How a solve ended. Only an OK result may be used as it is."""
+    """How a solve ended. Only an OK result may be used as it is.
+
+    Of an UNOBSERVABLE one the other directions may be used. NOT_CONVERGED and CONTRADICTED (a prior
+    contradicts the motion) are failures.
+    """
 
     OK = "ok"
     UNOBSERVABLE = "unobservable"
     NOT_CONVERGED = "not_converged"
+    CONTRADICTED = "contradicted"
+
+    @property
+    def failure(self) -> str:
+        """Why nothing of a result may be used; empty unless the solve failed."""
+        return _FAILURES.get(self, "")
+
+
+_FAILURES = {
+    SolveStatus.NOT_CONVERGED: "the solver did not converge",
+    SolveStatus.CONTRADICTED: "a prior contradicts the motion",
+}
 
 
 class DofVerdict(str, Enum):

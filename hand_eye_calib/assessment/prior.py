@@ -41,8 +41,16 @@ _DIFFERENCE = 1e-6
 # Smallest variance to divide by (m^2 or rad^2): noise-free data has none.
 _ROUNDING_VARIANCE = 1e-18
 
+# Smallest standard deviation of a prior (m or rad): nobody measures better, and smaller ones make
+# the equations singular.
+_MIN_SIGMA = 1e-6
+
 # A prior more than this many standard deviations from the estimate from motion contradicts it.
 _MAX_DISTANCE = 4.0
+
+# Along an unobservable axis the motion says nothing that a prior could contradict. No machine has
+# sensors farther apart than this (m): such a prior is in another unit.
+_MAX_LEVER_ARM = 50.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +64,7 @@ class Fused:
         Covariance and verdicts of both together.
     contradictions : dict
         Axis name to the number of standard deviations between prior and motion, for the axes on
-        which they contradict each other.
+        which they contradict each other. The prior on these was left out.
     """
 
     T_parent_child: FloatArray
@@ -83,8 +91,10 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
     """
     covariance = assessment.cov_parent_child_in_child
     unknown = _unknown_directions(covariance)
+    contradictions = _contradictions(T_parent_child, assessment, prior) if prior else {}
+    prior = {axis: known for axis, known in prior.items() if axis not in contradictions}
     if not prior and not unknown.shape[1]:
-        return Fused(T_parent_child, assessment, {})
+        return Fused(T_parent_child, assessment, contradictions)
     root, inverse_root, targets = _whitened(T_parent_child, covariance, unknown)
     T = T_parent_child
     for _ in range(_MAX_STEPS):
@@ -99,7 +109,7 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     if not prior:
-        return Fused(T, assessment, {})
+        return Fused(T, assessment, contradictions)
     posterior = root @ np.linalg.inv(normal) @ root.T
     verdicts = _verdicts(
         assessment.observability,
@@ -107,7 +117,6 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
         _sigmas_in_parent(T_parent_child[:3, :3], covariance),
         prior,
     )
-    contradictions = _contradictions(T_parent_child, covariance, prior)
     return Fused(T, Assessment(posterior, verdicts), contradictions)
 
 
@@ -198,7 +207,7 @@ def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArra
 
 def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
     errors = _errors(T, prior)
-    return np.array([errors[axis] / sigma for axis, (_, sigma) in prior.items()])
+    return np.array([errors[axis] / max(sigma, _MIN_SIGMA) for axis, (_, sigma) in prior.items()])
 
 
 def _errors(T: FloatArray, prior: Prior) -> dict[str, float]:
@@ -221,13 +230,24 @@ def _errors(T: FloatArray, prior: Prior) -> dict[str, float]:
 
 
 def _contradictions(
-    T_parent_child: FloatArray, covariance: FloatArray, prior: Prior
+    T_parent_child: FloatArray, assessment: Assessment, prior: Prior
 ) -> dict[str, float]:
+    """Axis name to the distance of the prior in standard deviations, if it is too large."""
+    covariance = assessment.cov_parent_child_in_child
     _, jacobian = _prior_residuals(T_parent_child, prior)
     distances = np.abs(_weighted(T_parent_child, prior)) / np.sqrt(
         1.0 + np.einsum("pi,ij,pj->p", jacobian, covariance, jacobian)
     )
-    return {axis: float(d) for axis, d in zip(prior, distances, strict=True) if d > _MAX_DISTANCE}
+    verdicts = {dof.name: dof.verdict for dof in assessment.observability}
+    return {
+        axis: distance
+        for (axis, (value, _)), distance in zip(prior.items(), distances.tolist(), strict=True)
+        if (
+            distance > _MAX_DISTANCE
+            if verdicts[axis] is not DofVerdict.UNOBSERVABLE
+            else axis in TRANSLATIONS and abs(value) > _MAX_LEVER_ARM
+        )
+    }
 
 
 def _verdicts(

@@ -33,7 +33,7 @@ from glob import glob, has_magic
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.console import note, with_progress
 from hand_eye_calib.cli.findings import with_findings
 from hand_eye_calib.cli.listing import print_table
@@ -314,8 +314,8 @@ def _calibrated(task: Task) -> Outcome:
         "findings": findings,
         "inputs": replayed.inputs,
     }
-    if calibration.status is SolveStatus.NOT_CONVERGED:
-        found["error"] = "the solver did not converge"
+    if calibration.status.failure:
+        found["error"] = calibration.status.failure
     if task.with_report:
         found["page"] = rendered(calibration, evidence, snapshot.config, replayed.inputs, findings)
     return found

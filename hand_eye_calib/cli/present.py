@@ -18,7 +18,16 @@ from hand_eye_calib.report.words import given_or_estimated, listing, with_sigma
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
 
-EXIT_CODES = {SolveStatus.OK: 0, SolveStatus.NOT_CONVERGED: 1, SolveStatus.UNOBSERVABLE: 3}
+EXIT_CODES = {
+    SolveStatus.OK: 0,
+    SolveStatus.NOT_CONVERGED: 1,
+    SolveStatus.CONTRADICTED: 1,
+    SolveStatus.UNOBSERVABLE: 3,
+}
+_REMEDIES = {
+    SolveStatus.NOT_CONVERGED: "record more varied motion",
+    SolveStatus.CONTRADICTED: "check value, unit and sign of the prior",
+}
 
 _ROTATIONS = ("roll", "pitch", "yaw")
 _ROTATION_VECTOR = ("rx", "ry", "rz")
@@ -70,8 +79,8 @@ def deliver(
     if evidence is not None and snapshot is not None:
         findings = more.get("findings", ())
         write_report(arguments.out, calibration, evidence, snapshot.config, inputs, findings)
-    if calibration.status is SolveStatus.NOT_CONVERGED:
-        fail("the solver did not converge; do not use this result, record more varied motion", 1)
+    if failure := calibration.status.failure:
+        fail(f"{failure}; do not use this result, {_REMEDIES[calibration.status]}", 1)
     return EXIT_CODES[calibration.status]
 
 
@@ -194,6 +203,5 @@ def _status(calibration: Calibration) -> str:
         names = calibration.unobservable()
         values = "its value" if len(names) == 1 else "their values"
         return f"unobservable: this motion does not determine {listing(names)}; do not use {values}"
-    if calibration.status is SolveStatus.NOT_CONVERGED:
-        return "not converged: do not use this result"
-    return calibration.status.value
+    words = calibration.status.value.replace("_", " ")
+    return f"{words}: do not use this result" if calibration.status.failure else words

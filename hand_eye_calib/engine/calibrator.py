@@ -22,7 +22,7 @@ from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import BufferLimits, PoseBuffer, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS, Snapshot, downsample, name_frames, pair_poses
 from hand_eye_calib.errors import InputError, NotEnoughDataError
-from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE
+from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
 
 # Bounds of a quaternion's squared length.
@@ -433,12 +433,10 @@ def _is_pose(x: Any, y: Any, z: Any, qx: Any, qy: Any, qz: Any, qw: Any) -> Any:
 def _what_is_wrong(position: Sequence[float], quat_xyzw: Sequence[float]) -> InputError:
     """The InputError for values that are not a pose."""
     x, y, z = position
-    if not abs(x + y + z) < np.inf:
+    if not np.isfinite(position).all():
         return InputError(f"position ({x}, {y}, {z}) is not finite")
     if max(abs(x), abs(y), abs(z)) > FARTHEST_M:
-        return InputError(
-            f"position ({x:.4g}, {y:.4g}, {z:.4g}) is more than {FARTHEST_M:g} m from the origin"
-        )
+        return InputError(far_position(x, y, z))
     qx, qy, qz, qw = quat_xyzw
     length = (qx * qx + qy * qy + qz * qz + qw * qw) ** 0.5
     return InputError(

@@ -273,6 +273,8 @@ def _spread_by_alignment(scale: Scale | None, time_offset: TimeOffset | None) ->
 def _status(converged: bool, fused: Fused) -> SolveStatus:
     if not converged:
         return SolveStatus.NOT_CONVERGED
+    if fused.contradictions:
+        return SolveStatus.CONTRADICTED
     unobservable = _named(fused.assessment, DofVerdict.UNOBSERVABLE)
     return SolveStatus.UNOBSERVABLE if unobservable else SolveStatus.OK
 
@@ -294,7 +296,7 @@ def _warnings_of(fused: Fused, converged: bool) -> list[str]:
     for axis, distance in fused.contradictions.items():
         warnings.append(
             f"the prior on {axis} is {distance:.1f} standard deviations from the estimate from "
-            "motion: check its value, unit and sign"
+            "motion and was left out: check its value, unit and sign"
         )
     if not converged:
         warnings.append("the solver did not converge: do not use this result")

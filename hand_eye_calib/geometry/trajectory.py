@@ -152,9 +152,11 @@ class Trajectory:
 
     def scaled(self, scale: float) -> Self:
         """The same rotations with every translation multiplied by ``scale``."""
+        scaled = copy.copy(self)  # in another unit, positions may be farther than FARTHEST_M
         poses = self.poses.copy()
         poses[:, :3, 3] *= scale
-        return type(self)(self.stamps_ns, poses, self.sensor_frame, self.world_frame)
+        object.__setattr__(scaled, "poses", poses)
+        return scaled
 
     def at(self, stamps_ns: IntArray, extrapolate: bool = False) -> FloatArray:
         """Interpolate poses at other stamps along the geodesic of SE(3) between neighbours.
@@ -199,6 +201,11 @@ class Trajectory:
         return poses
 
 
+def far_position(x: float, y: float, z: float) -> str:
+    """What is wrong with a position farther than FARTHEST_M from the origin."""
+    return f"position ({x:.4g}, {y:.4g}, {z:.4g}) is more than {FARTHEST_M:g} m from the origin"
+
+
 def _check_poses(poses: FloatArray) -> None:
     """Raise InputError at the first pose (N, 4, 4) that is no rigid transform."""
     finite = np.isfinite(poses).all(axis=(1, 2))
@@ -206,6 +213,12 @@ def _check_poses(poses: FloatArray) -> None:
         raise InputError(
             f"pose {int(np.argmin(finite))} has a value that is not finite; "
             "remove it or repair its source"
+        )
+    is_far = (np.abs(poses[:, :3, 3]) > FARTHEST_M).any(axis=1)
+    if is_far.any():
+        index = int(np.argmax(is_far))
+        raise InputError(
+            f"pose {index}: {far_position(*poses[index, :3, 3])}; check its unit, or remove it"
         )
     rotation = poses[:, :3, :3]
     deviation = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(

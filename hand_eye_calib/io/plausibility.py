@@ -11,15 +11,13 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry.trajectory import FARTHEST_M, far_position
 
 # An isolated pose lies this many times farther from both neighbours than these from each other (and
 # than the usual step).
 _FACTOR = 10.0
 _SMALLEST_JUMP_M, _SMALLEST_JUMP_RAD, _SMALLEST_JUMP_S = 0.2, 0.1, 0.5
 _BLOCK = 4096
-
-# Coordinates from the earth's centre are of 6.4e6 m.
-_FARTHEST_M = 1e8
 
 
 def check_positions(positions: FloatArray) -> None:
@@ -30,13 +28,10 @@ def check_positions(positions: FloatArray) -> None:
     InputError
         At the first; its attribute ``index`` has the row.
     """
-    is_far = (np.abs(positions) > _FARTHEST_M).any(axis=1)
+    is_far = (np.abs(positions) > FARTHEST_M).any(axis=1)
     if is_far.any():
         index = int(np.argmax(is_far))
-        x, y, z = positions[index]
-        error = InputError(
-            f"position ({x:.4g}, {y:.4g}, {z:.4g}) is more than {_FARTHEST_M:g} m from the origin"
-        )
+        error = InputError(far_position(*positions[index]))
         error.index = index  # type: ignore[attr-defined]
         raise error
 

@@ -223,7 +223,7 @@ def _remarks(calibration: Calibration) -> list[str]:
     ]
     if calibration.status is not SolveStatus.OK:
         names = ", ".join(calibration.unobservable())
-        what = f"the motion does not reveal {names}" if names else "the solver did not converge"
+        what = calibration.status.failure or f"the motion does not reveal {names}"
         remarks.append(f"DO NOT USE AS IT IS: {what}.")
     return [printable(" ".join(remark.split())) for remark in remarks]
 

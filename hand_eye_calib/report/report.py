@@ -157,8 +157,8 @@ def _names(calibration: Calibration, verdict: DofVerdict) -> list[str]:
 
 def _verdict(calibration: Calibration) -> str:
     """What to think of the result, in a sentence."""
-    if calibration.status is SolveStatus.NOT_CONVERGED:
-        return "The solver did not converge. Do not use this result."
+    if failure := calibration.status.failure:
+        return f"{failure.capitalize()}. Do not use this result."
     hidden, weak = calibration.unobservable(), _names(calibration, DofVerdict.WEAK)
     if len(hidden) == 6:
         return "This motion determines nothing of how the sensors are mounted."

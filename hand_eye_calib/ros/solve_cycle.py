@@ -178,7 +178,7 @@ class SolveCycle:
         return self._report_result(solved.calibration)
 
     def _report_result(self, calibration: Calibration) -> tuple[bool, str]:
-        if calibration.status is not SolveStatus.NOT_CONVERGED:
+        if not calibration.status.failure:
             self.result, self.solved_at_s = calibration, time.monotonic()
             self._publish(calibration)
         text = describe(calibration, self.seen)

@@ -15,7 +15,7 @@ from motions import (
 import hand_eye_calib as hec
 from hand_eye_calib.calibration import SolveStatus
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.calibrator import Calibrator, UnusablePose
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
@@ -155,6 +155,8 @@ class TestRefusals:
         [
             ((0, np.nan, 0), (0, 0, 0, 1), r"position \(0, nan, 0\) is not finite"),
             ((np.inf, 0, 0), (0, 0, 0, 1), "is not finite"),
+            ((0, -1e154, 0), (0, 0, 0, 1), r"is more than 1e\+08 m from the origin"),
+            ((1.7e308, 1.7e308, 0), (0, 0, 0, 1), r"is more than 1e\+08 m from the origin"),
             ((0, 0, 0), (0, 0, 0, 0), "has length 0, expected 1"),
             ((0, 0, 0), (0.5, 0.5, 0.5, 0.6), "has length 1.05"),
             ((0, 0, 0), (0, 0, np.nan, 1), "has length nan"),
@@ -165,6 +167,17 @@ class TestRefusals:
         with pytest.raises(InputError, match=message):
             calibrator.add_pose("parent", 0, position, quat)
         assert calibrator.statistics("parent").received == 0
+
+    def test_a_far_position_among_many_is_named(self):
+        calibrator = Calibrator()
+        positions = np.zeros((5, 3))
+        positions[3, 2] = 1e154
+        with pytest.raises(UnusablePose, match="from the origin") as caught:
+            calibrator.add_poses(
+                "parent", np.arange(5), positions, np.tile([0.0, 0.0, 0.0, 1.0], (5, 1))
+            )
+        assert caught.value.index == 3
+        assert calibrator.statistics("parent").received == 3
 
     def test_poses_of_no_stream(self):
         calibrator = Calibrator()

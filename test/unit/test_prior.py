@@ -7,10 +7,13 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 from hand_eye_calib.assessment.covariance import AXES, UNKNOWN_TRANSLATION, Assessment
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig, parse_prior
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.results import load_result
+from hand_eye_calib.io.trajectory_files import write_trajectory
 
 # A sensor on a mast, looking back.
 MOUNT = se3.from_rotation_translation(
@@ -145,13 +148,65 @@ class TestFullMotion:
             dof.verdict for dof in plain.observability
         ]
 
-    def test_a_contradiction_is_said(self):
-        result = calibrate(*self.drive(), reference="B10", prior={"x": (-0.6, 0.001)})
-        assert any("prior on x is" in warning and "sign" in warning for warning in result.warnings)
-        assert not any(
-            "standard deviations" in w
-            for w in calibrate(*self.drive(), reference="B10", prior={"x": (0.6, 0.05)}).warnings
-        )
+    @pytest.mark.parametrize(
+        ("axis", "prior"),
+        [("x", (-0.6, 0.001)), ("x", (100.0, 1e-9)), ("z", (15.0, 0.05)), ("yaw", (0.2, 0.01))],
+    )
+    def test_a_contradiction_is_refused_and_the_prior_left_out(self, axis, prior):
+        plain = calibrate(*self.drive(), reference="B10")
+        result = calibrate(*self.drive(), reference="B10", prior={axis: prior})
+        assert result.status is SolveStatus.CONTRADICTED
+        assert result.status.failure == "a prior contradicts the motion"
+        (warning,) = (w for w in result.warnings if f"prior on {axis} is" in w)
+        assert "check its value, unit and sign" in warning
+        np.testing.assert_array_equal(result.T_parent_child, plain.T_parent_child)
+        np.testing.assert_array_equal(result.covariance, plain.covariance)
+
+    def test_the_other_priors_are_still_used(self):
+        prior = {"x": (100.0, 1e-9), "y": (-0.3, 1e-4)}
+        result = calibrate(*self.drive(), reference="B10", prior=prior)
+        assert result.status is SolveStatus.CONTRADICTED
+        np.testing.assert_allclose(result.T_parent_child[:3, 3], MOUNT[:3, 3], atol=0.01)
+        assert result.observability[1].verdict is DofVerdict.PRIOR
+
+    def test_a_prior_that_agrees_is_no_contradiction(self):
+        result = calibrate(*self.drive(), reference="B10", prior={"x": (0.6, 0.05)})
+        assert result.status is SolveStatus.OK
+        assert not any("standard deviations" in warning for warning in result.warnings)
+
+    @pytest.mark.parametrize("sigma", [1e-9, 1e-15])
+    def test_tiny_standard_deviations_are_no_trouble(self, sigma):
+        for streams in (self.drive(), flat_drive()):
+            result = calibrate(*streams, reference="B10", prior={"z": (1.85, sigma)})
+            assert result.status is SolveStatus.OK
+            np.testing.assert_allclose(result.T_parent_child[:3, 3], MOUNT[:3, 3], atol=0.02)
+
+
+def test_along_an_unobservable_axis_only_an_impossible_distance_contradicts():
+    # A boom of 15 m is longer than "unknown" assumes, and the motion says nothing about it.
+    long = calibrate(*flat_drive(), reference="B10", prior={"z": (15.0, 0.05)})
+    assert long.status is SolveStatus.OK
+    assert long.T_parent_child[2, 3] == pytest.approx(15.0, abs=0.05)
+    in_millimetres = calibrate(*flat_drive(), reference="B10", prior={"z": (1850.0, 20.0)})
+    assert in_millimetres.status is SolveStatus.CONTRADICTED
+    assert in_millimetres.unobservable() == ["z"]
+
+
+def test_the_command_refuses_a_contradiction(tmp_path, capsys):
+    paths = []
+    for name, stream in zip(("parent", "child"), flat_drive(), strict=True):
+        paths.append(str(tmp_path / f"{name}.tum"))
+        write_trajectory(paths[-1], stream)
+    frames = ["--parent-frame", "lidar", "--child-frame", "camera"]
+    command = ["calibrate", *paths, *frames, "--reference", "B10", "--out", str(tmp_path / "out")]
+    assert main([*command, "--prior", "x=100+/-1e-9"]) == 1
+    captured = capsys.readouterr()
+    assert "a prior contradicts the motion" in captured.err
+    assert "contradicted: do not use this result" in captured.out
+    assert "static_transform" not in captured.out
+    assert load_result(tmp_path / "out").status is SolveStatus.CONTRADICTED
+    written = (tmp_path / "out" / "extrinsic.urdf.xacro").read_text(encoding="utf-8")
+    assert "DO NOT USE AS IT IS: a prior contradicts the motion" in written
 
 
 def test_precisions_add_up():

@@ -31,6 +31,11 @@ def test_extrapolation_is_refused_unless_asked_for():
     np.testing.assert_allclose(beyond, POSES[1] @ se3.exp(2 * step), atol=1e-14)
 
 
+# One coordinate of the last pose.
+FAR = np.zeros((3, 4, 4))
+FAR[2, 2, 3] = 1.0
+
+
 @pytest.mark.parametrize(
     ("stamps", "poses", "message"),
     [
@@ -44,6 +49,11 @@ def test_extrapolation_is_refused_unless_asked_for():
         ),
         (STAMPS, POSES * np.array([1, 1, 2])[:, None, None], "pose 2 is not a rigid transform"),
         (STAMPS, POSES @ np.diag([1.0, 1.0, -1.0, 1.0]), "pose 0 is not a rigid transform"),
+        (
+            STAMPS,
+            POSES + 1e154 * FAR,
+            r"pose 2: position \(.*1e\+154\) is more than 1e\+08 m from the origin",
+        ),
     ],
 )
 def test_unusable_input_names_the_first_offender(stamps, poses, message):
@@ -81,3 +91,8 @@ def test_its_representation_is_one_short_line():
     assert text.startswith("Trajectory(3 poses over ")
     assert text.endswith(" s, sensor_frame='lidar')")
     assert len(text) < 80
+
+
+def test_a_change_of_unit_may_go_beyond_the_limit():
+    far = Trajectory(STAMPS, POSES + 9e7 * FAR).scaled(1000.0)
+    assert far.poses[2, 2, 3] > 8e10
