@@ -12,10 +12,14 @@ over q and t from the identity, and q is normalised only afterwards, so the rota
 the one that was fitted (lengths between 0.5 and 1 are common with noise).
 """
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers.ali import residual_rows
 from hand_eye_calib.solvers.separable import squared_translation_residual
 from hand_eye_calib.solvers.solution import Solution
@@ -30,7 +34,7 @@ _SUFFICIENT_DECREASE = 1e-8
 _ROUNDING = 10 * np.finfo(float).eps
 
 
-def solve(pairs):
+def solve(pairs: MotionPairs) -> Solution:
     """Minimise the translation residual over an unnormalised quaternion, by Newton's method from
     the identity.
 
@@ -53,7 +57,7 @@ def solve(pairs):
     """
     # Residuals through the triangular factor, not through its square: on noise-free data the square
     # loses half of the digits.
-    rows = np.linalg.qr(residual_rows(pairs), mode="r")
+    rows = np.asarray(np.linalg.qr(residual_rows(pairs), mode="r"))
     start_gradient = np.abs(_derivatives(_IDENTITY, rows)[1]).max()
     rows *= np.sqrt(min(1.0, _LARGEST_START_GRADIENT / max(start_gradient, np.finfo(float).tiny)))
     parameters, shift = _IDENTITY, 0.0
@@ -76,7 +80,9 @@ def solve(pairs):
     return Solution(T_parent_child, objective, converged, iterations, np.ones(len(pairs)))
 
 
-def _descent_step(gradient, hessian, last_shift):
+def _descent_step(
+    gradient: FloatArray, hessian: FloatArray, last_shift: float
+) -> tuple[FloatArray, float]:
     """Newton step and the shift of the Hessian's diagonal it took: none, else about a third of the
     last one and up.
     """
@@ -86,10 +92,11 @@ def _descent_step(gradient, hessian, last_shift):
             shift *= growth
         else:
             shift = max(last_shift / 3, 1e-20) if last_shift else 1e-4
-    return -np.linalg.solve(hessian + shift * np.eye(7), gradient), shift or last_shift
+    step = -np.linalg.solve(hessian + shift * np.eye(7), gradient)
+    return np.asarray(step), shift or last_shift
 
 
-def _symmetric(*entries):
+def _symmetric(*entries: tuple[int, int, float]) -> FloatArray:
     matrix = np.zeros((4, 4))
     for row, column, value in entries:
         matrix[row, column] += value / 2
@@ -114,10 +121,10 @@ _P = np.array(
 )
 
 
-def _factor(q):
+def _factor(q: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """``sqrt(|q|)`` with its gradient and Hessian."""
     squared = q @ q
-    factor = squared**0.25
+    factor = float(squared**0.25)
     return (
         factor,
         factor * q / (2 * squared),
@@ -125,7 +132,7 @@ def _factor(q):
     )
 
 
-def _lift(parameters):
+def _lift(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The thirteen numbers x = (vec M(q), t, 1) and their derivative (13, 7)."""
     q = parameters[:4]
     factor, factor_gradient, _ = _factor(q)
@@ -137,12 +144,12 @@ def _lift(parameters):
     return np.concatenate([np.eye(3).ravel() + 2 * factor * P, parameters[4:], [1.0]]), derivative
 
 
-def _value(parameters, rows):
+def _value(parameters: FloatArray, rows: FloatArray) -> float:
     residuals = rows @ _lift(parameters)[0]
-    return residuals @ residuals
+    return float(residuals @ residuals)
 
 
-def _derivatives(parameters, rows):
+def _derivatives(parameters: FloatArray, rows: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Cost, gradient (7,) and Hessian (7, 7)."""
     x, derivative = _lift(parameters)
     q = parameters[:4]
@@ -154,4 +161,4 @@ def _derivatives(parameters, rows):
     hessian[:4, :4] += 4 * (
         factor_hessian * (q @ weighted @ q) + cross + cross.T + 2 * factor * weighted
     )
-    return residuals @ residuals, 2 * residuals @ slope, hessian
+    return float(residuals @ residuals), 2 * residuals @ slope, hessian

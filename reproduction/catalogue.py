@@ -1,8 +1,12 @@
 """Experiments by name: the cells each needs and the files it writes."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hand_eye_calib.errors import ConfigError, InputError
 from reproduction import (
@@ -17,8 +21,13 @@ from reproduction import (
     unlike,
 )
 from reproduction.published import KITTI, LEVELS, METHODS, SIMULATED
-from reproduction.rows import ALI_AS_PUBLISHED, cells
+from reproduction.rows import ALI_AS_PUBLISHED, Cell, Row, cells
+from reproduction.statistics import Table
 
+if TYPE_CHECKING:
+    from reproduction.sources import PublishedSource, Source
+
+Files = dict[str, list[Path]]
 _SIMULATION_METHODS = (*METHODS, ALI_AS_PUBLISHED)
 
 
@@ -33,58 +42,46 @@ class Artefact:
     cells : list of Cell
         What must be solved for it.
     write : callable
-        Given :class:`Results`, writes the files and returns their paths.
+        Given the name and :class:`Results`, writes the files and returns their paths.
     data : tuple of str
         The kinds of source it can be made from.
     """
 
     name: str
-    cells: list
-    write: object
-    data: tuple = ("published", "simulated")
+    cells: list[Cell]
+    write: Callable[[str, Results], list[Path]]
+    data: tuple[str, ...] = ("published", "simulated")
 
-    def fits(self, source):
+    def fits(self, source: Source) -> bool:
         """Whether a source has what it needs."""
         return source.data in self.data and all(
             cell.dataset in source.datasets for cell in self.cells
         )
 
 
-def _artefacts():
-    found = {
-        "fig4": Artefact("fig4", [], lambda results: figures.write_components("fig4", results))
-    }
-    for name, methods in figures.FIGURE_METHODS.items():
-        found[name] = Artefact(
-            name,
-            cells(SIMULATED, methods),
-            lambda results, name=name: figures.write_error_figure(name, results),
-        )
-    for name, dataset in tables.SUMMARY_TABLES.items():
-        found[name] = Artefact(
-            name,
-            cells([dataset], METHODS),
-            lambda results, name=name: tables.write_summary_table(name, results),
-        )
-    for name, (dataset, method) in tables.VARIANT_TABLES.items():
-        found[name] = Artefact(
-            name,
-            cells([dataset], [method]),
-            lambda results, name=name: tables.write_variant_table(name, results),
-        )
+def _artefacts() -> dict[str, Artefact]:
     everything = cells(SIMULATED, _SIMULATION_METHODS) + cells(KITTI, METHODS)
-    found["conclusions"] = Artefact("conclusions", everything, conclusions.write)
-    found["findings"] = Artefact("findings", everything, findings.write)
-    found["adaptive"] = Artefact(
-        "adaptive", [], lambda results: hindsight.write("adaptive", results)
-    )
-    found["repeats"] = Artefact(
-        "repeats", [], lambda results: repeats.write("repeats", results), ("published",)
-    )
-    found["unlike"] = Artefact(
-        "unlike", [], lambda results: unlike.write("unlike", results), ("simulated",)
-    )
-    return found
+    found = [
+        Artefact("fig4", [], figures.write_components),
+        *(
+            Artefact(name, cells(SIMULATED, methods), figures.write_error_figure)
+            for name, methods in figures.FIGURE_METHODS.items()
+        ),
+        *(
+            Artefact(name, cells([dataset], METHODS), tables.write_summary_table)
+            for name, dataset in tables.SUMMARY_TABLES.items()
+        ),
+        *(
+            Artefact(name, cells([dataset], [method]), tables.write_variant_table)
+            for name, (dataset, method) in tables.VARIANT_TABLES.items()
+        ),
+        Artefact("conclusions", everything, conclusions.write),
+        Artefact("findings", everything, findings.write),
+        Artefact("adaptive", [], hindsight.write),
+        Artefact("repeats", [], repeats.write, ("published",)),
+        Artefact("unlike", [], unlike.write, ("simulated",)),
+    ]
+    return {artefact.name: artefact for artefact in found}
 
 
 ARTEFACTS = _artefacts()
@@ -125,29 +122,29 @@ class Results:
         Number of processes of the studies, which are not solved cell by cell.
     """
 
-    source: object
-    theirs_source: object
-    rows: list
+    source: Source
+    theirs_source: PublishedSource | None
+    rows: list[Row]
     out: Path
     jobs: int = 1
 
     @property
-    def same_cases(self):
+    def same_cases(self) -> bool:
         """Whether ours and the published results are of the same trajectories."""
         return self.source == self.theirs_source
 
     @property
-    def n_runs(self):
+    def n_runs(self) -> int:
         """Number of runs per level of the simulated data sets."""
         return self.source.runs
 
     @cached_property
-    def ours(self):
+    def ours(self) -> Table:
         """:class:`~reproduction.statistics.Table` of our errors."""
         return statistics.ours(self.rows)
 
     @cached_property
-    def theirs(self):
+    def theirs(self) -> Table | None:
         """Table of the published errors; None without published data."""
         if self.same_cases:
             return statistics.theirs(self.rows)
@@ -161,7 +158,7 @@ class Results:
         )
         return statistics.theirs_of_cases(cases, _SIMULATION_METHODS)
 
-    def of(self, dataset, method):
+    def of(self, dataset: str, method: str) -> list[Row]:
         """Rows of a method on a data set."""
         return [row for row in self.rows if (row.dataset, row.method) == (dataset, method)]
 
@@ -183,7 +180,9 @@ class Experiment:
         If the source has no cases of this experiment.
     """
 
-    def __init__(self, name, source, theirs_source=None):
+    def __init__(
+        self, name: str, source: Source, theirs_source: PublishedSource | None = None
+    ) -> None:
         artefacts = [ARTEFACTS[artefact] for artefact in EXPERIMENTS[name]]
         self.artefacts = [artefact for artefact in artefacts if artefact.fits(source)]
         self.left_out = [artefact.name for artefact in artefacts if artefact not in self.artefacts]
@@ -200,7 +199,13 @@ class Experiment:
         )
         self._source, self._theirs_source = source, theirs_source
 
-    def run(self, out, jobs, on_solved=lambda cell: None, on_written=lambda name: None):
+    def run(
+        self,
+        out: Path,
+        jobs: int,
+        on_solved: Callable[[Cell], object] = lambda cell: None,
+        on_written: Callable[[str], object] = lambda name: None,
+    ) -> tuple[Results, Files]:
         """Solve what is not solved yet, and write the files.
 
         Parameters
@@ -238,7 +243,7 @@ class Experiment:
         files = {}
         for artefact in self.artefacts:
             try:
-                files[artefact.name] = artefact.write(results)
+                files[artefact.name] = artefact.write(artefact.name, results)
             except OSError as error:
                 raise InputError(
                     f"cannot write {error.filename}: {error.strerror}; choose another "

@@ -2,20 +2,29 @@
 published results.
 """
 
+from __future__ import annotations
+
 import argparse
 import json
 import os
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.main import exit_code_of
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import ConfigError
+from reproduction.rows import Row
 from reproduction.writing import put_into_page
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Files, Results
+    from reproduction.sources import PublishedSource, Source
 
 _SILENT_S = 2.0
 
@@ -50,7 +59,7 @@ folder with --data-folder."""
 )
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run an experiment; returns the exit code.
 
     Parameters
@@ -65,7 +74,7 @@ def main(argv=None):
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 
-def add_arguments(parser):
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
@@ -111,7 +120,7 @@ def add_arguments(parser):
     add_json_argument(parser)
 
 
-def run(arguments):
+def run(arguments: argparse.Namespace) -> int:
     """Run the experiment; returns the exit code."""
     from reproduction.catalogue import Experiment
 
@@ -139,7 +148,7 @@ def run(arguments):
     return 0
 
 
-def _sources(arguments):
+def _sources(arguments: argparse.Namespace) -> tuple[Source, PublishedSource | None]:
     """The source of the cases, and the published source to compare with or None."""
     from reproduction import sources
 
@@ -172,12 +181,12 @@ def _sources(arguments):
     return simulated, published
 
 
-def _cores():
+def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
-def _progress(total):
+def _progress(total: int) -> Iterator[Callable[[Any], None]]:
     """A function that advances the progress bar by one; the bar appears after two seconds, on a
     terminal only.
     """
@@ -195,7 +204,7 @@ def _progress(total):
     task = bar.add_task("", total=total)
     appears_at = time.monotonic() + _SILENT_S
 
-    def advance(what):
+    def advance(what: Any) -> None:
         if not bar.live.is_started and sys.stderr.isatty() and time.monotonic() >= appears_at:
             bar.start()
         bar.update(task, advance=1, description=getattr(what, "name", what))
@@ -207,7 +216,7 @@ def _progress(total):
             bar.stop()
 
 
-def _document(arguments, results, files):
+def _document(arguments: argparse.Namespace, results: Results, files: Files) -> dict[str, Any]:
     document = {
         "experiment": arguments.id,
         "data": results.source.configuration()["data"],
@@ -223,7 +232,7 @@ def _document(arguments, results, files):
     return document
 
 
-def _agreement(rows, method):
+def _agreement(rows: Sequence[Row], method: str) -> dict[str, Any]:
     chosen = [row for row in rows if row.method == method]
     found = {"method": method, "rows": len(chosen), "agreeing": sum(row.agrees for row in chosen)}
     found["differing"] = dict(Counter(row.why() for row in chosen if not row.agrees))
@@ -235,7 +244,7 @@ def _agreement(rows, method):
     return found
 
 
-def _text(document, files):
+def _text(document: dict[str, Any], files: Files) -> str:
     from reproduction.rows import TITLES
 
     lines = []

@@ -1,10 +1,15 @@
 """Comparison with the published results: every row, every plotted point, differences and why."""
 
+from __future__ import annotations
+
 from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-from reproduction.rows import METRICS, TITLES, UNITS, agree
+from reproduction.rows import METRICS, TITLES, UNITS, Row, agree
+from reproduction.statistics import Summary
 from reproduction.writing import markdown_table, percent, write_csv
 
 # Half the width of the 95 % interval of a median, in interquartile ranges over the root of the
@@ -14,7 +19,7 @@ _NOTCH = 1.57
 _MOST_LISTED = 30
 
 
-def write_rows(path, rows):
+def write_rows(path: Path, rows: Sequence[Row]) -> Path:
     """Every row with ours, theirs and why they differ, as CSV; returns the path."""
     named = [f"{metric}_{UNITS[metric]}" for metric in METRICS]
     header = [
@@ -37,7 +42,7 @@ def write_rows(path, rows):
                 row.method,
                 row.reference,
                 *row.errors,
-                *row.published,
+                *row.theirs,
                 row.objective,
                 row.published_objective,
                 row.agrees,
@@ -48,14 +53,14 @@ def write_rows(path, rows):
     )
 
 
-def describe_rows(rows):
+def describe_rows(rows: Sequence[Row]) -> str:
     """Markdown: how many rows agree, by method, and the reasons why others do not."""
     methods = sorted({row.method for row in rows})
     lines = []
     for method in methods:
         of_method = [row for row in rows if row.method == method]
         agreeing = sum(row.agrees for row in of_method)
-        absolute = sum(agree(row.errors[k], row.published[k]) for row in of_method for k in (2, 3))
+        absolute = sum(agree(row.errors[k], row.theirs[k]) for row in of_method for k in (2, 3))
         reasons = Counter(row.why() for row in of_method if not row.agrees)
         lines.append(
             [
@@ -84,7 +89,7 @@ def describe_rows(rows):
     )
 
 
-def _list_differing(rows):
+def _list_differing(rows: Sequence[Row]) -> str:
     if not rows:
         return ""
     listed = [
@@ -93,7 +98,7 @@ def _list_differing(rows):
             TITLES[row.method],
             row.reference,
             _three(row.errors),
-            _three(row.published),
+            _three(row.theirs),
             _objectives(row),
             row.why(),
         ]
@@ -116,11 +121,11 @@ def _list_differing(rows):
     return "\n\n" + markdown_table(header, listed) + more
 
 
-def _three(errors):
+def _three(errors: Sequence[float]) -> str:
     return f"{errors[2]:.4g}, {errors[3]:.4g}"
 
 
-def _objectives(row):
+def _objectives(row: Row) -> str:
     return (
         "-"
         if row.published_objective is None
@@ -128,24 +133,22 @@ def _objectives(row):
     )
 
 
-def describe_dnlo(rows):
+def describe_dnlo(rows: Sequence[Row]) -> str:
     """Markdown: the objectives of DNLO against those at the published answers, and how far the
     errors moved.
     """
     rows = [row for row in rows if row.method == "dnlo"]
     verdicts = Counter(row.objective_verdict for row in rows)
-    same = sum(agree(row.errors[2], row.published[2]) for row in rows)
+    same = sum(agree(row.errors[2], row.theirs[2]) for row in rows)
     moved = np.array(
         [
-            abs(row.errors[2] - row.published[2])
+            abs(row.errors[2] - row.theirs[2])
             for row in rows
-            if not agree(row.errors[2], row.published[2])
+            if not agree(row.errors[2], row.theirs[2])
         ]
     )
     nearer = sum(
-        row.errors[2] < row.published[2]
-        for row in rows
-        if not agree(row.errors[2], row.published[2])
+        row.errors[2] < row.theirs[2] for row in rows if not agree(row.errors[2], row.theirs[2])
     )
     text = (
         "DNLO has many local minima and is compared by its objective, eq. (5), taken by the same "
@@ -162,7 +165,7 @@ def describe_dnlo(rows):
     return text
 
 
-def compare_summaries(ours, theirs, same_cases):
+def compare_summaries(ours: Summary, theirs: Summary, same_cases: bool) -> bool:
     """Whether a plotted point agrees with the published one.
 
     Parameters
@@ -182,14 +185,14 @@ def compare_summaries(ours, theirs, same_cases):
     return low <= their_high and their_low <= high
 
 
-def _interval(summary):
+def _interval(summary: Summary) -> tuple[float, float]:
     if summary.is_median:
         half = _NOTCH * (summary.high - summary.low) / np.sqrt(summary.n)
         return summary.centre - half, summary.centre + half
     return summary.low, summary.high
 
 
-def reasons(rows):
+def reasons(rows: Sequence[Row]) -> str:
     """Why rows differ, with counts, in one string."""
     counted = Counter(row.why() for row in rows if row.published is not None and not row.agrees)
     return "; ".join(

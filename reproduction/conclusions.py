@@ -1,14 +1,23 @@
 """The paper's conclusions, one by one: whether our run shows them, and by which figures."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from reproduction.figures import components
 from reproduction.published import METHODS, REFERENCES, SIMULATED
-from reproduction.rows import ALI_AS_PUBLISHED, TITLES
+from reproduction.rows import ALI_AS_PUBLISHED, TITLES, Row
+from reproduction.statistics import Table
 from reproduction.tables import rectified_errors
 from reproduction.writing import write_csv, write_text
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Results
 
 _AS_PUBLISHED = (ALI_AS_PUBLISHED, "dnl", "dnlo", "park", "taylor", "zhuang")
 _KITTI_TITLES = {"kitti_short": "short", "kitti_long": "long"}
@@ -25,8 +34,8 @@ class Conclusion:
     evidence: str
 
 
-def write(results):
-    """Write conclusions.md and conclusions.csv; returns the paths."""
+def write(name: str, results: Results) -> list[Path]:
+    """Write ``NAME.md`` and ``NAME.csv``; returns the paths."""
     found = check(results)
     blocks = []
     for number, conclusion in enumerate(found, start=1):
@@ -35,16 +44,16 @@ def write(results):
             f"{conclusion.section})\n\n*{conclusion.verdict}.* {conclusion.evidence}"
         )
     return [
-        write_text(results.out / "conclusions.md", "# The paper's conclusions, checked", *blocks),
+        write_text(results.out / f"{name}.md", "# The paper's conclusions, checked", *blocks),
         write_csv(
-            results.out / "conclusions.csv",
+            results.out / f"{name}.csv",
             ["section", "claim", "verdict", "evidence"],
             ([item.section, item.claim, item.verdict, item.evidence] for item in found),
         ),
     ]
 
 
-def check(results):
+def check(results: Results) -> list[Conclusion]:
     """List of Conclusion for results of all methods on all data sets; Ali on simulated drives is
     the paper's own unless named proper.
     """
@@ -59,15 +68,21 @@ def check(results):
     ]
 
 
-def _verdict(holds, in_part=False):
+def _verdict(holds: Any, in_part: Any = False) -> str:
     return "Holds" if holds else "Holds in part" if in_part else "Does not hold"
 
 
-def _named(method):
+def _named(method: str) -> str:
     return "Ali with a normalised quaternion" if method == "ali" else TITLES[method]
 
 
-def _scores(table, dataset, method, metric="e_at", references=REFERENCES):
+def _scores(
+    table: Table,
+    dataset: str,
+    method: str,
+    metric: str = "e_at",
+    references: Sequence[str] = REFERENCES,
+) -> str:
     unit = "m" if metric.endswith("t") else "deg"
     return (
         ", ".join(
@@ -78,7 +93,7 @@ def _scores(table, dataset, method, metric="e_at", references=REFERENCES):
     )
 
 
-def _on_references(table):
+def _on_references(table: Table) -> Iterator[Conclusion]:
     counts, n_rows = {}, 0
     for method in (*_AS_PUBLISHED, "ali"):
         errors = np.concatenate(
@@ -113,7 +128,7 @@ def _on_references(table):
         for dataset, value in others.items()
     }
     noise_ratio = score["A"] / min(score.values())
-    rank = sorted(score, key=score.get).index("A") + 1
+    rank = sorted(score, key=lambda name: score[name]).index("A") + 1
     yield Conclusion(
         "4.2.1",
         "Reference A is not the best even with Gaussian noise, and noticeably worse with "
@@ -154,7 +169,7 @@ def _on_references(table):
     )
 
 
-def _on_components(results):
+def _on_components(results: Results) -> Conclusion:
     found = components(results.source.cases("noise", 0.0))
     worst_z = max(
         found["z"][name].centre / min(found["x"][name].centre, found["y"][name].centre)
@@ -175,7 +190,7 @@ def _on_components(results):
     )
 
 
-def _on_relative_errors(results, table):
+def _on_relative_errors(results: Results, table: Table) -> Iterator[Conclusion]:
     relative = {
         metric: table.best_reference("mixture", "dnlo", metric)
         for metric in ("e_rt", "e_rR", "e_at", "e_aR")
@@ -218,23 +233,26 @@ def _on_relative_errors(results, table):
     )
 
 
-def _picked_right(rows, method):
+def _picked_right(rows: Sequence[Row], method: str) -> float:
     """Share of the mixture's runs in which the reference with the smallest e_rt has the smallest
     e_at too.
     """
-    runs = {}
+    runs: dict[str, list[Row]] = {}
     for row in rows:
         if (row.dataset, row.method) == ("mixture", method):
             runs.setdefault(row.run, []).append(row)
-    return np.mean(
-        [
-            min(of_run, key=lambda row: row.errors[0]) is min(of_run, key=lambda row: row.errors[2])
-            for of_run in runs.values()
-        ]
+    return float(
+        np.mean(
+            [
+                min(of_run, key=lambda row: row.errors[0])
+                is min(of_run, key=lambda row: row.errors[2])
+                for of_run in runs.values()
+            ]
+        )
     )
 
 
-def _on_methods(table):
+def _on_methods(table: Table) -> Iterator[Conclusion]:
     best = {
         dataset: {method: table.best_reference(dataset, method) for method in _AS_PUBLISHED}
         for dataset in SIMULATED
@@ -249,11 +267,11 @@ def _on_methods(table):
     yield _dnlo_against_others(table, best)
 
 
-def _variants(best):
+def _variants(best: Mapping[str, str]) -> str:
     return ", ".join(f"{TITLES[method]} {reference}" for method, reference in best.items())
 
 
-def _best_with_noise(best):
+def _best_with_noise(best: Mapping[str, str]) -> Conclusion:
     return Conclusion(
         "4.2.2",
         "With Gaussian noise B10 is the best variant of all methods but Zhuang.",
@@ -262,7 +280,7 @@ def _best_with_noise(best):
     )
 
 
-def _best_with_outliers(best):
+def _best_with_outliers(best: Mapping[str, str]) -> Conclusion:
     return Conclusion(
         "4.2.2",
         "With outliers B1 is the best variant of most methods.",
@@ -271,9 +289,11 @@ def _best_with_outliers(best):
     )
 
 
-def _dnlo_with_outliers(table, best):
+def _dnlo_with_outliers(table: Table, best: Mapping[str, str]) -> Conclusion:
     scores = {method: table.score("outliers", method, best[method]) for method in _AS_PUBLISHED}
-    rival = min((method for method in scores if method != "dnlo"), key=scores.get)
+    rival = min(
+        (method for method in scores if method != "dnlo"), key=lambda method: scores[method]
+    )
     return Conclusion(
         "4.2.2",
         "With outliers DNLO clearly outperforms the others.",
@@ -284,8 +304,8 @@ def _dnlo_with_outliers(table, best):
     )
 
 
-def _ali_with_outliers(table, best):
-    def errors(method, reference):
+def _ali_with_outliers(table: Table, best: Mapping[str, str]) -> Conclusion:
+    def errors(method: str, reference: str) -> dict[str, float]:
         return {
             metric: table.score("outliers", method, reference, metric)
             for metric in ("e_at", "e_aR")
@@ -309,7 +329,7 @@ def _ali_with_outliers(table, best):
     )
 
 
-def _separable_rotation(table):
+def _separable_rotation(table: Table) -> Conclusion:
     rotation = {
         dataset: max(
             table.values(dataset, level, method, reference, "e_aR").max()
@@ -328,7 +348,7 @@ def _separable_rotation(table):
     )
 
 
-def _references_with_drift(table):
+def _references_with_drift(table: Table) -> Conclusion:
     factors = {}
     for method in _AS_PUBLISHED:
         values = [
@@ -348,7 +368,7 @@ def _references_with_drift(table):
     )
 
 
-def _best_with_mixture(table, best):
+def _best_with_mixture(table: Table, best: Mapping[str, str]) -> Conclusion:
     by_mean = {method: _best_by_mean(table, method) for method in _AS_PUBLISHED}
     return Conclusion(
         "4.2.2",
@@ -358,13 +378,13 @@ def _best_with_mixture(table, best):
     )
 
 
-def _dnlo_against_others(table, best):
+def _dnlo_against_others(table: Table, best: Mapping[str, Mapping[str, str]]) -> Conclusion:
     ranks = {}
     for dataset in SIMULATED:
         scores = {
             method: table.score(dataset, method, best[dataset][method]) for method in _AS_PUBLISHED
         }
-        order = sorted(scores, key=scores.get)
+        order = sorted(scores, key=lambda method: scores[method])
         ratio = scores["dnlo"] / scores[order[0]]
         ranks[dataset] = (order.index("dnlo") + 1, order[0], ratio)
     matched = sum(ratio < 1.05 for *_, ratio in ranks.values())
@@ -381,13 +401,13 @@ def _dnlo_against_others(table, best):
     )
 
 
-def _best_by_mean(table, method):
+def _best_by_mean(table: Table, method: str) -> str:
     return min(
         REFERENCES, key=lambda name: table.values("mixture", None, method, name, "e_at").mean()
     )
 
 
-def _on_kitti(results):
+def _on_kitti(results: Results) -> Iterator[Conclusion]:
     rows = {
         dataset: {
             method: {row.reference: row for row in results.of(dataset, method)}
@@ -410,7 +430,7 @@ def _on_kitti(results):
         for dataset, of_dataset in rows.items()
     }
 
-    def named(chosen, error):
+    def named(chosen: Mapping[str, Row], error: Callable[[Row], float]) -> str:
         return ", ".join(
             f"{TITLES[method]} {row.reference} ({error(row):.3f} m)"
             for method, row in chosen.items()
@@ -471,7 +491,7 @@ def _on_kitti(results):
     )
 
 
-def _reference_against_method(results, table):
+def _reference_against_method(results: Results, table: Table) -> Conclusion:
     evidence, holds = [], []
     for dataset in (*SIMULATED, *_KITTI_TITLES):
         errors = {
@@ -505,7 +525,7 @@ def _reference_against_method(results, table):
     )
 
 
-def _score(results, table, dataset, method, reference):
+def _score(results: Results, table: Table, dataset: str, method: str, reference: str) -> float:
     if dataset in SIMULATED:
         return table.score(dataset, method, reference)
     return next(row.errors[2] for row in results.of(dataset, method) if row.reference == reference)

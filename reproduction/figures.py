@@ -2,16 +2,31 @@
 comparisons.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reproduction import comparison
-from reproduction.published import REFERENCES, SIMULATED
-from reproduction.rows import ALI_AS_PUBLISHED, METRICS, TITLES
-from reproduction.statistics import quartile_summary
+from reproduction.published import REFERENCES, SIMULATED, Case
+from reproduction.rows import ALI_AS_PUBLISHED, METRICS, TITLES, Row
+from reproduction.statistics import Summary, Table, quartile_summary
 from reproduction.writing import bullets, markdown_table, percent, write_csv, write_text
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Results
+
+# Data set, method, reference; with level and metric.
+Choice = tuple[str, str, str]
+Point = tuple[str, float | None, str, str, str]
+# By component and reference.
+Components = dict[str, dict[str, Summary]]
 
 _FIG5_METHODS = (ALI_AS_PUBLISHED, "ali", "dnl", "dnlo", "park", "taylor", "zhuang")
 FIGURE_METHODS = {
@@ -31,7 +46,7 @@ _INTERVALS = (
 _COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
-def write_error_figure(name, results):
+def write_error_figure(name: str, results: Results) -> list[Path]:
     """Write a figure of errors, its numbers and its comparison; returns the paths.
 
     Parameters
@@ -73,7 +88,7 @@ def write_error_figure(name, results):
     return paths + _compare(name, points, choices, results)
 
 
-def _choices(dataset, methods, table):
+def _choices(dataset: str, methods: Sequence[str], table: Table) -> list[Choice]:
     """(dataset, method, reference) shown: every reference of a single method, else the best of
     each.
     """
@@ -82,7 +97,7 @@ def _choices(dataset, methods, table):
     return [(dataset, method, table.best_reference(dataset, method)) for method in methods]
 
 
-def _titles(name, results):
+def _titles(name: str, results: Results) -> tuple[str, str]:
     label = name.removeprefix("fig").removesuffix("_proper")
     number = f"Figure {label}" if results.same_cases else f"As Figure {label}"
     runs = results.n_runs
@@ -103,7 +118,9 @@ def _titles(name, results):
     return f"{number}. Calibration errors of {method} for every reference, on {where}", _INTERVALS
 
 
-def _draw(title, note, choices, results, stem):
+def _draw(
+    title: str, note: str, choices: Sequence[Choice], results: Results, stem: Path
+) -> list[Path]:
     # Imported here: tables need no Matplotlib.
     from reproduction import paper_figures
 
@@ -121,11 +138,11 @@ def _draw(title, note, choices, results, stem):
     return paper_figures.draw_errors(title, note, panels, stem)
 
 
-def _coinciding(choices, table):
+def _coinciding(choices: Sequence[Choice], table: Table) -> list[list[Choice]]:
     """Choices whose errors are the same at every level (Park and Taylor): one line is drawn for all
     of a group.
     """
-    groups = []
+    groups: list[tuple[list[Choice], list[float]]] = []
     for dataset, method, reference in choices:
         centres = [
             table.summary(dataset, level, method, reference, metric).centre
@@ -141,7 +158,9 @@ def _coinciding(choices, table):
     return [group for group, _ in groups]
 
 
-def _line(paper_figures, group, one_method, metric, table):
+def _line(
+    paper_figures: ModuleType, group: Sequence[Choice], one_method: bool, metric: str, table: Table
+) -> Any:
     dataset, method, reference = group[0]
     levels = table.levels(dataset, method)
     summaries = tuple(table.summary(dataset, level, method, reference, metric) for level in levels)
@@ -157,14 +176,16 @@ def _line(paper_figures, group, one_method, metric, table):
     )
 
 
-def _numbers(point, summary):
+def _numbers(point: Point, summary: Summary) -> list[Any]:
     statistic = "median and quartiles" if summary.is_median else "mean and 95 % interval"
     dataset, level, *rest = point
-    level = "" if level is None else level
-    return [dataset, level, *rest, statistic, summary.centre, summary.low, summary.high, summary.n]
+    shown = "" if level is None else level
+    return [dataset, shown, *rest, statistic, summary.centre, summary.low, summary.high, summary.n]
 
 
-def _compare(name, points, choices, results):
+def _compare(
+    name: str, points: Sequence[Point], choices: Sequence[Choice], results: Results
+) -> list[Path]:
     if results.theirs is None:
         text = "Nothing to compare with: name the folder of the published data with --data-folder."
         return [
@@ -174,7 +195,7 @@ def _compare(name, points, choices, results):
                 text,
             )
         ]
-    rows = {}
+    rows: dict[tuple[Any, ...], list[Row]] = {}
     for row in results.rows:
         rows.setdefault((row.dataset, row.level, row.method, row.reference), []).append(row)
     compared = []
@@ -212,7 +233,7 @@ def _compare(name, points, choices, results):
         _by_dataset(compared),
     ]
     if name == "fig5":
-        blocks.append(_best_variants(choices, results))
+        blocks.append(_best_variants(choices, results.ours, results.theirs))
     if results.same_cases:
         shown = [
             row for row in results.rows if (row.dataset, row.method, row.reference) in set(choices)
@@ -225,7 +246,7 @@ def _compare(name, points, choices, results):
     return paths
 
 
-def _why(point, rows, same_cases):
+def _why(point: Point, rows: Mapping[tuple[Any, ...], Sequence[Row]], same_cases: bool) -> str:
     if same_cases:
         return comparison.reasons(rows[point[:4]])
     return (
@@ -235,7 +256,7 @@ def _why(point, rows, same_cases):
     )
 
 
-def _count(compared, measure):
+def _count(compared: Sequence[Sequence[Any]], measure: str) -> str:
     """How many points agree; the proper Ali, which the paper does not have, counts separately."""
     lines = []
     for proper in (False, True):
@@ -249,19 +270,18 @@ def _count(compared, measure):
     return "\n".join(lines)
 
 
-def _by_dataset(compared):
+def _by_dataset(compared: Sequence[Sequence[Any]]) -> str:
     lines = []
     for dataset, group in groupby(compared, key=lambda line: line[0]):
-        group = list(group)
-        lines.append(
-            [dataset, percent(sum(line[-2] for line in group), len(group)), _farthest(group)]
-        )
+        of_dataset = list(group)
+        agreeing = sum(line[-2] for line in of_dataset)
+        lines.append([dataset, percent(agreeing, len(of_dataset)), _farthest(of_dataset)])
     return markdown_table(
         ["data set", "plotted points that agree", "farthest from the published value"], lines
     )
 
 
-def _farthest(group):
+def _farthest(group: Sequence[Sequence[Any]]) -> str:
     differing = [line for line in group if not line[-2]]
     if not differing:
         return "-"
@@ -270,14 +290,12 @@ def _farthest(group):
     return f"{TITLES[line[2]]} {line[3]}{level}, {line[4]}: {line[6]:.4g}, published {line[10]:.4g}"
 
 
-def _best_variants(choices, results):
+def _best_variants(choices: Sequence[Choice], ours: Table, theirs: Table) -> str:
     lines = []
     for dataset, method, reference in choices:
-        published = results.theirs.best_reference(dataset, method)
-        score, other = (
-            results.ours.score(dataset, method, reference),
-            results.theirs.score(dataset, method, published),
-        )
+        published = theirs.best_reference(dataset, method)
+        score = ours.score(dataset, method, reference)
+        other = theirs.score(dataset, method, published)
         lines.append(
             [dataset, TITLES[method], reference, f"{score:.4f}", published, f"{other:.4f}"]
         )
@@ -295,7 +313,7 @@ def _best_variants(choices, results):
     )
 
 
-def write_components(name, results):
+def write_components(name: str, results: Results) -> list[Path]:
     """Figure 4: the absolute components of the parent's relative motions on the drives without
     noise; returns the paths.
     """
@@ -336,11 +354,11 @@ def write_components(name, results):
     return paths + _compare_components(name, ours, results)
 
 
-def components(cases):
+def components(cases: Sequence[Case]) -> Components:
     """Summaries of the absolute components (m, deg) of all relative motions, by component and
     reference.
     """
-    found = {component: {} for component in _COMPONENTS}
+    found: Components = {component: {} for component in _COMPONENTS}
     for reference in REFERENCES:
         motions = np.concatenate([case.pairs(reference).Ts_parenti_parentj for case in cases])
         angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler("ZYX", degrees=True)[:, ::-1]
@@ -351,14 +369,14 @@ def components(cases):
     return found
 
 
-def _component_rows(found):
+def _component_rows(found: Components) -> Iterator[list[Any]]:
     for component in _COMPONENTS:
         unit = "m" if component in "xyz" else "deg"
         for reference, summary in found[component].items():
             yield [component, reference, unit, summary.centre, summary.low, summary.high, summary.n]
 
 
-def _describe_ratios(reference, ours):
+def _describe_ratios(reference: str, ours: Components) -> str:
     x, y, z, roll, pitch, yaw = (ours[name][reference].centre for name in _COMPONENTS)
     return (
         f"{reference}: |z| is {z / max(x, y):.2f} of the larger of |x| and |y|; |roll| and |pitch| "
@@ -366,7 +384,7 @@ def _describe_ratios(reference, ours):
     )
 
 
-def _compare_components(name, ours, results):
+def _compare_components(name: str, ours: Components, results: Results) -> list[Path]:
     heading = f"# {name}: comparison with the paper"
     ratios = [_describe_ratios(reference, ours) for reference in REFERENCES]
     blocks = [

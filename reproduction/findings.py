@@ -2,26 +2,39 @@
 ground truth.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.solvers.solution import Solution
 from reproduction import comparison
 from reproduction.kitti_truth import RECTIFIED
-from reproduction.published import KITTI, LEVELS, REFERENCES, SIMULATED
-from reproduction.rows import ALI_AS_PUBLISHED, TITLES, agree
+from reproduction.published import KITTI, LEVELS, REFERENCES, SIMULATED, Case
+from reproduction.rows import ALI_AS_PUBLISHED, TITLES, Row, agree
+from reproduction.statistics import Table
 from reproduction.writing import markdown_table, percent, write_text
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Results
+    from reproduction.sources import Source
 
 _WRONG_DEG = 90.0
 
 
-def write(results):
-    """Write findings.md and rows.csv; returns the paths."""
+def write(name: str, results: Results) -> list[Path]:
+    """Write ``NAME.md`` and rows.csv; returns the paths."""
     return [
         write_text(
-            results.out / "findings.md",
+            results.out / f"{name}.md",
             "# What the run says about the published results",
             "## Row by row",
             _agreement(results.rows),
@@ -44,7 +57,7 @@ def write(results):
     ]
 
 
-def _agreement(rows):
+def _agreement(rows: Sequence[Row]) -> str:
     """The share of rows that agree, of the four methods with one answer and of Ali."""
     lines = []
     for title, methods in (
@@ -63,12 +76,12 @@ def _agreement(rows):
     return "\n".join(lines)
 
 
-def _dnlo_by_dataset(rows):
+def _dnlo_by_dataset(rows: Sequence[Row]) -> str:
     lines = []
     for dataset in (*SIMULATED, *KITTI):
         chosen = [row for row in rows if (row.dataset, row.method) == (dataset, "dnlo")]
         verdicts = [row.objective_verdict for row in chosen]
-        same = sum(agree(row.errors[2], row.published[2]) for row in chosen)
+        same = sum(agree(row.errors[2], row.theirs[2]) for row in chosen)
         counts = [verdicts.count(verdict) for verdict in ("lower", "equal", "higher")]
         medians = [
             f"{np.median([getattr(row, name)[2] for row in chosen]):.4f}"
@@ -88,7 +101,7 @@ def _dnlo_by_dataset(rows):
     return markdown_table(header, lines)
 
 
-def _ali(table):
+def _ali(table: Table) -> str:
     blocks = []
     for dataset in SIMULATED:
         level = LEVELS[dataset][-1]
@@ -123,12 +136,12 @@ def _ali(table):
     return "\n\n".join(blocks)
 
 
-def _zhuang(rows):
+def _zhuang(rows: Sequence[Row]) -> str:
     chosen = [row for row in rows if row.method == "zhuang" and row.dataset in SIMULATED]
     unsettled = sum(not row.converged for row in chosen)
-    free = [row for row in chosen if row.level == 0.0 and row.published[3] > _WRONG_DEG]
+    free = [row for row in chosen if row.level == 0.0 and row.theirs[3] > _WRONG_DEG]
     runs = sorted({row.run for row in free})
-    wrong = sum(row.published[3] > _WRONG_DEG for row in chosen)
+    wrong = sum(row.theirs[3] > _WRONG_DEG for row in chosen)
     angles = sorted(
         {
             round(_angle_deg(np.eye(3), row.transform[:3, :3]), 1)
@@ -146,7 +159,7 @@ def _zhuang(rows):
     )
 
 
-def _truths(source):
+def _truths(source: Source) -> str:
     lines = []
     for dataset in KITTI:
         (case,) = source.cases(dataset, None)
@@ -165,15 +178,15 @@ def _truths(source):
     return markdown_table(header, lines)
 
 
-def _angle_deg(first, second):
+def _angle_deg(first: FloatArray, second: FloatArray) -> float:
     return float(np.degrees(se3.rotation_angle(first.T @ second)))
 
 
-def _vector(values):
+def _vector(values: Iterable[float]) -> str:
     return "(" + ", ".join(f"{value:.4f}" for value in values) + ")"
 
 
-def _scale(case):
+def _scale(case: Case) -> str:
     """Calibration of the long drive with the child's lengths scaled for the smallest objective."""
     lines = []
     for method in ("dnl", "dnlo"):
@@ -208,7 +221,7 @@ def _scale(case):
     )
 
 
-def _solve_scaled(case, method, reference, scale):
+def _solve_scaled(case: Case, method: str, reference: str, scale: float) -> Solution:
     poses = case.child.poses.copy()
     poses[:, :3, 3] *= scale
     return Method(method).solve(motion_pairs(case.parent.poses, poses, reference))

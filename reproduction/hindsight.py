@@ -2,7 +2,12 @@
 best choice with hindsight.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import norm
@@ -10,14 +15,19 @@ from scipy.stats import norm
 from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.assessment import metrics
 from hand_eye_calib.assessment.covariance import assess_adaptive
+from hand_eye_calib.assessment.metrics import Errors
 from hand_eye_calib.assessment.reference_selection import CANDIDATES, select_reference
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method
-from reproduction.published import LEVELS, SIMULATED
+from reproduction.published import LEVELS, SIMULATED, Case
 from reproduction.runner import in_parallel
 from reproduction.writing import markdown_table, write_csv, write_text
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Results
+    from reproduction.sources import Source
 
 _COVERAGE = 0.90
 _ROUNDING_M = 1e-5
@@ -51,16 +61,16 @@ class LevelStudy:
     level: float | None
     e_at: float
     e_aR: float
-    best_e_at: tuple | None
-    best_e_aR: tuple | None
+    best_e_at: tuple[float, str] | None
+    best_e_aR: tuple[float, str] | None
     nees: float
     coverage: float
-    nuisances: dict
+    nuisances: dict[str, int]
     auto_e_at: float
-    fixed_e_at: tuple
+    fixed_e_at: tuple[float, str]
 
 
-def write(name, results):
+def write(name: str, results: Results) -> list[Path]:
     """Study every level and write ``NAME.md`` and ``NAME.csv``; returns their paths."""
     tasks = [
         (results.source, dataset, level)
@@ -86,7 +96,7 @@ def write(name, results):
     ]
 
 
-def study_level(source, dataset, level):
+def study_level(source: Source, dataset: str, level: float | None) -> LevelStudy:
     """LevelStudy of the cases of a data set at a level."""
     cases = source.cases(dataset, level)
     errors, squared_errors, covered, nuisances = [], [], [], []
@@ -120,19 +130,21 @@ def study_level(source, dataset, level):
     )
 
 
-def _dnlo_error(poses, case, reference):
+def _dnlo_error(poses: PosePairs, case: Case, reference: str) -> float:
     solution = Method("dnlo").solve(motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, reference))
     return metrics.absolute_errors(solution.T_parent_child, case.T_parent_child)[0]
 
 
-def _best_published(cases, error):
+def _best_published(
+    cases: Sequence[Case], error: Callable[[Errors], float]
+) -> tuple[float, str] | None:
     if not cases[0].results:
         return None
     medians = {
         key: np.median([error(case.results[key].errors) for case in cases])
         for key in cases[0].results
     }
-    method, reference = min(medians, key=medians.get)
+    method, reference = min(medians, key=lambda key: float(medians[key]))
     return float(medians[method, reference]), f"{method} {reference}"
 
 
@@ -154,7 +166,7 @@ _COLUMNS = (
 )
 
 
-def _estimator_cells(study):
+def _estimator_cells(study: LevelStudy) -> list[str]:
     return [
         *_level(study),
         f"{study.e_at:.5f}",
@@ -166,7 +178,7 @@ def _estimator_cells(study):
     ]
 
 
-def _auto_cells(study):
+def _auto_cells(study: LevelStudy) -> list[str] | None:
     """Cells of a level; None if both errors are rounding, so that their ratio means nothing."""
     if max(study.auto_e_at, study.fixed_e_at[0]) < _ROUNDING_M:
         return None
@@ -174,7 +186,7 @@ def _auto_cells(study):
     return [*_level(study), f"{study.auto_e_at:.5f}", _best(study.fixed_e_at), f"{ratio:.2f}"]
 
 
-def _cells(study):
+def _cells(study: LevelStudy) -> list[str]:
     chosen = ", ".join(f"{name} {count}" for name, count in study.nuisances.items())
     return [
         *_estimator_cells(study),
@@ -183,9 +195,9 @@ def _cells(study):
     ]
 
 
-def _level(study):
+def _level(study: LevelStudy) -> list[str]:
     return [study.dataset, "" if study.level is None else f"{study.level:g}"]
 
 
-def _best(best):
+def _best(best: tuple[float, str] | None) -> str:
     return "" if best is None else f"{best[0]:.5f} ({best[1]})"

@@ -2,10 +2,20 @@
 the motions.
 """
 
+from __future__ import annotations
+
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hand_eye_calib.report import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from reproduction.statistics import Summary
 
 REFERENCE_LOOKS = {
     "A": (style.BLACK, "D", "-"),
@@ -71,7 +81,9 @@ class Line:
     summaries: tuple
 
 
-def draw_errors(title, note, panels, stem):
+def draw_errors(
+    title: str, note: str, panels: Mapping[tuple[str, str], Sequence[Line]], stem: Path
+) -> list[Path]:
     """Errors of several references or methods: a row per data set, a column per metric.
 
     Parameters
@@ -104,7 +116,7 @@ def draw_errors(title, note, panels, stem):
         return style.save(figure, stem)
 
 
-def _scale(ax, lines, metric):
+def _scale(ax: Axes, lines: Sequence[Line], metric: str) -> None:
     """A logarithmic axis that includes zero; box plots need none, their errors are never zero."""
     centres = [summary.centre for line in lines for summary in line.summaries]
     if not lines[0].levels:
@@ -117,7 +129,7 @@ def _scale(ax, lines, metric):
     style.plain_decades(ax.yaxis)
 
 
-def _legend(ax, lines):
+def _legend(ax: Axes, lines: Sequence[Line]) -> None:
     """The full names, where there are any, to the right of a row of panels."""
     if not any(line.name for line in lines):
         return
@@ -138,7 +150,7 @@ def _legend(ax, lines):
     )
 
 
-def _draw_lines(ax, lines):
+def _draw_lines(ax: Axes, lines: Sequence[Line]) -> None:
     span = lines[0].levels[-1] - lines[0].levels[0]
     for number, line in enumerate(lines):
         # Side by side, so that the intervals can be told apart.
@@ -172,7 +184,7 @@ def _draw_lines(ax, lines):
     _label_ends(ax, lines, span)
 
 
-def _label_ends(ax, lines, span):
+def _label_ends(ax: Axes, lines: Sequence[Line], span: float) -> None:
     """The name of each line at its right end, moved apart where they would overlap."""
     to_fraction = ax.transData + ax.transAxes.inverted()
     last = lines[0].levels[-1]
@@ -201,7 +213,7 @@ def _label_ends(ax, lines, span):
         )
 
 
-def _draw_boxes(ax, lines):
+def _draw_boxes(ax: Axes, lines: Sequence[Line]) -> None:
     for place, line in enumerate(lines):
         _draw_box(ax, place, line.summaries[0], line.look[0])
     ax.set_xticks(
@@ -213,7 +225,7 @@ def _draw_boxes(ax, lines):
         tick.set(color=line.look[0], fontweight="bold", fontsize=6.2)
 
 
-def _draw_box(ax, place, summary, colour):
+def _draw_box(ax: Axes, place: float, summary: Summary, colour: str) -> None:
     statistics = {
         "med": summary.centre,
         "q1": summary.low,
@@ -236,7 +248,9 @@ def _draw_box(ax, place, summary, colour):
     )
 
 
-def draw_components(title, note, components, stem):
+def draw_components(
+    title: str, note: str, components: Mapping[str, Mapping[str, Summary]], stem: Path
+) -> list[Path]:
     """Box plots of the components of the relative motions.
 
     Parameters

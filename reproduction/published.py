@@ -5,17 +5,21 @@ The folder is a clone of that repository: ``kitti_tests`` and ``simulation_tests
 in TUM format, ``calib`` (or ``published``) one CSV of results per test set.
 """
 
+from __future__ import annotations
+
 import csv
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.metrics import Errors
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import read_trajectory
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers import park
 
 METHODS = ("ali", "dnl", "dnlo", "park", "taylor", "zhuang")
@@ -24,13 +28,13 @@ N_RUNS = 38
 
 # Level folders of a simulated data set and the levels' values, and the column of its CSV that has
 # them.
-_LEVELS = {
+_LEVELS: dict[str, dict[str, float | None]] = {
     "noise": {f"noise_{level:.6f}": level for level in (0.0, 0.002, 0.004, 0.006, 0.008, 0.01)},
     "outliers": {f"outliers_{level:.0f}": level for level in (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)},
     "drift": {f"drift_{level:.6f}": level for level in (0.0, 0.01, 0.02, 0.03, 0.04, 0.05)},
     "mixture": {".": None},
 }
-_LEVEL_COLUMNS = {
+_LEVEL_COLUMNS: dict[str, str | None] = {
     "noise": "noise_var",
     "outliers": "outliers",
     "drift": "drift_rate",
@@ -51,7 +55,7 @@ class PublishedResult:
     rad) with all of them.
     """
 
-    T_parent_child: np.ndarray
+    T_parent_child: FloatArray
     errors: Errors
 
 
@@ -81,26 +85,32 @@ class Case:
     run: str
     parent: Trajectory
     child: Trajectory
-    T_parent_child: np.ndarray
-    results: dict
+    T_parent_child: FloatArray
+    results: Mapping[tuple[str, str], PublishedResult]
 
     @property
-    def name(self):
+    def name(self) -> str:
         """Such as noise/0.002/run_12."""
         level = [] if self.level is None else [f"{self.level:g}"]
         return "/".join([self.dataset, *level, self.run])
 
     @property
-    def stamps_ns(self):
+    def stamps_ns(self) -> IntArray:
         """(N,) int64 array: stamps of both trajectories."""
         return self.child.stamps_ns
 
-    def pairs(self, reference):
+    def pairs(self, reference: str) -> MotionPairs:
         """Motion pairs of a reference."""
         return motion_pairs(self.parent.poses, self.child.poses, reference)
 
 
-def check_folder(folder):
+# Name, parent, child, truth.
+Run = tuple[str, Trajectory, Trajectory, FloatArray]
+# By level (None without one), then by method and reference, in the order of the file.
+PublishedResults = dict[float | None, dict[tuple[str, str], list[PublishedResult]]]
+
+
+def check_folder(folder: str | Path) -> Path:
     """The folder as a path.
 
     Raises
@@ -122,12 +132,12 @@ def check_folder(folder):
     return folder
 
 
-def results_folder(folder):
+def results_folder(folder: Path) -> Path:
     """Where in the checked folder the CSV files of results are."""
     return next(folder / name for name in _RESULTS_FOLDERS if (folder / name).is_dir())
 
 
-def load_kitti_short(folder):
+def load_kitti_short(folder: str | Path) -> Case:
     """Drive 2011_09_30_drive_0027: parent lidar, child grey stereo camera without its first pose,
     which precedes the lidar's first.
 
@@ -147,7 +157,7 @@ def load_kitti_short(folder):
     )
 
 
-def load_kitti_long(folder):
+def load_kitti_long(folder: str | Path) -> Case:
     """Drive 2011_10_03_drive_0027: parent grey stereo camera, child colour stereo camera.
 
     Raises
@@ -166,7 +176,9 @@ def load_kitti_long(folder):
     )
 
 
-def _kitti_case(dataset, parent, child, truth_file, results_file):
+def _kitti_case(
+    dataset: str, parent: Trajectory, child: Trajectory, truth_file: Path, results_file: Path
+) -> Case:
     # As in the paper: the parent's poses at the child's stamps, extrapolated along its end segments
     # if the child's stamps reach further.
     parent_at_child = Trajectory(child.stamps_ns, parent.at(child.stamps_ns, extrapolate=True))
@@ -182,7 +194,9 @@ def _kitti_case(dataset, parent, child, truth_file, results_file):
     )
 
 
-def load_simulated(folder, datasets=SIMULATED, levels=None):
+def load_simulated(
+    folder: str | Path, datasets: Sequence[str] = SIMULATED, levels: Sequence[float] | None = None
+) -> list[Case]:
     """The simulated cases: 38 trajectories at each of six levels of noise, outliers and drift, and
     in the mixture.
 
@@ -219,7 +233,7 @@ def load_simulated(folder, datasets=SIMULATED, levels=None):
     return cases
 
 
-def _read_runs(folder):
+def _read_runs(folder: Path) -> list[Run]:
     """(name, parent, child, truth) of every run."""
     return [
         (
@@ -232,7 +246,12 @@ def _read_runs(folder):
     ]
 
 
-def _match_runs(dataset, level, runs, results):
+def _match_runs(
+    dataset: str,
+    level: float | None,
+    runs: Sequence[Run],
+    results: Mapping[tuple[str, str], Sequence[PublishedResult]],
+) -> list[Case]:
     """Cases in the order of the published rows, which do not name their trajectory.
 
     Every (method, reference) block lists the same trajectories in the same order. Park has a
@@ -254,15 +273,12 @@ def _match_runs(dataset, level, runs, results):
         distance = np.abs(published[:, None] - ours).max(axis=(2, 3))
         order = distance.argmin(axis=1)
         if len(set(order)) == N_RUNS and distance.min(axis=1).max() < _SAME_ANSWER:
-            return [
-                Case(
-                    dataset,
-                    level,
-                    *runs[run],
-                    {key: rows[position] for key, rows in results.items()},
-                )
-                for position, run in enumerate(order)
-            ]
+            cases = []
+            for position, index in enumerate(order):
+                run, parent, child, truth = runs[index]
+                of_run = {key: rows[position] for key, rows in results.items()}
+                cases.append(Case(dataset, level, run, parent, child, truth, of_run))
+            return cases
     raise InputError(
         f"the trajectories of {dataset}{'' if level is None else f' at level {level:g}'} "
         "do not go with the published results: expected "
@@ -271,11 +287,11 @@ def _match_runs(dataset, level, runs, results):
     )
 
 
-def _read_results(path, level_column):
+def _read_results(path: Path, level_column: str | None) -> PublishedResults:
     """Level (None without a column), then (method, reference), to the list of results in the file's
     order.
     """
-    results = {}
+    results: PublishedResults = {}
     try:
         with open(path, newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
@@ -291,7 +307,7 @@ def _read_results(path, level_column):
     return results
 
 
-def _result(row):
+def _result(row: Mapping[str, str]) -> PublishedResult:
     matrix = np.array(row["T"].replace("[", " ").replace("]", " ").split(), dtype=float).reshape(
         4, 4
     )

@@ -5,12 +5,16 @@ Their folders lie beside the published data of Välimäki et al. 2023; sets with
 out.
 """
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
 from reproduction.kitti_truth import RECTIFIED
@@ -47,7 +51,7 @@ class Recording:
     parent: Trajectory
     child: Trajectory
 
-    def parts(self, count, offset_s):
+    def parts(self, count: int, offset_s: float) -> list[Recording]:
         """As many Recordings of equal duration, one after the other; ``offset_s`` brings the
         child's clock to the parent's.
         """
@@ -86,12 +90,12 @@ class RecordedSet:
     """
 
     name: str
-    drives: tuple
-    options: dict = field(default_factory=dict)
-    truth: np.ndarray | None = None
+    drives: tuple[Recording, ...]
+    options: dict[str, Any] = field(default_factory=dict)
+    truth: FloatArray | None = None
 
 
-def recorded_sets(folder):
+def recorded_sets(folder: str | Path) -> tuple[list[RecordedSet], list[str]]:
     """The sets whose files are there, and the names of the folders that are not.
 
     Parameters
@@ -112,8 +116,8 @@ def recorded_sets(folder):
     ]
 
 
-def _kitti(folder):
-    def read(drive, *names):
+def _kitti(folder: Path) -> list[RecordedSet]:
+    def read(drive: str, *names: str) -> tuple[Recording]:
         return (Recording(*(read_trajectory_file(folder / drive / name)[0] for name in names)),)
 
     short = read(_SHORT, "LIDAR_HDL64E/traj_HDL_aft_opt.csv", f"cam01/{_CAMERA}")
@@ -124,7 +128,7 @@ def _kitti(folder):
     ]
 
 
-def _zxl19(folder):
+def _zxl19(folder: Path) -> list[RecordedSet]:
     # The road is flat: the height of the lidar is a matter for a tape measure. It leans a little
     # against the axis of turning, so that without this the unknown height would be part of what is
     # uncertain of x and y.
@@ -140,7 +144,7 @@ def _zxl19(folder):
     return [RecordedSet("zxl19", bags, {"prior": {"z": (0.0, 0.3)}})]
 
 
-def _tango(folder):
+def _tango(folder: Path) -> list[RecordedSet]:
     devices = {
         name: _read(folder / f"asl_tango_easy/{file}.csv", _ASL_COLUMNS)
         for name, file in _DEVICES.items()
@@ -151,11 +155,11 @@ def _tango(folder):
     ]
 
 
-def _read(path, columns):
+def _read(path: Path, columns: str) -> Trajectory:
     return read_trajectory_file(path, "csv", columns=columns, repair=True)[0]
 
 
-def _selected(trajectory, mask):
+def _selected(trajectory: Trajectory, mask: BoolArray) -> Trajectory:
     return dataclasses.replace(
         trajectory, stamps_ns=trajectory.stamps_ns[mask], poses=trajectory.poses[mask]
     )

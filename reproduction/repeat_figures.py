@@ -1,5 +1,10 @@
 """The figure of ``python -m reproduction repeats``: scatter of repeats over stated sigma."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
 from hand_eye_calib.report import style
 
 _LOOKS = {
@@ -9,7 +14,12 @@ _LOOKS = {
 _RANGE = (0.05, 10.0)
 
 
-def draw_ratios(title, ratios, chance, stem):
+def draw_ratios(
+    title: str,
+    ratios: Mapping[str, Mapping[str, Mapping[str, float]]],
+    chance: tuple[float, float],
+    stem: Path,
+) -> list[Path]:
     """One panel per method, one row per set, one mark per axis.
 
     Parameters

@@ -8,19 +8,28 @@ systematic errors (a miscalibrated sensor, scan distortion in every turn); only 
 ground truth, the second table, shows those.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import chi2
 
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.calibration import DofVerdict
+from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.engine.offline import calibrate
-from reproduction.recordings import PARTS, recorded_sets
+from reproduction.recordings import PARTS, RecordedSet, Recording, recorded_sets
 from reproduction.runner import in_parallel
+from reproduction.sources import PublishedSource
 from reproduction.writing import markdown_table, write_csv, write_text
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Results
 
 METHODS = {
     "adaptive": {"method": "adaptive"},
@@ -66,19 +75,23 @@ class AxisRatio:
     freedom: int
 
     @property
-    def is_within_two(self):
+    def is_within_two(self) -> bool:
         """Whether spread and sigma are within a factor of two of each other."""
         return 0.5 <= self.ratio <= 2.0
 
 
-def write(name, results):
+Truth = dict[str, Any]
+
+
+def write(name: str, results: Results) -> list[Path]:
     """Calibrate all repeats and write ``NAME.csv``, ``NAME_truth.csv``, ``NAME.md`` and the figure;
     returns their paths.
     """
+    assert isinstance(results.source, PublishedSource)
     sets, absent = recorded_sets(Path(results.source.folder).parent)
     tasks = [(found, method) for found in sets for method in METHODS]
-    ratios = sum(in_parallel(_set_ratios, tasks, results.jobs), [])
-    truths = sum(
+    ratios: list[AxisRatio] = sum(in_parallel(_set_ratios, tasks, results.jobs), [])
+    truths: list[Truth] = sum(
         in_parallel(
             _against_truth, [task for task in tasks if task[0].truth is not None], results.jobs
         ),
@@ -117,11 +130,11 @@ def write(name, results):
     return [path for path in paths if path is not None]
 
 
-def _draw(stem, ratios):
+def _draw(stem: Path, ratios: Sequence[AxisRatio]) -> list[Path]:
     # Imported here: the numbers need no Matplotlib.
     from reproduction import repeat_figures
 
-    found = {}
+    found: dict[str, dict[str, dict[str, float]]] = {}
     for ratio in ratios:
         found.setdefault(ratio.method, {}).setdefault(ratio.dataset, {})[ratio.axis] = ratio.ratio
     return repeat_figures.draw_ratios(
@@ -129,24 +142,26 @@ def _draw(stem, ratios):
     )
 
 
-def band(freedom):
+def band(freedom: int) -> tuple[float, float]:
     """Range (low, high) that 95 % of the ratios lie in when every stated sigma is right."""
     tail = (1 - _CONFIDENCE) / 2
-    return tuple(float(np.sqrt(chi2.ppf(share, freedom) / freedom)) for share in (tail, 1 - tail))
+    low, high = np.sqrt(chi2.ppf((tail, 1 - tail), freedom) / freedom)
+    return float(low), float(high)
 
 
-def _band_text(freedom):
+def _band_text(freedom: int) -> str:
     return "{:.2f} to {:.2f}".format(*band(freedom))
 
 
-def spread_and_sigma(calibrations):
+def spread_and_sigma(
+    calibrations: Sequence[Calibration],
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Variance (6,) of several answers, mean stated variance (6,), and whether all of them observe
     the axis (6,).
     """
     sigmas = np.array([answer.sigmas for answer in calibrations])
-    known = np.array(
-        [[dof.verdict in _KNOWN for dof in answer.observability] for answer in calibrations]
-    ).all(axis=0)
+    are_known = [[dof.verdict in _KNOWN for dof in answer.observability] for answer in calibrations]
+    known: BoolArray = np.logical_and.reduce(are_known)
     deviations = np.array(
         [
             deviation(answer.T_parent_child, calibrations[0].T_parent_child)
@@ -157,7 +172,7 @@ def spread_and_sigma(calibrations):
     return deviations.var(axis=0, ddof=1), stated, known
 
 
-def _answer(recording, found, method, **options):
+def _answer(recording: Recording, found: RecordedSet, method: str, **options: Any) -> Calibration:
     return calibrate(
         recording.parent,
         recording.child,
@@ -165,7 +180,7 @@ def _answer(recording, found, method, **options):
     )
 
 
-def _groups(found, method):
+def _groups(found: RecordedSet, method: str) -> list[list[Calibration]]:
     """Lists of answers that repeat each other."""
     if len(found.drives) > 1:
         return [[_answer(drive, found, method) for drive in found.drives]]
@@ -176,12 +191,13 @@ def _groups(found, method):
     ]
 
 
-def _set_ratios(found, method):
+def _set_ratios(found: RecordedSet, method: str) -> list[AxisRatio]:
     """AxisRatio of every axis that all repeats of a set observe."""
     groups = [(len(answers) - 1, *spread_and_sigma(answers)) for answers in _groups(found, method)]
     freedom = sum(degrees for degrees, *_ in groups)
     known = np.logical_and.reduce([known for *_, known in groups])
-    squared = sum(degrees * spread / stated for degrees, spread, stated, _ in groups) / freedom
+    summed = sum(degrees * spread / stated for degrees, spread, stated, _ in groups)
+    squared = np.asarray(summed) / freedom
     spread = np.sqrt(sum(degrees * spread for degrees, spread, _, _ in groups) / freedom) * _UNITS
     with np.errstate(invalid="ignore"):
         sigma = (
@@ -216,7 +232,7 @@ _RATIO_HEADER = [
 ]
 
 
-def _ratio_row(ratio):
+def _ratio_row(ratio: AxisRatio) -> list[object]:
     return [
         ratio.dataset,
         ratio.method,
@@ -230,8 +246,8 @@ def _ratio_row(ratio):
     ]
 
 
-def _ratio_table(ratios):
-    rows = {}
+def _ratio_table(ratios: Sequence[AxisRatio]) -> str:
+    rows: dict[tuple[str, str], dict[str, str]] = {}
     for ratio in ratios:
         rows.setdefault((ratio.dataset, ratio.method), {})[ratio.axis] = f"{ratio.ratio:.2f}"
     cells = [
@@ -241,7 +257,7 @@ def _ratio_table(ratios):
     return markdown_table(["set", "method", *AXES], cells)
 
 
-def _pooled_table(ratios):
+def _pooled_table(ratios: Sequence[AxisRatio]) -> str:
     rows = []
     for method in METHODS:
         chosen = [ratio for ratio in ratios if ratio.method == method]
@@ -275,7 +291,7 @@ def _pooled_table(ratios):
     return markdown_table(header, rows)
 
 
-def _against_truth(found, method):
+def _against_truth(found: RecordedSet, method: str) -> list[Truth]:
     """A dict per axis: error, sigma, z, and possible causes."""
     whole = found.drives[0]
     answer = _answer(whole, found, method)
@@ -286,8 +302,11 @@ def _against_truth(found, method):
         _answer(whole, found, "dnlo auto", reference=reference) for reference in _OTHER_REFERENCES
     ]
 
-    def errors(answers):
-        return np.array([deviation(one.T_parent_child, found.truth) * _UNITS for one in answers])
+    assert found.truth is not None
+    truth = found.truth
+
+    def errors(answers: Sequence[Calibration]) -> FloatArray:
+        return np.array([deviation(one.T_parent_child, truth) * _UNITS for one in answers])
 
     error, without_offset, without_scale = errors([answer, as_given, unscaled])
     of_thirds, of_others = errors(thirds), errors(others)
@@ -312,7 +331,7 @@ def _against_truth(found, method):
     ]
 
 
-def _reason(error, sigma, of_thirds, of_others):
+def _reason(error: float, sigma: float, of_thirds: FloatArray, of_others: FloatArray) -> str:
     """Why a z-score is large; empty if it is not."""
     if not abs(error) > _SUSPICIOUS * sigma:
         return ""
@@ -330,7 +349,7 @@ def _reason(error, sigma, of_thirds, of_others):
     )
 
 
-def _truth_table(truths):
+def _truth_table(truths: Sequence[Truth]) -> str:
     header = [
         "drive",
         "method",

@@ -1,16 +1,26 @@
 """One row of results per (case, method, reference): ours, the published one, whether they agree."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment import metrics
+from hand_eye_calib.assessment.metrics import Errors
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, dnlo
 from hand_eye_calib.solvers.registry import Method
 from reproduction import ali_as_published
-from reproduction.published import KITTI, LEVELS, REFERENCES
+from reproduction.published import KITTI, LEVELS, REFERENCES, Case
+
+if TYPE_CHECKING:
+    from reproduction.sources import Source
 
 METRICS = ("e_rt", "e_rR", "e_at", "e_aR")
 UNITS = {"e_rt": "m", "e_rR": "deg", "e_at": "m", "e_aR": "deg"}
@@ -45,7 +55,7 @@ class Cell:
     method: str
 
     @property
-    def name(self):
+    def name(self) -> str:
         """Such as noise_0.002_dnlo."""
         level = [] if self.level is None else [f"{self.level:g}"]
         return "_".join([self.dataset, *level, self.method])
@@ -77,42 +87,52 @@ class Row:
     run: str
     method: str
     reference: str
-    errors: tuple
+    errors: tuple[float, ...]
     objective: float
     converged: bool
-    T_parent_child: tuple
-    published: tuple | None
+    T_parent_child: tuple[float, ...]
+    published: tuple[float, ...] | None
     published_objective: float | None
 
     @property
-    def name(self):
+    def name(self) -> str:
         """Such as noise/0.002/run_12."""
         return "/".join(
             [self.dataset, *([] if self.level is None else [f"{self.level:g}"]), self.run]
         )
 
     @property
-    def transform(self):
+    def transform(self) -> FloatArray:
         """``T_parent_child`` as (4, 4) array."""
         return np.reshape(self.T_parent_child, (4, 4))
 
     @property
-    def agrees(self):
+    def theirs(self) -> tuple[float, ...]:
+        """The published errors of a row that has them."""
+        if self.published is None:
+            raise ValueError(f"nothing is published for {self.name}")
+        return self.published
+
+    @property
+    def agrees(self) -> bool:
         """Whether all four errors are the published ones."""
         return all(
-            agree(ours, theirs) for ours, theirs in zip(self.errors, self.published, strict=True)
+            agree(ours, theirs) for ours, theirs in zip(self.errors, self.theirs, strict=True)
         )
 
     @property
-    def objective_verdict(self):
+    def objective_verdict(self) -> str:
         """Of dnl and dnlo: whether our objective is "lower", "equal" or "higher" than at the
         published answer.
         """
-        if is_above(self.objective, self.published_objective):
+        theirs = self.published_objective
+        if theirs is None:
+            raise ValueError(f"no objective is published for {self.name}")
+        if is_above(self.objective, theirs):
             return "higher"
-        return "lower" if is_above(self.published_objective, self.objective) else "equal"
+        return "lower" if is_above(theirs, self.objective) else "equal"
 
-    def why(self):
+    def why(self) -> str:
         """Why this row does not agree with the published one; empty where it does."""
         if self.published is None or self.agrees:
             return ""
@@ -129,17 +149,17 @@ class Row:
         return "unexplained"
 
 
-def agree(ours, theirs):
+def agree(ours: float, theirs: float) -> bool:
     """Whether two errors (m or deg) are the same."""
     return abs(ours - theirs) <= max(_RELATIVE * abs(theirs), _ABSOLUTE)
 
 
-def is_above(objective, other):
+def is_above(objective: float, other: float) -> bool:
     """Whether an objective is larger by more than rounding."""
     return objective > other * (1 + _OBJECTIVE_SHARE) + _OBJECTIVE_FLOOR
 
 
-def cells(datasets, methods):
+def cells(datasets: Sequence[str], methods: Sequence[str]) -> list[Cell]:
     """Cells of data sets at all levels, by method in turn."""
     return [
         Cell(dataset, level, method)
@@ -149,7 +169,7 @@ def cells(datasets, methods):
     ]
 
 
-def solve_cell(source, cell):
+def solve_cell(source: Source, cell: Cell) -> list[Row]:
     """List of Row of a cell, by run and reference."""
     return [
         _solve(case, cell.method, reference)
@@ -158,7 +178,7 @@ def solve_cell(source, cell):
     ]
 
 
-def in_m_and_deg(errors):
+def in_m_and_deg(errors: Errors) -> tuple[float, float, float, float]:
     """The four metrics as a tuple, rotations in degrees."""
     return (
         errors.e_rt,
@@ -168,18 +188,18 @@ def in_m_and_deg(errors):
     )
 
 
-def published_name(method):
+def published_name(method: str) -> str:
     """Name of a method in the published results."""
     return "ali" if method == ALI_AS_PUBLISHED else method
 
 
 # A process solves the methods of one level in turn.
 @lru_cache(maxsize=1)
-def _cases(source, dataset, level):
+def _cases(source: Source, dataset: str, level: float | None) -> list[Case]:
     return source.cases(dataset, level)
 
 
-def _solve(case, method, reference):
+def _solve(case: Case, method: str, reference: str) -> Row:
     pairs = case.pairs(reference)
     solution = (
         ali_as_published.solve(pairs) if method == ALI_AS_PUBLISHED else Method(method).solve(pairs)
@@ -200,7 +220,7 @@ def _solve(case, method, reference):
     )
 
 
-def _objective(method, pairs, T_parent_child):
+def _objective(method: str, pairs: MotionPairs, T_parent_child: FloatArray) -> float | None:
     if method not in ("dnl", "dnlo"):
         return None
     costs = dnl.pair_costs(pairs, T_parent_child)

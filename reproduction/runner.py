@@ -2,6 +2,8 @@
 continues.
 """
 
+from __future__ import annotations
+
 import hashlib
 import importlib.metadata
 import json
@@ -10,13 +12,18 @@ import os
 import shutil
 import signal
 import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from reproduction.rows import Row, solve_cell
+from reproduction.rows import Cell, Row, solve_cell
+
+if TYPE_CHECKING:
+    from reproduction.sources import Source
 
 _HERE = Path(__file__).parent
 _PACKAGE = Path(se3.__file__).parents[1]
@@ -49,10 +56,10 @@ class Store:
         If the folder cannot be made.
     """
 
-    def __init__(self, folder, configuration):
+    def __init__(self, folder: Path, configuration: Mapping[str, Any]) -> None:
         self._folder = folder
         manifest = folder / "configuration.json"
-        wanted = json.loads(json.dumps(configuration | _versions()))
+        wanted = json.loads(json.dumps({**configuration, **_versions()}))
         try:
             if manifest.exists() and _read(manifest) != wanted:
                 shutil.rmtree(folder)
@@ -64,7 +71,7 @@ class Store:
                 "directory with --out"
             ) from None
 
-    def load(self, cell):
+    def load(self, cell: Cell) -> list[Row] | None:
         """Rows of a cell; None if it is not solved yet."""
         rows = _read(self._path(cell))
         return (
@@ -73,15 +80,21 @@ class Store:
             else [Row(**{name: _frozen(value) for name, value in row.items()}) for row in rows]
         )
 
-    def save(self, cell, rows):
+    def save(self, cell: Cell, rows: Sequence[Row]) -> None:
         """Store the rows of a cell."""
         _write(self._path(cell), [vars(row) for row in rows])
 
-    def _path(self, cell):
+    def _path(self, cell: Cell) -> Path:
         return self._folder / f"{cell.name}.json"
 
 
-def run(source, cells, store, jobs, on_done=lambda cell: None):
+def run(
+    source: Source,
+    cells: Sequence[Cell],
+    store: Store,
+    jobs: int,
+    on_done: Callable[[Cell], object] = lambda cell: None,
+) -> dict[Cell, list[Row]]:
     """Solve the cells that are not in the store yet.
 
     Parameters
@@ -118,7 +131,9 @@ def run(source, cells, store, jobs, on_done=lambda cell: None):
     return {cell: found[cell] for cell in cells}
 
 
-def in_parallel(function, tasks, jobs):
+def in_parallel(
+    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int
+) -> list[Any]:
     """``function(*task)`` of every task on ``jobs`` processes; a list in the order of tasks."""
     with _workers(min(jobs, len(tasks))) as executor:
         with _interrupts_held():
@@ -127,7 +142,7 @@ def in_parallel(function, tasks, jobs):
 
 
 @contextmanager
-def _workers(count):
+def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
     """Worker processes that are terminated if the block raises."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     others = set(multiprocessing.active_children())
@@ -154,7 +169,7 @@ def _workers(count):
 
 
 @contextmanager
-def _interrupts_held():
+def _interrupts_held() -> Iterator[None]:
     """Block SIGINT: processes started in this block inherit that and are ended by their parent."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -163,17 +178,19 @@ def _interrupts_held():
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker():
+def _start_worker() -> None:
     """End with the parent process, however it ends."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _end_with_parent():
-    multiprocessing.parent_process().join()
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
     os._exit(1)
 
 
-def _versions():
+def _versions() -> dict[str, str]:
     code = hashlib.sha256()
     for entry in _CODE:
         for path in sorted(entry.rglob("*.py")) or [entry]:
@@ -183,18 +200,18 @@ def _versions():
     }
 
 
-def _frozen(value):
+def _frozen(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _read(path):
+def _read(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):
         return None
 
 
-def _write(path, document):
+def _write(path: Path, document: object) -> None:
     """Write atomically: an interrupted run leaves no partial file."""
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_text(json.dumps(document), encoding="utf-8")

@@ -1,8 +1,11 @@
 """Sources of the cases of an experiment: the published trajectories, or simulated drives."""
 
+from __future__ import annotations
+
 import hashlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
@@ -30,13 +33,13 @@ class PublishedSource:
     datasets = (*published.SIMULATED, *published.KITTI)
     runs = published.N_RUNS
 
-    def cases(self, dataset, level):
+    def cases(self, dataset: str, level: float | None) -> list[Case]:
         """List of Case of a data set at a level; None for those without levels."""
         if dataset in _KITTI_LOADERS:
             return [_KITTI_LOADERS[dataset](self.folder)]
         return published.load_simulated(self.folder, [dataset], None if level is None else [level])
 
-    def configuration(self):
+    def configuration(self) -> dict[str, Any]:
         """What the cases depend on, for telling whether stored results still hold: names, sizes and
         times of the files.
         """
@@ -67,12 +70,12 @@ class SimulatedSource:
     data = "simulated"
     datasets = published.SIMULATED
 
-    def cases(self, dataset, level):
+    def cases(self, dataset: str, level: float | None) -> list[Case]:
         """List of Case of a data set at a level; without published results."""
         noise = _noise(dataset, level)
         return [self._case(dataset, level, noise, number) for number in range(self.runs)]
 
-    def _case(self, dataset, level, noise, number):
+    def _case(self, dataset: str, level: float | None, noise: NoiseConfig, number: int) -> Case:
         drive = simulate_drive((self.seed, number), PUBLISHED_DRIVE, noise)
         return Case(
             dataset,
@@ -84,7 +87,7 @@ class SimulatedSource:
             {},
         )
 
-    def configuration(self):
+    def configuration(self) -> dict[str, Any]:
         """What the cases depend on."""
         return {
             "data": self.data,
@@ -94,15 +97,20 @@ class SimulatedSource:
         }
 
 
-def find_folder(folder):
+Source = PublishedSource | SimulatedSource
+
+
+def find_folder(folder: str | Path) -> str:
     """The folder of the published data: itself, or the folder valimaki2023 in it."""
     inside = Path(folder) / "valimaki2023"
     return str(published.check_folder(inside if inside.is_dir() else folder).resolve())
 
 
-def _noise(dataset, level):
+def _noise(dataset: str, level: float | None) -> NoiseConfig:
     if dataset == "mixture":
         return MIXTURE
+    if level is None:
+        raise ValueError(f"{dataset} needs a level")
     name, factor = {
         "noise": ("gaussian", 1.0),
         "outliers": ("outliers", 0.01),

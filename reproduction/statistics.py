@@ -2,13 +2,19 @@
 and quartiles.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from reproduction.published import REFERENCES
-from reproduction.rows import METRICS, in_m_and_deg, published_name
+from hand_eye_calib.arrays import FloatArray
+from reproduction.published import REFERENCES, Case
+from reproduction.rows import METRICS, Row, in_m_and_deg, published_name
 
 
 @dataclass(frozen=True)
@@ -30,12 +36,12 @@ class Summary:
     centre: float
     low: float
     high: float
-    whiskers: tuple
+    whiskers: tuple[float, float]
     n: int
     is_median: bool
 
 
-def mean_summary(values):
+def mean_summary(values: ArrayLike) -> Summary:
     """Mean and 95 % confidence interval of (N,) values."""
     values = np.asarray(values)
     mean, n = values.mean(), len(values)
@@ -50,7 +56,7 @@ def mean_summary(values):
     )
 
 
-def quartile_summary(values):
+def quartile_summary(values: ArrayLike) -> Summary:
     """Median and quartiles of (N,) values."""
     values = np.sort(values)
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
@@ -65,9 +71,13 @@ def quartile_summary(values):
     )
 
 
-def summarise(dataset, values):
+def summarise(dataset: str, values: ArrayLike) -> Summary:
     """As the paper does: the mixture by quartiles, the others by mean."""
     return quartile_summary(values) if dataset == "mixture" else mean_summary(values)
+
+
+# Data set, level, method, reference, errors.
+Entry = tuple[str, float | None, str, str, tuple[float, ...]]
 
 
 class Table:
@@ -79,30 +89,34 @@ class Table:
         ``errors``: the four metrics, m and deg.
     """
 
-    def __init__(self, entries):
-        collected = {}
+    def __init__(self, entries: Iterable[Entry]) -> None:
+        collected: dict[tuple[Any, ...], list[tuple[float, ...]]] = {}
         for *key, errors in entries:
             collected.setdefault(tuple(key), []).append(errors)
         self._errors = {key: np.array(errors) for key, errors in collected.items()}
 
-    def values(self, dataset, level, method, reference, metric):
+    def values(
+        self, dataset: str, level: float | None, method: str, reference: str, metric: str
+    ) -> FloatArray:
         """(N,) errors of the runs; m or deg."""
         return self._errors[dataset, level, method, reference][:, METRICS.index(metric)]
 
-    def levels(self, dataset, method):
+    def levels(self, dataset: str, method: str) -> tuple[float | None, ...]:
         """Levels of a data set, ascending; (None,) for the mixture."""
         found = {key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)}
         return tuple(sorted(found, key=lambda level: level or 0.0))
 
-    def has(self, dataset, method):
+    def has(self, dataset: str, method: str) -> bool:
         """Whether the table has a method on a data set."""
         return bool(self.levels(dataset, method))
 
-    def summary(self, dataset, level, method, reference, metric):
+    def summary(
+        self, dataset: str, level: float | None, method: str, reference: str, metric: str
+    ) -> Summary:
         """:class:`Summary` of the runs."""
         return summarise(dataset, self.values(dataset, level, method, reference, metric))
 
-    def score(self, dataset, method, reference, metric="e_at"):
+    def score(self, dataset: str, method: str, reference: str, metric: str = "e_at") -> float:
         """The value that variants are compared by: the mean over levels of the mean over runs; of
         the mixture, the median.
         """
@@ -113,23 +127,23 @@ class Table:
             )
         )
 
-    def best_reference(self, dataset, method, metric="e_at"):
+    def best_reference(self, dataset: str, method: str, metric: str = "e_at") -> str:
         """The reference with the smallest score."""
         return min(REFERENCES, key=lambda reference: self.score(dataset, method, reference, metric))
 
-    def ranking(self, dataset, method, metric="e_at"):
+    def ranking(self, dataset: str, method: str, metric: str = "e_at") -> list[str]:
         """References from the smallest score to the largest."""
         return sorted(
             REFERENCES, key=lambda reference: self.score(dataset, method, reference, metric)
         )
 
 
-def ours(rows):
+def ours(rows: Sequence[Row]) -> Table:
     """:class:`Table` of our errors."""
     return Table((row.dataset, row.level, row.method, row.reference, row.errors) for row in rows)
 
 
-def theirs(rows):
+def theirs(rows: Sequence[Row]) -> Table:
     """:class:`Table` of the published errors of the same rows."""
     return Table(
         (row.dataset, row.level, row.method, row.reference, row.published)
@@ -138,7 +152,7 @@ def theirs(rows):
     )
 
 
-def theirs_of_cases(cases, methods):
+def theirs_of_cases(cases: Iterable[Case], methods: Sequence[str]) -> Table:
     """:class:`Table` of the published errors of cases, whatever was solved."""
     return Table(
         (

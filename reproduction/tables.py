@@ -2,14 +2,23 @@
 the rectified ground truth.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from hand_eye_calib.assessment.metrics import absolute_errors
 from reproduction import comparison
 from reproduction.kitti_truth import RECTIFIED
 from reproduction.published import METHODS, REFERENCES
-from reproduction.rows import TITLES, agree
+from reproduction.rows import TITLES, Row, agree
 from reproduction.writing import markdown_table, percent, write_csv, write_text
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Results
 
 SUMMARY_TABLES = {"table1": "kitti_short", "table2": "kitti_long"}
 _DRIVES = {
@@ -25,7 +34,7 @@ VARIANT_TABLES = {
 
 # As printed in the paper: variant; e_rt, e_rR, e_at, e_aR; improvement of e_at and e_aR over B1
 # (none where B1 is the best).
-PRINTED = {
+PRINTED: dict[str, dict[str, tuple[Any, ...]]] = {
     "kitti_short": {
         "ali": ("B5", 0.170, 0.294, 0.342, 0.722, 0.288, -0.056),
         "dnl": ("B5", 0.170, 0.293, 0.342, 0.721, 0.288, -0.052),
@@ -60,18 +69,26 @@ _NOTE = (
 )
 
 
-def rectified_errors(row):
+# By method and reference.
+Variants = Mapping[str, Mapping[str, Row]]
+# Variant and its values; None without a gain.
+Line = tuple[str, tuple[float | None, ...]]
+
+
+def rectified_errors(row: Row) -> tuple[float, float]:
     """e_at (m) and e_aR (deg) against the rectified ground truth."""
     e_at, e_aR = absolute_errors(row.transform, RECTIFIED[row.dataset])
     return e_at, float(np.degrees(e_aR))
 
 
-def best_variant(rows, error=lambda row: row.errors[2]):
+def best_variant(
+    rows: Iterable[Row], error: Callable[[Row], float] = lambda row: row.errors[2]
+) -> Row:
     """The row with the smallest e_at, or another error."""
     return min(rows, key=error)
 
 
-def write_summary_table(name, results):
+def write_summary_table(name: str, results: Results) -> list[Path]:
     """Tables 1 and 2; returns the paths."""
     dataset = SUMMARY_TABLES[name]
     rows = {
@@ -81,7 +98,8 @@ def write_summary_table(name, results):
         method: _line(best_variant(rows[method].values()), rows[method]["B1"]) for method in METHODS
     }
     smallest = {
-        column: min(values[column] for _, values in lines.values()) for column in _ERROR_COLUMNS
+        column: min(value for _, values in lines.values() if (value := values[column]) is not None)
+        for column in _ERROR_COLUMNS
     }
     header = ["method", *_COLUMNS, *_RECTIFIED_COLUMNS]
     body = [
@@ -108,7 +126,7 @@ def write_summary_table(name, results):
     ]
 
 
-def _line(row, b1):
+def _line(row: Row, b1: Row) -> Line:
     """Variant and the ten numbers of a method."""
     rectified = rectified_errors(row)
     if row.reference == "B1":
@@ -118,7 +136,7 @@ def _line(row, b1):
     return row.reference, (*row.errors, *gains, *rectified, *rectified_gains)
 
 
-def _print(value, bold=None):
+def _print(value: float | None, bold: float | None = None) -> str:
     """To three decimals; bold where that reads as ``bold`` does."""
     if value is None:
         return "-"
@@ -126,7 +144,7 @@ def _print(value, bold=None):
     return f"**{text}**" if bold is not None and text == f"{bold:.3f}" else text
 
 
-def _best_against_rectified(rows):
+def _best_against_rectified(rows: Variants) -> str:
     lines = []
     for method, by_reference in rows.items():
         row = best_variant(by_reference.values(), lambda row: rectified_errors(row)[0])
@@ -151,11 +169,14 @@ def _best_against_rectified(rows):
     return markdown_table(header, lines)
 
 
-def _compare_with_print(name, rows, lines, results):
+def _compare_with_print(
+    name: str, rows: Variants, lines: Mapping[str, Line], results: Results
+) -> list[Path]:
     """Cell by cell: ours (of our best variant, and of the paper's), the published file's, and as
     printed.
     """
-    dataset, compared = SUMMARY_TABLES[name], []
+    dataset = SUMMARY_TABLES[name]
+    compared: list[list[Any]] = []
     for method, (variant, values) in lines.items():
         printed_variant, *printed = PRINTED[dataset][method]
         there = rows[method][printed_variant]
@@ -227,17 +248,17 @@ def _compare_with_print(name, rows, lines, results):
     ]
 
 
-def _blank(value):
+def _blank(value: float | None) -> float | str:
     return "" if value is None else value
 
 
-def write_variant_table(name, results):
+def write_variant_table(name: str, results: Results) -> list[Path]:
     """Tables S1 to S12; returns the paths."""
     dataset, method = VARIANT_TABLES[name]
     rows = results.of(dataset, method)
     best = best_variant(rows)
     header = ["reference", *_COLUMNS[:4], "rectified: e_at (m)", "rectified: e_aR (deg)"]
-    lines = [
+    lines: list[list[Any]] = [
         [row.reference, *row.errors, *rectified_errors(row)]
         for row in sorted(rows, key=lambda row: REFERENCES.index(row.reference))
     ]
@@ -259,7 +280,7 @@ def write_variant_table(name, results):
             "" if agree(ours, theirs) else row.why(),
         ]
         for row in rows
-        for metric, ours, theirs in zip(_COLUMNS[:4], row.errors, row.published, strict=True)
+        for metric, ours, theirs in zip(_COLUMNS[:4], row.errors, row.theirs, strict=True)
     ]
     blocks = [comparison.describe_rows(rows)]
     if method == "dnlo":
@@ -279,7 +300,7 @@ def write_variant_table(name, results):
                         f"{row.objective:.6f}",
                         f"{row.published_objective:.6f}",
                         f"{row.errors[2]:.4f}",
-                        f"{row.published[2]:.4f}",
+                        f"{row.theirs[2]:.4f}",
                     ]
                     for row in rows
                 ],

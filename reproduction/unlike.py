@@ -1,9 +1,15 @@
 """``python -m reproduction unlike``: the estimators on simulations unlike the published ones."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.simulation.drive import simulate_drive
@@ -12,13 +18,21 @@ from hand_eye_calib.simulation.options import MIXTURE, DriveConfig
 from reproduction.hindsight import study_level
 from reproduction.published import Case
 from reproduction.runner import in_parallel
+from reproduction.sources import SimulatedSource
 from reproduction.writing import markdown_table, write_csv, write_text
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Results
 
 # Handheld motion: every component of twist and place is the sum of this many sines of up to so many
 # Hz.
 _SINES, _FASTEST_HZ = 4, 0.4
 _TURNING, _MOVING = 0.8, 0.5  # rad/s and m
 _SUBSTEPS = 10
+
+
+Poses = tuple[FloatArray, FloatArray]
+Disturbance = Callable[[FloatArray, FloatArray, np.random.Generator], Poses]
 
 
 @dataclass(frozen=True)
@@ -37,49 +51,51 @@ class Scenario:
     """
 
     title: str
-    disturb: object
+    disturb: Disturbance
     drive: DriveConfig = DriveConfig(poses=200)
     handheld: bool = False
 
 
-def _white(level):
+def _white(level: float) -> Disturbance:
     return lambda parent, child, rng: (
         add_gaussian(parent, level, rng),
         add_gaussian(child, level, rng),
     )
 
 
-def _mixture(parent, child, rng):
+def _mixture(parent: FloatArray, child: FloatArray, rng: np.random.Generator) -> Poses:
     return add_noise(parent, child, MIXTURE, rng)
 
 
-def _parent_drifts(parent, child, rng):
+def _parent_drifts(parent: FloatArray, child: FloatArray, rng: np.random.Generator) -> Poses:
     return _white(0.002)(add_drift(parent, 0.03, rng), child, rng)
 
 
-def _random_walks(parent, child, rng):
+def _random_walks(parent: FloatArray, child: FloatArray, rng: np.random.Generator) -> Poses:
     """Random walk of both odometries: 0.05 deg and 1 mm per pose."""
-    return tuple(
-        _moved_from(poses, np.ones(len(poses), dtype=bool), 0.001, np.radians(0.05), rng)
-        for poses in (parent, child)
-    )
+
+    def walked(poses: FloatArray) -> FloatArray:
+        everywhere = np.ones(len(poses), dtype=bool)
+        return _moved_from(poses, everywhere, 0.001, np.radians(0.05), rng)
+
+    return walked(parent), walked(child)
 
 
-def _turning_jumps(parent, child, rng):
+def _turning_jumps(parent: FloatArray, child: FloatArray, rng: np.random.Generator) -> Poses:
     """At 3 % of the poses of either stream the rest of the track is rotated by 2 deg and shifted by
     0.1 m per axis.
     """
-    jumped = (
-        _moved_from(poses, rng.random(len(poses)) < 0.03, 0.1, np.radians(2.0), rng)
-        for poses in (parent, child)
-    )
-    return _white(0.002)(*jumped, rng)
+
+    def jumped(poses: FloatArray) -> FloatArray:
+        return _moved_from(poses, rng.random(len(poses)) < 0.03, 0.1, np.radians(2.0), rng)
+
+    return _white(0.002)(jumped(parent), jumped(child), rng)
 
 
-def _spikes(parent, child, rng):
+def _spikes(parent: FloatArray, child: FloatArray, rng: np.random.Generator) -> Poses:
     """5 % of the poses of either stream are off by 0.3 m and 5 deg per axis, independently."""
 
-    def spiky(poses):
+    def spiky(poses: FloatArray) -> FloatArray:
         spiked = np.where(rng.random(len(poses)) < 0.05, 1.0, 0.0)[:, None]
         return poses @ se3.exp(
             spiked * rng.standard_normal((len(poses), 6)) * np.repeat([0.3, np.radians(5.0)], 3)
@@ -88,21 +104,25 @@ def _spikes(parent, child, rng):
     return _white(0.002)(spiky(parent), spiky(child), rng)
 
 
-def _slow_noise(parent, child, rng):
+def _slow_noise(parent: FloatArray, child: FloatArray, rng: np.random.Generator) -> Poses:
     """Errors of 1 cm and 0.5 deg correlated over 1 s (ten poses): not white, no random walk."""
-    return tuple(
-        poses @ se3.exp(_lasting(len(poses), rng) * np.repeat([0.01, np.radians(0.5)], 3))
-        for poses in (parent, child)
-    )
+
+    def noisy(poses: FloatArray) -> FloatArray:
+        errors = _lasting(len(poses), rng) * np.repeat([0.01, np.radians(0.5)], 3)
+        return poses @ se3.exp(errors)
+
+    return noisy(parent), noisy(child)
 
 
-def _scaled(parent, child, rng):
+def _scaled(parent: FloatArray, child: FloatArray, rng: np.random.Generator) -> Poses:
     child = child.copy()
     child[:, :3, 3] *= 1.03
     return _white(0.002)(parent, child, rng)
 
 
-def _moved_from(poses, where, metres, radians, rng):
+def _moved_from(
+    poses: FloatArray, where: BoolArray, metres: float, radians: float, rng: np.random.Generator
+) -> FloatArray:
     """At each marked pose the rest of the track is moved, about that pose."""
     steps = se3.inverse(poses[:-1]) @ poses[1:]
     errors = (
@@ -115,7 +135,7 @@ def _moved_from(poses, where, metres, radians, rng):
     return moved
 
 
-def _lasting(count, rng, memory=0.9):
+def _lasting(count: int, rng: np.random.Generator, memory: float = 0.9) -> FloatArray:
     """(count, 6) array: unit variance, each value like the last."""
     values = rng.standard_normal((count, 6))
     for k in range(1, count):
@@ -162,11 +182,11 @@ class UnlikeSource:
     seed: int
     runs: int
 
-    def cases(self, dataset, level):
+    def cases(self, dataset: str, level: float | None) -> list[Case]:
         """List of Case of a scenario; ``level`` is None."""
         return [self._case(dataset, level, number) for number in range(self.runs)]
 
-    def _case(self, dataset, level, number):
+    def _case(self, dataset: str, level: float | None, number: int) -> Case:
         scenario = SCENARIOS[dataset]
         rng = np.random.default_rng((self.seed, number, list(SCENARIOS).index(dataset)))
         drive = simulate_drive((self.seed, number), scenario.drive)
@@ -174,14 +194,13 @@ class UnlikeSource:
         if scenario.handheld:
             parent = _handheld(scenario.drive, rng)
             child = se3.inverse(drive.T_pw_cw) @ parent @ drive.T_parent_child
-        parent, child = (
-            Trajectory(drive.parent.stamps_ns, poses)
-            for poses in scenario.disturb(parent, child, rng)
-        )
-        return Case(dataset, level, f"run_{number + 1:02}", parent, child, drive.T_parent_child, {})
+        disturbed = scenario.disturb(parent, child, rng)
+        streams = [Trajectory(drive.parent.stamps_ns, poses) for poses in disturbed]
+        run = f"run_{number + 1:02}"
+        return Case(dataset, level, run, streams[0], streams[1], drive.T_parent_child, {})
 
 
-def _handheld(drive, rng):
+def _handheld(drive: DriveConfig, rng: np.random.Generator) -> FloatArray:
     """Poses (N, 4, 4) of a handheld device that rotates about all axes."""
     times_s = np.arange(drive.poses * _SUBSTEPS) / (drive.parent_rate * _SUBSTEPS)
     frequency = rng.uniform(0.05, _FASTEST_HZ, (6, _SINES))
@@ -199,8 +218,9 @@ def _handheld(drive, rng):
     return poses
 
 
-def write(name, results):
+def write(name: str, results: Results) -> list[Path]:
     """Study every scenario and write ``NAME.md`` and ``NAME.csv``; returns their paths."""
+    assert isinstance(results.source, SimulatedSource)
     source = UnlikeSource(results.source.seed, results.source.runs)
     studies = in_parallel(
         study_level, [(source, scenario, None) for scenario in SCENARIOS], results.jobs

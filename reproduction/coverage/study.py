@@ -60,7 +60,9 @@ class Plan:
 def measure(plan: Plan, jobs: int) -> list[Row]:
     """Rows of every class, level, rig and cycle for every method, then the pooled ones."""
     tasks = [task for method in plan.methods for task in _tasks(plan, method)]
-    rows = in_parallel(_measured, [rest for table, *rest in tasks if table in plan.tables], jobs)
+    rows = in_parallel(
+        _measured, [tuple(rest) for table, *rest in tasks if table in plan.tables], jobs
+    )
     together = [
         pooled(table, name, method, rows)
         for method in plan.methods
