@@ -114,19 +114,16 @@ def check_streams(
         aligned = replace(streams, child=streams.child.shifted(correlation.offset_s))
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
-    explanation, reason = None, ""
     try:
         explanation = explain(aligned, thorough=correlation.is_clear)
     except NotEnoughDataError as error:
-        reason = str(error)
+        explanation, too_short = None, [wording.too_short_to_compare(str(error))]
     if explanation is None or not explanation.holds:
         if not correlation.is_clear:
             # Nothing is said about the rates of a frozen stream.
             findings += [] if frozen else [_rates_disagree(correlation)]
-        elif explanation is None:
-            findings.append(wording.too_short_to_compare(reason))
         else:
-            findings += explanation.findings
+            findings += explanation.findings if explanation else too_short
         return CheckResult(gravest_first(findings), correlation)
     if not correlation.is_clear:
         # Short recordings may not show the offset, and yet the streams agree at the given one.

@@ -227,10 +227,7 @@ class Calibrator:
             _Column.of(buffer, np.flatnonzero(names == name), stamps_ns, poses)
             for name, buffer in self._buffers.items()
         ]
-        is_plain = np.zeros(len(stamps_ns), dtype=bool)
-        for column in columns:
-            is_plain[column.rows] = column.is_plain
-        others = [*np.flatnonzero(~is_plain).tolist(), len(stamps_ns)]
+        others = _rows_that_are_not_plain(columns, len(stamps_ns))
         taken = np.ones(len(stamps_ns), dtype=bool)
         first = 0
         while first < len(stamps_ns):
@@ -241,15 +238,16 @@ class Calibrator:
             for column in columns:
                 column.store(first, stop)
             if stop < len(stamps_ns):
-                pose = poses[stop].tolist()
-                try:
-                    taken[stop] = self.add_pose(
-                        str(names[stop]), int(stamps_ns[stop]), pose[:3], pose[3:]
-                    )
-                except InputError as error:
-                    raise UnusablePose(stop, error) from None
+                taken[stop] = self._add_row(stop, str(names[stop]), stamps_ns, poses)
             first = stop + 1
         return taken
+
+    def _add_row(self, row: int, stream: str, stamps_ns: IntArray, poses: FloatArray) -> bool:
+        pose = poses[row].tolist()
+        try:
+            return self.add_pose(stream, int(stamps_ns[row]), pose[:3], pose[3:])
+        except InputError as error:
+            raise UnusablePose(row, error) from None
 
     def snapshot(self) -> Snapshot:
         """All that is known now, for an estimate in this or another thread."""
@@ -420,6 +418,14 @@ class _Column:
         begin, end = bisect_left(self.rows, first), bisect_left(self.rows, stop)
         if begin < end:
             self.buffer.extend(self.stamps_ns[begin:end], self.poses[begin:end])
+
+
+def _rows_that_are_not_plain(columns: Sequence[_Column], n_rows: int) -> list[int]:
+    """The rows, in order, and their number."""
+    is_plain = np.zeros(n_rows, dtype=bool)
+    for column in columns:
+        is_plain[column.rows] = column.is_plain
+    return [*np.flatnonzero(~is_plain).tolist(), n_rows]
 
 
 def _is_pose(x: Any, y: Any, z: Any, qx: Any, qy: Any, qz: Any, qw: Any) -> Any:

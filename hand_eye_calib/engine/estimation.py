@@ -2,7 +2,7 @@
 assess, add the prior, judge.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -85,15 +85,30 @@ def estimate_extrinsic(
         If there are too few poses for the reference or for the scale.
     """
     scale = _settle_scale(pose_pairs, config)
-    scaled = child_scaled(pose_pairs, scale.value)
     solve = _solve_pairs if METHODS[config.method].uses_reference else _solve_adaptive
-    evaluation = solve(scaled, config)
-    solution = evaluation.solution
+    evaluation = solve(child_scaled(pose_pairs, scale.value), config)
+    T_method = evaluation.solution.T_parent_child
     spread = _spread_by_alignment(scale.estimate, time_offset)
-    assessment = widened(evaluation.assessment, solution.T_parent_child[:3, :3], spread)
-    fused = fuse(solution.T_parent_child, assessment, config.prior())
+    assessment = widened(evaluation.assessment, T_method[:3, :3], spread)
+    fused = fuse(T_method, assessment, config.prior())
+    result = _calibration(evaluation, fused, pose_pairs.stamps_ns, config)
     offset_s = time_offset.seconds if time_offset else fixed_time_offset(config)
-    residuals = _residuals(evaluation, pose_pairs.stamps_ns, fused.T_parent_child)
+    return replace(
+        result,
+        time_offset_s=offset_s + evaluation.time_correction_s,
+        time_offset_sigma_s=time_offset.sigma_s if time_offset else 0.0,
+        scale=scale.value * evaluation.scale_correction,
+        scale_sigma=scale.estimate.sigma if scale.estimate else 0.0,
+        warnings=scale.warnings + result.warnings,
+    )
+
+
+def _calibration(
+    evaluation: _Evaluation, fused: Fused, stamps_ns: IntArray, config: CalibratorConfig
+) -> Calibration:
+    """The result, without frame names, time offset and scale."""
+    solution = evaluation.solution
+    residuals = _residuals(evaluation, stamps_ns, fused.T_parent_child)
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
@@ -106,19 +121,11 @@ def estimate_extrinsic(
         reference_reason=evaluation.reference_reason,
         noise=evaluation.noise,
         backend=config.backend,
-        n_poses=len(pose_pairs),
+        n_poses=len(stamps_ns),
         n_pairs=len(residuals),
         n_inliers=int(residuals.is_inlier.sum()),
-        time_offset_s=offset_s + evaluation.time_correction_s,
-        time_offset_sigma_s=time_offset.sigma_s if time_offset else 0.0,
-        scale=scale.value * evaluation.scale_correction,
-        scale_sigma=scale.estimate.sigma if scale.estimate else 0.0,
-        stamp_ns=int(pose_pairs.stamps_ns[-1]),
-        warnings=(
-            *scale.warnings,
-            *_warnings_of(fused, solution.converged),
-            *evaluation.warnings,
-        ),
+        stamp_ns=int(stamps_ns[-1]),
+        warnings=(*_warnings_of(fused, solution.converged), *evaluation.warnings),
         motion_residuals=residuals,
     )
 
