@@ -10,7 +10,7 @@ holds for all of them::
     bags:
       - monday/*                           # paths are relative to this file
       - bag: [tuesday/drive_0, tuesday/drive_1]
-        name: tuesday                      # of its folder in --out; by default the bag's own name
+        name: tuesday                      # of its folder in --out; by default the bag's own
         child_topic: /camera/slam
         options: {reference: B10}
 
@@ -24,12 +24,14 @@ import multiprocessing
 import os
 import signal
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from glob import glob, has_magic
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -185,15 +187,26 @@ def read_batch(
     given = {"options": options} | dict(sources)
     defaults = _merged(given, _checked(path, common, "beside 'bags'"))
     wanted = {"with_fingerprints": with_fingerprints, "with_report": with_report}
-    tasks: list[Task] = []
+    recordings = list(_recordings(path, bags, defaults))
+    names = _names(path, recordings)
+    return [
+        _task(where, name, paths, entry, wanted)
+        for name, (where, paths, entry) in zip(names, recordings, strict=True)
+    ]
+
+
+_Recording = tuple[str, list[str], dict[str, Any]]
+
+
+def _recordings(
+    path: Path, bags: Sequence[Any], defaults: Mapping[str, Any]
+) -> Iterator[_Recording]:
+    """Each recording of a batch file: where it stands in the file, its bags, what holds for it."""
     for number, entry in enumerate(bags, start=1):
         where = f"entry {number}"
         entry = _checked(path, entry if isinstance(entry, dict) else {"bag": entry}, where)
-        merged = _merged(defaults, entry)
         for paths in _expanded(path, entry, where):
-            taken = {task.name for task in tasks}
-            tasks.append(_task(f"{path}, {where}", paths, merged, taken, wanted))
-    return tasks
+            yield f"{path}, {where}", paths, _merged(defaults, entry)
 
 
 def _checked(path: Path, entry: dict[str, Any], where: str) -> dict[str, Any]:
@@ -239,38 +252,51 @@ def _expanded(path: Path, entry: Mapping[str, Any], where: str) -> list[list[str
 
 def _task(
     where: str,
+    name: str,
     bags: Sequence[str],
     entry: Mapping[str, Any],
-    taken: set[str],
     wanted: Mapping[str, bool],
 ) -> Task:
     from hand_eye_calib.io.transforms import TfSource
 
     try:
         CalibratorConfig.from_options(entry["options"])
-        for name in ("parent_tf", "child_tf"):
-            if name in entry:
-                TfSource.parse(str(entry[name]))
+        for source in ("parent_tf", "child_tf"):
+            if source in entry:
+                TfSource.parse(str(entry[source]))
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-    base = name = _name(where, entry.get("name"), bags)
-    while name in taken:
-        name = (
-            f"{base}_{1 + sum(other.startswith(base) for other in taken)}"
-            if name == base
-            else name + "_"
-        )
     sources = {source: str(entry[source]) for source in _SOURCES if source in entry}
     return Task(
         name=name, bags=tuple(bags), options=dict(entry["options"]), sources=sources, **wanted
     )
 
 
-def _name(where: str, given: Any, bags: Sequence[str]) -> str:
+def _names(path: Path, recordings: Sequence[_Recording]) -> list[str]:
+    """A name for each recording, none twice: its own or that of its first bag, with the folder if
+    several bags are called alike, as monday/bag and tuesday/bag.
+    """
+    stems = Counter(Path(paths[0]).stem for _, paths, entry in recordings if not entry.get("name"))
+    names: list[str] = []
+    for where, paths, entry in recordings:
+        bag = Path(paths[0])
+        is_alone = stems[bag.stem] == 1 or bag.parent == path.parent
+        usual = bag.stem if is_alone else f"{bag.parent.name}_{bag.stem}"
+        names.append(_free(_name(where, entry.get("name") or usual), set(names)))
+    return names
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """The name, with a number if it is taken."""
+    numbered = (f"{name}_{number}" for number in count(2))
+    return next(one for one in chain([name], numbered) if one not in taken)
+
+
+def _name(where: str, given: Any) -> str:
     """Name of a recording, and of its folder in ``--out``."""
-    if not isinstance(given, (str, int, float, type(None))):
+    if not isinstance(given, (str, int, float)):
         raise ConfigError(f"{where}: expected a name; got {given!r}")
-    name = str(given or Path(bags[0]).stem).replace("/", "_")
+    name = str(given).replace("/", "_")
     is_file_name = name.isprintable() and len(name.encode()) <= _LONGEST_NAME
     if not is_file_name or name.strip(". ") == "" or name.lower() in (_SUMMARY, _STATE):
         raise ConfigError(

@@ -182,7 +182,8 @@ def _limits(calibration: Calibration) -> str:
         ]
         if known:
             worst = max(known, key=lambda dof: dof.sigma)
-            texts.append(f"{size(worst.sigma, worst.name)} ({worst.name})")
+            where = _AXIS_NAMES.get(worst.name, worst.name).partition(" (")[0]
+            texts.append(f"{size(worst.sigma, worst.name)} ({where})")
     return listing(texts)
 
 

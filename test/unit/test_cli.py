@@ -736,6 +736,18 @@ def test_what_takes_a_while_is_shown_on_a_terminal_and_wiped_out(monkeypatch, ca
     assert capsys.readouterr().err == "\r\033[K"
 
 
+def test_what_takes_longer_shows_the_seconds(monkeypatch, capsys):
+    monkeypatch.setattr("hand_eye_calib.cli.console._SILENT_S", 0.01)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    shown = ""
+    with waiting_for("solving"):
+        deadline = time.monotonic() + 10
+        while "\rsolving ... 0 s" not in shown and time.monotonic() < deadline:
+            shown += capsys.readouterr().err
+    assert "\rsolving ... 0 s" in shown
+    assert capsys.readouterr().err.endswith("\r\033[K")
+
+
 def test_progress_is_silent_at_first_and_shows_share_rate_and_time_left(monkeypatch, capsys):
     assert list(with_progress(range(3), 3, "reading")) == [0, 1, 2]
     assert capsys.readouterr().err == ""

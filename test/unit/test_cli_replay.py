@@ -399,7 +399,7 @@ def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
     assert first.sources == {"parent_tf": "odom:lidar", "child_topic": "/c"}
     assert second.options == {"method": "dnl", "max_gap": 0.3, "reference": "A"}
     assert second.sources == {"parent_topic": "/p", "child_topic": "/c"}
-    assert (first.name, second.name) == ("a", "a_2")
+    assert (first.name, second.name) == ("a", "b_a")
     assert first.bags == (str(tmp_path / "a"),)
 
 
@@ -424,3 +424,12 @@ def test_every_bag_of_other_programs_is_listed_or_refused_in_one_line(run):
         assert len(err.splitlines()) == 1, err
         refused.append(path.name)
     assert refused == ["empty-file.bag"]
+
+
+def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
+    for folder in ("monday", "tuesday"):
+        (tmp_path / folder / "bag").mkdir(parents=True)
+    path = tmp_path / "fleet.yaml"
+    path.write_text("bags: ['*/bag', other, other, {bag: monday/bag, name: first}]")
+    names = [task.name for task in batch.read_batch(path, {}, {})]
+    assert names == ["monday_bag", "tuesday_bag", "other", "other_2", "first"]
