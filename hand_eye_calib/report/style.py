@@ -105,6 +105,8 @@ def save(figure: Figure, stem: Path) -> list[Path]:
     """Write ``stem``.png and ``stem``.svg; returns both paths."""
     paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
     figure.savefig(paths[0], metadata={"Software": None})
+    # The layout of the first file serves for the second.
+    figure.set_layout_engine("none")
     figure.savefig(paths[1], metadata={"Date": None})
     return paths
 
