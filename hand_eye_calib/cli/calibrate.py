@@ -1,6 +1,7 @@
 """``calibrate PARENT CHILD``: two trajectory files."""
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +23,9 @@ examples:
 
 _FORMATS = (
     "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; csv: columns "
-    "by the names in the header, or with --columns. Default: tum"
+    "by the names in the header, or with --columns. Default: what the file looks like"
 )
+_USUAL_FORMAT = "tum"
 _FILE_OPTIONS: dict[str, dict[str, Any]] = {
     "format": {"choices": TRAJECTORY_FORMATS, "help": _FORMATS},
     "columns": {
@@ -91,41 +93,49 @@ def read_files(arguments: argparse.Namespace) -> tuple[dict[str, "Trajectory"], 
 
     trajectories: dict[str, Trajectory] = {}
     notes: list[str] = []
+    formats = {stream: _format_of(arguments, stream) for stream in STREAMS}
     for stream in STREAMS:
-        settings = _settings_of(arguments, stream)
         trajectories[stream], repaired = read_trajectory_file(
             getattr(arguments, stream),
-            settings.pop("format"),
+            formats[stream],
             repair=arguments.repair_stamps,
-            **settings,
+            **_settings_of(arguments, stream, formats),
         )
         notes += repaired
     return trajectories, notes
 
 
-def _settings_of(arguments: argparse.Namespace, stream: str) -> dict[str, Any]:
+def _format_of(arguments: argparse.Namespace, stream: str) -> str:
+    """The format that was given for the file of a stream, or that it looks like."""
+    from hand_eye_calib.io.format_guess import guess_format
+
+    if given := getattr(arguments, f"{stream}_format") or arguments.format:
+        return given
+    path = getattr(arguments, stream)
+    guess = guess_format(path)
+    # Columns are named for csv, and only csv has lines like those of euroc.
+    if guess == "euroc" and (arguments.columns or getattr(arguments, f"{stream}_columns")):
+        guess = "csv"
+    if guess != _USUAL_FORMAT:
+        note(f"{path} looks like format {guess}; to change that, give --{stream}-format")
+    return guess
+
+
+def _settings_of(
+    arguments: argparse.Namespace, stream: str, formats: Mapping[str, str]
+) -> dict[str, Any]:
     """How to read the file of a stream: its own options before those for both."""
     given = {
         name: getattr(arguments, f"{stream}_{name}") or getattr(arguments, name)
         for name in _FILE_OPTIONS
+        if name != "format"
     }
-    given["format"] = given["format"] or "tum"
     # An option for both files is meant for those of them that have its format.
     for name, belongs_to in (("columns", "csv"), ("times", "kitti")):
         is_own = bool(getattr(arguments, f"{stream}_{name}"))
-        if (
-            given["format"] != belongs_to
-            and not is_own
-            and _is_other(arguments, stream, belongs_to)
-        ):
+        if formats[stream] != belongs_to and not is_own and belongs_to in formats.values():
             given[name] = None
     return given
-
-
-def _is_other(arguments: argparse.Namespace, stream: str, file_format: str) -> bool:
-    """Whether the other file has this format."""
-    other = STREAMS[1 - STREAMS.index(stream)]
-    return (getattr(arguments, f"{other}_format") or arguments.format) == file_format
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -278,7 +278,10 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
         str(parent),
         str(tmp_path / "child.tum"),
     ]
-    assert main([*command, "--columns", "t,x,y,z,qw,qx,qy,qz"]) == 2
+    columns = ["--columns", "t,x,y,z,qw,qx,qy,qz"]
+    assert main([*command, *columns, "--repair-stamps"]) == 0
+    assert json.loads(capsys.readouterr().out)["T_parent_child"] == document["T_parent_child"]
+    assert main([*command, "--format", "tum", *columns]) == 2
     assert "columns are named for format csv only; the format is tum" in capsys.readouterr().err
 
 
