@@ -109,7 +109,7 @@ def study_level(source: Source, dataset: str, level: float | None) -> LevelStudy
         errors.append(metrics.absolute_errors(solution.T_parent_child, case.T_parent_child))
         squared_errors.append(xi @ np.linalg.solve(covariance, xi))
         covered.append(np.abs(xi) < norm.isf((1 - _COVERAGE) / 2) * np.sqrt(np.diag(covariance)))
-        nuisances.append(solution.nuisance)
+        nuisances.append(solution.systematic)
         dnlo = {reference: _dnlo_error(poses, case, reference) for reference in CANDIDATES}
         fixed.append([dnlo[reference] for reference in CANDIDATES])
         auto.append(dnlo[select_reference(poses, Method("dnlo")).reference])

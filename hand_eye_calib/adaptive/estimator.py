@@ -2,39 +2,47 @@
 along with it.
 
 Instead of choosing which poses to compare, all evidence is weighed as the noise of these very
-trajectories asks for: white noise favours long baselines, drift short ones, and a jump cuts the
-trajectory. docs/adaptive.md derives and tests it.
+trajectories asks for: white noise favours long baselines, drift short ones, errors that last neither,
+and a jump cuts the trajectory. docs/adaptive.md derives and tests it.
 """
 
+from __future__ import annotations
+
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import BLOCK, diagonal_blocks
+from hand_eye_calib.adaptive import noise_model, reml
 from hand_eye_calib.adaptive.increments import (
-    ALL_SYSTEMATIC,
-    CENTRES,
-    NUISANCES,
-    Increments,
-    nuisance_columns,
-    nuisance_values,
+    N_SYSTEMATIC,
+    SYSTEMATIC,
+    Course,
+    Linearisation,
+    Streams,
+    course_of,
+    linearise,
+    motions,
+    parameters_of,
 )
-from hand_eye_calib.adaptive.noise import (
-    LOWEST_VARIANCE,
-    NoiseLevels,
-    Solve,
-    covariance_factor,
-    fit_rotation_variances,
-    fit_translation_variances,
-    generalised_least_squares,
-    join_variances,
-    joined_columns,
-    solve_normal_equations,
-    solve_weighted,
-    starting_variances,
+from hand_eye_calib.adaptive.noise_model import CENTRES, SCALE_DRIFT, Extent, NoiseModel
+from hand_eye_calib.adaptive.outliers import (
+    NO_WEIGHT,
+    Outliers,
+    bridged,
+    first_outliers,
+    judged,
+    student_weights,
+    surprises,
+    tails_are_heavy,
+    with_jumps_across_spikes,
 )
+from hand_eye_calib.adaptive.relinearise import corrected, restored
+from hand_eye_calib.adaptive.resampling import part_products
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
+from hand_eye_calib.adaptive.state_space import NormalEquations, Posterior, StateSpace, selected
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.registry import Method
@@ -42,55 +50,48 @@ from hand_eye_calib.solvers.registry import Method
 # Robust start: DNLO over this reference sees through jumps, and does not need the noise levels.
 _START_REFERENCE = "B3"
 
-# First look for jumps: increments this many robust sigmas out. Wide, for the noise levels are not
-# known yet.
-_FIRST_JUMP_SIGMAS = 5.0
-_MEDIAN_OF_CHI_3 = 1.538
-
-# Once the noise is known: false alarms expected in a whole trajectory.
-_FALSE_ALARMS = 0.01
-
-# A jump is given up when an increment of its size or more has this probability.
-_PROBABLE = 0.01
-
-# No more than this share of the increments can be jumps: where the noise levels would have it so,
-# they are wrong.
-_MOST_JUMPS = 0.5
-
-# Noise levels need no more increments than this; longer drives lend evenly spread stretches of
-# them.
-_MOST_NOISE_INCREMENTS = 800
-_STRETCH = 100
-
-# Noise levels and X are improved in turn until X moves by less than this share of its sigma and no
-# jump appears.
-_MAX_ROUNDS, _SETTLED_SIGMAS = 4, 0.1
-
 # Rotation noise turns about the origin of a world if residuals seen from there are so much smaller
 # than at the sensors.
 _DECISIVE = 0.7
 
-# Rotation noise this large beside the rotation between poses is not small. Then every so many poses
-# are tried, if enough of them remain.
-_DROWNED = 0.2
-_STRIDES = (3, 10, 30)
-_FEWEST_STRIDES = 50
+# Noise levels need no more poses than this, in bursts that are spread evenly: bursts show the fast
+# errors, the time between them the slow ones. Slow errors take more time and need fewer poses.
+_MOST_POSES, _MOST_POSES_LASTING, _BURST = 400, 250, 10
 
-# Systematic errors larger than this (of the length, m/m, s) are none: a wrong unit, a clock that
-# was not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground a
-# child that slips sideways looks like one that is mounted askew.
-_MOST_SCALE_ERROR, _MOST_BIAS, _MOST_OFFSET_S = 0.5, 0.2, 0.5
+# Systematic errors that are in the model while the noise levels are fitted: scale, bias, time. Both
+# biases at once would differ by noise alone.
+_WHILE_FITTING = [0, 1, 2, 3, 7]
+
+# Rounds of looking for jumps; of weighing heavy tails.
+_OUTLIER_ROUNDS, _TAIL_ROUNDS = 4, 3
+
+# No more than this share of the poses are wrong by themselves.
+_MOST_SPIKES = 0.1
+
+# Rotation noise this large beside the rotation between poses is not small.
+_NOISY = 0.2
+
+# Errors that last are looked for if a first step promises to lower the loss by so much, and part of the
+# model if it is so much lower in the end.
+_LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
+
+# Systematic errors larger than this (of the length, m/m, s) are none: a wrong unit, a clock that was
+# not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground a child
+# that slips sideways looks like one that is mounted askew.
+_LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5])
 _MOST_GROWTH = 5.0
 
-# Errors that outlast the model show in sums of so many innovations; an excess below this many
-# standard deviations may be chance.
-_SUMMED, _CHANCE_SIGMAS = 16, 3.0
-
-_MAX_STEPS = 20
-_CONVERGED_SIGMAS, _CONVERGED_STEP = 1e-4, 1e-10
+# X is followed until it moves by less than this share of its sigma, at least one round.
+_MAX_ROUNDS = 6
+_SETTLED_SIGMAS, _SETTLED_STEP = 0.05, 1e-9
 
 
-def solve(stamps_ns, Ts_pw_p, Ts_cw_c, nuisances=NUISANCES):
+def solve(
+    stamps_ns: IntArray,
+    Ts_pw_p: FloatArray,
+    Ts_cw_c: FloatArray,
+    systematic: Sequence[str] = SYSTEMATIC,
+) -> AdaptiveSolution:
     """Estimate T_parent_child, the noise of the trajectories, and their covariance.
 
     Parameters
@@ -98,391 +99,357 @@ def solve(stamps_ns, Ts_pw_p, Ts_cw_c, nuisances=NUISANCES):
     stamps_ns : (N,) int64 array
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of both sensors in their own worlds at these stamps.
-    nuisances : sequence of str
-        Systematic errors to choose from, by Schwarz's criterion (BIC); the first is fitted in any
-        case, and should be "none" if there are others.
+    systematic : sequence of str
+        Systematic errors to choose from, by Schwarz's criterion (BIC); "none" must be among them.
 
     Returns
     -------
     AdaptiveSolution
     """
-    poses, first = _Poses(stamps_ns, Ts_pw_p, Ts_cw_c), nuisances[0]
-    plain = _at_best_stride(_fit(_start(poses, np.arange(len(stamps_ns)), first)))
-    chosen = _with_systematic_errors(plain, nuisances) if len(nuisances) > 1 else plain
-    if chosen.nuisance != first:
-        solution = _polished(_fit(chosen))
-        if solution.converged and _is_plausible(solution.nuisance, solution.parameters):
-            return solution
-    # What does not lead to an answer is given up in turn: systematic errors, then noise that turns
-    # about the origin of a world.
-    solution = _polished(plain)
-    if not solution.converged and solution.centre != "sensors":
-        solution = _polished(
-            _fit(_start(poses, np.arange(len(stamps_ns)), first, centres=("sensors",)))
-        )
+    stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
+    streams = Streams(stamps_s, Ts_pw_p, Ts_cw_c)
+    plain = _without_outliers(_fitted(_start(streams, len(systematic) > 1)))
+    rich = _with_lasting_errors(plain)
+    solution = _polished(_with_systematic_errors(rich, systematic))
+    if not solution.converged:
+        solution = _polished(_with_systematic_errors(plain, ("none",)))
     return solution
-
-
-def solve_without(stamps_ns, Ts_pw_p, Ts_cw_c, solution, left_out):
-    """Answers near a given one without the evidence of some increments, for resampling. The noise
-    levels are kept.
-
-    Leaving increments out as such would cut the trajectory there, and with white noise most is
-    known across the gap: the spread of the answers would overstate the error. Left out is what each
-    increment adds to those before it: its innovations. These are independent of each other if the
-    model is right.
-
-    Parameters
-    ----------
-    stamps_ns, Ts_pw_p, Ts_cw_c
-        As for :func:`solve`.
-    solution : AdaptiveSolution
-        Their solution.
-    left_out : (B, n) bool array
-        Increments to leave out, for each of B answers.
-
-    Returns
-    -------
-    (B, 4, 4) array
-    """
-    kept = np.flatnonzero(solution.used)
-    increments = _Poses(stamps_ns, Ts_pw_p, Ts_cw_c).increments(kept, solution.centre)
-    linearisation = increments.linearise(
-        solution.T_parent_child, solution.nuisance, solution.parameters
-    )
-    factor = covariance_factor(
-        linearisation.components, solution.noise.variances(), _across(kept, solution.jumps)
-    )
-    innovations = factor.whiten(joined_columns(linearisation.residuals, linearisation.jacobian))
-    innovations = innovations.reshape(len(increments), BLOCK, -1)
-    per_increment = np.swapaxes(innovations, 1, 2) @ innovations
-    steps = [
-        solve_normal_equations(per_increment[~row].sum(axis=0)).step[:6]
-        for row in _across(kept, left_out)
-    ]
-    return solution.T_parent_child @ se3.exp(np.array(steps))
-
-
-def _across(kept, flags):
-    """Whether any of the increments (..., n) is flagged between each kept pose and the next."""
-    return np.logical_or.reduceat(flags[..., : kept[-1]], kept[:-1], axis=-1)
-
-
-@dataclass(frozen=True)
-class _Poses:
-    stamps_ns: np.ndarray
-    Ts_pw_p: np.ndarray
-    Ts_cw_c: np.ndarray
-
-    def increments(self, kept, centre):
-        typical_ns = float(np.median(np.diff(self.stamps_ns)))
-        return Increments(
-            self.stamps_ns[kept], self.Ts_pw_p[kept], self.Ts_cw_c[kept], centre, typical_ns
-        )
 
 
 @dataclass(frozen=True)
 class _State:
-    """Where the search stands."""
+    """Where the search stands.
 
-    poses: _Poses
-    kept: np.ndarray
-    increments: Increments
-    jumps: np.ndarray
-    spikes: np.ndarray
-    T: np.ndarray
-    nuisance: str
-    parameters: np.ndarray
-    variances: np.ndarray | None = None
-    solve: Solve | None = None
-    iterations: int = 0
-
-    @property
-    def arguments(self):
-        return self.T, self.nuisance, self.parameters
-
-    def moved(self, step):
-        return dataclasses.replace(
-            self, T=self.T @ se3.exp(step[:6]), parameters=self.parameters + step[6:]
-        )
-
-    def without_spikes(self):
-        """Without poses between two jumps. The increments that bridge them count as jumps until
-        shown to be none.
-        """
-        jumps, kept = self.jumps, self.kept
-        spikes = np.r_[False, jumps[:-1] & jumps[1:], False]
-        if not spikes.any():
-            return self
-        remaining = np.flatnonzero(~spikes)
-        increments = self.poses.increments(kept[remaining], self.increments.centre)
-        return dataclasses.replace(
-            self,
-            kept=kept[remaining],
-            increments=increments,
-            jumps=_across(remaining, jumps),
-            spikes=np.union1d(self.spikes, kept[spikes]),
-        )
-
-
-def _start(poses, kept, nuisance, spikes=(), centres=CENTRES):
-    """Robust first answer from some of the poses, and what it says about jumps and the centre of
-    the rotation noise.
+    Attributes
+    ----------
+    streams, poses : Streams
+        As given, and freed of the errors known so far, spikes bridged.
+    error : (N, 6) array
+        Those errors.
+    columns : list of int
+        Parameters of systematic errors in the model.
+    parameters : (8,) array
+        Their values.
+    other_sigmas : (8,) array
+        Standard deviations of parameters that are not in the model.
+    weights : (N,) array
+        Of white errors; other than 1 where tails are heavy.
     """
-    T = (
-        Method("dnlo")
-        .solve(motion_pairs(poses.Ts_pw_p[kept], poses.Ts_cw_c[kept], _START_REFERENCE))
-        .T_parent_child
-    )
-    increments = poses.increments(kept, centres[0])
-    increments = [increments.about(centre) for centre in centres]
-    sizes = [
-        np.median(np.linalg.norm(each.seen_from_centre(T)[:, 3:], axis=1)) for each in increments
-    ]
-    best = int(np.argmin(sizes))
-    increments = increments[best if sizes[best] < _DECISIVE * sizes[0] else 0]
-    jumps = _robust_jumps(increments.seen_from_centre(T))
-    parameters = np.zeros(len(nuisance_columns(nuisance)))
+
+    streams: Streams
+    poses: Streams
+    error: FloatArray
+    course: Course
+    T: FloatArray
+    model: NoiseModel
+    levels: FloatArray
+    outliers: Outliers
+    weights: FloatArray
+    heavy: bool = False
+    systematic: str = "none"
+    columns: list[int] = dataclasses.field(default_factory=list)
+    parameters: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
+    other_sigmas: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
+    n_evaluations: int = 0
+
+    def linearised(self, kept: IntArray | None = None) -> tuple[Streams, Course, Linearisation]:
+        """At all or some of the poses."""
+        index = np.arange(len(self.streams)) if kept is None else kept
+        poses, course = self.poses[index], self.course[index]
+        linearisation = linearise(poses, course, self.T, self.parameters)
+        if self.error.any():
+            linearisation = restored(linearisation, self.error[index])
+        return poses, course, linearisation
+
+    def space(self, kept: IntArray | None = None, model: NoiseModel | None = None) -> StateSpace:
+        """State space of all or some of the poses."""
+        poses, course, linearisation = self.linearised(kept)
+        index = np.arange(len(self.streams)) if kept is None else kept
+        outliers = self.outliers.across(index)
+        return (model or self.model).state_space(
+            poses,
+            linearisation,
+            course.twists,
+            self.T,
+            self.columns,
+            np.where(outliers.spikes, NO_WEIGHT, self.weights[index]),
+            outliers.jumps,
+        )
+
+    def posterior(self) -> Posterior:
+        """Of all poses."""
+        return Posterior(self.space(), self.levels)
+
+    def moved(self, step: FloatArray) -> _State:
+        """After a step of xi and of the parameters in the model."""
+        parameters = self.parameters.copy()
+        parameters[self.columns[: len(step) - 6]] += step[6:]
+        return dataclasses.replace(self, T=self.T @ se3.exp(step[:6]), parameters=parameters)
+
+
+def _start(streams: Streams, with_systematic: bool) -> _State:
+    """Robust first answer, and what it says about jumps, noise and the centre of its rotation."""
+    pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, _START_REFERENCE)
+    T = Method("dnlo").solve(pairs).T_parent_child
+    course = course_of(streams, T)
+    linearisation = linearise(streams, course, T, np.zeros(N_SYSTEMATIC))
+    interval_s = float(np.median(np.diff(streams.stamps_s)))
+    metres = max(float(np.median(linearisation.metres)), 1e-9)
+    extent = Extent(interval_s, metres, float(streams.stamps_s[-1]))
+    outliers = first_outliers(linearisation.residuals)
+    poses = bridged(streams, T, outliers.spikes)
+    if outliers.spikes.any():
+        bridging = linearise(poses, course, T, np.zeros(N_SYSTEMATIC)).residuals
+        outliers = with_jumps_across_spikes(outliers, linearisation.residuals, bridging)
+    model = NoiseModel((SCALE_DRIFT,), "time", _centre(streams, T, linearisation.residuals), extent)
+    beside = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
+    levels = model.first_levels(*_rough_levels(linearisation.residuals, beside))
     return _State(
-        poses, kept, increments, jumps, np.array(spikes, dtype=int), T, nuisance, parameters
+        streams=streams,
+        poses=poses,
+        error=np.zeros((len(streams), 6)),
+        course=course,
+        T=T,
+        model=model,
+        levels=levels,
+        outliers=outliers,
+        weights=np.ones(len(streams)),
+        columns=_WHILE_FITTING if with_systematic else [],
     )
 
 
-def _at_best_stride(state):
-    """The fit to every pose, or to every third, tenth ... where that states the smaller covariance.
+def _centre(streams: Streams, T: FloatArray, residuals: FloatArray) -> str:
+    """What white rotation noise turns the trajectories about, see ``noise_model.CENTRES``."""
+    worlds = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
+    sizes = {"sensors": float(np.median(np.linalg.norm(residuals[:, :3], axis=1)))}
+    for centre, poses in worlds.items():
+        to_origin = se3.inverse(poses)[:, :3, 3]
+        there = residuals[:, :3] + np.cross(residuals[:, 3:], to_origin)
+        sizes[centre] = float(np.median(np.linalg.norm(there, axis=1)))
+    best = min(CENTRES, key=lambda centre: sizes[centre])
+    return best if sizes[best] < _DECISIVE * sizes["sensors"] else "sensors"
 
-    Where noise drowns the rotation between poses, the first order that all of this rests on does
-    not hold, and fast cameras repeat their errors from pose to pose. Longer steps cure both.
+
+def _rough_levels(residuals: FloatArray, left_out: np.ndarray) -> tuple[FloatArray, FloatArray]:
+    """Log variances of white noise (2,) and of the walk (2,), from scatter and correlation.
+
+    Differences of white noise have variance 2 s^2 and a covariance of -s^2 with their neighbours;
+    the walk adds variance alone.
     """
-    angles = se3.rotation_angle(state.increments.rotation_a)
-    if state.variances[0] < (_DROWNED * np.median(angles)) ** 2:
-        return state
-    best, kept = state, state.kept
-    for stride in _STRIDES:
-        if len(kept) < stride * _FEWEST_STRIDES:
+    kept = ~left_out
+    together = kept[1:] & kept[:-1]
+    white, walk = np.empty((2, 2))
+    for index, part in enumerate((slice(0, 3), slice(3, 6))):
+        of_part = residuals[:, part]
+        total = np.mean(of_part[kept] ** 2) if kept.any() else noise_model.LOWEST_VARIANCE
+        total = max(float(total), 100 * noise_model.LOWEST_VARIANCE)
+        products = of_part[1:][together] * of_part[:-1][together]
+        neighbours = np.mean(products) if together.any() else -total / 2
+        white[index] = np.clip(-neighbours, 0.05 * total, 0.5 * total)
+        walk[index] = max(total - 2 * white[index], 0.02 * total)
+    return np.log(white), np.log(walk)
+
+
+def _sample(n_poses: int, most: int) -> IntArray | None:
+    """Evenly spread bursts of poses; None for all of them."""
+    if n_poses <= most:
+        return None
+    starts = np.linspace(0, n_poses - _BURST, most // _BURST).astype(int)
+    return np.unique((starts[:, None] + np.arange(_BURST)).ravel())
+
+
+def _fitted(state: _State, walks: tuple[str, ...] = ("time", "distance")) -> _State:
+    """Noise levels of white noise, walk and drifting scale, and one step of X."""
+    kept = _sample(len(state.streams), _MOST_POSES)
+    fits = []
+    levels = state.levels
+    if walks != (state.model.walk_by,) and not state.course.is_uneven:
+        walks = (state.model.walk_by,)
+    for walk_by in walks:
+        model = dataclasses.replace(state.model, walk_by=walk_by)
+        start = model.raised(levels)
+        fits.append((model, reml.fit(state.space(kept, model), start, model.prior(start))))
+        levels = fits[0][1].levels
+    model, fit = min(fits, key=lambda each: each[1].loss)
+    step = NormalEquations(selected(fit.posterior.products, list(range(6)))).step
+    T = state.T @ se3.exp(step)
+    n_evaluations = state.n_evaluations + sum(fit.n_evaluations for _, fit in fits)
+    return dataclasses.replace(
+        state,
+        model=model,
+        levels=fit.levels,
+        T=T,
+        course=course_of(state.streams, T, model.step_noise(fit.levels)),
+        n_evaluations=n_evaluations,
+    )
+
+
+def _without_outliers(state: _State) -> _State:
+    """Jumps and spikes found, the noise fitted again, tails weighed if they are heavy."""
+    walk = (state.model.walk_by,)
+    found, of_white = _outliers_found(state, _OUTLIER_ROUNDS)
+    if not found.outliers.same_as(state.outliers):
+        found = _fitted(found, walk)
+        found, of_white = _outliers_found(found, 1)
+    if np.mean(found.outliers.spikes) > _MOST_SPIKES:
+        # Whole stretches are noisy, not single poses wrong: they count less, and none is left out.
+        outliers = Outliers(found.outliers.jumps, np.zeros_like(found.outliers.spikes))
+        found = dataclasses.replace(found, outliers=outliers, poses=found.streams)
+    elif not tails_are_heavy(found.outliers, of_white):
+        return found
+    state = dataclasses.replace(found, heavy=True)
+    for _ in range(2):
+        for _ in range(_TAIL_ROUNDS):
+            state = dataclasses.replace(state, weights=student_weights(state.posterior()))
+        state = _fitted(state, walk)
+    return _outliers_found(state, 2)[0]
+
+
+def _outliers_found(state: _State, rounds: int) -> tuple[_State, FloatArray]:
+    """Jumps and spikes in turn, until they stay; and the last chi-squares (N,) of white errors."""
+    for _ in range(rounds):
+        posterior = state.posterior()
+        if _is_noisy(state):
+            state = _freed(state, posterior)
+            posterior = state.posterior()
+        of_walk, of_white = surprises(posterior, state.outliers.spikes)
+        outliers = judged(state.outliers, of_walk, of_white, with_spikes=not state.heavy)
+        if outliers.same_as(state.outliers):
             break
-        rival = _fit(_start(state.poses, kept[::stride], state.nuisance, state.spikes))
-        if _log_volume(rival) < _log_volume(best):
-            best = rival
-    return best
+        poses = bridged(state.streams, state.T, outliers.spikes)
+        error = np.zeros_like(state.error)
+        state = dataclasses.replace(state, outliers=outliers, poses=poses, error=error)
+    return state, of_white
 
 
-def _log_volume(state):
-    """Logarithm of the size of the stated covariance; infinite if there are directions it says
-    nothing about.
+def _is_noisy(state: _State) -> bool:
+    """Whether the rotation between poses is not large beside its noise."""
+    angles = se3.rotation_angle(motions(state.streams.Ts_pw_p)[:, :3, :3])
+    return bool(np.exp(0.5 * state.levels[noise_model.ROTATION]) > _NOISY * np.median(angles))
+
+
+def _with_lasting_errors(plain: _State) -> _State:
+    """The same with errors that last, if the data ask for them."""
+    kept = _sample(len(plain.streams), _MOST_POSES_LASTING)
+    scores = []
+    for tau_s in plain.model.taus_s():
+        model, faint = plain.model.with_faint_lasting(plain.levels, tau_s)
+        scores.append((tau_s, *reml.derivatives(Posterior(plain.space(kept, model), faint))))
+    slow, start, promised = plain.model.promising(scores, plain.levels)
+    if promised < _LEAST_PROMISE:
+        return plain
+    model = plain.model.richer((*slow, *plain.model.slow))
+    fit = reml.fit(plain.space(kept, model), model.raised(start), model.prior(model.raised(start)))
+    before = Posterior(plain.space(kept), plain.levels)
+    n_evaluations = plain.n_evaluations + fit.n_evaluations + len(scores) + 1
+    if before.loss - fit.loss < _LEAST_GAIN:
+        return dataclasses.replace(plain, n_evaluations=n_evaluations)
+    model, levels = model.reduced(fit)
+    return dataclasses.replace(plain, model=model, levels=levels, n_evaluations=n_evaluations)
+
+
+def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
+    """The model of systematic errors that Schwarz's criterion asks for, one step from where the
+    search stands. All models are judged under the same noise.
     """
-    return (
-        np.inf if state.solve.unseen.size else float(np.linalg.slogdet(state.solve.covariance)[1])
-    )
+    every = dataclasses.replace(state, columns=list(range(N_SYSTEMATIC)))
+    products = every.posterior().products
+    n_observations = 6 * int((~state.outliers.jumps).sum())
 
+    def normal(name: str) -> NormalEquations:
+        columns = [6 + column for column in parameters_of(name)]
+        return NormalEquations(selected(products, [*range(6), *columns]))
 
-def _fit(state):
-    """Noise levels, jumps and X of a model in turn, until they agree."""
-    for _ in range(_MAX_ROUNDS):
-        state = state.without_spikes()
-        linearisation, variances = _noise_levels(state, *state.arguments)
-        solve = generalised_least_squares(linearisation, variances, state.jumps)
-        known_jumps = state.jumps
-        state = dataclasses.replace(
-            state.moved(solve.step),
-            variances=variances,
-            iterations=state.iterations + 1,
-            solve=solve,
-        )
-        residuals = state.increments.residuals(*state.arguments)
-        jumps = _jumps(residuals, linearisation.components, variances, solve.factor, known_jumps)
-        state = dataclasses.replace(state, jumps=jumps)
-        settled = np.abs(solve.step) < _SETTLED_SIGMAS * np.sqrt(np.diag(solve.covariance))
-        if np.array_equal(jumps, known_jumps) and settled.all():
-            break
-    return state
+    def criterion(name: str) -> float:
+        return fits[name].cost + len(parameters_of(name)) * np.log(max(n_observations, 2))
 
-
-def _with_systematic_errors(state, nuisances):
-    """The model of systematic errors that Schwarz's criterion asks for, one step from the fit
-    without.
-
-    All models are judged on the same evidence: the same jumps, and the noise levels that are left
-    when all systematic errors are accounted for.
-    """
-    zeros = np.zeros(len(nuisance_columns(ALL_SYSTEMATIC)))
-    linearisation, variances = _noise_levels(state, state.T, ALL_SYSTEMATIC, zeros)
-    factor = covariance_factor(linearisation.components, variances, state.jumps)
-    n_observations = 6 * int((~state.jumps).sum())
-
-    whitened = factor.whiten(joined_columns(linearisation.residuals, linearisation.jacobian))
-    products = whitened.T @ whitened
-
-    def solve(nuisance):
-        columns = [*range(6), *(6 + column for column in nuisance_columns(nuisance)), -1]
-        return solve_normal_equations(products[np.ix_(columns, columns)], factor)
-
-    solves = {nuisance: solve(nuisance) for nuisance in nuisances}
-    known = solves[nuisances[0]].covariance[:6, :6]
-    credible = [name for name, solved in solves.items() if _is_credible(solved, name, known)]
-    best = min(
-        credible,
-        key=lambda name: (
-            solves[name].cost + len(nuisance_columns(name)) * np.log(max(n_observations, 2))
-        ),
-    )
+    fits = {name: normal(name) for name in systematic}
+    known = fits["none"].covariance
+    credible = [name for name, fit in fits.items() if _is_credible(fit, name, known)]
+    best = min(credible, key=criterion)
+    sigmas = np.zeros(N_SYSTEMATIC)
+    for name in {"scale", "time"} & set(fits):
+        sigmas[parameters_of(name)] = np.sqrt(np.diag(fits[name].covariance)[6:])
     chosen = dataclasses.replace(
-        state, nuisance=best, parameters=np.zeros(len(nuisance_columns(best))), variances=variances
+        state, systematic=best, columns=parameters_of(best), other_sigmas=sigmas
     )
-    return chosen.moved(solves[best].step)
+    return chosen.moved(fits[best].step)
 
 
-def _is_plausible(nuisance, parameters):
-    """Whether systematic errors are of a size that sensors have."""
-    scale, biases, offset_s = nuisance_values(nuisance, parameters)
-    return (
-        max(
-            abs(scale) / _MOST_SCALE_ERROR,
-            np.abs(biases).max() / _MOST_BIAS,
-            abs(offset_s) / _MOST_OFFSET_S,
-        )
-        < 1.0
-    )
-
-
-def _is_credible(solve, nuisance, known):
-    """Whether a model's systematic errors are of a plausible size, and X can be told from them."""
-    if not _is_plausible(nuisance, solve.step[6:]):
+def _is_credible(fit: NormalEquations, name: str, known: FloatArray) -> bool:
+    """Whether systematic errors are of a size that sensors have, and X can be told from them."""
+    if name == "none":
+        return True
+    if (np.abs(fit.step[6:]) > _LARGEST[parameters_of(name)]).any():
         return False
-    growth = np.linalg.eigvals(
-        np.linalg.pinv(known, hermitian=True) @ solve.covariance[:6, :6]
-    ).real.max()
-    return growth < _MOST_GROWTH**2
+    growth = np.linalg.eigvals(np.linalg.pinv(known, hermitian=True) @ fit.covariance[:6, :6])
+    return bool(growth.real.max() < _MOST_GROWTH**2)
 
 
-def _polished(state):
-    """The covariance is settled; what is left is to follow the residuals to the minimum."""
-    increments, variances, jumps = state.increments, state.variances, state.jumps
-    factor = covariance_factor(increments.components(*state.arguments), variances, jumps)
-    converged, iterations = False, state.iterations
-    while not converged and iterations < _MAX_STEPS:
-        iterations += 1
-        solve = solve_weighted(
-            increments.residuals(*state.arguments), increments.jacobian(*state.arguments), factor
-        )
-        state = state.moved(solve.step)
-        tolerance = np.maximum(
-            _CONVERGED_SIGMAS * np.sqrt(np.diag(solve.covariance)), _CONVERGED_STEP
-        )
-        converged = bool((np.abs(solve.step) < tolerance).all())
-    used, spikes = np.zeros((2, len(state.poses.stamps_ns)), dtype=bool)
-    used[state.kept] = spikes[state.spikes] = True
-    misfit = _misfit(
-        factor.whiten(increments.residuals(*state.arguments).reshape(-1, 1)).reshape(-1, 6)[~jumps]
-    )
-    all_jumps = np.zeros(len(spikes) - 1, dtype=bool)
-    # A jump across poses left out is said to be before the next pose that is not.
-    all_jumps[state.kept[1:][jumps] - 1] = True
+def _polished(state: _State) -> AdaptiveSolution:
+    """X followed to the end, derivatives taken from poses freed of their errors."""
+    converged = False
+    posterior = state.posterior()
+    for _ in range(_MAX_ROUNDS):
+        state = _relinearised(state, posterior)
+        posterior = state.posterior()
+        normal = posterior.normal
+        settled = _SETTLED_SIGMAS * np.sqrt(np.diag(normal.covariance))
+        converged = bool((np.abs(normal.step) < np.maximum(settled, _SETTLED_STEP)).all())
+        if converged:
+            break
+    return _solution(state.moved(posterior.normal.step), posterior, converged)
+
+
+def _relinearised(state: _State, posterior: Posterior) -> _State:
+    """After a step, at poses freed of the errors that the posterior knows, tails weighed again."""
+    state = _freed(state.moved(posterior.normal.step), posterior)
+    weights = student_weights(posterior) if state.heavy else state.weights
+    return dataclasses.replace(state, weights=weights, n_evaluations=state.n_evaluations + 1)
+
+
+def _freed(state: _State, posterior: Posterior) -> _State:
+    """With poses freed of the errors that the posterior knows."""
+    states = posterior.restricted()[0][:, :, 0]
+    error = state.model.lasting(states, state.poses, state.T)
+    white = noise_model.sensor_white(state.levels)
+    given = bridged(state.streams, state.T, state.outliers.spikes)
+    return dataclasses.replace(state, poses=corrected(given, error, state.T, white), error=error)
+
+
+def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveSolution:
+    normal, streams = posterior.normal, state.streams
+    n_columns = len(state.columns)
+    freedom = 6 * int((~state.outliers.jumps).sum()) - 6 - n_columns
+    misfit = normal.cost / max(freedom, 1)
+    covariance = misfit * normal.covariance
+    steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     return AdaptiveSolution(
-        state.T,
-        misfit * solve.covariance[:6, :6],
-        solve.unseen[:6],
-        NoiseLevels.from_variances(variances),
-        increments.centre,
-        state.nuisance,
-        state.parameters,
-        all_jumps,
-        spikes,
-        used,
-        misfit,
-        _metres(state.poses.Ts_pw_p[used]) / len(used),
-        solve.loss(),
-        converged,
-        iterations,
+        T_parent_child=state.T,
+        cov_parent_child_in_child=covariance[:6, :6],
+        unseen=normal.unseen[:6],
+        model=state.model,
+        levels=state.levels,
+        weights=state.weights,
+        systematic=state.systematic,
+        parameters=state.parameters,
+        parameter_sigmas=_sigmas(state, covariance[6:, 6:]),
+        jumps=state.outliers.jumps,
+        spikes=state.outliers.spikes,
+        heavy_tails=state.heavy,
+        misfit=misfit,
+        metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
+        part_products=part_products(posterior),
+        objective=0.5 * (posterior.log_determinant + normal.cost),
+        converged=converged,
+        iterations=state.n_evaluations,
     )
 
 
-def _noise_levels(state, *arguments):
-    """Linearisation at given arguments, and variances (4,) from it or, for long drives, from evenly
-    spread stretches.
+def _sigmas(state: _State, covariance: FloatArray) -> FloatArray:
+    """Standard deviations (8,) of all parameters: of those in the model by their covariance, of
+    the scale and the time offset otherwise by the models that have them.
     """
-    linearisation, jumps = state.increments.linearise(*arguments), state.jumps
-    sampled = linearisation
-    if len(jumps) > _MOST_NOISE_INCREMENTS:
-        sample = _stretches(len(jumps))
-        sampled, jumps = linearisation.rows(sample), jumps[sample]
-    return linearisation, _fit_noise(sampled, jumps, state.variances)
-
-
-def _metres(poses):
-    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-
-
-def _misfit(innovations):
-    """By how much the variance of sums of successive innovations (n, 6) exceeds that of independent
-    ones; 1 if it may be chance.
-    """
-    n_sums = len(innovations) // _SUMMED
-    if n_sums == 0:
-        return 1.0
-    sums = innovations[: n_sums * _SUMMED].reshape(n_sums, _SUMMED, 6).sum(axis=1)
-    excess = max((sums[:, part] ** 2).mean() / _SUMMED for part in (slice(0, 3), slice(3, 6)))
-    return float(excess) if excess > 1.0 + _CHANCE_SIGMAS * np.sqrt(2.0 / (3 * n_sums)) else 1.0
-
-
-def _fit_noise(linearisation, jumps, variances):
-    """Variances (4,) from some of the increments, starting from earlier ones if there are any."""
-    if variances is None:
-        rotation = starting_variances(linearisation.residuals[:, :3], jumps)
-        translation = starting_variances(linearisation.residuals[:, 3:], jumps)
-    else:
-        rotation, translation = variances[::2], variances[1::2]
-    rotation = fit_rotation_variances(linearisation, jumps, rotation)
-    return join_variances(
-        rotation, fit_translation_variances(linearisation, jumps, rotation, translation)
-    )
-
-
-def _robust_jumps(residuals):
-    jumps = np.zeros(len(residuals), dtype=bool)
-    for columns in (slice(0, 3), slice(3, 6)):
-        sizes = np.linalg.norm(residuals[:, columns], axis=1)
-        jumps |= sizes > max(
-            _FIRST_JUMP_SIGMAS * np.median(sizes) / _MEDIAN_OF_CHI_3, 10 * np.sqrt(LOWEST_VARIANCE)
-        )
-    return jumps
-
-
-def _jumps(residuals, components, variances, factor, known_jumps):
-    """Increments that the noise does not explain.
-
-    Judged by what is left of each once those before it are known. For a known jump that is next to
-    nothing, its variance being huge; it stays one unless its whole size is quite probable after
-    all.
-    """
-    innovations = factor.whiten(residuals.reshape(-1, 1)).reshape(-1, 6)
-    surprising = (innovations**2).sum(axis=1) > _chi2_quantile(_FALSE_ALARMS / len(residuals))
-    blocks = diagonal_blocks(components.covariance(variances))
-    sizes = (residuals * np.linalg.solve(blocks, residuals[:, :, None])[:, :, 0]).sum(axis=1)
-    jumps = surprising | (known_jumps & (sizes > _chi2_quantile(_PROBABLE)))
-    excess = int(jumps.sum()) - int(_MOST_JUMPS * len(jumps))
-    if excess > 0:
-        flagged = np.flatnonzero(jumps)
-        jumps[flagged[np.argsort(sizes[flagged], kind="stable")[:excess]]] = False
-    return jumps
-
-
-def _chi2_quantile(tail):
-    """What chi-square with six degrees of freedom exceeds with this probability, from 1e-30 to
-    0.99, without importing scipy.special.
-
-    It exceeds 2 h with probability ``exp(-h) (1 + h + h^2 / 2)``. The negative logarithm of that is
-    convex and grows with h: Newton's method converges from above, in ten steps or fewer.
-    """
-    half = 10.0 - 2.0 * np.log(tail)
-    for _ in range(_MAX_STEPS):
-        series = 1.0 + half + half**2 / 2
-        excess = half - np.log(series) + np.log(tail)
-        half -= excess * series / (half**2 / 2)
-    return 2.0 * half
-
-
-def _stretches(n_increments):
-    """Indices of evenly spread stretches of the increments."""
-    starts = np.linspace(0, n_increments - _STRETCH, _MOST_NOISE_INCREMENTS // _STRETCH).astype(int)
-    return (starts[:, None] + np.arange(_STRETCH)).ravel()
+    sigmas = state.other_sigmas.copy()
+    sigmas[state.columns] = np.sqrt(np.diag(covariance))
+    return sigmas

@@ -1,44 +1,39 @@
-"""What the adaptive estimator looks at: the increments of Y(i) = T_pw_p(i) X T_cw_c(i)^-1, and
-where their noise comes from.
+"""What the adaptive estimator looks at: increments of the error between two trajectories.
 
-Y is the child's world in the parent's world, the same at all times if nothing is wrong. Between
-consecutive poses i and j = i + 1 its change, written at the sensors and turned into the axes of the
-parent's world, is
+Errors act on the right, in each sensor's own frame: ``T_pw_p Exp(a)`` and ``T_cw_c Exp(b)``. In the
+child's frame, with ``c = Ad(X^-1) a - b``,
 
-    r_R = Rp_i Log(R_A R R_B' R')                      (rad)
-    r_t = (Rp_j - Rp_i) t + p_j - p_i - Rp_i R t_B     (m)
+    e_i = Log(B_i^-1 X^-1 A_i X) = c_{i+1} - Ad(B_i^-1) c_i + w_i + (I - Ad(B_i^-1)) xi
 
-with the parent's pose (Rp, p), the motions A and B, and X = (R, t). To first order in the noise of
-the poses (rotations Phi_p, Phi_c and positions n_p, n_c of the two sensors, all turned into the
-axes of the parent's world)
+for motions A, B between poses i and i + 1, errors w of the motions themselves, and ``X Exp(-xi)`` in
+place of X. Systematic errors add their own columns: a scale, a bias per metre of either path, a time
+offset.
 
-    r_R = psi_j - psi_i                                          psi = Phi_p - Phi_c
-    r_t = Phi_p_j x l_j - Phi_p_i x l_i + (n_p - n_c)_j - (n_p - n_c)_i - psi_i x g_i
-
-with the lever l = Rp t and the step g_i = Rp_i R t_B. Noise that is isotropic at the sensor is
-isotropic in any axes, so these residuals are stationary but for the known levers, and their
-covariance is block tridiagonal.
-
-Odometry is wrong about the sensor's own place. A camera that sees a target is not: it is right
-about where the target is, and where it is wrong about the target's rotation, its own place swings
-about the target. Its position error then contains Phi x d, d being the way from the origin of its
-world to the sensor.
+The columns rest on steps free of each increment's own noise: the mean of the steps two before and
+two after. Steps that share the noise of the residuals would be drawn towards it, and a child whose
+steps are lost in noise would seem to shrink.
 """
 
-import copy
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import cut_below, to_bands
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
 
-# Systematic errors, and which parameters are theirs: by how much the child's lengths are short,
-# bias per metre of the child's or of the parent's path along the axes of that sensor (m/m), by how
-# much the child's stamps are late (s).
-_SYSTEMATIC = {"none": [], "scale": [0], "bias": [1, 2, 3], "parent bias": [4, 5, 6], "time": [7]}
-NUISANCES = (
+# Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
+# of the child's or of the parent's path along the axes of that sensor (m/m), by how much the child's
+# stamps are late (s).
+_PARAMETERS: dict[str, list[int]] = {
+    "none": [],
+    "scale": [0],
+    "bias": [1, 2, 3],
+    "parent bias": [4, 5, 6],
+    "time": [7],
+}
+SYSTEMATIC = (
     "none",
     "scale",
     "bias",
@@ -48,290 +43,200 @@ NUISANCES = (
     "bias+time",
     "parent bias+time",
 )
-ALL_SYSTEMATIC = "scale+bias+parent bias+time"
-_N_SYSTEMATIC = 8
+N_SYSTEMATIC = 8
 
-# What white rotation noise turns a trajectory about: either sensor itself, or the origin of the
-# child's or of the parent's world.
-CENTRES = ("sensors", "child", "parent")
+# Steps count as noise until they differ from their neighbours by so many times its variance.
+_CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
 
+# Steps that vary by less than this share are alike.
+_EVEN = 0.2
 
-def nuisance_columns(nuisance):
-    """Which of the parameters of all systematic errors are those of a model."""
-    return [index for name in nuisance.split("+") for index in _SYSTEMATIC[name]]
+SCALE, TIME = 0, 7
 
 
-def nuisance_values(nuisance, parameters):
-    """Scale error, biases per metre of child and parent (2, 3) and lateness of the stamps (s); zero
-    where the model has none.
-    """
-    values = np.zeros(_N_SYSTEMATIC)
-    values[nuisance_columns(nuisance)] = parameters
-    return values[0], values[1:7].reshape(2, 3), values[7]
+def parameters_of(systematic: str) -> list[int]:
+    """Which of the parameters of all systematic errors a model has."""
+    return [index for name in systematic.split("+") for index in _PARAMETERS[name]]
 
 
 @dataclass(frozen=True)
-class Components:
-    """Where the covariance of the residuals comes from: white rotation, white translation, drift of
-    rotation, drift of translation.
+class Streams:
+    """Poses of both sensors at common stamps.
 
     Attributes
     ----------
-    white_rotation : (n, 6, 12) array
-        Bands of the covariance for unit variance of white rotation noise.
-    joined : (n - 1,) array
-        1 where an increment starts at the pose at which the one before it ends, 0 elsewhere.
-    relative_interval : (n,) array
-        Variance of the drift over each increment for unit variance over a typical one.
+    stamps_s : (N,) array
+        From the first on.
+    Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
     """
 
-    white_rotation: np.ndarray
-    joined: np.ndarray
-    relative_interval: np.ndarray
+    stamps_s: FloatArray
+    Ts_pw_p: FloatArray
+    Ts_cw_c: FloatArray
 
-    def covariance(self, variances):
-        """Bands (n, 6, 12) of the covariance for variances (4,) of the four."""
-        white_r, white_t, drift_r, drift_t = variances
-        bands = white_r * self.white_rotation
-        bands[:, :3, 0] += drift_r * self.relative_interval[:, None]
-        bands[:, 3:, 0] += 2.0 * white_t + drift_t * self.relative_interval[:, None]
-        bands[:-1, 3:, 6] -= white_t * self.joined[:, None]
-        return bands
+    def __len__(self) -> int:
+        return len(self.stamps_s)
 
-    def rows(self, selected):
-        """Those of some increments, in order; neighbours that were not neighbours before are
-        independent of each other.
-        """
-        apart = np.flatnonzero(np.diff(selected) != 1)
-        white_rotation, joined = self.white_rotation[selected], self.joined[selected[:-1]]
-        cut_below(white_rotation, apart)
-        joined[apart] = 0.0
-        return Components(white_rotation, joined, self.relative_interval[selected])
+    def __getitem__(self, index: IntArray) -> Streams:
+        return Streams(self.stamps_s[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
+
+
+@dataclass(frozen=True)
+class Course:
+    """How the sensors move, by steps free of each increment's own noise; sums over time.
+
+    Attributes
+    ----------
+    twists : (N, 6) array
+        Velocity (m/s, rad/s) of the child in its own frame.
+    path : (N, 3) array
+        Of the child, in its world, m.
+    along_c, along_p : (N, 3, 3) arrays
+        Metres travelled by child and parent times the axes in which they were travelled.
+    """
+
+    twists: FloatArray
+    path: FloatArray
+    along_c: FloatArray
+    along_p: FloatArray
+
+    @property
+    def is_uneven(self) -> bool:
+        """Whether the child is not about as fast at all times."""
+        metres = np.linalg.norm(np.diff(self.path, axis=0), axis=1)
+        return bool(np.std(metres) > _EVEN * np.mean(metres))
+
+    def __getitem__(self, index: IntArray) -> Course:
+        return Course(
+            self.twists[index], self.path[index], self.along_c[index], self.along_p[index]
+        )
+
+
+def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.inf) -> Course:
+    """Course of both sensors; the child's steps are the mean of what both streams say.
+
+    Parameters
+    ----------
+    streams : Streams
+    T_parent_child : (4, 4) array
+    noise_m : float
+        Standard deviation per axis of the noise of a step. The smaller it is beside what steps
+        differ from their neighbours by, the more they are believed themselves.
+    """
+    intervals_s = np.diff(streams.stamps_s)
+    by_parent, by_child = motions(streams.Ts_pw_p), motions(streams.Ts_cw_c)
+    as_child = se3.inverse(T_parent_child) @ by_parent @ T_parent_child
+    step = _cleaned(0.5 * (by_child[:, :3, 3] + as_child[:, :3, 3]), intervals_s, noise_m)
+    metres_c = np.linalg.norm(_cleaned(by_child[:, :3, 3], intervals_s, noise_m), axis=1)
+    metres_p = np.linalg.norm(_cleaned(by_parent[:, :3, 3], intervals_s, noise_m), axis=1)
+    axes_c, axes_p = streams.Ts_cw_c[:-1, :3, :3], streams.Ts_pw_p[:-1, :3, :3]
+    return Course(
+        _twists(by_child, intervals_s),
+        _summed(turned(axes_c, step)),
+        _summed(axes_c * metres_c[:, None, None]),
+        _summed(axes_p * metres_p[:, None, None]),
+    )
+
+
+def motions(Ts_world_sensor: FloatArray) -> FloatArray:
+    """Motions (N - 1, 4, 4) from each pose to the next."""
+    return se3.inverse(Ts_world_sensor[:-1]) @ Ts_world_sensor[1:]
+
+
+def turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Matrices (n, k, 3) times vectors (n, 3)."""
+    return (rotations @ vectors[:, :, None])[:, :, 0]
+
+
+def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> FloatArray:
+    """Steps (n, 3) with the mean velocity of the steps two before and two after, as far as what they
+    differ from it by may be noise.
+    """
+    rates = np.pad(steps / intervals_s[:, None], ((2, 2), (0, 0)), mode="edge")
+    cleaned = 0.5 * (rates[:-4] + rates[4:]) * intervals_s[:, None]
+    own = float(np.median((steps - cleaned) ** 2))
+    believed = max(1.0 - _CAUTION * noise_m**2 / max(own, _LEAST_VARIANCE), 0.0)
+    return cleaned + believed * (steps - cleaned)
+
+
+def _summed(steps: FloatArray) -> FloatArray:
+    return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
+
+
+def _twists(by_child: FloatArray, intervals_s: FloatArray) -> FloatArray:
+    """Velocities (N, 6): of the four motions around a pose the mean of the middle two, component
+    by component. Jumps are no velocity.
+    """
+    rates = se3.log(by_child) / intervals_s[:, None]
+    padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=0)
+    return np.sort(around, axis=2)[:, :, 1:3].mean(axis=2)
 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Residuals, derivatives and noise components at one X.
+    """Residuals and derivatives at one X.
 
     Attributes
     ----------
     residuals : (n, 6) array
-        (r_R, r_t) of every increment.
-    jacobian : (n, 6, 6 + k) array
-        Derivatives by xi = (rho, phi) in ``X exp(xi)`` and by the k nuisance parameters.
-    components : Components
+        e.
+    jacobian : (n, 6, 6 + 8) array
+        Derivatives by xi in ``X Exp(xi)`` and by the parameters of all systematic errors.
+    adjoints : (n, 6, 6) array
+        Ad(B^-1).
+    by_scale : (n, 6, 1) array
+        Derivative by the scale, as in the jacobian.
+    metres : (n,) array
+        Path of the child.
     """
 
-    residuals: np.ndarray
-    jacobian: np.ndarray
-    components: Components
-
-    def rows(self, selected):
-        """That of some increments, in order."""
-        return Linearisation(
-            self.residuals[selected], self.jacobian[selected], self.components.rows(selected)
-        )
+    residuals: FloatArray
+    jacobian: FloatArray
+    adjoints: FloatArray
+    by_scale: FloatArray
+    metres: FloatArray
 
 
-class Increments:
-    """Increments of two synchronised trajectories.
+def linearise(
+    streams: Streams, course: Course, T_parent_child: FloatArray, parameters: FloatArray
+) -> Linearisation:
+    """Residuals and derivatives.
 
     Parameters
     ----------
-    stamps_ns : (N,) int64 array
-    Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
-    centre : {"sensors", "child", "parent"}
-        What white rotation noise turns the trajectories about, see ``CENTRES``.
-    typical_ns : float, optional
-        Interval in which drift has unit variance; the median one by default.
+    streams : Streams
+    course : Course
+        At the same poses.
+    T_parent_child : (4, 4) array
+    parameters : (8,) array
+        Of all systematic errors, see the module.
     """
+    back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
+    back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
+    metres_c = back_c @ np.diff(course.along_c, axis=0)
+    metres_p = back_p @ np.diff(course.along_p, axis=0)
+    step = turned(back_c, np.diff(course.path, axis=0))
 
-    def __init__(self, stamps_ns, Ts_pw_p, Ts_cw_c, centre="sensors", typical_ns=None):
-        pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
-        intervals = np.diff(stamps_ns).astype(float)
-        self.centre = centre
-        self.rotation_i, self.rotation_j = Ts_pw_p[:-1, :3, :3], Ts_pw_p[1:, :3, :3]
-        self.steps_p = np.diff(Ts_pw_p[:, :3, 3], axis=0)
-        self.rotation_a = pairs.Ts_parenti_parentj[:, :3, :3]
-        self.rotation_b = pairs.Ts_childi_childj[:, :3, :3]
-        self.translation_b = pairs.Ts_childi_childj[:, :3, 3]
-        self.metres_a = np.linalg.norm(self.steps_p, axis=1)
-        self.metres_b = np.linalg.norm(self.translation_b, axis=1)
-        self.per_second_r, self.per_second_t = _per_second_later(
-            pairs.Ts_childi_childj, intervals * 1e-9
-        )
-        # Ways from the origins of their worlds to the sensors, in the axes of the parent's world
-        # and of the child.
-        self.from_origin_p, self.from_origin_c = (
-            Ts_pw_p[:-1, :3, 3],
-            -se3.inverse(Ts_cw_c[:-1])[:, :3, 3],
-        )
-        # A random walk's variance grows with time; bounded, so that no gap or twin stamp dominates.
-        self.relative_interval = np.clip(
-            intervals / (typical_ns or np.median(intervals)), 0.1, 100.0
-        )
+    Ts_cw_c = streams.Ts_cw_c
+    if parameters[TIME]:
+        Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
+    by_child, by_parent = motions(Ts_cw_c), motions(streams.Ts_pw_p)
+    by_child[:, :3, 3] *= 1.0 + parameters[SCALE]
+    by_child[:, :3, 3] -= metres_c @ parameters[1:4]
+    by_parent[:, :3, 3] -= metres_p @ parameters[4:7]
+    back = se3.inverse(by_child)
+    as_child = se3.inverse(T_parent_child) @ by_parent @ T_parent_child
+    adjoints = se3.adjoint(back)
 
-    def __len__(self):
-        return len(self.relative_interval)
-
-    def about(self, centre):
-        """The same increments with their rotation noise about another centre."""
-        other = copy.copy(self)
-        other.centre = centre
-        return other
-
-    def _corrected(self, nuisance, parameters):
-        """The child's motions with systematic errors taken out: rotations (n, 3, 3) and
-        translations (n, 3).
-        """
-        scale, (bias, _), offset_s = nuisance_values(nuisance, parameters)
-        rotation_b = (
-            self.rotation_b @ se3.rotation_exp(offset_s * self.per_second_r)
-            if offset_s
-            else self.rotation_b
-        )
-        translation_b = (1.0 + scale) * (self.translation_b + offset_s * self.per_second_t)
-        return rotation_b, translation_b - bias * self.metres_b[:, None]
-
-    def residuals(self, T_parent_child, nuisance="none", parameters=()):
-        """(n, 6) array: (r_R, r_t), see the module."""
-        rotation = T_parent_child[:3, :3]
-        rotation_b, translation_b = self._corrected(nuisance, parameters)
-        mismatch = self.rotation_a @ rotation @ np.swapaxes(rotation_b, 1, 2) @ rotation.T
-        residual_r = _turned(self.rotation_i, se3.rotation_log(mismatch))
-        residual_t = self._steps_by_parent(T_parent_child) - _turned(
-            self.rotation_i @ rotation, translation_b
-        )
-        _, (_, bias), _ = nuisance_values(nuisance, parameters)
-        residual_t -= self.rotation_i @ bias * self.metres_a[:, None]
-        return np.concatenate([residual_r, residual_t], axis=1)
-
-    def seen_from_centre(self, T_parent_child):
-        """Residuals (n, 6) at the point that white rotation noise leaves in place: r_t is then that
-        of translation noise alone.
-        """
-        residuals = self.residuals(T_parent_child)
-        if self.centre == "child":
-            way = _turned(self.rotation_i @ T_parent_child[:3, :3], self.from_origin_c)
-        elif self.centre == "parent":
-            way = self.from_origin_p + self.rotation_i @ T_parent_child[:3, 3]
-        else:
-            return residuals
-        residuals[:, 3:] -= np.cross(residuals[:, :3], way)
-        return residuals
-
-    def _steps_by_parent(self, T_parent_child):
-        """The child's steps (n, 3), in the axes of the parent's world, as the parent's motion has
-        them.
-        """
-        return (self.rotation_j - self.rotation_i) @ T_parent_child[:3, 3] + self.steps_p
-
-    def jacobian(self, T_parent_child, nuisance="none", parameters=()):
-        """(n, 6, 6 + k) array, see :class:`Linearisation`."""
-        rotation = T_parent_child[:3, :3]
-        turned = (self.rotation_j - self.rotation_i) @ rotation
-        into_world = self.rotation_i @ rotation
-        rotation_b, translation_b = self._corrected(nuisance, parameters)
-        columns = nuisance_columns(nuisance)
-        jacobian = np.zeros((len(self), 6, 6 + len(columns)))
-        jacobian[:, :3, 3:6] = turned
-        jacobian[:, 3:, :3] = turned
-        jacobian[:, 3:, 3:6] = into_world @ se3.skew(translation_b)
-        if columns:
-            scale, _, offset_s = nuisance_values(nuisance, parameters)
-            systematic = np.zeros((len(self), 6, _N_SYSTEMATIC))
-            systematic[:, 3:, 0] = -self._fair_steps(T_parent_child, scale, offset_s)
-            systematic[:, 3:, 1:4] = into_world * self.metres_b[:, None, None]
-            systematic[:, 3:, 4:7] = -self.rotation_i * self.metres_a[:, None, None]
-            systematic[:, :3, 7] = -_turned(into_world @ rotation_b, self.per_second_r)
-            systematic[:, 3:, 7] = -(1.0 + scale) * _turned(into_world, self.per_second_t)
-            jacobian[:, :, 6:] = systematic[:, :, columns]
-        return jacobian
-
-    def _fair_steps(self, T_parent_child, scale, offset_s):
-        """The child's steps (n, 3) in its own unit and the axes of the parent's world, for the
-        derivative by scale.
-
-        Taken from the child alone, they would be correlated with the residuals through its noise,
-        and a child whose steps drown in noise would seem to be shrinking. The mean of what both
-        sensors say is not, where both are as noisy.
-        """
-        by_parent = self._steps_by_parent(T_parent_child) / (1.0 + scale)
-        by_child = _turned(
-            self.rotation_i @ T_parent_child[:3, :3],
-            self.translation_b + offset_s * self.per_second_t,
-        )
-        return {"sensors": 0.5 * (by_parent + by_child), "child": by_parent, "parent": by_child}[
-            self.centre
-        ]
-
-    def components(self, T_parent_child, nuisance="none", parameters=()):
-        """Components at one X.
-
-        White rotation noise about the sensors is split evenly between them, that about the origin
-        of a world is its sensor's; this decides how it enters the translation residual: psi_i as
-        (-1, p x), psi_j as (1, -q x), in rows of rotation and of translation.
-        """
-        rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
-        step = _turned(self.rotation_i @ rotation, self._corrected(nuisance, parameters)[1])
-        # Ways to the child from what each source's noise turns about, at i (with the step that is
-        # still ahead) and at j.
-        if self.centre == "child":
-            from_origin = _turned(self.rotation_i @ rotation, self.from_origin_c) + step
-            sources = [(1.0, from_origin, from_origin)]
-        else:
-            parent_i, parent_j = self.rotation_i @ translation + step, self.rotation_j @ translation
-            if self.centre == "parent":
-                sources = [
-                    (
-                        1.0,
-                        parent_i + self.from_origin_p,
-                        parent_j + self.from_origin_p + self.steps_p,
-                    )
-                ]
-            else:
-                sources = [(0.5, parent_i, parent_j), (0.5, step, np.zeros_like(step))]
-        diagonal, below = np.zeros((len(self), 6, 6)), np.zeros((len(self) - 1, 6, 6))
-        for share, p, q in sources:
-            skew_p, skew_q = np.sqrt(share) * se3.skew(p), np.sqrt(share) * se3.skew(q)
-            diagonal[:, 3:, 3:] -= skew_p @ skew_p + skew_q @ skew_q
-            diagonal[:, 3:, :3] -= np.sqrt(share) * (skew_p + skew_q)
-            # Increments k - 1 and k share pose k: the first ends there, the second starts there.
-            below[:, 3:, 3:] += skew_p[1:] @ skew_q[:-1]
-            below[:, 3:, :3] += np.sqrt(share) * skew_p[1:]
-            below[:, :3, 3:] -= np.sqrt(share) * skew_q[:-1]
-        diagonal[:, range(3), range(3)], below[:, range(3), range(3)] = 2.0, -1.0
-        return Components(to_bands(diagonal, below), np.ones(len(self) - 1), self.relative_interval)
-
-    def linearise(self, T_parent_child, nuisance="none", parameters=()):
-        """All three at one X."""
-        arguments = (T_parent_child, nuisance, parameters)
-        return Linearisation(
-            self.residuals(*arguments), self.jacobian(*arguments), self.components(*arguments)
-        )
-
-
-def _per_second_later(Ts_childi_childj, intervals_s):
-    """Change of motions per second by which both their ends are taken later: rotation vectors (n,
-    3) in axes j, translations (n, 3).
-
-    The velocity at a pose is the mean of the middle two of the four increments around it, component
-    by component: jumps are no velocity.
-    """
-    velocities = se3.log(Ts_childi_childj) / np.maximum(intervals_s, 1e-9)[:, None]
-    around = np.lib.stride_tricks.sliding_window_view(
-        np.pad(velocities, ((2, 2), (0, 0)), mode="edge"), 4, axis=0
-    )
-    velocities = np.sort(around, axis=2)[:, :, 1:3].mean(axis=2)
-    (at_i, at_j), rotation = (velocities[:-1], velocities[1:]), Ts_childi_childj[:, :3, :3]
-    per_second_r = at_j[:, 3:] - _turned(np.swapaxes(rotation, 1, 2), at_i[:, 3:])
-    per_second_t = (
-        _turned(rotation, at_j[:, :3])
-        - at_i[:, :3]
-        - np.cross(at_i[:, 3:], Ts_childi_childj[:, :3, 3])
-    )
-    return per_second_r, per_second_t
-
-
-def _turned(rotations, vectors):
-    return (rotations @ vectors[:, :, None])[:, :, 0]
+    jacobian = np.zeros((len(step), 6, 6 + N_SYSTEMATIC))
+    jacobian[:, :, :6] = np.eye(6) - adjoints
+    by = jacobian[:, :, 6:]
+    by[:, :3, SCALE] = -turned(back[:, :3, :3], step)
+    by[:, :3, 1:4] = back[:, :3, :3] @ metres_c
+    axes = T_parent_child[:3, :3].T @ np.swapaxes(by_parent[:, :3, :3], 1, 2)
+    by[:, :3, 4:7] = -axes @ metres_p
+    by[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+    residuals = se3.log(back @ as_child)
+    by_scale = by[:, :, SCALE : SCALE + 1].copy()
+    return Linearisation(residuals, jacobian, adjoints, by_scale, np.linalg.norm(step, axis=1))

@@ -11,7 +11,7 @@ import sys
 from importlib.machinery import PathFinder
 
 _WRAPPER = "scipy.linalg._flapack"
-_USED = ("dpbtrf", "dtbtrs", "dpttrf", "dpttrs")
+_USED = ("dpbtrf", "dpbtrs", "dtbtrs", "dpttrf", "dpttrs")
 
 
 def _load_wrapper():
@@ -38,4 +38,4 @@ def _load_wrapper():
 
 
 _wrapper = _load_wrapper()
-dpbtrf, dtbtrs, dpttrf, dpttrs = (getattr(_wrapper, name) for name in _USED)
+dpbtrf, dpbtrs, dtbtrs, dpttrf, dpttrs = (getattr(_wrapper, name) for name in _USED)

@@ -16,12 +16,23 @@ towards zero, the more so the less the sensors turn between i and j. With noise 
 axis in the rotations of w pairs, t is off by ``-2 s^2 w (sum w (R_A - I)'(R_A - I))^-1 t``.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import BLOCK, blocks_below, diagonal_blocks
-from hand_eye_calib.adaptive.increments import Increments
+from hand_eye_calib.adaptive.increments import (
+    N_SYSTEMATIC,
+    Streams,
+    course_of,
+    linearise,
+    motions,
+    turned,
+)
+from hand_eye_calib.adaptive.solution import AdaptiveSolution
+from hand_eye_calib.adaptive.state_space import covariance_times
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers import dnl, dnlo
 
 
@@ -39,27 +50,37 @@ class ReferencePredictor:
     """
 
     def __init__(
-        self, stamps_ns, Ts_pw_p, Ts_cw_c, solution, threshold=None, min_inlier_fraction=0.0
-    ):
+        self,
+        stamps_ns: IntArray,
+        Ts_pw_p: FloatArray,
+        Ts_cw_c: FloatArray,
+        solution: AdaptiveSolution,
+        threshold: float | None = None,
+        min_inlier_fraction: float = 0.0,
+    ) -> None:
         self._poses = Ts_pw_p, Ts_cw_c
         self._solution = solution
         self._rejection = threshold, min_inlier_fraction
-        increments = Increments(stamps_ns, Ts_pw_p, Ts_cw_c, solution.centre)
+        streams = Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c)
+        X = solution.T_parent_child
+        course = course_of(streams, X)
         # As the method sees them: systematic errors are part of the residual, not taken out.
-        T_parent_child = solution.T_parent_child
-        bands = increments.components(T_parent_child).covariance(solution.noise.variances())
-        self._diagonal, self._below = diagonal_blocks(bands), blocks_below(bands)
-        modelled = increments.residuals(T_parent_child, solution.nuisance, solution.parameters)
-        plain = increments.residuals(T_parent_child)
-        self._systematic = np.where(solution.left_out[:, None], 0.0, plain - modelled)
-        self._jumps = np.where(solution.left_out[:, None], plain, 0.0)
+        plain = linearise(streams, course, X, np.zeros(N_SYSTEMATIC))
+        modelled = linearise(streams, course, X, solution.parameters).residuals
+        cut = np.zeros(len(streams) - 1, dtype=bool)
+        self._space = solution.model.state_space(
+            streams, plain, course.twists, X, [], solution.weights, cut
+        )
+        left_out = solution.left_out[:, None]
+        self._systematic = np.where(left_out, 0.0, plain.residuals - modelled)
+        self._jumps = np.where(left_out, plain.residuals, 0.0)
         # The way to a pose that is wrong by itself and the way back are one event.
         self._events = np.flatnonzero(np.r_[True, ~solution.spikes[1:-1]])
-        self._into_world = Ts_pw_p[:, :3, :3] @ T_parent_child[:3, :3]
-        steps = (self._into_world[:-1] @ increments.translation_b[:, :, None])[:, :, 0]
+        self._into_world = Ts_pw_p[:, :3, :3] @ X[:3, :3]
+        steps = turned(self._into_world[:-1], motions(Ts_cw_c)[:, :3, 3])
         self._path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
-    def covariance(self, reference):
+    def covariance(self, reference: str) -> FloatArray | None:
         """(6, 6) mean squared error of xi = (rho, phi) expected with a reference; None where it
         leaves too few pairs.
         """
@@ -70,37 +91,25 @@ class ReferencePredictor:
         hessian, pushes = self._pushes(pairs, weights)
         if np.linalg.cond(hessian) > 1e12:
             return None
-        flat = pushes.reshape(-1, BLOCK)
+        flat = pushes.reshape(-1, 6)
         systematic = self._systematic.ravel() @ flat
         jumps = np.add.reduceat((self._jumps[:, None] @ pushes)[:, 0], self._events, axis=0)
         pushed = (
-            flat.T @ self._of_noise(pushes).reshape(-1, BLOCK)
+            flat.T @ covariance_times(self._space, self._solution.levels, pushes).reshape(-1, 6)
             + np.outer(systematic, systematic)
             + jumps.T @ jumps
         )
         pull = self._pull(pairs, weights)
         return np.linalg.solve(hessian, np.linalg.solve(hessian, pushed).T) + np.outer(pull, pull)
 
-    def _of_noise(self, columns):
-        """The increments' covariance times columns (n, 6, k)."""
-        product = self._diagonal @ columns
-        product[1:] += self._below @ columns[:-1]
-        product[:-1] += np.swapaxes(self._below, 1, 2) @ columns[1:]
-        return product
-
-    def _pull(self, pairs, weights):
+    def _pull(self, pairs: MotionPairs, weights: FloatArray) -> FloatArray:
         """(6,) array: by how much rotation noise is expected to pull the translation towards zero."""
         rotation, translation = (
             self._solution.T_parent_child[:3, :3],
             self._solution.T_parent_child[:3, 3],
         )
-        noise = self._solution.noise
-        spans = float(weights @ (pairs.j - pairs.i))
-        # The parent's share of the noise: half of either variance; white noise enters at both ends
-        # of a motion.
-        total = (
-            float(weights.sum()) * noise.rotation_white**2 + 0.5 * spans * noise.rotation_drift**2
-        )
+        # The parent's share of the noise is half of its variance.
+        total = 0.5 * float(weights @ self._solution.noise.rotation_variance(pairs.j - pairs.i))
         moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
         turning = (weights[:, None, None] * moved).reshape(-1, 3).T @ moved.reshape(-1, 3)
         return np.r_[
@@ -108,7 +117,7 @@ class ReferencePredictor:
             np.zeros(3),
         ]
 
-    def _weights(self, pairs):
+    def _weights(self, pairs: MotionPairs) -> FloatArray:
         threshold, fraction = self._rejection
         if threshold is None:
             return np.ones(len(pairs))
@@ -116,9 +125,9 @@ class ReferencePredictor:
             dnl.pair_costs(pairs, self._solution.T_parent_child), threshold, fraction * len(pairs)
         )[0]
 
-    def _pushes(self, pairs, weights):
+    def _pushes(self, pairs: MotionPairs, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Half the cost's second derivative by xi, (6, 6), and (n, 6, 6): by how much each
-        increment's (r_R, r_t) pushes xi against it.
+        increment pushes xi against it.
         """
         i, j, path = pairs.i, pairs.j, self._path
         turned = self._into_world[j] - self._into_world[i]
@@ -133,10 +142,12 @@ class ReferencePredictor:
         weighted[:, :3] += se3.skew(path[j]) @ weighted[:, 3:]
         pushes = _sum_over_spans(weighted, i, j, len(path) - 1)
         pushes[:, :3] -= se3.skew(path[1:]) @ pushes[:, 3:]
-        return hessian, pushes
+        # Increments are translation before rotation, along the child's axes at their ends.
+        back = np.swapaxes(self._into_world[1:], 1, 2)
+        return hessian, np.concatenate([back @ pushes[:, 3:], back @ pushes[:, :3]], axis=1)
 
 
-def _sum_over_spans(values, i, j, n_increments):
+def _sum_over_spans(values: FloatArray, i: IntArray, j: IntArray, n_increments: int) -> FloatArray:
     """For each increment the sum of the values (K, ...) of all pairs (i, j) that span it, both in
     order.
     """

@@ -1,20 +1,120 @@
 """The adaptive estimator's answer, and what it says in words about the noise it found."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import nuisance_values
-from hand_eye_calib.adaptive.noise import NoiseLevels
+from hand_eye_calib.adaptive.increments import SCALE, TIME
+from hand_eye_calib.adaptive.noise_model import (
+    JITTER,
+    N_FAST,
+    ROTATION,
+    TRANSLATION,
+    WALK_ROTATION,
+    WALK_TRANSLATION,
+    NoiseModel,
+)
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 
 _TURNING = {
     "sensors": "",
     "child": ", its rotation about the origin of the child's world, as of a camera that sees a target",
     "parent": ", its rotation about the origin of the parent's world, as of a camera that sees a target",
 }
+_FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
+
+# Stamps that jitter by less are not worth a sentence (s).
+_NOTABLE_JITTER_S = 1e-4
 
 
 @dataclass(frozen=True)
+class SlowNoise:
+    """An error that lasts.
+
+    Attributes
+    ----------
+    kind : {"body", "world", "scale"}
+        What it is fixed to, or that it is a drifting scale.
+    part : {"translation", "rotation", "scale"}
+    sigma : float
+        Standard deviation per axis, in m, rad or as a share.
+    tau_s : float
+        Correlation time.
+    """
+
+    kind: str
+    part: str
+    sigma: float
+    tau_s: float
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """Standard deviations per axis, of both sensors' trajectories together.
+
+    Attributes
+    ----------
+    rotation_white, translation_white : float
+        Independent error of each pose, rad and m.
+    rotation_drift, translation_drift : float
+        What an error that stays grows by in a typical interval between poses, rad and m.
+    jitter_s : float
+        Of the stamps.
+    walk_by : {"time", "distance"}
+        What the errors that stay grow with.
+    centre : {"sensors", "child", "parent"}
+        What white rotation noise turns the trajectories about: the sensors, or the origin of the
+        child's or the parent's world.
+    slow : tuple of SlowNoise
+    interval_s : float
+        Typical interval between poses.
+    """
+
+    rotation_white: float
+    translation_white: float
+    rotation_drift: float
+    translation_drift: float
+    jitter_s: float
+    walk_by: str
+    centre: str
+    slow: tuple[SlowNoise, ...]
+    interval_s: float
+
+    @classmethod
+    def of(cls, model: NoiseModel, levels: FloatArray) -> NoiseLevels:
+        """From log levels."""
+        sigmas = np.exp(0.5 * levels)
+        slow = tuple(
+            SlowNoise(process.kind, process.part, float(sigmas[at]), float(np.exp(levels[at + 1])))
+            for process, at in zip(model.slow, range(N_FAST, len(levels), 2), strict=True)
+        )
+        return cls(
+            rotation_white=float(sigmas[ROTATION]),
+            translation_white=float(sigmas[TRANSLATION]),
+            rotation_drift=float(sigmas[WALK_ROTATION]),
+            translation_drift=float(sigmas[WALK_TRANSLATION]),
+            jitter_s=float(sigmas[JITTER]),
+            walk_by=model.walk_by,
+            centre=model.centre,
+            slow=slow,
+            interval_s=model.extent.interval_s,
+        )
+
+    def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
+        """Variance (rad^2) per axis of the rotation over so many typical intervals."""
+        variance = 2 * self.rotation_white**2 + n_intervals * self.rotation_drift**2
+        for slow in self.slow:
+            if slow.part == "rotation":
+                ratio = n_intervals * self.interval_s / slow.tau_s
+                variance = variance - 2 * slow.sigma**2 * np.expm1(-ratio)
+        return np.asarray(variance)
+
+
+@dataclass(frozen=True, kw_only=True)
 class AdaptiveSolution:
     """Answer of the adaptive estimator.
 
@@ -22,161 +122,212 @@ class AdaptiveSolution:
     ----------
     T_parent_child : (4, 4) array
     cov_parent_child_in_child : (6, 6) array
-        Covariance of xi = (rho, phi) in ``X exp(xi)`` under the model, nuisance parameters and
-        misfit accounted for.
+        Covariance of xi = (rho, phi) in ``X exp(xi)`` under the model, systematic errors and misfit
+        accounted for.
     unseen : (6, U) array
         Directions of xi that no increment says anything about.
-    noise : NoiseLevels
-    centre : {"sensors", "child", "parent"}
-        What white rotation noise turns the trajectories about: the sensors, or the origin of the
-        child's or the parent's world.
-    nuisance : str
-        Which systematic errors the data asks for, one of ``increments.NUISANCES``.
-    parameters : (k,) array
-        Their parameters, see :attr:`scale`, :attr:`biases` and :attr:`time_offset_s`.
+    model : NoiseModel
+    levels : (m,) array
+        Log levels of the model.
+    weights : (n + 1,) array
+        Of the poses' white errors; other than 1 where tails are heavy.
+    systematic : str
+        Which systematic errors the data asks for, one of ``increments.SYSTEMATIC``.
+    parameters : (8,) array
+        Parameters of all systematic errors, see :attr:`scale`, :attr:`biases` and
+        :attr:`time_offset_s`; zero for those that are not assumed.
+    parameter_sigmas : (8,) array
+        Their standard deviations: for those not assumed, what they would be known to.
     jumps : (n,) bool array
         Increments (from pose i to i + 1) across which a trajectory jumped for good.
     spikes : (n + 1,) bool array
         Poses that are wrong by themselves, and left out.
-    used : (n + 1,) bool array
-        Poses that the answer rests on: without spikes, and where noise drowns the motion from pose
-        to pose, only every so many.
+    heavy_tails : bool
+        Whether white errors are weighed as of Student's t distribution.
     misfit : float
-        How many times larger the errors' variance over longer times is than the noise levels have
-        it, 1 if the difference may be chance. The covariance has this factor in it.
+        Weighted squared residual over its degrees of freedom. The covariance has this factor in it.
     metres_per_pose : float
         Path of the parent from pose to pose.
+    part_products : (K, p + 1, p + 1) array
+        What each part of the recording adds, see :mod:`~hand_eye_calib.adaptive.resampling`.
     objective : float
         Negative log likelihood.
     converged : bool
     iterations : int
-        Generalised least-squares steps.
+        Evaluations of the likelihood.
     """
 
-    T_parent_child: np.ndarray
-    cov_parent_child_in_child: np.ndarray
-    unseen: np.ndarray
-    noise: NoiseLevels
-    centre: str
-    nuisance: str
-    parameters: np.ndarray
-    jumps: np.ndarray
-    spikes: np.ndarray
-    used: np.ndarray
+    T_parent_child: FloatArray
+    cov_parent_child_in_child: FloatArray
+    unseen: FloatArray
+    model: NoiseModel
+    levels: FloatArray
+    weights: FloatArray
+    systematic: str
+    parameters: FloatArray
+    parameter_sigmas: FloatArray
+    jumps: BoolArray
+    spikes: BoolArray
+    heavy_tails: bool
     misfit: float
     metres_per_pose: float
+    part_products: FloatArray
     objective: float
     converged: bool
     iterations: int
 
-    @property
-    def scale(self):
-        """Factor from the child's lengths to the parent's."""
-        return 1.0 + float(nuisance_values(self.nuisance, self.parameters)[0])
+    @cached_property
+    def noise(self) -> NoiseLevels:
+        """Noise levels in plain units."""
+        return NoiseLevels.of(self.model, self.levels)
 
     @property
-    def biases(self):
+    def scale(self) -> float:
+        """Factor from the child's lengths to the parent's."""
+        return 1.0 + float(self.parameters[SCALE])
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the scale."""
+        return float(self.parameter_sigmas[SCALE])
+
+    @property
+    def biases(self) -> FloatArray:
         """(2, 3) array: error of the child's and of the parent's path per metre travelled, each
         along the axes of its sensor.
         """
-        return nuisance_values(self.nuisance, self.parameters)[1]
+        return self.parameters[1:7].reshape(2, 3)
 
     @property
-    def time_offset_s(self):
+    def time_offset_s(self) -> float:
         """Seconds to add to the child's stamps."""
-        return -float(nuisance_values(self.nuisance, self.parameters)[2])
+        return -float(self.parameters[TIME])
 
     @property
-    def left_out(self):
+    def time_offset_sigma_s(self) -> float:
+        """Standard deviation of the time offset."""
+        return float(self.parameter_sigmas[TIME])
+
+    @property
+    def left_out(self) -> BoolArray:
         """(n,) bool array: increments that are no evidence, across a jump or at a spike."""
         return self.jumps | self.spikes[1:] | self.spikes[:-1]
 
     @property
-    def _after_a_metre(self):
+    def _after_a_metre(self) -> float:
         """How many times larger a random walk is after a metre than after the path between two
         poses.
         """
-        return (1.0 / max(self.metres_per_pose, 1e-9)) ** 0.5
+        return float((1.0 / max(self.metres_per_pose, 1e-9)) ** 0.5)
 
-    def describe(self, stamps_ns):
+    def describe(self, stamps_ns: IntArray) -> dict[str, Any]:
         """The noise in plain numbers and strings: levels per axis, systematic errors, when
         trajectories went wrong (ns), all of it in words.
         """
+        noise = self.noise
         return {
-            "rotation_white_rad": self.noise.rotation_white,
-            "translation_white_m": self.noise.translation_white,
-            "rotation_drift_rad_per_pose": self.noise.rotation_drift,
-            "translation_drift_m_per_pose": self.noise.translation_drift,
-            "rotation_drift_rad_after_a_metre": self.noise.rotation_drift * self._after_a_metre,
-            "translation_drift_m_after_a_metre": self.noise.translation_drift * self._after_a_metre,
-            "rotation_turns_about": self.centre,
-            "systematic": self.nuisance,
+            "rotation_white_rad": noise.rotation_white,
+            "translation_white_m": noise.translation_white,
+            "rotation_drift_rad_per_pose": noise.rotation_drift,
+            "translation_drift_m_per_pose": noise.translation_drift,
+            "rotation_drift_rad_after_a_metre": noise.rotation_drift * self._after_a_metre,
+            "translation_drift_m_after_a_metre": noise.translation_drift * self._after_a_metre,
+            "drift_grows_with": noise.walk_by,
+            "stamp_jitter_s": noise.jitter_s,
+            "lasting": [vars(slow).copy() for slow in noise.slow],
+            "rotation_turns_about": noise.centre,
+            "heavy_tails": self.heavy_tails,
+            "systematic": self.systematic,
             "systematic_parameters": self.parameters.tolist(),
+            "scale": self.scale,
+            "scale_sigma": self.scale_sigma,
+            "time_offset_s": self.time_offset_s,
+            "time_offset_sigma_s": self.time_offset_sigma_s,
             "jumps_before_stamp_ns": stamps_ns[1:][self.jumps].tolist(),
             "spikes_at_stamp_ns": stamps_ns[self.spikes].tolist(),
             "misfit": self.misfit,
             "in_words": self._in_words(stamps_ns),
         }
 
-    def _in_words(self, stamps_ns):
-        noise, turning, per_metre = self.noise, _TURNING[self.centre], self._after_a_metre
+    def _in_words(self, stamps_ns: IntArray) -> list[str]:
+        return [
+            *self._noise_in_words(),
+            *self._systematic_in_words(),
+            *_when(
+                "jump of a trajectory, just before",
+                "jumps of a trajectory, just before",
+                stamps_ns[1:][self.jumps],
+            ),
+            *_when(
+                "pose wrong by itself and left out, at",
+                "poses wrong by themselves and left out, at",
+                stamps_ns[self.spikes],
+            ),
+        ]
+
+    def _noise_in_words(self) -> list[str]:
+        noise, per_metre = self.noise, self._after_a_metre
         said = [
-            f"each pose is off by {_length(noise.translation_white)} and {_angle(noise.rotation_white)} per axis (both sensors "
-            f"together){turning}",
-            f"what stays grows by {_length(noise.translation_drift)} and {_angle(noise.rotation_drift)} from pose to pose, that is by "
-            f"{_length(noise.translation_drift * per_metre)} and {_angle(noise.rotation_drift * per_metre)} in the first metre, "
+            f"each pose is off by {_length(noise.translation_white)} and "
+            f"{_angle(noise.rotation_white)} per axis (both sensors together)"
+            f"{_TURNING[noise.centre]}",
+            f"what stays grows by {_length(noise.translation_drift)} and "
+            f"{_angle(noise.rotation_drift)} from pose to pose, that is by "
+            f"{_length(noise.translation_drift * per_metre)} and "
+            f"{_angle(noise.rotation_drift * per_metre)} in the first metre, "
             "ten times that in a hundred",
         ]
-        systematic = self.nuisance.split("+")
+        said += [_slow_in_words(slow) for slow in noise.slow]
+        if noise.jitter_s > _NOTABLE_JITTER_S:
+            said.append(f"stamps jitter by {1000 * noise.jitter_s:.2g} ms")
+        if self.heavy_tails:
+            said.append("many poses are far more wrong than the rest, and count less")
+        return said
+
+    def _systematic_in_words(self) -> list[str]:
+        said, systematic = [], self.systematic.split("+")
         if "scale" in systematic:
             off = 100 * (self.scale - 1)
+            than = "shorter" if off > 0 else "longer"
             said.append(
-                f"the child's lengths are {abs(off):.2f} % {'shorter' if off > 0 else 'longer'} than the parent's"
+                f"the child's lengths are {abs(off):.2f} +/- {100 * self.scale_sigma:.2g} % "
+                f"{than} than the parent's"
             )
-        for name, sensor, bias in zip(
-            ("bias", "parent bias"), ("child", "parent"), self.biases, strict=True
-        ):
+        sensors = (("bias", "child"), ("parent bias", "parent"))
+        for (name, sensor), bias in zip(sensors, self.biases, strict=True):
             if name in systematic:
                 along = ", ".join(
                     f"{axis} {1000 * value:.2g}" for axis, value in zip("xyz", bias, strict=True)
                 )
                 said.append(
-                    f"the {sensor}'s path is off by {along} mm per metre travelled, along its own axes"
+                    f"the {sensor}'s path is off by {along} mm per metre travelled, "
+                    "along its own axes"
                 )
         if "time" in systematic:
             offset_ms = 1000 * self.time_offset_s
             said.append(
-                f"the child's stamps are {abs(offset_ms):.1f} ms {'early' if offset_ms > 0 else 'late'}"
-            )
-        said += _when(
-            "jump of a trajectory, just before",
-            "jumps of a trajectory, just before",
-            stamps_ns[1:][self.jumps],
-        )
-        said += _when(
-            "pose wrong by itself and left out, at",
-            "poses wrong by themselves and left out, at",
-            stamps_ns[self.spikes],
-        )
-        if np.mean(self.used | self.spikes) < 1.0:
-            every = round(1.0 / np.mean(self.used | self.spikes))
-            said.append(f"noise drowns the motion from pose to pose: one pose in {every} is used")
-        if self.misfit > 1.0:
-            said.append(
-                f"errors last longer than this noise would: the standard deviations are made {np.sqrt(self.misfit):.1f} times larger for it"
+                f"the child's stamps are {abs(offset_ms):.1f} +/- "
+                f"{1000 * self.time_offset_sigma_s:.2g} ms {'early' if offset_ms > 0 else 'late'}"
             )
         return said
 
 
-def _length(metres):
+def _slow_in_words(slow: SlowNoise) -> str:
+    if slow.kind == "scale":
+        return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
+    size = _length(slow.sigma) if slow.part == "translation" else _angle(slow.sigma)
+    return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
+
+
+def _length(metres: float) -> str:
     return f"{100 * metres:.2g} cm"
 
 
-def _angle(radians):
+def _angle(radians: float) -> str:
     return f"{np.degrees(radians):.2g} deg"
 
 
-def _when(one, several, stamps_ns):
+def _when(one: str, several: str, stamps_ns: IntArray) -> list[str]:
     """A line, or none, about what happened at these times."""
     if not len(stamps_ns):
         return []

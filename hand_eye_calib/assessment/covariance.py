@@ -15,7 +15,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.adaptive.estimator import AdaptiveSolution, solve_without
+from hand_eye_calib.adaptive.resampling import answers_without
+from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.lever_arm import HIDDEN_SHARE, ROUNDING_ANGLE, LeverArms
 from hand_eye_calib.calibration import DofObservability, DofVerdict
@@ -31,6 +32,10 @@ SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
 
 _BLOCKS = 10
 _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
+
+# What the ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance
+# exceed once in ten times.
+_CHANCE = np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28])
 
 # Standard deviations that stand for "unknown" in the covariance: the distance between sensors on a
 # large machine. An unknown direction is never exactly an axis of the parent sensor, so that part of
@@ -108,15 +113,12 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
     -------
     Assessment
     """
-    poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
-    resampled = jackknife_covariance(
-        len(solution.jumps),
-        solution.T_parent_child,
-        lambda left_out: solve_without(*poses, solution, left_out),
-    )
-    unseen = [*solution.unseen.T, *_noise_driven_baselines(pose_pairs.Ts_pw_p, solution)]
     covariance = solution.cov_parent_child_in_child
-    return _combine(solution.T_parent_child, covariance, resampled, _basis(unseen))
+    if len(solution.jumps) >= _BLOCKS * _MIN_PAIRS_PER_BLOCK:
+        steps = answers_without(solution.part_products, _BLOCKS)
+        covariance = beyond_chance(covariance, _spread_of_blocks(steps))
+    unseen = [*solution.unseen.T, *_noise_driven_baselines(pose_pairs.Ts_pw_p, solution)]
+    return _combine(solution.T_parent_child, covariance, None, _basis(unseen))
 
 
 def _noise_driven_baselines(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> list[FloatArray]:
@@ -140,7 +142,7 @@ def _noise_driven_over(
     weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
     if not weights.any():
         weights[:] = 1.0
-    variance = 2 * solution.noise.rotation_white**2 + baseline * solution.noise.rotation_drift**2
+    variance = solution.noise.rotation_variance(baseline)
     chords = (motions - np.eye(3)) @ solution.T_parent_child[:3, :3]
     return _hidden_translations(LeverArms.of(chords, weights), variance * np.eye(3))
 
@@ -232,21 +234,39 @@ def jackknife_covariance(
     block_of_pair = np.arange(n_pairs) * n_blocks // n_pairs
     left_out = block_of_pair[None, :] == np.arange(n_blocks)[:, None]
     deviations = se3.log(se3.inverse(T_parent_child) @ solve_without(left_out))
-    deviations -= deviations.mean(axis=0)
-    return (n_blocks - 1) / n_blocks * deviations.T @ deviations
+    return _spread_of_blocks(deviations)
+
+
+def _spread_of_blocks(deviations: FloatArray) -> FloatArray:
+    """Jackknife covariance (6, 6) of the deviations (B, 6) of the answers without a block."""
+    n_blocks, centred = len(deviations), deviations - deviations.mean(axis=0)
+    return (n_blocks - 1) / n_blocks * centred.T @ centred
 
 
 def larger_by_direction(first: FloatArray, second: FloatArray | None) -> FloatArray:
     """The first covariance, raised to the second in every direction in which that is larger."""
-    if second is None:
-        return first
+    return first if second is None else _raised(first, second, np.ones(len(first)))
+
+
+def beyond_chance(model: FloatArray, resampled: FloatArray) -> FloatArray:
+    """The model's covariance, raised in the directions in which that of ten blocks exceeds what
+    chance would make of it.
+
+    The ratios of a right model to its jackknife scatter: with ten blocks the largest of six is 2.5
+    on average. They are divided by what they exceed in one recording of ten.
+    """
+    return _raised(model, resampled, _CHANCE)
+
+
+def _raised(first: FloatArray, second: FloatArray, limits: FloatArray) -> FloatArray:
+    """The first covariance, with the ratios of the second to it, ascending, beyond limits (6,)."""
     # In the coordinates where the first is the identity, the eigenvalues of the second are the
     # ratios.
     variances, axes = np.linalg.eigh(first)
     root = axes * np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE))
     values, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, second).T))
     raised = root @ vectors
-    return (raised * np.maximum(values, 1.0)) @ raised.T
+    return (raised * np.maximum(values / limits, 1.0)) @ raised.T
 
 
 def _verdicts(

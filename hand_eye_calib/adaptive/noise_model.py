@@ -1,0 +1,354 @@
+"""The noise of two trajectories: which errors there are, how strong, and how they enter.
+
+Every pose of both sensors has a white error (translation, rotation, and along the velocity, for
+stamps that jitter), the motions a random walk that grows with time or with the path, and slow
+errors are first-order Gauss-Markov processes: fixed to the child's body, fixed to the parent's
+world, and a drifting scale. Each has one variance for translation and one for rotation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.adaptive.increments import Linearisation, Streams
+from hand_eye_calib.adaptive.reml import Fit, Prior
+from hand_eye_calib.adaptive.state_space import WHITE, Group, StateSpace
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.geometry import se3
+
+# What white rotation noise turns a trajectory about: either sensor itself, or the origin of the
+# child's or of the parent's world, as of a camera that sees a target.
+CENTRES = ("sensors", "child", "parent")
+
+# Log levels before those of slow processes: white translation (m^2), white rotation (rad^2), jitter
+# of stamps (s^2), walk of translation and of rotation.
+TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(5)
+N_FAST = 5
+
+# Variances never fall below this (rad^2 or m^2): rounding, not noise. White noise and walk do not
+# fall below these shares of the whole, either; the precisions of both stand in one matrix.
+LOWEST_VARIANCE = 1e-14
+_LEAST_WHITE, _LEAST_WALK = np.exp(-14.0), np.exp(-12.0)
+_LOWEST_LEVEL, _HIGHEST_LEVEL = -32.0, 14.0
+
+# Expected jitter of stamps (s^2), expected variance of a drifting scale, and how well they are
+# known; of time constants, too.
+_JITTER, _SCALE_VARIANCE = np.exp(-14.0), np.exp(-10.0)
+_JITTER_PRECISION, _SCALE_PRECISION, _TAU_PRECISION = 0.05, 0.02, 0.3
+
+# Time constants are between an interval and this share of the recording.
+_LONGEST_SHARE = 0.25
+
+# A walk's variance over an increment, in units of a typical one: bounded, so that neither a gap nor
+# twin stamps nor a halt dominate.
+_LEAST_INTERVAL, _MOST_INTERVAL, _LEAST_METRES, _MOST_METRES = 0.1, 100.0, 0.05, 1e3
+
+# Processes that last are looked for at so many time constants, from a few intervals to a share of the
+# recording, where they have this share of the white and walking noise; one is tried if a step of its
+# variance alone promises to lower the loss by so much.
+_N_TAUS, _FIRST_TAU, _LAST_TAU = 2, 10.0, 0.06
+_FAINT, _PROMISING = 1e-3, 1.0
+
+# Where a search starts again, no white noise and no walk is smaller than this share of the whole.
+_AUDIBLE_WHITE, _AUDIBLE_WALK = 0.1, 1e-3
+
+# A process whose variance the data say less about than this is left out: it makes no difference.
+_LEAST_INFORMATION = 0.3
+
+_TRANSLATIONS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+_ROTATIONS = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+_PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
+
+
+@dataclass(frozen=True)
+class Slow:
+    """A slow process: ``kind`` body, world or scale; ``part`` translation, rotation or scale."""
+
+    kind: str
+    part: str
+
+    @property
+    def size(self) -> int:
+        """Number of states."""
+        return 1 if self.kind == "scale" else 3
+
+
+SCALE_DRIFT = Slow("scale", "scale")
+LASTING = tuple(Slow(kind, part) for kind in ("body", "world") for part in _PARTS)
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Typical interval (s), typical step (m) and duration (s) of a recording."""
+
+    interval_s: float
+    metres: float
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Which errors there are.
+
+    Attributes
+    ----------
+    slow : tuple of Slow
+    walk_by : {"time", "distance"}
+    centre : {"sensors", "child", "parent"}
+    extent : Extent
+    """
+
+    slow: tuple[Slow, ...]
+    walk_by: str
+    centre: str
+    extent: Extent
+
+    def state_space(
+        self,
+        streams: Streams,
+        linearisation: Linearisation,
+        twists: FloatArray,
+        T_parent_child: FloatArray,
+        columns: list[int],
+        weights: FloatArray,
+        cut: BoolArray,
+    ) -> StateSpace:
+        """The state space of a linearisation.
+
+        Parameters
+        ----------
+        streams : Streams
+        linearisation : Linearisation
+        twists : (N, 6) array
+            The child's, see :class:`~hand_eye_calib.adaptive.increments.Course`.
+        T_parent_child : (4, 4) array
+        columns : list of int
+            Parameters of systematic errors to estimate.
+        weights : (N,) array
+        cut : (n,) bool array
+        """
+        to_child = se3.adjoint(se3.inverse(T_parent_child))
+        ahead, behind = self._entries(streams, linearisation, to_child)
+        walk = (_TRANSLATIONS, _both_rotations(to_child))
+        white = (
+            _TRANSLATIONS[None],
+            self._white_rotation(streams, to_child),
+            twists[:, :, None] * twists[:, None, :],
+        )
+        jacobian = linearisation.jacobian[:, :, [*range(6), *(6 + column for column in columns)]]
+        return StateSpace(
+            intervals_s=np.diff(streams.stamps_s),
+            relative=self._relative(streams, linearisation),
+            residuals=linearisation.residuals,
+            jacobian=jacobian,
+            ahead=ahead,
+            behind=behind,
+            white=white,
+            walk=walk,
+            groups=self._groups(),
+            weights=weights,
+            cut=cut,
+        )
+
+    def _relative(self, streams: Streams, linearisation: Linearisation) -> FloatArray:
+        if self.walk_by == "time":
+            intervals = np.diff(streams.stamps_s) / self.extent.interval_s
+            return np.clip(intervals, _LEAST_INTERVAL, _MOST_INTERVAL)
+        steps = linearisation.metres / self.extent.metres
+        return np.clip(steps, _LEAST_METRES, _MOST_METRES)
+
+    def _groups(self) -> tuple[Group, ...]:
+        groups, state, level = [], WHITE, N_FAST
+        for process in self.slow:
+            groups.append(Group(slice(state, state + process.size), level, level + 1))
+            state, level = state + process.size, level + 2
+        return tuple(groups)
+
+    def _entries(
+        self, streams: Streams, linearisation: Linearisation, to_child: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        n, size = len(streams) - 1, WHITE + sum(process.size for process in self.slow)
+        ahead, behind = np.zeros((n, 6, size)), np.zeros((n, 6, size))
+        ahead[:, :, :WHITE], behind[:, :, :WHITE] = np.eye(6), linearisation.adjoints
+        for process, group in zip(self.slow, self._groups(), strict=True):
+            if process.kind == "scale":
+                behind[:, :, group.states] = -linearisation.by_scale
+                continue
+            directions = slow_directions(process, streams, to_child)
+            ahead[:, :, group.states] = directions[1:]
+            behind[:, :, group.states] = linearisation.adjoints @ directions[:-1]
+        return ahead, behind
+
+    def _white_rotation(self, streams: Streams, to_child: FloatArray) -> FloatArray:
+        if self.centre == "sensors":
+            return _both_rotations(to_child)[None]
+        poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
+        swing = np.zeros((len(poses), 6, 3))
+        swing[:, :3], swing[:, 3:] = se3.skew(se3.inverse(poses)[:, :3, 3]), np.eye(3)
+        if self.centre == "parent":
+            swing = to_child @ swing
+        return swing @ np.swapaxes(swing, 1, 2)
+
+    def richer(self, slow: tuple[Slow, ...]) -> NoiseModel:
+        """The same with other slow processes."""
+        return dataclasses.replace(self, slow=slow)
+
+    def prior(self, levels: FloatArray) -> Prior:
+        """What is known beforehand, for a search from these levels."""
+        extent = self.extent
+        total = _whole(levels)
+        mean, precision = levels.copy(), np.zeros(len(levels))
+        lower, upper = np.full((2, len(levels)), _LOWEST_LEVEL)
+        upper[:] = _HIGHEST_LEVEL
+        lower[:N_FAST] = np.log(LOWEST_VARIANCE)
+        lower[:2] = np.maximum(lower[:2], total + np.log(_LEAST_WHITE))
+        lower[3:5] = np.maximum(lower[3:5], total + np.log(_LEAST_WALK))
+        mean[JITTER], precision[JITTER] = np.log(_JITTER), _JITTER_PRECISION
+        lower[JITTER] = _LOWEST_LEVEL
+        for process, group in zip(self.slow, self._groups(), strict=True):
+            precision[group.tau] = _TAU_PRECISION
+            lower[group.tau] = np.log(extent.interval_s)
+            upper[group.tau] = np.log(max(_LONGEST_SHARE * extent.duration_s, extent.interval_s))
+            if process.kind == "scale":
+                mean[group.variance] = np.log(_SCALE_VARIANCE)
+                precision[group.variance] = _SCALE_PRECISION
+        return Prior(mean, precision, lower, upper)
+
+    def first_levels(self, white: FloatArray, walk: FloatArray) -> FloatArray:
+        """Log levels to start at, from log variances (2,) of white noise and walk."""
+        levels = [*white, np.log(_JITTER), *walk]
+        levels += [np.log(_SCALE_VARIANCE), np.log(0.1 * self.extent.duration_s)]
+        return np.array(levels)
+
+    def raised(self, levels: FloatArray) -> FloatArray:
+        """Log levels with no white noise and no walk so small that a search cannot hear it."""
+        levels, total = levels.copy(), _whole(levels)
+        levels[:2] = np.maximum(levels[:2], total + np.log(_AUDIBLE_WHITE))
+        levels[3:5] = np.maximum(levels[3:5], total + np.log(_AUDIBLE_WALK))
+        return levels
+
+    def step_noise(self, levels: FloatArray) -> float:
+        """Standard deviation per axis (m) of white noise and walk of a typical step."""
+        return float(np.exp(0.5 * _whole(levels)[0]))
+
+    def with_faint_lasting(self, levels: FloatArray, tau_s: float) -> tuple[NoiseModel, FloatArray]:
+        """The model with all processes that last, and log levels at which they hardly count."""
+        slow_levels = []
+        for process in LASTING:
+            white, walk = _fast_levels(process)
+            whole = np.logaddexp(levels[white], levels[walk])
+            slow_levels += [whole + np.log(_FAINT), np.log(tau_s)]
+        model = self.richer((*LASTING, *self.slow))
+        return model, np.concatenate([levels[:N_FAST], slow_levels, levels[N_FAST:]])
+
+    def taus_s(self) -> list[float]:
+        """Time constants to look for lasting errors at."""
+        shortest = _FIRST_TAU * self.extent.interval_s
+        longest = max(_LAST_TAU * self.extent.duration_s, shortest)
+        return np.geomspace(shortest, longest, _N_TAUS).tolist()
+
+    def promising(
+        self, scores: list[tuple[float, FloatArray, FloatArray]], levels: FloatArray
+    ) -> tuple[tuple[Slow, ...], FloatArray, float]:
+        """Processes that last whose presence promises to lower the loss, log levels to start their
+        search at, and by how much they promise to lower it together.
+
+        Parameters
+        ----------
+        scores : list of (float, (m,) array, (m, m) array)
+            Time constants, and derivatives of the loss and average information at the levels of
+            :meth:`with_faint_lasting`.
+        levels : (m,) array
+            Log levels without these processes.
+        """
+        chosen, starts, total = [], [], 0.0
+        for index, process in enumerate(LASTING):
+            at = N_FAST + 2 * index
+            white, walk = _fast_levels(process)
+            faint = np.logaddexp(levels[white], levels[walk]) + np.log(_FAINT)
+            gains = [_promised(gradient, information, at) for _, gradient, information in scores]
+            best = int(np.argmax([gain for gain, _ in gains]))
+            gain, factor = gains[best]
+            if gain > _PROMISING:
+                chosen.append(process)
+                starts += [
+                    faint + np.log(np.clip(factor, 1.0, 0.3 / _FAINT)),
+                    np.log(scores[best][0]),
+                ]
+                total = max(total, gain)
+        start = np.concatenate([levels[:N_FAST], starts, levels[N_FAST:]])
+        return tuple(chosen), start, total
+
+    def reduced(self, fit: Fit) -> tuple[NoiseModel, FloatArray]:
+        """The model and log levels without the slow processes that make no difference."""
+        keep = [
+            bool(fit.information[group.variance, group.variance] > _LEAST_INFORMATION)
+            for group in self._groups()
+        ]
+        levels = [
+            fit.levels[[group.variance, group.tau]]
+            for group, kept in zip(self._groups(), keep, strict=True)
+            if kept
+        ]
+        slow = tuple(process for process, kept in zip(self.slow, keep, strict=True) if kept)
+        return self.richer(slow), np.concatenate([fit.levels[:N_FAST], *levels])
+
+    def lasting(
+        self, states: FloatArray, streams: Streams, T_parent_child: FloatArray
+    ) -> FloatArray:
+        """The error c (N, 6) that states (N, d) make, in the child's frame."""
+        to_child = se3.adjoint(se3.inverse(T_parent_child))
+        error = states[:, :WHITE].copy()
+        for process, group in zip(self.slow, self._groups(), strict=True):
+            if process.kind != "scale":
+                directions = slow_directions(process, streams, to_child)
+                error += (directions @ states[:, group.states, None])[:, :, 0]
+        return error
+
+
+def slow_directions(process: Slow, streams: Streams, to_child: FloatArray) -> FloatArray:
+    """Matrices (N, 6, 3) from a process to the error c."""
+    part = _PARTS[process.part]
+    if process.kind == "body":
+        return np.broadcast_to(np.eye(6)[:, part], (len(streams), 6, 3))
+    return to_child[:, part] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
+
+
+def sensor_white(levels: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of one sensor's white errors, half of both sensors'."""
+    white = np.exp(levels[[TRANSLATION, ROTATION]])
+    return 0.5 * (white[0] * _TRANSLATIONS + white[1] * _ROTATIONS)
+
+
+def _both_rotations(to_child: FloatArray) -> FloatArray:
+    """Rotation noise, half of it the parent's, which moves the child by the lever arm."""
+    return 0.5 * (_ROTATIONS + to_child @ _ROTATIONS @ to_child.T)
+
+
+def _promised(gradient: FloatArray, information: FloatArray, at: int) -> tuple[float, float]:
+    """By how much a step of one variance lowers the loss, and the factor that it multiplies it by.
+
+    White noise, jitter and walk may move along with it.
+    """
+    others = [0, 1, 2, 3, 4]
+    block = information[np.ix_(others, others)] + 0.05 * np.eye(len(others))
+    shared = information[others, at]
+    own = information[at, at] - shared @ np.linalg.solve(block, shared)
+    slope = gradient[at]
+    if slope >= 0.0 or own <= 0.0:
+        return 0.0, 1.0
+    return 0.5 * slope**2 / own, 1.0 - slope / own
+
+
+def _fast_levels(process: Slow) -> tuple[int, int]:
+    if process.part == "translation":
+        return TRANSLATION, WALK_TRANSLATION
+    return ROTATION, WALK_ROTATION
+
+
+def _whole(levels: FloatArray) -> FloatArray:
+    """Log variances (2,) of increments of translation and rotation, white noise and walk together."""
+    return np.logaddexp(levels[[3, 4]], levels[:2] + np.log(2.0))

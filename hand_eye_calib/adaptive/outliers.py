@@ -1,0 +1,211 @@
+"""Jumps, poses that are wrong by themselves, and heavy tails.
+
+What one increment or one pose's white error is expected to be from everything else, against what it
+is, in units of the covariance of the difference: chi-square with six degrees of freedom if nothing
+is wrong. With u = V^-1 r and P = V^-1 that is ``u_i' P_ii^-1 u_i`` (de Jong, Penzer, J. Amer.
+Statist. Assoc. 93, 1998), and follows from the smoothed states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.adaptive.increments import Streams
+from hand_eye_calib.adaptive.reml import walk_covariance
+from hand_eye_calib.adaptive.state_space import WHITE, Posterior
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.geometry import se3
+
+# Precision, as a share, of a pose's white error that is no evidence.
+NO_WEIGHT = 1e-7
+
+# False alarms expected in a whole recording; and what is given up again as probable enough.
+_FALSE_ALARMS, _PROBABLE = 0.01, 0.01
+
+# No more than this share of the increments can be jumps: otherwise the noise levels are wrong.
+_MOST_JUMPS = 0.5
+
+# First look for jumps: increments this many robust sigmas out. Wide, for the noise levels are not
+# known yet. More pairs of them than this share are no spikes.
+_FIRST_JUMP_SIGMAS = 5.0
+_MEDIAN_OF_CHI_3 = 1.538
+_LEAST_JUMP = 1e-6
+_MOST_SPIKES = 0.3
+
+# Tails are heavy if the fourth moment of the white errors exceeds the square of the second by this
+# factor (4/3 for normal ones).
+_HEAVY_KURTOSIS = 1.7
+
+# Degrees of freedom of Student's t distribution for heavy tails, plus 6.
+_STUDENT = 4.0
+
+# Share of a covariance that keeps differences of covariances away from zero.
+_ROUNDING, _LEAST_VARIANCE = 1e-9, 1e-18
+
+_MAX_STEPS = 20
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Evidence that does not count.
+
+    Attributes
+    ----------
+    jumps : (n,) bool array
+        Increments across which a trajectory jumps for good.
+    spikes : (N,) bool array
+        Poses that are wrong by themselves.
+    """
+
+    jumps: BoolArray
+    spikes: BoolArray
+
+    def across(self, kept: np.ndarray) -> Outliers:
+        """For some of the poses, in order: a jump between two of them counts for their increment."""
+        if len(kept) == len(self.spikes):
+            return self
+        jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
+        return Outliers(jumps, self.spikes[kept])
+
+    def same_as(self, other: Outliers) -> bool:
+        """Whether nothing differs."""
+        return np.array_equal(self.jumps, other.jumps) and np.array_equal(self.spikes, other.spikes)
+
+
+def first_outliers(residuals: FloatArray) -> Outliers:
+    """What stands out of residuals (n, 6) without knowing their noise.
+
+    A pose between two jumps counts as a spike, and its increments as evidence, until shown
+    otherwise.
+    """
+    jumps = _standing_out(residuals, _limits(residuals))
+    spikes = np.r_[False, jumps[1:] & jumps[:-1], False]
+    if np.mean(spikes) > _MOST_SPIKES:
+        return Outliers(jumps, np.zeros(len(spikes), dtype=bool))
+    return Outliers(jumps & ~(spikes[1:] | spikes[:-1]), spikes)
+
+
+def with_jumps_across_spikes(
+    outliers: Outliers, residuals: FloatArray, bridging: FloatArray
+) -> Outliers:
+    """With a jump behind each spike where what stood out of the residuals (n, 6) stands out of those
+    with bridged poses, too.
+    """
+    behind = _standing_out(bridging, _limits(residuals)) & outliers.spikes[:-1]
+    return Outliers(outliers.jumps | behind, outliers.spikes)
+
+
+def _limits(residuals: FloatArray) -> list[float]:
+    limits = []
+    for part in (slice(0, 3), slice(3, 6)):
+        sizes = np.linalg.norm(residuals[:, part], axis=1)
+        robust = _FIRST_JUMP_SIGMAS * float(np.median(sizes)) / _MEDIAN_OF_CHI_3
+        limits.append(max(robust, _LEAST_JUMP))
+    return limits
+
+
+def _standing_out(residuals: FloatArray, limits: list[float]) -> BoolArray:
+    sizes = [np.linalg.norm(residuals[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))]
+    return (sizes[0] > limits[0]) | (sizes[1] > limits[1])
+
+
+def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Chi-squares of all increments (n,) and of all poses' white errors (N,)."""
+    space = posterior.space
+    states, walk = posterior.restricted()
+    walks = np.linalg.inv(posterior.walk_precision) * space.relative[:, None, None]
+    known = walk_covariance(posterior) + walk[:, :, 1:] @ walk[:, :, 1:].transpose(0, 2, 1)
+    of_walk = _chi_squares(walk[:, :, 0], walks, known, space.cut)
+
+    own = states[:, :WHITE]
+    whites = np.linalg.inv(posterior.white_precision)
+    whites = np.where(spikes, 1.0, 1.0 / space.weights)[:, None, None] * whites
+    known = posterior.selected_inverse[0][:, :WHITE, :WHITE]
+    known = known + own[:, :, 1:] @ own[:, :, 1:].transpose(0, 2, 1)
+    return of_walk, _chi_squares(own[:, :, 0], whites, known, spikes)
+
+
+def _chi_squares(
+    values: FloatArray, prior: FloatArray, posterior: FloatArray, left_out: BoolArray
+) -> FloatArray:
+    """Of smoothed values (n, 6), whose own evidence counted unless it was left out."""
+    spread = np.where(left_out[:, None, None], prior + posterior, prior - posterior)
+    spread += _ROUNDING * prior + _LEAST_VARIANCE * np.eye(6)
+    return (values * np.linalg.solve(spread, values[:, :, None])[:, :, 0]).sum(axis=1)
+
+
+def judged(
+    outliers: Outliers, of_walk: FloatArray, of_white: FloatArray, with_spikes: bool
+) -> Outliers:
+    """Outliers by the chi-squares of increments (n,) and poses (N,): the largest of its
+    neighbourhood is one, and a jump that is probable after all is none.
+    """
+    alarming = chi_square_quantile(_FALSE_ALARMS / len(of_white))
+    probable = chi_square_quantile(_PROBABLE)
+    beside = np.maximum(of_white[1:], of_white[:-1])
+    found = (of_walk > alarming) & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
+    jumps = outliers.jumps & (of_walk >= probable)
+    if np.sum(jumps | found) <= _MOST_JUMPS * len(jumps):
+        jumps = jumps | found
+    spikes = outliers.spikes
+    if with_spikes:
+        walks = np.maximum(np.r_[0.0, of_walk], np.r_[of_walk, 0.0])
+        spikes = spikes | (of_white > alarming) & _is_peak(of_white) & (of_white > walks)
+    return Outliers(jumps, spikes)
+
+
+def _is_peak(values: FloatArray) -> BoolArray:
+    padded = np.r_[0.0, values, 0.0]
+    return (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
+
+
+def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> Streams:
+    """Streams with the child's poses at spikes as the parent's motion from the pose before has them.
+
+    A pose that is wrong by itself is no evidence, but its large error would not be small in the
+    increments on both sides of it, which are of first order.
+    """
+    Ts_cw_c = streams.Ts_cw_c.copy()
+    at = np.flatnonzero(spikes[1:]) + 1
+    by_parent = se3.inverse(streams.Ts_pw_p[at - 1]) @ streams.Ts_pw_p[at]
+    motions = se3.inverse(T_parent_child) @ by_parent @ T_parent_child
+    for pose, motion in zip(at, motions, strict=True):
+        Ts_cw_c[pose] = Ts_cw_c[pose - 1] @ motion
+    return Streams(streams.stamps_s, streams.Ts_pw_p, Ts_cw_c)
+
+
+def tails_are_heavy(outliers: Outliers, of_white: FloatArray) -> bool:
+    """Whether the white errors (chi-squares (N,)) are far from normal."""
+    normal = of_white[~outliers.spikes]
+    return bool(np.mean(normal**2) > _HEAVY_KURTOSIS * np.mean(normal) ** 2)
+
+
+def student_weights(posterior: Posterior) -> FloatArray:
+    """Weights (N,) of white errors with Student's t distribution, from those in force.
+
+    ``u = (nu + 6) / (nu + E w' S^-1 w)``; of the expectation, the share that smoothing takes from
+    the white errors is spread over the poses in inverse proportion to their weights.
+    """
+    states = posterior.restricted()[0][:, :WHITE, 0]
+    pulled = (posterior.white_precision @ states[:, :, None])[:, :, 0]
+    squares = (states * pulled).sum(axis=1)
+    kept = min(float(np.mean(posterior.space.weights * squares)) / 6.0, 1.0)
+    hidden = 6.0 * (1.0 - kept) / posterior.space.weights
+    return (_STUDENT + 6.0) / (_STUDENT + squares + hidden)
+
+
+def chi_square_quantile(tail: float) -> float:
+    """What chi-square with six degrees of freedom exceeds with this probability, from 1e-30 to
+    0.99, without importing scipy.special.
+
+    It exceeds 2 h with probability ``exp(-h) (1 + h + h^2 / 2)``. The negative logarithm of that is
+    convex and grows with h: Newton's method converges from above, in ten steps or fewer.
+    """
+    half = 10.0 - 2.0 * np.log(tail)
+    for _ in range(_MAX_STEPS):
+        series = 1.0 + half + half**2 / 2
+        excess = half - np.log(series) + np.log(tail)
+        half -= excess * series / (half**2 / 2)
+    return 2.0 * float(half)

@@ -1,0 +1,231 @@
+"""Noise levels by restricted maximum likelihood: exact derivatives, average information.
+
+The derivatives need only the blocks of the states' covariance on the diagonal and beside it; the
+curvature is the average of observed and expected information (Gilmour, Thompson, Cullis, Biometrics
+51, 1995), ``1/2 f_k' P f_l`` with ``f_k = dV/dlevel_k P r``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.adaptive.state_space import WHITE, Markov, Posterior, StateSpace
+from hand_eye_calib.arrays import FloatArray
+
+# The search ends if a step promises to lower the loss by less: noise levels need no more than a few
+# per cent. Steps stay within a radius of the log levels.
+_SETTLED_LOSS, _SETTLED_STEP, _MAX_STEPS = 0.02, 1e-3, 20
+_FIRST_RADIUS, _LARGEST_RADIUS = 1.5, 3.0
+_GOOD, _POOR, _SHRINK = 0.5, 0.2, 0.3
+
+# Information that every level has beforehand: bounds the step along levels that do not matter.
+_LEAST_CURVATURE = 0.05
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the log levels beforehand: means, precisions and bounds, (m,) each."""
+
+    mean: FloatArray
+    precision: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+    def loss(self, levels: FloatArray) -> float:
+        """Negative log density, constants left out."""
+        return 0.5 * float((self.precision * (levels - self.mean) ** 2).sum())
+
+    def gradient(self, levels: FloatArray) -> FloatArray:
+        """(m,) array: derivatives of the loss."""
+        return self.precision * (levels - self.mean)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Log levels, the posterior at them, and the average information (m, m)."""
+
+    levels: FloatArray
+    posterior: Posterior
+    information: FloatArray
+    n_evaluations: int
+
+    @property
+    def loss(self) -> float:
+        """Negative restricted log likelihood."""
+        return self.posterior.loss
+
+
+def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Fit:
+    """Levels of the least loss near a start, by Newton steps within a radius."""
+    levels = np.clip(start, prior.lower, prior.upper)
+    posterior, radius, n_evaluations = Posterior(space, levels), _FIRST_RADIUS, 1
+    loss = posterior.loss + prior.loss(levels)
+    for _ in range(_MAX_STEPS):
+        gradient, information = derivatives(posterior)
+        gradient = gradient + prior.gradient(levels)
+        curvature = information + np.diag(prior.precision + _LEAST_CURVATURE)
+        gain = 0.0
+        while radius > _SETTLED_STEP:
+            step, is_newton = _step(levels, gradient, curvature, prior, radius)
+            promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
+            if np.abs(step).max() < _SETTLED_STEP or (is_newton and promised < _SETTLED_LOSS):
+                break
+            rival = _posterior(space, levels + step)
+            n_evaluations += 1
+            gain = loss - _total(rival, prior)
+            if rival is not None and gain > 0.0:
+                break
+            radius, gain = _SHRINK * float(np.abs(step).max()), 0.0
+        if gain == 0.0 or rival is None:
+            break
+        levels, posterior, loss = rival.levels, rival, loss - gain
+        if gain > _GOOD * promised:
+            radius = min(2.0 * radius, _LARGEST_RADIUS)
+        elif gain < _POOR * promised:
+            radius = 0.5 * float(np.abs(step).max())
+        if gain < 0.5 * _SETTLED_LOSS:
+            break
+    return Fit(levels, posterior, information, n_evaluations)
+
+
+def _posterior(space: StateSpace, levels: FloatArray) -> Posterior | None:
+    try:
+        return Posterior(space, levels)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _total(posterior: Posterior | None, prior: Prior) -> float:
+    if posterior is None or not np.isfinite(posterior.loss):
+        return np.inf
+    return posterior.loss + prior.loss(posterior.levels)
+
+
+def _step(
+    levels: FloatArray, gradient: FloatArray, curvature: FloatArray, prior: Prior, radius: float
+) -> tuple[FloatArray, bool]:
+    """Step of the levels that are free to move, damped to stay within the radius; and whether it
+    is undamped.
+    """
+    free = (levels > prior.lower + 1e-9) | (gradient < 0)
+    free &= (levels < prior.upper - 1e-9) | (gradient > 0)
+    step, damping = np.zeros(len(levels)), 0.0
+    values, vectors = np.linalg.eigh(curvature[np.ix_(free, free)])
+    along = vectors.T @ gradient[free]
+    least = 0.05 * max(float(np.abs(gradient[free]).max(initial=0.0)) / radius, 1e-3)
+    while True:
+        step[free] = -vectors @ (along / (values + damping))
+        if np.abs(step).max() <= radius:
+            break
+        damping = max(2.0 * damping, least)
+    return np.clip(levels + step, prior.lower, prior.upper) - levels, damping == 0.0
+
+
+def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
+    """Gradient (m,) of the loss by the log levels and the average information (m, m)."""
+    states, walk = posterior.restricted()
+    covariance, below = posterior.selected_inverse
+    second = covariance + states @ states.transpose(0, 2, 1)
+    joined = below + states[1:] @ states[:-1].transpose(0, 2, 1)
+    gradient = np.concatenate(
+        [
+            _white_gradient(posterior, second),
+            _walk_gradient(posterior, walk),
+            *(_markov_gradient(process, second, joined) for process in posterior.markov),
+        ]
+    )
+    return gradient, _average_information(posterior, states[:, :, 0], walk[:, :, 0])
+
+
+def _white_gradient(posterior: Posterior, second: FloatArray) -> FloatArray:
+    space, precision = posterior.space, posterior.white_precision
+    moments = second[:, :WHITE, :WHITE] * space.weights[:, None, None]
+    if len(precision) == 1:
+        excess = len(moments) * precision - precision @ moments.sum(axis=0) @ precision
+    else:
+        excess = precision - precision @ moments @ precision
+    total = excess.sum(axis=0)
+    traces = [
+        float((total * basis[0]).sum() if len(basis) == 1 else (excess * basis).sum())
+        for basis in space.white
+    ]
+    return 0.5 * np.exp(posterior.levels[: len(traces)]) * traces
+
+
+def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
+    space, precision = posterior.space, posterior.walk_precision
+    moments = walk_covariance(posterior) + walk @ walk.transpose(0, 2, 1)
+    total = np.tensordot(posterior.evidence, moments, axes=1)
+    excess = (~space.cut).sum() * precision - precision @ total @ precision
+    first = len(space.white)
+    traces = [float((excess * basis).sum()) for basis in space.walk]
+    return 0.5 * np.exp(posterior.levels[first : first + len(traces)]) * traces
+
+
+def walk_covariance(posterior: Posterior) -> FloatArray:
+    """Covariance (n, 6, 6) of the walk's increments for known parameters."""
+    space = posterior.space
+    covariance, below = posterior.selected_inverse
+    ahead, behind = space.ahead.transpose(0, 2, 1), space.behind.transpose(0, 2, 1)
+    mixed = space.ahead @ below @ behind
+    both = space.ahead @ covariance[1:] @ ahead + space.behind @ covariance[:-1] @ behind
+    return both - mixed - mixed.transpose(0, 2, 1)
+
+
+def _markov_gradient(process: Markov, second: FloatArray, joined: FloatArray) -> FloatArray:
+    phi, rest, states = process.phi, process.rest, process.group.states
+    here = np.einsum("nii->n", second[:, states, states])
+    ahead = np.einsum("nii->n", joined[:, states, states])
+    innovations = here[1:] - 2.0 * phi * ahead + phi**2 * here[:-1]
+    size, variance = process.group.size, process.variance
+    by_variance = 0.5 * (
+        size * len(here) - (here[0] + float((innovations / rest).sum())) / variance
+    )
+    by_phi = (phi * innovations / rest**2 - (ahead - phi * here[:-1]) / rest) / variance
+    by_phi -= size * phi / rest
+    return np.array([by_variance, float((by_phi * _phi_slope(process)).sum())])
+
+
+def _phi_slope(process: Markov) -> FloatArray:
+    """Derivative of phi by log tau."""
+    return process.phi * process.ratio
+
+
+def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
+    space = posterior.space
+    variances = np.exp(posterior.levels)
+    columns = np.empty((len(space), 6, len(variances)))
+    pulled = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
+    for index, basis in enumerate(space.white):
+        parts = variances[index] * (basis @ pulled[:, :, None])
+        columns[:, :, index] = (parts[1:] - space.behind[:, :, :WHITE] @ parts[:-1])[:, :, 0]
+    pushed = walk @ posterior.walk_precision
+    for index, basis in enumerate(space.walk, start=len(space.white)):
+        columns[:, :, index] = variances[index] * pushed @ basis
+    for process in posterior.markov:
+        group = process.group
+        values = states[:, group.states]
+        for index, part in ((group.variance, values), (group.tau, _by_tau(process, values))):
+            ahead = space.ahead[:, :, group.states] @ part[1:, :, None]
+            behind = space.behind[:, :, group.states] @ part[:-1, :, None]
+            columns[:, :, index] = (ahead - behind)[:, :, 0]
+    columns[space.cut] = 0.0
+    weighed = posterior.weighed(posterior.smoothed(columns)[1]).reshape(-1, len(variances))
+    own = columns.reshape(weighed.shape).T @ weighed
+    shared = space.jacobian.reshape(len(weighed), -1).T @ weighed
+    information = 0.5 * (own - shared.T @ posterior.normal.covariance @ shared)
+    return 0.5 * (information + information.T)
+
+
+def _by_tau(process: Markov, values: FloatArray) -> FloatArray:
+    """Derivative by log tau of the states (N, k) that the covariance makes of fixed forces."""
+    phi, rest, slope = process.phi, process.rest, _phi_slope(process)
+    by_rest = 2.0 * phi * slope / rest**2
+    beside = (slope / rest + phi * by_rest)[:, None]
+    first = (2.0 * phi * slope / rest + phi**2 * by_rest)[:, None]
+    forces = np.zeros_like(values)
+    forces[1:] += by_rest[:, None] * values[1:] - beside * values[:-1]
+    forces[:-1] += first * values[:-1] - beside * values[1:]
+    return -process.covariance_times(forces)

@@ -1,0 +1,62 @@
+"""What each part of a recording adds to what is known from the parts before it.
+
+Leaving increments out as such would cut the trajectory there, and with white noise most is known
+across the gap: answers without a part would scatter more than the error does. What a part adds, its
+innovations, is independent of the other parts if the model is right.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hand_eye_calib.adaptive.state_space import WHITE, NormalEquations, Posterior
+from hand_eye_calib.arrays import FloatArray
+
+N_PARTS = 40
+
+
+def part_products(posterior: Posterior) -> FloatArray:
+    """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 40."""
+    space = posterior.space
+    n, columns = len(space), posterior.columns
+    ends = np.unique(np.linspace(0, n, min(N_PARTS, n) + 1).astype(int))[1:]
+    weighed = posterior.weighed(columns)
+    whitened = posterior.factor.whiten(space.gathered(weighed))
+    totals = np.array([_up_to(end, posterior, columns, weighed, whitened) for end in ends])
+    own = np.add.reduceat(np.swapaxes(columns, 1, 2) @ weighed, np.r_[0, ends[:-1]], axis=0)
+    passed = np.add.reduceat(
+        np.swapaxes(whitened[:-1], 1, 2) @ whitened[:-1], np.r_[0, ends[:-1]], axis=0
+    )
+    sums = np.cumsum(own - passed, axis=0) - totals
+    return np.diff(sums, axis=0, prepend=0.0 * sums[:1])
+
+
+def _up_to(
+    end: int,
+    posterior: Posterior,
+    columns: FloatArray,
+    weighed: FloatArray,
+    whitened: FloatArray,
+) -> FloatArray:
+    """Products of the last state's whitened columns if the recording ended at this pose."""
+    space = posterior.space
+    before = posterior.factor.below(end - 1)
+    ahead = space.ahead[end - 1]
+    precision = ahead.T @ (posterior.walk_precision * posterior.evidence[end - 1]) @ ahead
+    precision -= before @ before.T
+    white = posterior.white_precision
+    precision[:WHITE, :WHITE] += space.weights[end] * white[end if len(white) > 1 else 0]
+    for process in posterior.markov:
+        states = np.arange(process.group.states.start, process.group.states.stop)
+        precision[states, states] += 1.0 / (process.variance * process.rest[end - 1])
+    right = ahead.T @ weighed[end - 1] - before @ whitened[end - 1]
+    last = np.linalg.solve(np.linalg.cholesky(precision), right)
+    return last.T @ last
+
+
+def answers_without(products: FloatArray, n_blocks: int) -> FloatArray:
+    """Steps (B, 6) of xi when each of B blocks of parts (K, p + 1, p + 1) is left out in turn."""
+    block_of_part = np.arange(len(products)) * n_blocks // len(products)
+    total = products.sum(axis=0)
+    blocks = [products[block_of_part == block].sum(axis=0) for block in range(n_blocks)]
+    return np.array([NormalEquations(total - block).step[:6] for block in blocks])

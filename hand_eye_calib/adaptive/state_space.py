@@ -1,0 +1,330 @@
+"""Exact likelihood of increments under white errors, random walks and errors that last.
+
+The increments of the common error c obey, see :mod:`~hand_eye_calib.adaptive.increments`,
+
+    e_i + J_i beta = H1_i x_{i+1} - H0_i x_i + w_i
+
+with the latent state x of every pose: its white error, and the values of slow processes, first-order
+Gauss-Markov each, ``g_{i+1} = phi_i g_i + q_i`` with ``phi_i = exp(-dt_i / tau)``. w is the random
+walk. In information form the posterior precision of all states is block tridiagonal,
+
+    P = Pi + U' W U,       log|V| = log|P| - log|Pi| - log|W|,       V^-1 Z = W (Z - U P^-1 U' W Z)
+
+so that one band factorisation gives the likelihood and everything else, in time linear in the poses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hand_eye_calib.adaptive import lapack
+from hand_eye_calib.adaptive.block_tridiagonal import Factor, add_diagonal, empty_bands, set_below
+from hand_eye_calib.arrays import BoolArray, FloatArray
+
+WHITE = 6
+
+# Diagonals are raised by this share, so that rounding cannot make them negative.
+_ROUNDING = 1e-13
+
+# Increments whose blocks are computed at a time, to bound memory.
+_CHUNK = 4096
+
+
+@dataclass(frozen=True)
+class Group:
+    """States that are independent Gauss-Markov processes with one variance and one time constant.
+
+    Attributes
+    ----------
+    states : slice
+        Of the latent state.
+    variance, tau : int
+        Where log variance and log time constant are among the levels.
+    """
+
+    states: slice
+    variance: int
+    tau: int
+
+    @property
+    def size(self) -> int:
+        """Number of states."""
+        return self.states.stop - self.states.start
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateSpace:
+    """A linear state space of N poses, n = N - 1 increments, d states and p parameters.
+
+    Attributes
+    ----------
+    intervals_s : (n,) array
+    relative : (n,) array
+        Variance of the walk over each increment, in units of a typical one.
+    residuals : (n, 6) array
+        e.
+    jacobian : (n, 6, p) array
+        J.
+    ahead, behind : (n, 6, d) arrays
+        H1 and H0.
+    white, walk : tuples of (1 or N, 6, 6) and (6, 6) arrays
+        What log levels scale: the covariances are ``sum exp(level) basis``.
+    groups : tuple of Group
+    weights : (N,) array
+        Factors of the precision of each pose's white error.
+    cut : (n,) bool array
+        Increments that are no evidence.
+    """
+
+    intervals_s: FloatArray
+    relative: FloatArray
+    residuals: FloatArray
+    jacobian: FloatArray
+    ahead: FloatArray
+    behind: FloatArray
+    white: tuple[FloatArray, ...]
+    walk: tuple[FloatArray, ...]
+    groups: tuple[Group, ...]
+    weights: FloatArray
+    cut: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.residuals)
+
+    @property
+    def n_states(self) -> int:
+        """d."""
+        return self.ahead.shape[2]
+
+    def observed(self, states: FloatArray) -> FloatArray:
+        """What states (N, d, k) contribute to the increments, (n, 6, k)."""
+        return self.ahead @ states[1:] - self.behind @ states[:-1]
+
+    def gathered(self, columns: FloatArray) -> FloatArray:
+        """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
+        states = np.zeros((len(self) + 1, self.n_states, columns.shape[2]))
+        states[1:] = self.ahead.transpose(0, 2, 1) @ columns
+        states[:-1] -= self.behind.transpose(0, 2, 1) @ columns
+        return states
+
+
+def covariance_times(space: StateSpace, levels: FloatArray, columns: FloatArray) -> FloatArray:
+    """V, of all increments, times columns (n, 6, k)."""
+    variances, n_white = np.exp(levels), len(space.white)
+    forces = space.gathered(columns)
+    states = np.zeros_like(forces)
+    white = _combined(variances[:n_white], space.white) / space.weights[:, None, None]
+    states[:, :WHITE] = white @ forces[:, :WHITE]
+    for group in space.groups:
+        process = markov(group, levels, space.intervals_s)
+        of_group = forces[:, group.states].reshape(len(forces), -1)
+        of_group = process.variance * process.covariance_times(of_group)
+        states[:, group.states] = of_group.reshape(len(forces), group.size, -1)
+    walk = _combined(variances[n_white : n_white + len(space.walk)], space.walk)
+    return space.observed(states) + space.relative[:, None, None] * (walk @ columns)
+
+
+@dataclass(frozen=True)
+class Markov:
+    """A group at given levels: ``dt_i / tau``, phi_i and the innovations' relative variances
+    ``1 - phi_i^2``.
+    """
+
+    group: Group
+    variance: float
+    ratio: FloatArray
+    phi: FloatArray
+    rest: FloatArray
+
+    def tridiagonal(self) -> tuple[FloatArray, FloatArray]:
+        """Diagonal (N,) and element beside it (n,) of the precision for unit variance."""
+        inverse = 1.0 / self.rest
+        diagonal = np.empty(len(inverse) + 1)
+        diagonal[0] = 1.0
+        diagonal[1:] = inverse
+        diagonal[:-1] += self.phi**2 * inverse
+        return diagonal, -self.phi * inverse
+
+    def covariance_times(self, columns: FloatArray) -> FloatArray:
+        """The covariance for unit variance times columns (N, k)."""
+        pivots, multipliers, _ = lapack.dpttrf(*self.tridiagonal())
+        return lapack.dpttrs(pivots, multipliers, columns)[0]
+
+
+def markov(group: Group, levels: FloatArray, intervals_s: FloatArray) -> Markov:
+    """A group's process at given log levels."""
+    ratio = intervals_s / np.exp(levels[group.tau])
+    variance = float(np.exp(levels[group.variance]))
+    return Markov(group, variance, ratio, np.exp(-ratio), -np.expm1(-2.0 * ratio))
+
+
+class Posterior:
+    """States and likelihood of a state space at given log levels.
+
+    Parameters
+    ----------
+    space : StateSpace
+    levels : (m,) array
+        Logarithms: variances of the white and of the walk bases, then variance and time constant
+        (s) of every group.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the levels make a matrix that is not positive definite to rounding.
+    """
+
+    def __init__(self, space: StateSpace, levels: FloatArray) -> None:
+        self.space, self.levels = space, levels
+        variances = np.exp(levels)
+        n_white = len(space.white)
+        walk = _combined(variances[n_white : n_white + len(space.walk)], space.walk)
+        self.white_precision = np.linalg.inv(_combined(variances[:n_white], space.white))
+        self.walk_precision = np.linalg.inv(walk)
+        self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
+        self.markov = [markov(group, levels, space.intervals_s) for group in space.groups]
+        self.factor = Factor(self._precision())
+        self._walk_log_determinant = np.linalg.slogdet(walk)[1]
+
+    def _precision(self) -> FloatArray:
+        space, n = self.space, len(self.space)
+        bands = empty_bands(n + 1, space.n_states)
+        for start in range(0, n, _CHUNK):
+            part = slice(start, min(start + _CHUNK, n))
+            after = slice(part.start + 1, part.stop + 1)
+            ahead = space.ahead[part].transpose(0, 2, 1)
+            behind = space.behind[part].transpose(0, 2, 1)
+            weighed_behind = self.weighed(space.behind[part], part)
+            add_diagonal(bands[after], ahead @ self.weighed(space.ahead[part], part))
+            add_diagonal(bands[part], behind @ weighed_behind)
+            set_below(bands[part], -ahead @ weighed_behind)
+        add_diagonal(bands, space.weights[:, None, None] * self.white_precision)
+        for process in self.markov:
+            diagonal, beside = process.tridiagonal()
+            states = process.group.states
+            bands[:, states, 0] += (diagonal / process.variance)[:, None]
+            bands[:-1, states, space.n_states] += (beside / process.variance)[:, None]
+        bands[:, :, 0] *= 1.0 + _ROUNDING
+        return bands
+
+    def weighed(self, columns: FloatArray, part: slice = slice(None)) -> FloatArray:
+        """W times columns (n, 6, k)."""
+        return (self.walk_precision @ columns) * self.evidence[part, None, None]
+
+    @cached_property
+    def log_determinant(self) -> float:
+        """log|V|, increments that are no evidence left out."""
+        space = self.space
+        n_poses, kept = len(space) + 1, ~space.cut
+        white = np.linalg.slogdet(self.white_precision)[1]
+        prior = n_poses / len(white) * white.sum() + WHITE * np.log(space.weights).sum()
+        for process in self.markov:
+            of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
+            prior -= process.group.size * of_one
+        walk = kept.sum() * self._walk_log_determinant + 6 * np.log(space.relative[kept]).sum()
+        return float(walk + self.factor.log_determinant() - prior)
+
+    def smoothed(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """States (N, d, k) expected from columns (n, 6, k) of increments, and what these leave."""
+        states = self.factor.solve(self.space.gathered(self.weighed(columns)))
+        return states, columns - self.space.observed(states)
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """J and, last, e: (n, 6, p + 1)."""
+        return np.concatenate([self.space.jacobian, self.space.residuals[:, :, None]], axis=2)
+
+    @cached_property
+    def of_columns(self) -> tuple[FloatArray, FloatArray]:
+        """:meth:`smoothed` of :attr:`columns`."""
+        return self.smoothed(self.columns)
+
+    @cached_property
+    def products(self) -> FloatArray:
+        """(p + 1, p + 1) array: products of J and, last, e, weighed with V^-1."""
+        columns, left = self.columns, self.weighed(self.of_columns[1])
+        products = columns.reshape(-1, columns.shape[2]).T @ left.reshape(-1, columns.shape[2])
+        return 0.5 * (products + products.T)
+
+    @cached_property
+    def normal(self) -> NormalEquations:
+        """Solution for all parameters."""
+        return NormalEquations(self.products)
+
+    @cached_property
+    def loss(self) -> float:
+        """Negative restricted log likelihood, constants left out (Patterson, Thompson, Biometrika
+        58, 1971).
+        """
+        return 0.5 * (self.log_determinant + self.normal.cost + self.normal.log_determinant)
+
+    @cached_property
+    def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
+        """Covariances of the states for known parameters: of each pose's (N, d, d), and between
+        each pose's and the one's before (n, d, d).
+        """
+        return self.factor.selected_inverse()
+
+    def restricted(self) -> tuple[FloatArray, FloatArray]:
+        """States (N, d, 1 + q) and walk (n, 6, 1 + q): expected values and, behind them, what the
+        parameters' uncertainty adds, as columns whose squares sum to it.
+        """
+        states, left = self.of_columns
+        return states @ self.normal.mixing, left @ self.normal.mixing
+
+
+# Information below this share of what a parameter's own diagonal promises is rounding; no diagonal
+# counts as smaller than the latter.
+_RANK_TOLERANCE, _LEAST_INFORMATION = 1e-12, float(np.finfo(float).tiny)
+
+
+class NormalEquations:
+    """Generalised least squares from products (p + 1, p + 1) of derivatives and, last, residuals.
+
+    Attributes
+    ----------
+    step : (p,) array
+        Change of the parameters; zero along directions without any evidence.
+    covariance : (p, p) array
+        Zero along these directions, too.
+    unseen : (p, U) array
+        Those directions, of unit length.
+    cost : float
+        Weighted squared residual after the step.
+    log_determinant : float
+        Of the information.
+    mixing : (p + 1, 1 + q) array
+        Residuals after the step, then the columns of a root of the covariance.
+    """
+
+    def __init__(self, products: FloatArray) -> None:
+        information, gradient = products[:-1, :-1], products[:-1, -1]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), _LEAST_INFORMATION))
+        values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
+        seen = values > _RANK_TOLERANCE
+        axes = scale[:, None] * vectors
+        root = axes[:, seen] / np.sqrt(values[seen])
+        self.covariance = root @ root.T
+        self.unseen = axes[:, ~seen] / np.linalg.norm(axes[:, ~seen], axis=0)
+        self.step = -self.covariance @ gradient
+        self.cost = float(products[-1, -1] + gradient @ self.step)
+        self.log_determinant = float(np.log(values[seen]).sum() - 2.0 * np.log(scale).sum())
+        self.mixing = np.zeros((len(products), 1 + root.shape[1]))
+        self.mixing[:-1, 0], self.mixing[-1, 0] = self.step, 1.0
+        self.mixing[:-1, 1:] = root
+
+
+def selected(products: FloatArray, columns: list[int]) -> FloatArray:
+    """The products of some parameters."""
+    rows = [*columns, len(products) - 1]
+    return products[np.ix_(rows, rows)]
+
+
+def _combined(variances: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
+    total = variances[0] * bases[0]
+    for variance, basis in zip(variances[1:], bases[1:], strict=True):
+        total = total + variance * basis
+    return total

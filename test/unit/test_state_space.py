@@ -1,0 +1,204 @@
+"""The likelihood of the noise model, against its definition with dense matrices."""
+
+import numpy as np
+import pytest
+
+from hand_eye_calib.adaptive import reml
+from hand_eye_calib.adaptive.block_tridiagonal import Factor, add_diagonal, empty_bands, set_below
+from hand_eye_calib.adaptive.outliers import surprises
+from hand_eye_calib.adaptive.resampling import answers_without, part_products
+from hand_eye_calib.adaptive.state_space import (
+    Group,
+    NormalEquations,
+    Posterior,
+    StateSpace,
+    covariance_times,
+)
+
+N_POSES, N_STATES, N_PARAMETERS = 15, 16, 7
+N_LEVELS = 5 + 2 * 4
+
+
+def space_of(seed=1, cut=(4,)):
+    """A state space of random numbers: two groups of three, one of three that lasts, a scale."""
+    random = np.random.default_rng(seed)
+    n = N_POSES - 1
+    intervals_s = random.uniform(0.05, 0.3, n)
+    adjoints = np.eye(6) + 0.2 * random.standard_normal((n, 6, 6))
+    directions = random.standard_normal((N_POSES, 6, 9))
+    directions[:, :, :3] = np.eye(6)[:, :3]
+    ahead, behind = np.zeros((2, n, 6, N_STATES))
+    ahead[:, :, :6], behind[:, :, :6] = np.eye(6), adjoints
+    ahead[:, :, 6:15], behind[:, :, 6:15] = directions[1:], adjoints @ directions[:-1]
+    behind[:, :, 15] = random.standard_normal((n, 6))
+    lever = random.standard_normal((3, 6))
+    velocity = random.standard_normal((N_POSES, 6, 1))
+    bases = np.diag([1.0, 1, 1, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1, 1]) + lever.T @ lever
+    ends = [6, 9, 12, 15, 16]
+    flags = np.zeros(n, dtype=bool)
+    flags[list(cut)] = True
+    return StateSpace(
+        intervals_s=intervals_s,
+        relative=intervals_s / 0.1,
+        residuals=random.standard_normal((n, 6)),
+        jacobian=random.standard_normal((n, 6, N_PARAMETERS)),
+        ahead=ahead,
+        behind=behind,
+        white=(bases[0][None], bases[1][None], velocity @ velocity.transpose(0, 2, 1)),
+        walk=bases,
+        groups=tuple(Group(slice(ends[k], ends[k + 1]), 5 + 2 * k, 6 + 2 * k) for k in range(4)),
+        weights=random.uniform(0.3, 2.0, N_POSES),
+        cut=flags,
+    )
+
+
+LEVELS = np.random.default_rng(2).uniform(-1.0, 1.0, N_LEVELS)
+
+
+def dense_covariance(space, levels):
+    """V (6 n, 6 n) by its definition, increments that are no evidence included."""
+    variances, n, d = np.exp(levels), len(space), space.n_states
+    prior = np.zeros((N_POSES, d, N_POSES, d))
+    for pose in range(N_POSES):
+        bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white]
+        white = sum(variance * basis for variance, basis in zip(variances, bases, strict=False))
+        prior[pose, :6, pose, :6] = white / space.weights[pose]
+    times = np.r_[0.0, np.cumsum(space.intervals_s)]
+    for group in space.groups:
+        apart = np.abs(times[:, None] - times) / variances[group.tau]
+        for state in range(group.states.start, group.states.stop):
+            prior[:, state, :, state] = variances[group.variance] * np.exp(-apart)
+    entries = np.zeros((n, 6, N_POSES, d))
+    for i in range(n):
+        entries[i, :, i + 1], entries[i, :, i] = space.ahead[i], -space.behind[i]
+    entries = entries.reshape(6 * n, -1)
+    walk = variances[3] * space.walk[0] + variances[4] * space.walk[1]
+    return entries @ prior.reshape(N_POSES * d, -1) @ entries.T + np.kron(
+        np.diag(space.relative), walk
+    )
+
+
+def dense_loss(space, levels):
+    """Restricted loss, step and its covariance by their textbook formulas."""
+    rows = np.repeat(~space.cut, 6)
+    V = dense_covariance(space, levels)[np.ix_(rows, rows)]
+    J, r = space.jacobian.reshape(-1, N_PARAMETERS)[rows], space.residuals.ravel()[rows]
+    information = J.T @ np.linalg.solve(V, J)
+    step = -np.linalg.solve(information, J.T @ np.linalg.solve(V, r))
+    rest = r + J @ step
+    log_determinants = np.linalg.slogdet(V)[1] + np.linalg.slogdet(information)[1]
+    loss = 0.5 * (log_determinants + rest @ np.linalg.solve(V, rest))
+    return loss, step, np.linalg.inv(information)
+
+
+def test_the_likelihood_is_that_of_the_dense_covariance():
+    space = space_of()
+    loss, step, covariance = dense_loss(space, LEVELS)
+    posterior = Posterior(space, LEVELS)
+    assert posterior.loss == pytest.approx(loss, rel=1e-11, abs=1e-9)
+    np.testing.assert_allclose(posterior.normal.step, step, atol=1e-9)
+    np.testing.assert_allclose(posterior.normal.covariance, covariance, atol=1e-9)
+
+
+def test_the_likelihood_stays_exact_where_there_is_hardly_any_walk_or_white_noise():
+    for level in (0, 1, 3, 4):
+        levels = LEVELS.copy()
+        levels[level] -= 13.0
+        space = space_of()
+        expected = dense_loss(space, levels)[0]
+        assert Posterior(space, levels).loss == pytest.approx(expected, rel=1e-7)
+
+
+def test_derivatives_of_the_likelihood_are_the_numerical_ones():
+    space, step = space_of(), 1e-5
+    gradient, information = reml.derivatives(Posterior(space, LEVELS))
+    numerical = [
+        (dense_loss(space, LEVELS + change)[0] - dense_loss(space, LEVELS - change)[0]) / (2 * step)
+        for change in step * np.eye(N_LEVELS)
+    ]
+    np.testing.assert_allclose(gradient, numerical, atol=1e-7)
+
+    rows = np.repeat(~space.cut, 6)
+    J, r = space.jacobian.reshape(-1, N_PARAMETERS)[rows], space.residuals.ravel()[rows]
+    inverse = np.linalg.inv(dense_covariance(space, LEVELS)[np.ix_(rows, rows)])
+    P = inverse - inverse @ J @ np.linalg.inv(J.T @ inverse @ J) @ J.T @ inverse
+    slopes = [
+        (dense_covariance(space, LEVELS + change) - dense_covariance(space, LEVELS - change))
+        / (2 * step)
+        for change in step * np.eye(N_LEVELS)
+    ]
+    forced = np.array([slope[np.ix_(rows, rows)] @ P @ r for slope in slopes])
+    np.testing.assert_allclose(information, 0.5 * forced @ P @ forced.T, atol=1e-7)
+
+
+def test_the_covariance_times_columns_is_that_of_the_dense_matrix():
+    space, columns = space_of(), np.random.default_rng(3).standard_normal((N_POSES - 1, 6, 4))
+    expected = dense_covariance(space, LEVELS) @ columns.reshape(-1, 4)
+    product = covariance_times(space, LEVELS, columns)
+    np.testing.assert_allclose(product.reshape(-1, 4), expected, atol=1e-10)
+
+
+def test_surprises_are_what_leaving_one_out_makes_of_it():
+    space = space_of(cut=())
+    of_walk, _ = surprises(Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool))
+    V = dense_covariance(space, LEVELS)
+    J, r = space.jacobian.reshape(-1, N_PARAMETERS), space.residuals.ravel()
+    inverse = np.linalg.inv(V)
+    P = inverse - inverse @ J @ np.linalg.inv(J.T @ inverse @ J) @ J.T @ inverse
+    u = (P @ r).reshape(-1, 6)
+    for i, found in enumerate(of_walk):
+        own = P[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+        assert found == pytest.approx(u[i] @ np.linalg.solve(own, u[i]), rel=1e-5)
+    # An increment that is no evidence is judged by the same number.
+    without = space_of(cut=(6,))
+    again, _ = surprises(Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool))
+    assert again[6] == pytest.approx(of_walk[6], rel=1e-5)
+
+
+def test_parts_add_what_a_recording_that_ends_there_would_know():
+    space = space_of()
+    posterior = Posterior(space, LEVELS)
+    parts = part_products(posterior)
+    np.testing.assert_allclose(parts.sum(axis=0), posterior.products, atol=1e-8)
+    n_known = 9  # of 14 parts, one increment each
+    rows = np.repeat(~space.cut, 6) & (np.arange(6 * len(space)) < 6 * n_known)
+    V = dense_covariance(space, LEVELS)[np.ix_(rows, rows)]
+    columns = posterior.columns.reshape(-1, N_PARAMETERS + 1)[rows]
+    expected = columns.T @ np.linalg.solve(V, columns)
+    np.testing.assert_allclose(parts[:n_known].sum(axis=0), expected, atol=1e-8)
+    steps = answers_without(parts, 2)
+    np.testing.assert_allclose(steps[1], NormalEquations(parts[:7].sum(axis=0)).step[:6], atol=1e-9)
+
+
+def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix():
+    random, n, d = np.random.default_rng(0), 5, 4
+    diagonal = random.normal(size=(n, d, d))
+    diagonal = diagonal @ np.swapaxes(diagonal, 1, 2) + 20 * np.eye(d)
+    below = random.normal(size=(n - 1, d, d))
+    matrix = np.zeros((n, d, n, d))
+    for k in range(n):
+        matrix[k, :, k] = diagonal[k]
+    for k in range(n - 1):
+        matrix[k + 1, :, k], matrix[k, :, k + 1] = below[k], below[k].T
+    matrix = matrix.reshape(n * d, n * d)
+
+    def bands(of_diagonal):
+        storage = empty_bands(n, d)
+        add_diagonal(storage, of_diagonal)
+        set_below(storage[:-1], below)
+        return storage
+
+    factor, right = Factor(bands(diagonal)), random.normal(size=(n, d, 3))
+    flat, inverse = right.reshape(n * d, 3), np.linalg.inv(matrix)
+    np.testing.assert_allclose(factor.solve(right).reshape(n * d, 3), inverse @ flat, atol=1e-12)
+    whitened = np.linalg.solve(np.linalg.cholesky(matrix), flat)
+    np.testing.assert_allclose(factor.whiten(right).reshape(n * d, 3), whitened, atol=1e-12)
+    assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1])
+    blocks = inverse.reshape(n, d, n, d)
+    found, found_below = factor.selected_inverse()
+    for k in range(n):
+        np.testing.assert_allclose(found[k], blocks[k, :, k], atol=1e-12)
+    for k in range(n - 1):
+        np.testing.assert_allclose(found_below[k], blocks[k + 1, :, k], atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        Factor(bands(-diagonal))
