@@ -1,1 +1,1 @@
-"""The adaptive estimator: models the noise of the two trajectories instead of choosing a reference."""
+"""The adaptive estimator: models the noise of both trajectories instead of choosing a reference."""

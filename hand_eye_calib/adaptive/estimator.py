@@ -2,8 +2,8 @@
 along with it.
 
 Instead of choosing which poses to compare, all evidence is weighed as the noise of these very
-trajectories asks for: white noise favours long baselines, drift short ones, errors that last neither,
-and a jump cuts the trajectory. docs/adaptive.md derives and tests it.
+trajectories asks for: white noise favours long baselines, drift short ones, errors that last
+neither, and a jump cuts the trajectory. docs/adaptive.md derives and tests it.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ _MOST_SPIKES = 0.1
 # Rotation noise this large beside the rotation between poses is not small.
 _NOISY = 0.2
 
-# Errors that last are looked for if a first step promises to lower the loss by so much, and part of the
-# model if it is so much lower in the end.
+# Errors that last are looked for if a first step promises to lower the loss by so much, and part of
+# the model if it is so much lower in the end.
 _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
 
-# Systematic errors larger than this (of the length, m/m, s) are none: a wrong unit, a clock that was
-# not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground a child
-# that slips sideways looks like one that is mounted askew.
+# Systematic errors larger than this (of the length, m/m, s) are none: a wrong unit, a clock that
+# was not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground a
+# child that slips sideways looks like one that is mounted askew.
 _LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5])
 _MOST_GROWTH = 5.0
 

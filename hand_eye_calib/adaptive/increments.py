@@ -5,9 +5,9 @@ child's frame, with ``c = Ad(X^-1) a - b``,
 
     e_i = Log(B_i^-1 X^-1 A_i X) = c_{i+1} - Ad(B_i^-1) c_i + w_i + (I - Ad(B_i^-1)) xi
 
-for motions A, B between poses i and i + 1, errors w of the motions themselves, and ``X Exp(-xi)`` in
-place of X. Systematic errors add their own columns: a scale, a bias per metre of either path, a time
-offset.
+for motions A, B between poses i and i + 1, errors w of the motions themselves, and ``X Exp(-xi)``
+in place of X. Systematic errors add their own columns: a scale, a bias per metre of either path, a
+time offset.
 
 The columns rest on steps free of each increment's own noise: the mean of the steps two before and
 two after. Steps that share the noise of the residuals would be drawn towards it, and a child whose
@@ -24,8 +24,8 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
-# of the child's or of the parent's path along the axes of that sensor (m/m), by how much the child's
-# stamps are late (s).
+# of the child's or of the parent's path along the axes of that sensor (m/m), by how much the
+# child's stamps are late (s).
 _PARAMETERS: dict[str, list[int]] = {
     "none": [],
     "scale": [0],
@@ -149,8 +149,8 @@ def turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> FloatArray:
-    """Steps (n, 3) with the mean velocity of the steps two before and two after, as far as what they
-    differ from it by may be noise.
+    """Steps (n, 3) with the mean velocity of the steps two before and two after, as far as what
+    they differ from it by may be noise.
     """
     rates = np.pad(steps / intervals_s[:, None], ((2, 2), (0, 0)), mode="edge")
     cleaned = 0.5 * (rates[:-4] + rates[4:]) * intervals_s[:, None]

@@ -46,9 +46,9 @@ _LONGEST_SHARE = 0.25
 # twin stamps nor a halt dominate.
 _LEAST_INTERVAL, _MOST_INTERVAL, _LEAST_METRES, _MOST_METRES = 0.1, 100.0, 0.05, 1e3
 
-# Processes that last are looked for at so many time constants, from a few intervals to a share of the
-# recording, where they have this share of the white and walking noise; one is tried if a step of its
-# variance alone promises to lower the loss by so much.
+# Processes that last are looked for at so many time constants, from a few intervals to a share of
+# the recording, where they have this share of the white and walking noise; one is tried if a step
+# of its variance alone promises to lower the loss by so much.
 _N_TAUS, _FIRST_TAU, _LAST_TAU = 2, 10.0, 0.06
 _FAINT, _PROMISING = 1e-3, 1.0
 
@@ -350,5 +350,5 @@ def _fast_levels(process: Slow) -> tuple[int, int]:
 
 
 def _whole(levels: FloatArray) -> FloatArray:
-    """Log variances (2,) of increments of translation and rotation, white noise and walk together."""
+    """Log variances (2,) of increments of translation and rotation: white noise plus walk."""
     return np.logaddexp(levels[[3, 4]], levels[:2] + np.log(2.0))

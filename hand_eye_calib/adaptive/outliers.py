@@ -63,7 +63,7 @@ class Outliers:
     spikes: BoolArray
 
     def across(self, kept: np.ndarray) -> Outliers:
-        """For some of the poses, in order: a jump between two of them counts for their increment."""
+        """For some poses, in order: a jump between two of them counts for their increment."""
         if len(kept) == len(self.spikes):
             return self
         jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
@@ -90,8 +90,8 @@ def first_outliers(residuals: FloatArray) -> Outliers:
 def with_jumps_across_spikes(
     outliers: Outliers, residuals: FloatArray, bridging: FloatArray
 ) -> Outliers:
-    """With a jump behind each spike where what stood out of the residuals (n, 6) stands out of those
-    with bridged poses, too.
+    """With a jump behind each spike where what stood out of the residuals (n, 6) stands out of
+    those with bridged poses, too.
     """
     behind = _standing_out(bridging, _limits(residuals)) & outliers.spikes[:-1]
     return Outliers(outliers.jumps | behind, outliers.spikes)
@@ -162,7 +162,8 @@ def _is_peak(values: FloatArray) -> BoolArray:
 
 
 def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> Streams:
-    """Streams with the child's poses at spikes as the parent's motion from the pose before has them.
+    """Streams with the child's poses at spikes as the parent's motion from the pose before has
+    them.
 
     A pose that is wrong by itself is no evidence, but its large error would not be small in the
     increments on both sides of it, which are of first order.

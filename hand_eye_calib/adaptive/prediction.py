@@ -103,7 +103,7 @@ class ReferencePredictor:
         return np.linalg.solve(hessian, np.linalg.solve(hessian, pushed).T) + np.outer(pull, pull)
 
     def _pull(self, pairs: MotionPairs, weights: FloatArray) -> FloatArray:
-        """(6,) array: by how much rotation noise is expected to pull the translation towards zero."""
+        """(6,) array: expected pull of the translation towards zero by rotation noise."""
         rotation, translation = (
             self._solution.T_parent_child[:3, :3],
             self._solution.T_parent_child[:3, 3],

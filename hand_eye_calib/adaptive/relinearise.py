@@ -1,8 +1,8 @@
 """Derivatives from poses freed of their errors, as far as these are known.
 
 Everything else is of first order in the errors. Where noise is not small beside the motion from
-pose to pose, the derivatives themselves are noise, and draw the answer (errors in variables). So the
-errors c are smoothed and split between the sensors,
+pose to pose, the derivatives themselves are noise, and draw the answer (errors in variables). So
+the errors c are smoothed and split between the sensors,
 
     a = Ad(X) S' (S' + S)^-1 c,     b = -S (S' + S)^-1 c,     S' = Ad(X^-1) S Ad(X^-1)',
 

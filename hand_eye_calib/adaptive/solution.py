@@ -22,8 +22,12 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 
 _TURNING = {
     "sensors": "",
-    "child": ", its rotation about the origin of the child's world, as of a camera that sees a target",
-    "parent": ", its rotation about the origin of the parent's world, as of a camera that sees a target",
+    "child": (
+        ", its rotation about the origin of the child's world, as of a camera that sees a target"
+    ),
+    "parent": (
+        ", its rotation about the origin of the parent's world, as of a camera that sees a target"
+    ),
 }
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
@@ -333,5 +337,6 @@ def _when(one: str, several: str, stamps_ns: IntArray) -> list[str]:
         return []
     shown = ", ".join(f"{stamp_ns * 1e-9:.3f}" for stamp_ns in stamps_ns[:5].tolist())
     return [
-        f"{len(stamps_ns)} {one if len(stamps_ns) == 1 else several} {shown}{' ...' if len(stamps_ns) > 5 else ''} s"
+        f"{len(stamps_ns)} {one if len(stamps_ns) == 1 else several} "
+        f"{shown}{' ...' if len(stamps_ns) > 5 else ''} s"
     ]

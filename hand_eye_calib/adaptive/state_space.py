@@ -4,13 +4,14 @@ The increments of the common error c obey, see :mod:`~hand_eye_calib.adaptive.in
 
     e_i + J_i beta = H1_i x_{i+1} - H0_i x_i + w_i
 
-with the latent state x of every pose: its white error, and the values of slow processes, first-order
-Gauss-Markov each, ``g_{i+1} = phi_i g_i + q_i`` with ``phi_i = exp(-dt_i / tau)``. w is the random
-walk. In information form the posterior precision of all states is block tridiagonal,
+with the latent state x of every pose: its white error, and the values of slow processes,
+first-order Gauss-Markov each, ``g_{i+1} = phi_i g_i + q_i`` with ``phi_i = exp(-dt_i / tau)``. w is
+the random walk. In information form the posterior precision of all states is block tridiagonal,
 
     P = Pi + U' W U,       log|V| = log|P| - log|Pi| - log|W|,       V^-1 Z = W (Z - U P^-1 U' W Z)
 
-so that one band factorisation gives the likelihood and everything else, in time linear in the poses.
+so that one band factorisation gives the likelihood and everything else, in time linear in the
+poses.
 """
 
 from __future__ import annotations

@@ -175,7 +175,7 @@ def test_white_errors_have_the_covariance_of_the_model(centre):
     expected = covariance_times(space, np.log(variances), identity).reshape(30, 30)
     found = np.cov(samples.T)
     scale = np.sqrt(np.diag(expected))
-    # the standard error of a correlation from 4000 samples is 0.016; 900 of them stay within 5 sigma
+    # A correlation of 4000 samples has a standard error of 0.016; 900 of them stay in 5 sigma.
     np.testing.assert_allclose(
         found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.08
     )
