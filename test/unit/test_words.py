@@ -1,4 +1,4 @@
-"""Numbers and names as people read them."""
+"""Numbers as people read them."""
 
 import pytest
 
@@ -20,11 +20,6 @@ from hand_eye_calib.report import words
 )
 def test_a_number_is_shown_to_two_digits_of_its_sigma(value, sigma, text):
     assert words.with_sigma(value, sigma) == text
-
-
-def test_names_from_outside_keep_to_one_line():
-    assert words.printable("a\x1b[31mb\nc\td") == "a\\x1b[31mb\\nc\\td"
-    assert words.printable("front left_camera 雷") == "front left_camera 雷"
 
 
 def test_lists_counts_and_lengths():
