@@ -266,8 +266,7 @@ def _read_kitti(path: _Path, times: _Path | None) -> _Table:
     table = _Table("12 numbers, the first three rows of a pose", matrices=True)
     if times is None:
         raise ConfigError(
-            f"{path}: the poses of format kitti have no stamps; name their file with times "
-            "(--times)"
+            f"{path}: the poses of format kitti have no stamps; name their file with `times`"
         )
     stamps = list(_data_lines(times, "stamps"))
     for index, (number, line) in enumerate(_data_lines(path, table.expected)):
@@ -317,7 +316,7 @@ def _header(path: _Path, lines: list[tuple[int, str]]) -> tuple[list[str], list[
     if all(_is_number(name) for name in names if name):
         raise InputError(
             f"{path}: the first line names no columns, so the order of the quaternion is unknown; "
-            "name them with columns (--columns), such as t,x,y,z,qx,qy,qz,qw; there are "
+            "name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
             f"{len(names)}"
         )
     return names, lines[1:]
@@ -332,7 +331,7 @@ def _choose(path: _Path, names: list[str]) -> dict[str, int]:
         if len(found) > 1:
             raise InputError(
                 f"{path}: columns {_listed([names[index] for index in found])} could all be "
-                f"{wanted}; name them with columns"
+                f"{wanted}; name them with `columns`"
             )
         if found:
             chosen[wanted] = found[0]
@@ -344,7 +343,7 @@ def _choose(path: _Path, names: list[str]) -> dict[str, int]:
     if missing:
         raise InputError(
             f"{path}: no column for {', '.join(missing)} among {_listed(names)}; name all columns "
-            "with columns (--columns), such as t,x,y,z,qw,qx,qy,qz"
+            "with `columns`, such as t,x,y,z,qw,qx,qy,qz"
         )
     return {name: index for name, index in chosen.items() if name in needed}
 
@@ -463,7 +462,7 @@ def _to_ns(path: _Path, table: _Table, stamp_unit: str | None) -> IntArray:
         index = max(range(len(table.stamps)), key=lambda index: abs(table.stamps[index]))
         raise InputError(
             f"{path}, line {table.line_numbers[index]}: the timestamp {table.stamps[index]:.6g} is "
-            f"too large for {recognised}; name its unit with stamp_unit (--stamp-unit)"
+            f"too large for {recognised}; name its unit with `stamp_unit`"
         )
     stamps_ns = np.array(
         [int((stamp * STAMP_UNITS[recognised]).to_integral_value()) for stamp in table.stamps],
@@ -475,7 +474,7 @@ def _to_ns(path: _Path, table: _Table, stamp_unit: str | None) -> IntArray:
     if not unit and is_whole and interval_s > _LONGEST_INTERVAL_S:
         raise InputError(
             f"{path}: the unit of the timestamps is unclear; read as {recognised}, the poses are "
-            f"{interval_s:.4g} s apart; name it with stamp_unit (--stamp-unit): s, ms, us or ns"
+            f"{interval_s:.4g} s apart; name it with `stamp_unit`: s, ms, us or ns"
         )
     return stamps_ns
 
@@ -569,7 +568,7 @@ def _ordered(
             f"{path}, line {table.line_numbers[index]}: timestamps must increase, found "
             f"{_seconds(stamps_ns[index])} after {_seconds(stamps_ns[index - 1])}; "
             f"{int(wrong.sum())} such lines; sort the lines and drop repeated timestamps, or have "
-            "that done with repair (--repair-stamps)"
+            "that done with `repair`"
         )
     order = np.argsort(stamps_ns, kind="stable")
     repeated = np.r_[False, stamps_ns[order][1:] == stamps_ns[order][:-1]]
