@@ -78,7 +78,8 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         ([f"1e999999999 {POSE}"], "line 1: .* timestamp"),
         (
             [f"13173756256617361230 {POSE}"],
-            "line 1: the timestamp 1.31738e.19 is too large for ns; name its unit with `stamp_unit`",
+            "line 1: the timestamp 1.31738e.19 is too large for ns; name its unit with "
+            "`stamp_unit`",
         ),
         (
             [f"{stamp} {POSE}" for stamp in (0, 33, 66, 99)],
