@@ -21,6 +21,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import BufferLimits, PoseBuffer, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS, Snapshot, downsample, name_frames, pair_poses
+from hand_eye_calib.engine.state import check_state
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
@@ -109,7 +110,20 @@ class Calibrator:
         return state | (_offset_state(self._time_offset) if self._time_offset else {})
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from a :meth:`state`, of this or an earlier calibrator."""
+        """Continue from a :meth:`state`, of this or an earlier calibrator.
+
+        Raises
+        ------
+        InputError
+            If no calibrator gave this state; nothing changes.
+        """
+        check_state(state, STREAMS, self._limits.capacity)
+        try:
+            self._restore(state)
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"the saved state cannot be used ({error})") from None
+
+    def _restore(self, state: Mapping[str, np.ndarray]) -> None:
         parts: dict[str, dict[str, np.ndarray]] = {
             part: {} for part in (*STREAMS, "kept", "offset", "correlation", "fit")
         }
@@ -117,12 +131,11 @@ class Calibrator:
             part, _, rest = name.partition(".")
             if rest:
                 parts[part][rest] = value
-        self._buffers = {
-            stream: PoseBuffer.from_state(parts[stream], self._limits) for stream in STREAMS
-        }
-        self._kept_parts = [PosePairs(**parts["kept"])]
+        buffers = {stream: PoseBuffer.from_state(parts[stream], self._limits) for stream in STREAMS}
+        kept = PosePairs(**parts["kept"])
+        time_offset = _offset_from_state(parts) if parts["offset"] else None
+        self._buffers, self._kept_parts, self._time_offset = buffers, [kept], time_offset
         self._paired_at = str(state["base"]) or None
-        self._time_offset = _offset_from_state(parts) if parts["offset"] else None
 
     def statistics(self, stream: str) -> StreamStatistics:
         """StreamStatistics of "parent" or "child"."""

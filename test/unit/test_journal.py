@@ -191,3 +191,37 @@ for count, message in enumerate(sequence, 1):
             calibrator.statistics("parent").received + calibrator.statistics("child").received
         )
         assert flushed <= recovered <= flushed + 10
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("parent.stamps_ns", lambda _: np.array(5)),
+        ("parent.stamps_ns", lambda array: array[::-1]),
+        ("parent.stamps_ns", lambda array: array.astype(float)),
+        ("child.poses", lambda array: array[:-1]),
+        ("child.poses", lambda array: array * np.nan),
+        ("child.frame", lambda _: np.array(["a", "b"])),
+        ("child.statistics", lambda array: array - 10**6),
+        ("child.statistics", lambda _: None),
+        ("kept.Ts_pw_p", lambda _: np.ones((0, 3, 3))),
+        ("kept.stamps_ns", lambda _: np.array([3, 2])),
+        ("base", lambda _: np.array(7)),
+        ("unknown.part", lambda _: np.array(7)),
+        ("offset.unknown", lambda _: np.array(7)),
+    ],
+)
+def test_a_state_that_no_calibrator_gave_is_refused(name, change):
+    calibrator = Calibrator(CONFIG)
+    for message in messages():
+        calibrator.add_pose(*message)
+    state = calibrator.state()
+    changed = state | {name: change(state.get(name))}
+    changed = {key: value for key, value in changed.items() if value is not None}
+    again = Calibrator(CONFIG)
+    again.add_pose(*next(messages()))
+    with pytest.raises(InputError, match="the saved state"):
+        again.restore(changed)
+    assert again.statistics("parent").received == 1
+    again.restore(state)
+    assert again.statistics("parent") == calibrator.statistics("parent")

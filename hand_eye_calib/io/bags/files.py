@@ -94,14 +94,21 @@ class BagFiles:
                 "the files beside it were read instead"
             )
             return None
-        missing = [name for name in names if not (path / name).is_file()]
+        named = [path / name for name in dict.fromkeys(names)]
+        found = [file for file in named if file.is_file() and _storage_suffix(file)]
+        if not found:
+            self.notes.append(
+                f"{path / 'metadata.yaml'} names none of the files beside it; "
+                "they were read instead"
+            )
+            return None
+        missing = [file.name for file in named if not file.is_file()]
         if missing:
             self.notes.append(
                 f"{path}: {', '.join(missing[:10])} of {len(names)} files in metadata.yaml is "
                 "missing; its messages are left out"
             )
-        found = [path / name for name in dict.fromkeys(names) if name not in missing]
-        return list(filter(_storage_suffix, found))
+        return found
 
     def _unpacked(self, file: Path) -> Path:
         """Unpack a file into a temporary folder; returns where it is."""

@@ -1,0 +1,237 @@
+"""Every input of the fuzzers: a file made from a seed, and what is done with it.
+
+What must hold: no traceback, errors in one line, no control characters on the terminal, and no file
+changed outside the directory of the results.
+"""
+
+import contextlib
+import io
+import os
+import tempfile
+from pathlib import Path
+
+from fuzz import bag_inputs, text_inputs
+from fuzz.chaos import Chaos
+
+from hand_eye_calib.cli import batch
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.journal import count_poses, has_session, read_journal
+from hand_eye_calib.io.trajectory_files import write_trajectory
+
+SOLVE = ("--method", "park", "--reference", "B3", "--scale", "1", "--time-offset", "0")
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+class Finding(Exception):
+    """Something that must not happen."""
+
+
+def command(*arguments):
+    """Run a command; returns its exit code. What it prints must be fit for a terminal."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = end.code
+    said = out.getvalue() + err.getvalue()
+    if code not in (0, 1, 2, 3):
+        raise Finding(f"exit code {code}")
+    if any(not (letter.isprintable() or letter in "\n") for letter in said):
+        raise Finding(f"control characters in {said[:300]!r}")
+    errors = [line for line in err.getvalue().splitlines() if ": error: " in line]
+    if code in (1, 2) and not errors and not out.getvalue():
+        raise Finding(f"exit code {code} without a word")
+    if max(map(len, err.getvalue().splitlines()), default=0) > 20_000:
+        raise Finding("a line of more than 20,000 characters")
+    return code
+
+
+# ---- what is done with each kind
+
+
+def bag(chaos, folder, name):
+    """List a bag, and calibrate from it."""
+    path = folder / name
+    if name.endswith(".mcap"):
+        path.write_bytes(bag_inputs.mcap(chaos))
+    elif name.endswith(".bag"):
+        path.write_bytes(bag_inputs.rosbag1(chaos))
+    else:
+        bag_inputs.write_sqlite3(chaos, path)
+    listed = command("replay", path, "--list", "--json")
+    topics = ("--parent-topic", "/a", "--child-topic", "/b", "--child-frame", "b")
+    saved = ("--out", folder / "out") if chaos.random.random() < 0.05 else ()
+    return min(listed, command("replay", path, *topics, *SOLVE, "--json", *saved))
+
+
+def mcap(chaos, folder):
+    return bag(chaos, folder, "bag.mcap")
+
+
+def rosbag1(chaos, folder):
+    return bag(chaos, folder, "bag.bag")
+
+
+def sqlite3(chaos, folder):
+    return bag(chaos, folder, chaos.choice(["bag.db3", "a%31#?.db3"]))
+
+
+def trajectory(chaos, folder):
+    """Calibrate from a text file and a good one."""
+    format = chaos.choice(["tum", "kitti", "euroc", "csv"])
+    data, times = text_inputs.trajectory(chaos, format)
+    (folder / "parent").write_bytes(data)
+    (folder / "times").write_bytes(times)
+    write_trajectory(folder / "child", text_inputs.CHILD)
+    options = ["--parent-format", format, "--parent-frame", "a", "--child-frame", "b"]
+    options += ["--parent-times", folder / "times"] if format == "kitti" else []
+    options += ["--repair-stamps"] if chaos.random.random() < 0.5 else []
+    files = (folder / "parent", folder / "child")
+    return command("calibrate", *files, *options, *SOLVE, "--json")
+
+
+def config(chaos, folder):
+    """Calibrate with options from a file."""
+    (folder / "file.yaml").write_bytes(text_inputs.yaml_text(chaos, "config"))
+    write_trajectory(folder / "parent", text_inputs.PARENT)
+    write_trajectory(folder / "child", text_inputs.CHILD)
+    files = (folder / "parent", folder / "child")
+    return command("calibrate", *files, "--config", folder / "file.yaml", *SOLVE, "--json")
+
+
+def info(chaos, folder):
+    """Show a result."""
+    (folder / "extrinsic.yaml").write_bytes(text_inputs.yaml_text(chaos, "info"))
+    return min(command("info", folder), command("info", folder, "--json"))
+
+
+def batches(chaos, folder):
+    """Read a batch file; what it names must stay below the directory of the results."""
+    path = folder / "fleet.yaml"
+    (folder / "bag.mcap").touch()
+    path.write_bytes(text_inputs.yaml_text(chaos, "batch"))
+    try:
+        tasks = batch.read_batch(path, {}, {})
+    except HandEyeCalibError as error:
+        if "\n" in str(error):
+            raise Finding(f"an error of several lines: {error}") from None
+        return 2
+    for task in tasks:
+        target = Path(os.path.normpath(folder / "out" / task.name))
+        if target.parent != folder / "out" or task.name in ("summary.json",):
+            raise Finding(f"results of {task.name!r} would go to {target}")
+        batch._stored(task, folder / "out")
+    return 0
+
+
+def metadata(chaos, folder):
+    """List a bag whose metadata.yaml is not as it should be."""
+    streams = {"/a": (text_inputs.PARENT, ODOMETRY), "/b": (text_inputs.CHILD, ODOMETRY)}
+    write_bag(folder / "bag", streams)
+    (folder / "bag" / "metadata.yaml").write_bytes(text_inputs.yaml_text(chaos, "metadata"))
+    code = command("replay", folder / "bag", "--list", "--json")
+    if code:
+        raise Finding("the bag beside it is not read")
+    return code
+
+
+def journal(chaos, folder):
+    """Resume a session."""
+    (folder / "session-000001.journal").write_bytes(text_inputs.journal(chaos))
+    return resume(folder)
+
+
+def resume(folder):
+    """Resume the session in a folder."""
+    if not has_session(folder):
+        raise Finding("the segment is not seen")
+    count_poses(folder)
+    calibrator = Calibrator(CalibratorConfig(reference="B3", method="park"))
+    try:
+        state, events, _ = read_journal(folder)
+        calibrator.restore(state)
+        for event in events:
+            if event[0] == "pose":
+                calibrator.add_pose(*event[1:])
+            else:
+                calibrator.set_frame(*event[1:])
+        calibrator.estimate()
+    except HandEyeCalibError as error:
+        if "\n" in str(error):
+            raise Finding(f"an error of several lines: {error}") from None
+        return 1
+    return 0
+
+
+def again(path, folder):
+    """Read a file that was once found to do what must not be."""
+    (folder / path.name).write_bytes(path.read_bytes())
+    if path.suffix == ".journal":
+        (folder / path.name).rename(folder / "session-000001.journal")
+        return resume(folder)
+    if path.suffix == ".yaml":
+        return command("info", folder / path.name)
+    return command("replay", folder / path.name, "--list", "--json")
+
+
+FORMATS = {
+    "mcap": mcap,
+    "rosbag1": rosbag1,
+    "sqlite3": sqlite3,
+    "trajectory": trajectory,
+    "config": config,
+    "info": info,
+    "batch": batches,
+    "metadata": metadata,
+    "journal": journal,
+}
+
+
+def snapshot(folder):
+    """Names, sizes and times of all files but those of the results."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if "out" not in path.relative_to(folder).parts and not path.is_dir():
+            state = path.lstat()
+            found[str(path)] = (state.st_size, state.st_mtime_ns)
+    return found
+
+
+def exercise(name, seed, folder):
+    """Make an input and use it; returns the exit code.
+
+    Raises
+    ------
+    Finding
+        If something happens that must not; any other error is a finding as well.
+    """
+    case = Path(tempfile.mkdtemp(prefix=f"{name}_{seed}_", dir=folder))
+    (case / "mine").write_text("mine")
+    for outside in ("tmp", "home"):
+        (case / outside).mkdir()
+    kept = {key: os.environ.get(key) for key in ("TMPDIR", "HOME")}
+    os.environ["MPLCONFIGDIR"] = str(Path(folder).parent)  # its list of fonts is written once
+    os.environ |= {"TMPDIR": str(case / "tmp"), "HOME": str(case / "home")}
+    tempfile.tempdir = None
+    (case / "work").mkdir()
+    before = snapshot(case)
+    try:
+        code = FORMATS[name](Chaos(f"{name} {seed}"), case / "work")
+    finally:
+        for key, value in kept.items():
+            os.environ.pop(key) if value is None else os.environ.update({key: value})
+        tempfile.tempdir = None
+    changed = {path for path in snapshot(case) if "/work/" not in path} - before.keys()
+    changed |= {path for path in before if snapshot(case).get(path) != before[path]}
+    inputs = ("bag", "a%31#?.db3", "parent", "child", "times", "file.yaml", "extrinsic.yaml",
+              "fleet.yaml", "session-000001.journal")  # fmt: skip
+    changed |= {path.name for path in (case / "work").iterdir()
+                if path.stem != "bag" and path.name not in (*inputs, "out")}  # fmt: skip
+    if changed:
+        raise Finding(f"written outside the directory of the results: {sorted(changed)}")
+    return code
