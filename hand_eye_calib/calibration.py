@@ -41,6 +41,7 @@ _PLAIN = (
 _PLAIN_LATER = (
     "time_offset_sigma_s",
     "scale_sigma",
+    "method_reason",
     "reference_reason",
     "noise",
     "cross_check",
@@ -50,7 +51,7 @@ _PLAIN_LATER = (
 _KINDS: dict[str, Any] = (
     dict.fromkeys(("method", "reference", "backend", "parent_frame", "child_frame"), str)
     | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
-    | {"reference_reason": str}
+    | dict.fromkeys(("method_reason", "reference_reason"), str)
     | dict.fromkeys(("noise", "cross_check"), (dict, type(None)))
 )
 
@@ -179,7 +180,7 @@ class Calibration:
     objective : float
         Value of the method's cost at ``T_method``; for dnlo eq. (5), the outliers' share included.
     method, reference, backend : str
-        How it was solved; ``reference`` is the one that ``auto`` chose.
+        How it was solved; ``method`` and ``reference`` are those that ``auto`` chose.
     n_poses, n_pairs, n_inliers : int
         Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
     time_offset_s, time_offset_sigma_s : float
@@ -187,8 +188,8 @@ class Calibration:
     scale, scale_sigma : float
         Factor applied to the child's translations, and one standard deviation: 0 if the scale was
         given.
-    reference_reason : str
-        Why ``auto`` chose the reference; empty if it was given.
+    method_reason, reference_reason : str
+        Why ``auto`` chose the method, the reference; empty if it was given.
     noise : dict or None
         Noise of the trajectories as the adaptive estimator found it; None with other methods.
     cross_check : dict or None
@@ -220,6 +221,7 @@ class Calibration:
     time_offset_sigma_s: float = 0.0
     scale: float = 1.0
     scale_sigma: float = 0.0
+    method_reason: str = ""
     reference_reason: str = ""
     noise: dict[str, Any] | None = None
     cross_check: dict[str, Any] | None = None

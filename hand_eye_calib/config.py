@@ -305,8 +305,9 @@ class CalibratorConfig(OptionSet):
 
     method: str = option(
         "dnlo",
-        "How motion pairs are solved; dnlo rejects outliers, adaptive estimates the noise and uses "
-        "no reference, the others use every pair.",
+        "How the extrinsic is solved; auto: adaptive if its noise model fits, otherwise dnlo; dnlo "
+        "rejects outliers, adaptive estimates the noise and uses no reference, the others use all "
+        "motion pairs.",
         choices=tuple(METHODS),
     )
     reference: str = option(

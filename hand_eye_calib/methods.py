@@ -17,9 +17,9 @@ class MethodRecord:
     Attributes
     ----------
     name : str
-        Value of the option ``method``.
+        Value of the option ``method``; "auto" chooses between dnlo and adaptive.
     uses_reference : bool
-        It solves the motion pairs of a reference. False: it uses the pose stream as a whole.
+        It solves the motion pairs of a reference alone. False: it uses the pose stream as a whole.
     rejects_outliers : bool
         Outliers are left out, so that a few jumps of a stream hardly change the answer.
     backends : tuple of str
@@ -57,6 +57,14 @@ class MethodRecord:
 METHODS = {
     record.name: record
     for record in (
+        MethodRecord(
+            name="auto",
+            uses_reference=False,
+            rejects_outliers=True,
+            most_poses_of_many=600,
+            most_poses_of_few=600,
+            parts=4,
+        ),
         MethodRecord(
             name="dnlo",
             rejects_outliers=True,

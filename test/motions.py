@@ -47,6 +47,12 @@ def disturbed(poses, seed, sigma_m, sigma_rad):
     return poses @ se3.exp(noise)
 
 
+def smooth_poses(times_s):
+    """(N, 4, 4) poses on a smooth curve in all six degrees of freedom."""
+    k = np.arange(1, 7)
+    return se3.exp(np.sin(times_s[:, None] * (0.5 + 0.15 * k) + k) * np.repeat([3.0, 0.8], 3))
+
+
 def as_trajectory(poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **frames):
     """Poses at a steady rate."""
     return Trajectory(

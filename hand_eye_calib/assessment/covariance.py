@@ -51,11 +51,10 @@ _ROUNDING_VARIANCE = 1e-24
 # Information below this share of the largest is rounding.
 _RANK_TOLERANCE = 1e-12
 
-# Standard deviations (m, rad) above which an observed axis is called weak, and a rotation
-# unobservable.
-WEAK_TRANSLATION = 0.05
-WEAK_ROTATION = float(np.radians(1.0))
-_UNOBSERVABLE_ROTATION = 0.3
+# Standard deviations (m, rad) above which an axis is weak, and above which it is unobservable: so
+# little is known that nobody can use the value.
+WEAK_TRANSLATION, UNOBSERVABLE_TRANSLATION = 0.05, 0.3
+WEAK_ROTATION, UNOBSERVABLE_ROTATION = float(np.radians(1.0)), 0.3
 
 TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
 AXES = TRANSLATIONS + ROTATIONS
@@ -278,15 +277,18 @@ def _verdicts(
     unknown_shares = ((to_parent @ unknown) ** 2).sum(axis=1)
     verdicts = []
     for name, sigma, share in zip(AXES, sigmas.tolist(), unknown_shares, strict=True):
-        is_lost = name in ROTATIONS and sigma > _UNOBSERVABLE_ROTATION
-        if share > HIDDEN_SHARE or is_lost:
-            verdicts.append(DofObservability(name, DofVerdict.UNOBSERVABLE, float("inf")))
-        else:
-            verdicts.append(known_dof(name, sigma))
+        verdicts.append(judged(name, float("inf") if share > HIDDEN_SHARE else sigma))
     return tuple(verdicts)
 
 
-def known_dof(axis: str, sigma: float) -> DofObservability:
-    """Observed or weak, by the standard deviation (m or rad)."""
-    is_weak = sigma > (WEAK_ROTATION if axis in ROTATIONS else WEAK_TRANSLATION)
-    return DofObservability(axis, DofVerdict.WEAK if is_weak else DofVerdict.OBSERVED, sigma)
+def judged(axis: str, sigma: float) -> DofObservability:
+    """Observed, weak or unobservable, by the standard deviation (m or rad)."""
+    weak, unobservable = (
+        (WEAK_ROTATION, UNOBSERVABLE_ROTATION)
+        if axis in ROTATIONS
+        else (WEAK_TRANSLATION, UNOBSERVABLE_TRANSLATION)
+    )
+    if sigma > unobservable:
+        return DofObservability(axis, DofVerdict.UNOBSERVABLE, float("inf"))
+    verdict = DofVerdict.WEAK if sigma > weak else DofVerdict.OBSERVED
+    return DofObservability(axis, verdict, sigma)

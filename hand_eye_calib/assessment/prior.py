@@ -20,7 +20,7 @@ from hand_eye_calib.assessment.covariance import (
     UNKNOWN_SIGMAS,
     UNKNOWN_TRANSLATION,
     Assessment,
-    known_dof,
+    judged,
 )
 from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
@@ -29,8 +29,8 @@ from hand_eye_calib.geometry import se3
 Prior: TypeAlias = Mapping[str, tuple[float, float]]
 
 # A direction is unknown if its variance is at least this share of the variance that stands for
-# unknown. With a prior, an axis is known below this share of that standard deviation.
-_UNKNOWN_SHARE, _KNOWN_SHARE = 0.25, 0.1
+# unknown.
+_UNKNOWN_SHARE = 0.25
 
 # An axis is mostly from the prior if the prior at least halves its variance.
 _MOSTLY_PRIOR = 0.5
@@ -141,7 +141,7 @@ def widened(assessment: Assessment, rotation: FloatArray, spread: FloatArray) ->
     observability = tuple(
         dof
         if dof.verdict is DofVerdict.UNOBSERVABLE
-        else known_dof(dof.name, float(np.hypot(dof.sigma, more)))
+        else judged(dof.name, float(np.hypot(dof.sigma, more)))
         for dof, more in zip(assessment.observability, added, strict=True)
     )
     return Assessment(assessment.cov_parent_child_in_child + spread, observability)
@@ -261,13 +261,11 @@ def _verdicts(
     for dof, sigma, sigma_before in zip(
         before, sigmas.tolist(), sigmas_before.tolist(), strict=True
     ):
-        unknown = UNKNOWN_ROTATION if dof.name in ROTATIONS else UNKNOWN_TRANSLATION
-        if sigma > _KNOWN_SHARE * unknown:
-            verdicts.append(DofObservability(dof.name, DofVerdict.UNOBSERVABLE, float("inf")))
-        elif dof.name in prior and sigma**2 < _MOSTLY_PRIOR * sigma_before**2:
-            verdicts.append(DofObservability(dof.name, DofVerdict.PRIOR, sigma))
-        else:
-            verdicts.append(known_dof(dof.name, sigma))
+        found = judged(dof.name, sigma)
+        is_known = found.verdict is not DofVerdict.UNOBSERVABLE
+        if is_known and dof.name in prior and sigma**2 < _MOSTLY_PRIOR * sigma_before**2:
+            found = DofObservability(dof.name, DofVerdict.PRIOR, sigma)
+        verdicts.append(found)
     return tuple(verdicts)
 
 

@@ -1,16 +1,18 @@
-"""``reference: auto``: of the references with nearly the smallest predicted error, the one nearest
-to the adaptive estimator's answer.
+"""``reference: auto``: of the references with nearly the smallest predicted error, of translation
+and rotation together, the one nearest to the adaptive estimator's answer.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hand_eye_calib.adaptive import estimator
+from hand_eye_calib.adaptive.estimator import AdaptiveSolution
 from hand_eye_calib.adaptive.prediction import ReferencePredictor
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -22,7 +24,10 @@ CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 _NEARLY_AS_GOOD = 1.3
 
 # Fewest poses from which the noise can be estimated.
-_MIN_POSES = 13
+MIN_POSES = 13
+
+# Smallest predicted error (m, rad) to divide by: noise-free data has none.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -32,49 +37,84 @@ class ReferenceChoice:
     Attributes
     ----------
     reference : str
-    predicted_m : dict of str to float
-        Candidate to its predicted root mean square translation error, m.
+    predicted_m, predicted_rad : dict of str to float
+        Candidate to its predicted root mean square translation (m) and rotation error (rad).
     alike : tuple of str
-        The candidates with nearly the smallest error, among which their answers decided.
+        The candidates with nearly the smallest joint error, among which their answers decided.
     """
 
     reference: str
     predicted_m: dict[str, float]
+    predicted_rad: dict[str, float]
     alike: tuple[str, ...] = ()
+
+    def joint_errors(self) -> dict[str, float]:
+        """Candidate to its predicted error in translation and rotation together: the root mean
+        square of both, each in units of the smallest one of any candidate.
+        """
+        least_m, least_rad = self._least()
+        return {
+            reference: float(
+                np.hypot(metres / least_m, self.predicted_rad[reference] / least_rad) / np.sqrt(2)
+            )
+            for reference, metres in self.predicted_m.items()
+        }
+
+    def distance(self, T_parent_child: FloatArray, T_other: FloatArray) -> float:
+        """Distance of two answers in the units of :meth:`joint_errors`."""
+        metres, radians = absolute_errors(T_parent_child, T_other)
+        least_m, least_rad = self._least()
+        return float(np.hypot(metres / least_m, radians / least_rad))
 
     def reason(self) -> str:
         """The reason in one sentence."""
-        worst = max(self.predicted_m, key=lambda reference: self.predicted_m[reference])
+        joint = self.joint_errors()
+        worst = max(joint, key=lambda reference: joint[reference])
         decided = (
             f"; of {', '.join(self.alike)} its answer is nearest to the adaptive estimator's"
             if len(self.alike) > 1
             else ""
         )
         return (
-            f"{self.reference} of {', '.join(self.predicted_m)}: with the noise of these "
-            "trajectories its predicted translation error is "
-            f"{self.predicted_m[self.reference]:.3g} m, that of {worst} "
-            f"{self.predicted_m[worst]:.3g} m{decided}"
+            f"{self.reference} of {', '.join(joint)}: with the noise of these trajectories its "
+            f"predicted error is {self._errors(self.reference)}, that of {worst} "
+            f"{self._errors(worst)}{decided}"
+        )
+
+    def _errors(self, reference: str) -> str:
+        degrees = np.degrees(self.predicted_rad[reference])
+        return f"{self.predicted_m[reference]:.3g} m and {degrees:.2g} deg"
+
+    def _least(self) -> tuple[float, float]:
+        return (
+            max(min(self.predicted_m.values()), _ROUNDING),
+            max(min(self.predicted_rad.values()), _ROUNDING),
         )
 
 
 def select_reference(
-    pose_pairs: PosePairs, method: Method, candidates: Sequence[str] = CANDIDATES
+    pose_pairs: PosePairs,
+    method: Method,
+    candidates: Sequence[str] = CANDIDATES,
+    solution: AdaptiveSolution | None = None,
 ) -> ReferenceChoice:
     """Choose the reference for a method.
 
     The residual cannot tell which reference is best (Välimäki et al. 2023, section 4.2). The noise
     can: the adaptive estimator identifies its level and drift, and the expected error of every
-    reference follows from them. If several references have about the same expected error, chance
-    decides which of them does best on these poses. The best guess is then the one whose answer is
-    nearest to the adaptive estimator's: the error of that estimator is smaller and, as that of the
-    best linear estimator, uncorrelated with the distance of the other answers from it.
+    reference follows from them, in translation and rotation together. If several references have
+    about the same expected error, chance decides which of them does best on these poses. The best
+    guess is then the one whose answer is nearest to the adaptive estimator's: the error of that
+    estimator is smaller and, as that of the best linear estimator, uncorrelated with the distance
+    of the other answers from it.
 
     Parameters
     ----------
     pose_pairs : PosePairs
     method : Method
     candidates : sequence of str
+    solution : AdaptiveSolution, optional
+        The adaptive estimator's answer for these poses, if it is known.
 
     Returns
     -------
@@ -85,42 +125,45 @@ def select_reference(
     NotEnoughDataError
         If there are too few poses to choose.
     """
-    if len(pose_pairs) < _MIN_POSES:
+    if len(pose_pairs) < MIN_POSES:
         raise NotEnoughDataError(
-            f"reference auto needs at least {_MIN_POSES} synchronised poses, "
+            f"reference auto needs at least {MIN_POSES} synchronised poses, "
             f"found {len(pose_pairs)}; drive on, or name a reference"
         )
     poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
-    solution = estimator.solve(*poses)
+    solution = solution or estimator.solve(*poses)
     predictor = ReferencePredictor(*poses, solution, *method.rejection)
-    covariances = {reference: predictor.covariance(reference) for reference in candidates}
-    predicted_m = {
-        reference: float(np.sqrt(np.trace(covariance[:3, :3])))
-        for reference, covariance in covariances.items()
-        if covariance is not None
-    }
-    if not predicted_m:
+    predicted = {reference: predictor.covariance(reference) for reference in candidates}
+    covariances = {name: found for name, found in predicted.items() if found is not None}
+    if not covariances:
         # No prediction: with every reference the motion leaves a direction unobservable.
-        return ReferenceChoice("B1", {"B1": float("inf")})
-    limit = _NEARLY_AS_GOOD * min(predicted_m.values())
-    alike = tuple(reference for reference, expected in predicted_m.items() if expected <= limit)
-    return ReferenceChoice(
-        _nearest(pose_pairs, method, alike, solution.T_parent_child), predicted_m, alike
-    )
+        return ReferenceChoice("B1", {"B1": float("inf")}, {"B1": float("inf")})
+    choice = ReferenceChoice("", _rms(covariances, slice(0, 3)), _rms(covariances, slice(3, 6)))
+    joint = choice.joint_errors()
+    limit = _NEARLY_AS_GOOD * min(joint.values())
+    alike = tuple(reference for reference, expected in joint.items() if expected <= limit)
+    nearest = _nearest(pose_pairs, method, dataclasses.replace(choice, alike=alike), solution)
+    return dataclasses.replace(choice, reference=nearest, alike=alike)
+
+
+def _rms(covariances: Mapping[str, FloatArray], part: slice) -> dict[str, float]:
+    """Root mean square error of a part of xi by reference."""
+    return {
+        reference: float(np.sqrt(np.trace(covariance[part, part])))
+        for reference, covariance in covariances.items()
+    }
 
 
 def _nearest(
-    pose_pairs: PosePairs, method: Method, references: Sequence[str], T_parent_child: FloatArray
+    pose_pairs: PosePairs, method: Method, choice: ReferenceChoice, solution: AdaptiveSolution
 ) -> str:
-    """The reference with which the method's translation is nearest to that of a transform."""
-    if len(references) == 1:
-        return references[0]
+    """The one of the alike references with which the method's answer is nearest to a solution."""
+    if len(choice.alike) == 1:
+        return choice.alike[0]
     fast = dataclasses.replace(method, backend="fast")
 
     def distance(reference: str) -> float:
-        T = fast.solve(
-            motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-        ).T_parent_child
-        return float(np.linalg.norm(T[:3, 3] - T_parent_child[:3, 3]))
+        pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
+        return choice.distance(fast.solve(pairs).T_parent_child, solution.T_parent_child)
 
-    return min(references, key=distance)
+    return min(choice.alike, key=distance)

@@ -174,6 +174,8 @@ def _solution_lines(calibration: Calibration) -> Iterator[str]:
         f"{calibration.reference}: {calibration.n_inliers} of {calibration.n_pairs} motion pairs "
         f"are inliers, from {calibration.n_poses} poses; objective {calibration.objective:.6g}"
     )
+    if calibration.method_reason:
+        yield f"  method {calibration.method_reason}"
     if calibration.reference_reason:
         yield f"  reference {calibration.reference_reason}"
     for line in (calibration.noise or {}).get("in_words", ()):

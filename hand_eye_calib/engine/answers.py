@@ -62,7 +62,7 @@ class OtherAnswers:
     Parameters
     ----------
     calibration : Calibration
-        The result. Its time offset and scale are used in every other answer.
+        The result. Its method, time offset and scale are used in every other answer.
     config : CalibratorConfig
         The options that gave it.
     pose_pairs : PosePairs
@@ -75,6 +75,7 @@ class OtherAnswers:
         self._calibration, self._poses = calibration, pose_pairs
         self._config = replace(
             config,
+            method=calibration.method,
             time_offset=calibration.time_offset_s,
             scale=calibration.scale,
             backend="fast",

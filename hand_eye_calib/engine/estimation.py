@@ -13,9 +13,15 @@ from hand_eye_calib.alignment.scale import Scale, child_scaled, estimate_scale
 from hand_eye_calib.alignment.similarity import MAX_UNEXPLAINED_TRANSLATION
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive
+from hand_eye_calib.assessment.covariance import (
+    TRANSLATIONS,
+    Assessment,
+    assess,
+    assess_adaptive,
+)
+from hand_eye_calib.assessment.model_fit import MAX_JUMPS, why_not
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
-from hand_eye_calib.assessment.reference_selection import select_reference
+from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
@@ -25,9 +31,6 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
-
-# Largest share of jumps with which the trajectories' errors still fit the adaptive noise model.
-_MAX_JUMPS = 0.1
 
 # Tried in turn if the reference that auto chose leaves an axis unobservable.
 _LONGER_REFERENCES = ("B5", "B20")
@@ -39,9 +42,11 @@ class _Evaluation:
 
     solution: Solution | AdaptiveSolution
     assessment: Assessment
+    method: str
     reference: str
     pairs: MotionPairs
     weights: FloatArray
+    method_reason: str = ""
     reference_reason: str = ""
     noise: dict[str, Any] | None = None
     scale_correction: float = 1.0
@@ -85,7 +90,8 @@ def estimate_extrinsic(
         If there are too few poses for the reference or for the scale.
     """
     scale = _settle_scale(pose_pairs, config)
-    solve = _solve_pairs if METHODS[config.method].uses_reference else _solve_adaptive
+    METHODS[config.method].require_backend(config.backend)
+    solve = _SOLVE.get(config.method, _solve_pairs)
     evaluation = solve(child_scaled(pose_pairs, scale.value), config)
     T_method = evaluation.solution.T_parent_child
     spread = _spread_by_alignment(scale.estimate, time_offset)
@@ -116,7 +122,8 @@ def _calibration(
         observability=fused.assessment.observability,
         T_method=solution.T_parent_child,
         objective=solution.objective,
-        method=config.method,
+        method=evaluation.method,
+        method_reason=evaluation.method_reason,
         reference=evaluation.reference,
         reference_reason=evaluation.reference_reason,
         noise=evaluation.noise,
@@ -157,12 +164,45 @@ def fixed_time_offset(config: CalibratorConfig) -> float:
     return config.time_offset
 
 
-def _solve_pairs(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
+def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
+    """The adaptive estimator if its noise model fits, as judged with DNLO's answer, otherwise DNLO.
+
+    The adaptive estimator is solved once; DNLO's reference is chosen from the noise that it found.
+    """
+    if len(pose_pairs) < MIN_POSES:
+        evaluation = _solve_adaptive(pose_pairs, config)
+        reason = f"auto: fewer than {MIN_POSES} poses, too few to compare with dnlo"
+        return replace(evaluation, method_reason=reason)
+    solution = _adaptive_solution(pose_pairs)
+    with_dnlo = replace(config, method="dnlo")
+    dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
+    by_model = _evaluated(pose_pairs, solution)
+    misfit = why_not(solution, by_model.assessment, _answer(dnlo))
+    if misfit and solution.systematic != "none":
+        # DNLO does not know of a scale or a time offset. Without them it may agree.
+        corrected = _corrected(pose_pairs, solution)
+        witness = _solve_pairs(corrected, replace(with_dnlo, reference=dnlo.reference))
+        misfit = why_not(solution, by_model.assessment, _answer(witness))
+    compared = f"dnlo on reference {dnlo.reference}"
+    if misfit:
+        reason = f"auto: {compared} stands, because the noise model does not fit: {misfit}"
+        return replace(dnlo, method_reason=reason)
+    reason = f"auto: the noise model fits, and its answer agrees with that of {compared}"
+    return replace(by_model, method_reason=reason)
+
+
+def _answer(evaluation: _Evaluation) -> tuple[FloatArray, Assessment]:
+    return evaluation.solution.T_parent_child, evaluation.assessment
+
+
+def _solve_pairs(
+    pose_pairs: PosePairs, config: CalibratorConfig, noise_model: AdaptiveSolution | None = None
+) -> _Evaluation:
     """A method of the paper on the motion pairs of one reference."""
     method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
     if config.reference != "auto":
         return _solve_reference(pose_pairs, method, config.reference)
-    choice = select_reference(pose_pairs, method)
+    choice = select_reference(pose_pairs, method, solution=noise_model)
     chosen = _solve_reference(pose_pairs, method, choice.reference, choice.reason())
     for reference in _LONGER_REFERENCES:
         # The prediction assumes noise without spikes and favours short baselines if there are any.
@@ -193,6 +233,7 @@ def _solve_reference(
     return _Evaluation(
         solution=solution,
         assessment=assessment,
+        method=method.name,
         reference=reference,
         pairs=pairs,
         weights=solution.weights,
@@ -208,32 +249,58 @@ def _named(assessment: Assessment, verdict: DofVerdict) -> list[str]:
     return [dof.name for dof in assessment.observability if dof.verdict is verdict]
 
 
+def _weak(assessment: Assessment) -> list[str]:
+    """Weak axes with their standard deviations in words."""
+    return [
+        f"{dof.name} (+/- {dof.sigma:.2g} m)"
+        if dof.name in TRANSLATIONS
+        else f"{dof.name} (+/- {np.degrees(dof.sigma):.2g} deg)"
+        for dof in assessment.observability
+        if dof.verdict is DofVerdict.WEAK
+    ]
+
+
 def _solve_adaptive(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
     """The adaptive estimator, which uses no reference."""
-    METHODS[config.method].require_backend(config.backend)
-    solution = adaptive_estimator.solve(
-        pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
+    evaluation = _evaluated(pose_pairs, _adaptive_solution(pose_pairs))
+    jumps = 1.0 - float(np.mean(evaluation.weights))
+    warning = (
+        f"{jumps:.0%} of the increments are jumps: the errors do not fit the adaptive noise "
+        "model; compare with method dnlo"
     )
+    return replace(evaluation, warnings=(warning,) if jumps > MAX_JUMPS else ())
+
+
+def _adaptive_solution(pose_pairs: PosePairs) -> AdaptiveSolution:
+    return adaptive_estimator.solve(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
+
+
+def _corrected(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
+    """The poses with the scale and the time offset that the solution found."""
     stamps_ns = pose_pairs.stamps_ns
     child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).scaled(solution.scale)
     Ts_cw_c = child.shifted(solution.time_offset_s).at(stamps_ns, extrapolate=True)
-    weights = (~solution.jumps).astype(float)
-    jumps = float(np.mean(solution.jumps))
-    warning = (
-        f"{jumps:.0%} of the increments are jumps: the errors do not fit the adaptive noise model; "
-        "compare with method dnlo"
-    )
+    return PosePairs(stamps_ns, pose_pairs.Ts_pw_p, Ts_cw_c)
+
+
+def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation:
+    """An answer of the adaptive estimator, assessed."""
+    stamps_ns, Ts_cw_c = pose_pairs.stamps_ns, _corrected(pose_pairs, solution).Ts_cw_c
     return _Evaluation(
         solution=solution,
         assessment=assess_adaptive(pose_pairs, solution),
+        method="adaptive",
         reference="increments",
         pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
-        weights=weights,
-        noise=solution.describe(pose_pairs.stamps_ns),
+        weights=(~solution.jumps).astype(float),
+        noise=solution.describe(stamps_ns),
         scale_correction=solution.scale,
         time_correction_s=solution.time_offset_s,
-        warnings=(warning,) if jumps > _MAX_JUMPS else (),
     )
+
+
+# Methods that do not only solve the motion pairs of a reference.
+_SOLVE = {"auto": _solve_auto, "adaptive": _solve_adaptive}
 
 
 def _settle_scale(pose_pairs: PosePairs, config: CalibratorConfig) -> _ScaleInUse:
@@ -294,6 +361,11 @@ def _warnings_of(fused: Fused, converged: bool) -> list[str]:
             f"the motion does not reveal {', '.join(unobservable)} of the child sensor in the "
             "parent sensor's frame: do not use these values; drive curves over slopes, or measure "
             f"them by hand and give them as {priors}"
+        )
+    if weak := _weak(fused.assessment):
+        warnings.append(
+            f"little is known of {', '.join(weak)} (one standard deviation): record longer, with "
+            "more rotation about other axes, or give what was measured by hand as a prior"
         )
     if mostly_prior := _named(fused.assessment, DofVerdict.PRIOR):
         warnings.append(

@@ -246,8 +246,11 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
     offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
     scale = (calibration.scale, calibration.scale_sigma)
     span = duration(evidence.tracks.times_s[-1])
+    method = f"{calibration.method} ({calibration.backend})"
+    if calibration.method_reason:
+        method += f"; {calibration.method_reason}"
     rows = {
-        "Method": f"{calibration.method} ({calibration.backend})",
+        "Method": method,
         "Reference": calibration.reference_reason or calibration.reference,
         "Poses": f"{calibration.n_poses:,} synchronised pose pairs over {span}",
         "Motion pairs": f"{calibration.n_inliers:,} of {calibration.n_pairs:,} are inliers",

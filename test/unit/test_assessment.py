@@ -7,11 +7,16 @@ from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering
 from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.adaptive.resampling import answers_without
 from hand_eye_calib.assessment.covariance import (
+    AXES,
+    Assessment,
     assess,
     jackknife_covariance,
+    judged,
     larger_by_direction,
     model_covariance,
 )
+from hand_eye_calib.assessment.metrics import absolute_errors
+from hand_eye_calib.assessment.prior import widened
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.geometry import se3
@@ -174,18 +179,16 @@ def test_of_references_that_promise_alike_the_one_nearest_to_the_adaptive_answer
     )
     method = Method("dnlo")
     choice = select_reference(poses, method)
-    least = min(choice.predicted_m.values())
-    assert 1 < len(choice.alike) < len(choice.predicted_m)
-    assert max(choice.predicted_m[reference] for reference in choice.alike) <= 1.3 * least
+    joint = choice.joint_errors()
+    assert 1 < len(choice.alike) < len(joint)
+    assert max(joint[reference] for reference in choice.alike) <= 1.3 * min(joint.values())
     best = estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c).T_parent_child
 
     def distance(reference):
-        return np.linalg.norm(
-            (
-                method.solve(motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, reference)).T_parent_child
-                - best
-            )[:3, 3]
-        )
+        pairs = motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, reference)
+        metres, radians = absolute_errors(method.solve(pairs).T_parent_child, best)
+        least_m, least_rad = min(choice.predicted_m.values()), min(choice.predicted_rad.values())
+        return np.hypot(metres / least_m, radians / least_rad)
 
     assert choice.reference == min(choice.alike, key=distance)
     assert f"of {', '.join(choice.alike)} its answer is nearest" in choice.reason()
@@ -207,3 +210,26 @@ def test_the_jackknife_of_dnlo_sees_the_inliers_change_sides():
         lambda left_out: method.solve_without(pairs, solution, left_out),
     )
     assert 0.1 < np.sqrt(np.trace(deviations[:3, :3])) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("axis", "sigma", "verdict"),
+    [
+        ("z", 0.04, DofVerdict.OBSERVED),
+        ("z", 0.06, DofVerdict.WEAK),
+        ("z", 1.19, DofVerdict.UNOBSERVABLE),
+        ("yaw", 0.01, DofVerdict.OBSERVED),
+        ("yaw", 0.02, DofVerdict.WEAK),
+        ("yaw", 0.31, DofVerdict.UNOBSERVABLE),
+    ],
+)
+def test_an_axis_is_judged_by_its_standard_deviation(axis, sigma, verdict):
+    judgement = judged(axis, sigma)
+    assert (judgement.name, judgement.verdict) == (axis, verdict)
+    assert judgement.sigma == (np.inf if verdict is DofVerdict.UNOBSERVABLE else sigma)
+
+
+def test_a_spread_that_makes_an_axis_useless_makes_it_unobservable():
+    before = Assessment(np.eye(6) * 1e-6, tuple(judged(axis, 1e-3) for axis in AXES))
+    after = widened(before, np.eye(3), np.diag([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    assert [dof.name for dof in after.observability if not np.isfinite(dof.sigma)] == ["z"]

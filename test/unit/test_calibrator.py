@@ -133,7 +133,7 @@ def test_every_method_is_available(method):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "tsai"}, "method must be one of dnlo, dnl, park"),
+        ({"method": "tsai"}, "method must be one of auto, dnlo, dnl, park"),
         ({"reference": "B0"}, "reference must be auto, A, B<n>"),
         ({"threshold": -1.0}, "threshold must be at least"),
         ({"min_inlier_fraction": 1.5}, "min_inlier_fraction must be at most 1"),

@@ -476,7 +476,7 @@ def parsed(options):
         (["replay", "bag", "--meth", "dnl"], "unknown option --meth; did you mean --method?"),
         (
             ["replay", "bag", "--method", "magic"],
-            "argument --method: must be one of dnlo, dnl",
+            "argument --method: must be one of auto, dnlo",
         ),
         (
             ["replay", "bag", "--threshold", "-1"],

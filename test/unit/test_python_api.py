@@ -11,6 +11,7 @@ from motions import (
     child_of,
     disturbed,
     planar_poses,
+    smooth_poses,
     wandering_poses,
 )
 
@@ -18,7 +19,6 @@ import hand_eye_calib as hec
 from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, prior_fields
 from hand_eye_calib.engine.offline import offline_config
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.methods import BACKENDS, METHODS
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.dnl import pair_costs
@@ -30,12 +30,6 @@ PRIOR_FIELDS = {f"prior_{axis}" for axis in (*AXIS_UNITS, "transform")}
 def streams(n_poses=40):
     poses = wandering_poses(n_poses)
     return as_trajectory(poses), as_trajectory(child_of(poses))
-
-
-def smooth_poses(times_s):
-    """(N, 4, 4) poses on a smooth curve in all six degrees of freedom."""
-    k = np.arange(1, 7)
-    return se3.exp(np.sin(times_s[:, None] * (0.5 + 0.15 * k) + k) * np.repeat([3.0, 0.8], 3))
 
 
 class TestOptionsOfCalibrate:
