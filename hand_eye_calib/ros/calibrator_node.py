@@ -138,6 +138,8 @@ class CalibratorNode(Node):
     def _discover(self) -> None:
         self._inputs[0].discover(self._options.node.parent_type)
         self._inputs[1].discover(self._options.node.child_type)
+        for each in self._inputs:
+            each.flush()
 
     def _on_solve_timer(self) -> None:
         silent = [each for each in self._inputs if each.guard.last_ns is None]

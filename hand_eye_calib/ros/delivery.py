@@ -4,7 +4,7 @@ from collections import deque
 from dataclasses import dataclass
 
 # A message that waited so long in the node's queue is late: the node falls behind (s).
-LATE_S = 0.1
+LATE_S = 1.0
 
 # A message may be overtaken by so many others of its publisher; farther back, the publisher was
 # started again.

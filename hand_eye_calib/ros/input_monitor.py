@@ -31,7 +31,7 @@ class InputMonitor:
     refused : Counter
         Messages that could not be used, by reason.
     delay_s : float or None
-        Median of the node's clock minus the stamps, in the last report.
+        Median of the node's clock minus the stamps, in the last report with messages.
     delivery : Delivery
     """
 
@@ -95,7 +95,8 @@ class InputMonitor:
         delivery = self.delivery.report()
         delays_s = np.array(self._delays_ns) * 1e-9
         self._delays_ns.clear()
-        self.delay_s = float(np.median(delays_s)) if delays_s.size else None
+        if delays_s.size:
+            self.delay_s = float(np.median(delays_s))
         level, text = self._judge(topic, steady_s, rate_hz, delivery, may_rest)
         values = {
             "topic": topic,

@@ -17,7 +17,7 @@ from hand_eye_calib.ros.input_monitor import InputMonitor
 from hand_eye_calib.ros.live_session import LiveSession
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.parameters import Parameters
-from hand_eye_calib.ros.stamp_guard import StampGuard, Verdict
+from hand_eye_calib.ros.stamp_guard import Judgement, StampGuard, Verdict
 
 # Best effort hears reliable publishers too; the queue holds seconds of a fast stream while a
 # callback is busy.
@@ -174,18 +174,30 @@ class PoseInput:
         clock_ns = self._node.get_clock().now().nanoseconds
         self.monitor.note(stamp_ns, clock_ns, steady_s, self._max_gap_ns)
         last_ns = self.guard.last_ns
-        verdict, messages = self.guard.check(stamp_ns, message, steady_s)
-        if verdict is Verdict.JUMPED_BACK:
-            self._say_jump_back(stamp_ns, last_ns)
+        judgement = self.guard.check(stamp_ns, (pose_type, message), steady_s)
+        if judgement.verdict is Verdict.JUMPED_BACK:
+            self._say_jump_back(judgement.taken[0][0], last_ns)
             self._on_jump_back(self)
-        elif verdict is Verdict.HOLD:
-            self._say_held(stamp_ns, last_ns)
-        elif verdict is Verdict.OUTDATED:
+        elif judgement.verdict is Verdict.OUTDATED:
             self.monitor.refused["of the session before"] += 1
-        for held_ns, held in messages:
-            self._take(pose_type, held_ns, held, is_first=last_ns is None)
+        self._use(judgement, is_first=last_ns is None)
 
-    def _take(self, pose_type: PoseType, stamp_ns: int, message: Any, is_first: bool) -> None:
+    def flush(self) -> None:
+        """Take messages that waited for others, if none came; to be called often."""
+        is_first = self.guard.last_ns is None
+        self._use(self.guard.flush(time.monotonic()), is_first)
+
+    def _use(self, judgement: Judgement, is_first: bool) -> None:
+        for stamp_ns in judgement.dropped:
+            text = "its stamp does not fit those before and after it"
+            self._refuse(stamp_ns, "corrupt stamp", text)
+        for stamp_ns, (pose_type, message) in judgement.taken:
+            self._take(pose_type, stamp_ns, message)
+        if is_first and judgement.taken:
+            first_s = judgement.taken[0][0] * 1e-9
+            self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
+
+    def _take(self, pose_type: PoseType, stamp_ns: int, message: Any) -> None:
         try:
             if pose_type.sensor_frame is not None:
                 self._set_frame(pose_type.sensor_frame(message))
@@ -194,9 +206,6 @@ class PoseInput:
             )
         except InputError as error:
             self._refuse(stamp_ns, "unusable", str(error))
-            return
-        if is_first:
-            self._log.info(f"first pose on {self.topic}, stamp {stamp_ns * 1e-9:.3f} s")
 
     def _set_frame(self, sensor_frame: str) -> None:
         if sensor_frame == self._sensor_frame:  # an empty one too: parameters or a default name it
@@ -210,11 +219,6 @@ class PoseInput:
             f"{self.topic} jumped back by {jump_s:.3f} s (a bag that loops? a clock that was "
             "reset?): new session, earlier poses forgotten"
         )
-
-    def _say_held(self, stamp_ns: int, last_ns: int | None) -> None:
-        jump_s = (stamp_ns - (last_ns or 0)) * 1e-9
-        text = f"its stamp is {jump_s:+.3f} s from the one before; held back until others agree"
-        self._refuse(stamp_ns, "jump in time", text)
 
     def _refuse(self, stamp_ns: int, reason: str, text: str) -> None:
         self.monitor.note_refused(reason, text, time.monotonic())
