@@ -86,6 +86,7 @@ class SolvingProcess:
         self._thread.join(timeout_s)
         in_time = not self._thread.is_alive()
         self._process.kill()
+        self._thread.join(_LAST_BREATH_S)  # its pipe has ended
         _end(self._process)
         return in_time
 

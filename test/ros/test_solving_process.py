@@ -179,12 +179,13 @@ def test_what_libraries_print_does_not_disturb(start):
 
 
 def test_stop_does_not_wait_for_a_long_solve(start, announced):
-    process = start(SLOW)
-    process.submit(Job(0, snapshot()))
-    time.sleep(0.2)
-    assert not process.stop(timeout_s=0.1)
-    wait_gone(process.pid)
-    assert not list(process.answers())
+    for wait_s in (0.0, 0.2, 1.0):  # while it starts, reads, solves
+        process = start(SLOW)
+        process.submit(Job(0, snapshot()))
+        time.sleep(wait_s)
+        assert not process.stop(timeout_s=0.1)
+        wait_gone(process.pid)
+        assert not list(process.answers())
 
 
 def test_it_waits_without_using_the_processor(start):
