@@ -199,8 +199,8 @@ def _input_reports(parts: NodeParts, steady_s: float) -> dict[str, Report]:
 
 
 def _clock_offset(parent: InputMonitor, child: InputMonitor) -> float | None:
-    """Clock offset seen between the inputs, in s to be added to the child's stamps; None before both
-    have delivered.
+    """Offset seen between the inputs' clocks, in s to be added to the child's stamps; None until
+    both have delivered.
     """
     if parent.delay_s is None or child.delay_s is None:
         return None
