@@ -54,16 +54,7 @@ def save_result(
     InputError
         If they cannot be written.
     """
-    other_inputs = dict(inputs or {})
-    provenance = {
-        "package": "hand_eye_calib",
-        "package_version": package_version(),
-        "versions": _versions(),
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "parameters": other_inputs.pop("options", {}),
-        "inputs": other_inputs,
-    }
-    document = calibration.to_dict() | {"provenance": provenance}
+    document = calibration.to_dict() | {"provenance": _provenance(inputs or {})}
     texts = {
         XACRO_NAME: _xacro_text(calibration),
         LAUNCH_NAME: _launch_text(calibration),
@@ -81,6 +72,18 @@ def save_result(
             "directory"
         ) from None
     return directory / FILE_NAME
+
+
+def _provenance(inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """Where a result came from, in plain values."""
+    return {
+        "package": "hand_eye_calib",
+        "package_version": package_version(),
+        "versions": _versions(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "parameters": inputs.get("options", {}),
+        "inputs": {name: value for name, value in inputs.items() if name != "options"},
+    }
 
 
 def keep_earlier_results(directory: str | Path) -> None:

@@ -65,7 +65,7 @@ def bag(chaos, folder, name):
         bag_inputs.write_sqlite3(chaos, path)
     listed = command("replay", path, "--list", "--json")
     topics = ("--parent-topic", "/a", "--child-topic", "/b", "--child-frame", "b")
-    saved = ("--out", folder / "out") if chaos.random.random() < 0.05 else ()
+    saved = ("--out", folder / "out") if chaos.random.random() < 0.01 else ()
     return min(listed, command("replay", path, *topics, *SOLVE, "--json", *saved))
 
 

@@ -312,6 +312,7 @@ class McapFile:
                     self.counts[key] += 1
                     if not run.takes(offset, end):
                         run.finish(self._chunks)
+                        run = _Run()
                     run.add(offset, end, log_ns)
                 elif opcode in (_SCHEMA, _CHANNEL):
                     self._note_channel(opcode, self._description(offset, size))
@@ -522,18 +523,16 @@ class _Run:
 
     def add(self, offset: int, end: int, log_ns: int) -> None:
         """Add a message."""
-        if self._last_ns < 0:
-            self._start = offset
+        self._start = self._start or offset
         self._end = end
         if log_ns <= LATEST_NS:
             self._first_ns, self._last_ns = min(self._first_ns, log_ns), max(self._last_ns, log_ns)
 
     def finish(self, chunks: _ChunkTable) -> None:
-        """Add the run to the chunks, and begin another."""
+        """Add the run to the chunks."""
         if self._last_ns >= 0:
             size = self._end - self._start
             chunks.add(_Chunk(self._start, size, self._first_ns, self._last_ns, 0, 1))
-        self.__init__()  # type: ignore[misc]
 
 
 def _check_content(content: Bytes, size: int, crc: int) -> None:
