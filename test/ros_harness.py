@@ -97,13 +97,19 @@ class NodeProcess:
         self._log_file = log_file
         command = [sys.executable, "-m", "hand_eye_calib", "calibrator"]
         arguments = [word for argument in ros_arguments for word in str(argument).split(" ", 1)]
+        source = str(Path(hand_eye_calib.__file__).parents[1])
+        environment = {
+            "ROS_DOMAIN_ID": str(domain),
+            "PYTHONUNBUFFERED": "1",
+            "PYTHONPATH": os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")])),
+        }
         with log_file.open("wb") as log:
             self.process = subprocess.Popen(
                 [*command, *(["--ros-args", *arguments] if arguments else [])],
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"},
-                cwd=Path(hand_eye_calib.__file__).parents[1],
+                env=os.environ | environment,
+                cwd=log_file.parent,  # below it, output directories may be chosen
             )
 
     @property

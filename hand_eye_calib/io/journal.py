@@ -95,6 +95,7 @@ class JournalWriter:
         if self._pending:
             # Unbuffered: a short write leaves a torn record at the end, which the next flush would
             # bury.
+            self._check_in_place()
             taken = self._file.write(self._pending)
             if taken != len(self._pending):
                 raise OSError(f"only {taken} of {len(self._pending)} bytes were written")
@@ -115,6 +116,7 @@ class JournalWriter:
         os.replace(temporary, path)
         self.close()
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - kept open for the session
+        self._path = path
         self._written, self._pending = 0, bytearray()
         for segment in old:
             segment.unlink(missing_ok=True)
@@ -127,6 +129,11 @@ class JournalWriter:
             finally:
                 self._file.close()
                 self._file = None
+
+    def _check_in_place(self) -> None:
+        """Raise OSError if the file is no longer where it was: what is written would be lost."""
+        if not os.path.samestat(os.stat(self._path), os.fstat(self._file.fileno())):
+            raise OSError("another program has replaced its file")
 
     def _add(self, kind: bytes, payload: bytes) -> None:
         self._pending += _record(kind, payload)

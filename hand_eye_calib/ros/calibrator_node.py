@@ -5,6 +5,7 @@ nothing here needs a lock.
 """
 
 import time
+from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -19,7 +20,7 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
 from hand_eye_calib.ros.inputs import PoseInput, qos_parameter_names
-from hand_eye_calib.ros.live_session import LiveSession
+from hand_eye_calib.ros.live_session import LiveSession, check_below, output_path
 from hand_eye_calib.ros.log import LOG_PERIOD_S, NodeLog
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.results import ResultFiles, ResultTopics
@@ -53,11 +54,14 @@ class CalibratorNode(Node):
             ) from None
         self._log = NodeLog(self.get_logger())
         self._session = LiveSession(self._log)
+        self._output_base: Path | None = None
         self._options = Parameters(
             self, set(qos_parameter_names(self)), self._follow_parameters, self._check_options
         )
         for line in self._options.unknown:
             self._log.warning(line)
+        # From now on, participants may choose a directory below this one.
+        self._output_base = output_path(self._options.node.output_directory or ".").resolve()
         self._session.reconfigure(self._options.calibrator)
         self._checks = CheckMonitor()
         self._files = ResultFiles()
@@ -225,6 +229,8 @@ class CalibratorNode(Node):
         """Raise ConfigError if options cannot be had together, or not on this machine."""
         if options.publish_tf:
             message_type()
+        if self._output_base is not None and options.output_directory:
+            check_below(self._output_base, options.output_directory)
         self._session.check_journal(options)
 
     def _follow_parameters(self) -> None:

@@ -182,3 +182,15 @@ def output_path(directory: str) -> Path:
         raise ConfigError(
             f"output_directory {directory!r}: {error}; write the whole path"
         ) from None
+
+
+def check_below(base: Path, directory: str) -> None:
+    """Raise ConfigError if an output directory is neither ``base`` nor below it: any participant
+    may set it while the node runs, and must not write elsewhere.
+    """
+    path = output_path(directory).resolve()
+    if not path.is_relative_to(base):
+        raise ConfigError(
+            f"output_directory must be {base} or below it while the node runs; got {path}: "
+            "start the node with the directory that is wanted"
+        )

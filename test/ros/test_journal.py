@@ -3,6 +3,7 @@
 import hashlib
 import os
 import resource
+import shutil
 import signal
 
 import numpy as np
@@ -211,8 +212,8 @@ def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):
 
 
 def test_a_directory_in_use_is_refused_as_a_parameter(start_node, peer, tmp_path):
-    node = start_node(*QUIET, *into(tmp_path / "mine"))
-    peer.trigger("solve")
+    node = start_node(*QUIET)
+    assert peer.set_parameter("output_directory", str(tmp_path / "mine")).successful
     lock = DirectoryLock(tmp_path / "theirs")
     result = peer.set_parameter("output_directory", str(tmp_path / "theirs"))
     assert not result.successful
@@ -222,3 +223,57 @@ def test_a_directory_in_use_is_refused_as_a_parameter(start_node, peer, tmp_path
     wait_written(peer, tmp_path / "theirs", 0)
     DirectoryLock(tmp_path / "mine").release()  # left to others
     assert node.stop()[0] == 0
+
+
+def test_participants_choose_a_directory_below_that_of_the_start_only(start_node, peer, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "link").symlink_to(tmp_path / "elsewhere")
+    start_node(*QUIET, *into(tmp_path / "mine"))
+    for outside in ("elsewhere", "mine/../elsewhere", "mine/link", "mine/link/below"):
+        refused = peer.set_parameter("output_directory", str(tmp_path / outside))
+        assert not refused.successful, outside
+        assert f"must be {tmp_path / 'mine'} or below it" in refused.reason
+    assert peer.set_parameter("output_directory", str(tmp_path / "mine" / "truck")).successful
+    wait_written(peer, tmp_path / "mine" / "truck", 0)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_a_directory_that_is_removed_is_reported_and_the_journal_comes_back(
+    start_node, peer, tmp_path
+):
+    node = start_node(*QUIET, *into(tmp_path / "out"))
+    publishers = peer.publishers()
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
+    peer.feed(publishers, stamps_ns[:60], Ts_pw_p[:60], Ts_cw_c[:60])
+    wait_written(peer, tmp_path / "out", 120)
+    shutil.rmtree(tmp_path / "out")
+    peer.feed(publishers, stamps_ns[60:], Ts_pw_p[60:], Ts_cw_c[60:])
+    node.wait_for_log("cannot write the session journal in", "No such file or directory")
+    wait_written(peer, tmp_path / "out", 240)
+    node.wait_for_log("is being written again")
+
+
+def test_a_copy_of_a_segment_is_not_taken_for_one(start_node, peer, tmp_path):
+    node = start_node(*QUIET, *into(tmp_path))
+    peer.feed(peer.publishers(), *drive(30))
+    wait_written(peer, tmp_path, 60)
+    node.process.kill()
+    node.wait()
+    (segment,) = (tmp_path / "journal").glob("*.journal")
+    shutil.copy(segment, segment.with_name("session-000001 (copy).journal"))
+    again = start_node(*QUIET, *into(tmp_path, "resume"))
+    again.wait_for_log("60 poses")
+    assert peer.trigger("reset").success
+    wait_written(peer, tmp_path, 0)
+    assert "cannot write" not in again.log
+
+
+def test_an_earlier_result_that_is_no_text_is_kept_and_replaced(start_node, peer, tmp_path):
+    (tmp_path / "extrinsic.yaml").write_bytes(b"\xff\xfe\x00 not UTF-8")
+    node = start_node(*QUIET, *into(tmp_path))
+    peer.solve(peer.publishers(), *drive())
+    assert peer.trigger("save").success
+    assert node.stop()[0] == 0
+    assert (tmp_path / "previous" / "extrinsic.yaml").read_bytes().startswith(b"\xff\xfe")
+    assert load_result(tmp_path).n_poses == 120
