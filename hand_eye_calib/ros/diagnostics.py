@@ -11,8 +11,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.calibration import (
     Calibration,
-    DofObservability,
-    DofVerdict,
     SolveStatus,
 )
 from hand_eye_calib.config import NodeConfig
@@ -127,7 +125,7 @@ def _result_values(calibration: Calibration, age_s: float, clock_ns: int) -> dic
         "age of its newest pose (s)": _age_of_newest(calibration.stamp_ns, clock_ns),
         "time offset used (s)": time_offset,
         "scale used": scale,
-        **{f"sigma {dof.name} {_unit(dof)}": _sigma(dof) for dof in calibration.observability},
+        **_sigmas(calibration),
         **{f"verdict {dof.name}": dof.verdict.value for dof in calibration.observability},
         "warnings": "; ".join(calibration.warnings) or "none",
     }
@@ -169,14 +167,16 @@ def _is_stale(parts: NodeParts, age_s: float) -> bool:
     return parts.session.has_new_poses and age_s > limit_s
 
 
-def _unit(dof: DofObservability) -> str:
-    return "(mm)" if dof.name in "xyz" else "(deg)"
+def _sigmas(calibration: Calibration) -> dict[str, str]:
+    """Standard deviations of the translation and of the angles as they are printed."""
+    translations = zip("xyz", calibration.sigmas[:3], strict=True)
+    angles = zip(("roll", "pitch", "yaw"), calibration.sigmas_rpy, strict=True)
+    values = {f"sigma {name} (mm)": _known(1000 * sigma, 2) for name, sigma in translations}
+    return values | {f"sigma {name} (deg)": _known(np.degrees(sigma), 4) for name, sigma in angles}
 
 
-def _sigma(dof: DofObservability) -> str:
-    if dof.verdict is DofVerdict.UNOBSERVABLE or not np.isfinite(dof.sigma):
-        return "unknown"
-    return f"{dof.sigma * 1000:.2f}" if dof.name in "xyz" else f"{np.degrees(dof.sigma):.4f}"
+def _known(sigma: float, decimals: int) -> str:
+    return f"{sigma:.{decimals}f}" if np.isfinite(sigma) else "unknown"
 
 
 # ---------------------------------------------------------------------- inputs
