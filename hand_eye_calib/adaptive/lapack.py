@@ -9,20 +9,21 @@ import importlib
 import importlib.util
 import sys
 from importlib.machinery import PathFinder
+from types import ModuleType
 
 _WRAPPER = "scipy.linalg._flapack"
 _USED = ("dpbtrf", "dpbtrs", "dtbtrs", "dpttrf", "dpttrs")
 
 
-def _load_wrapper():
-    """The wrapper alone where it is where SciPy has always had it, otherwise SciPy's public module
-    of the same functions.
+def _load_wrapper() -> ModuleType:
+    """The wrapper alone if it is where SciPy has always had it, otherwise SciPy's public module of
+    the same functions.
     """
     if _WRAPPER not in sys.modules:
         scipy = importlib.util.find_spec("scipy")
-        folders = scipy.submodule_search_locations if scipy else []
+        folders = (scipy.submodule_search_locations if scipy else None) or []
         spec = PathFinder.find_spec(_WRAPPER, [f"{folder}/linalg" for folder in folders])
-        if spec is None:
+        if spec is None or spec.loader is None:
             return importlib.import_module("scipy.linalg.lapack")
         wrapper = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(wrapper)
