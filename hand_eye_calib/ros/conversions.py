@@ -18,6 +18,7 @@ from nav_msgs.msg import Odometry
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 
 _Triple = TypeVar("_Triple", Point, Vector3)
@@ -61,7 +62,8 @@ def _transform(transform: Any) -> tuple[Any, Any]:
 
 
 def _child_frame(message: Any) -> str:
-    return message.child_frame_id
+    """The frame with control characters escaped, as it is read from bags."""
+    return printable(message.child_frame_id)
 
 
 POSE_TYPES = {

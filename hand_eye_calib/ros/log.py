@@ -4,6 +4,8 @@ import time
 from collections.abc import Hashable
 from typing import Protocol
 
+from hand_eye_calib.errors import printable
+
 LOG_PERIOD_S = 5.0
 
 
@@ -35,17 +37,17 @@ class NodeLog:
     def info(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
         """Write what a person may want to know."""
         if self._is_due(key, period_s):
-            self._logger.info(text)
+            self._logger.info(_escaped(text))
 
     def warning(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
         """Write what a person should look at."""
         if self._is_due(key, period_s):
-            self._logger.warning(text)
+            self._logger.warning(_escaped(text))
 
     def error(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
         """Write what went wrong."""
         if self._is_due(key, period_s):
-            self._logger.error(text)
+            self._logger.error(_escaped(text))
 
     def _is_due(self, key: Hashable, period_s: float) -> bool:
         if key is None:
@@ -55,3 +57,8 @@ class NodeLog:
             return False
         self._written_at_s[key] = now_s
         return True
+
+
+def _escaped(text: str) -> str:
+    """Text of one or more lines without other control characters."""
+    return "\n".join(map(printable, text.split("\n")))

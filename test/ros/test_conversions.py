@@ -10,6 +10,7 @@ from hand_eye_calib import config
 from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros import conversions
+from hand_eye_calib.ros.log import NodeLog
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 
@@ -35,6 +36,26 @@ def calibration(covariance, T_parent_child=T_PARENT_CHILD):
 
 def test_every_pose_type_of_the_options_can_be_read():
     assert set(conversions.POSE_TYPES) | {"auto"} == set(config.POSE_TYPES)
+
+
+def test_control_characters_in_names_of_frames_are_escaped():
+    message = Odometry()
+    message.child_frame_id = "li\x1b[2J\ndar"
+    assert conversions.POSE_TYPES["nav_msgs/msg/Odometry"].sensor_frame(message) == (
+        "li\\x1b[2J\\ndar"
+    )
+
+
+def test_control_characters_do_not_reach_the_log():
+    written = []
+
+    class Recorder:
+        info = warning = error = written.append
+
+    log = NodeLog(Recorder())
+    for write in (log.info, log.warning, log.error):
+        write("frame a\x1b[2J\nsecond line")
+    assert written == ["frame a\\x1b[2J\nsecond line"] * 3
 
 
 @pytest.mark.parametrize(
