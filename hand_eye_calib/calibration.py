@@ -181,6 +181,10 @@ class Calibration:
         Value of the method's cost at ``T_method``; for dnlo eq. (5), the outliers' share included.
     method, reference, backend : str
         How it was solved; ``method`` and ``reference`` are those that ``auto`` chose.
+    floor : (6, 6) array or None
+        Covariance, of the same xi, of errors that are the same in every part of the recording, so
+        that nothing in it shows them (:mod:`hand_eye_calib.assessment.floor`). ``covariance`` does
+        not contain it. None in a result read from a file that does not have it.
     n_poses, n_pairs, n_inliers : int
         Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
     time_offset_s, time_offset_sigma_s : float
@@ -210,6 +214,7 @@ class Calibration:
     status: SolveStatus
     observability: tuple[DofObservability, ...]
     T_method: FloatArray | None = None
+    floor: FloatArray | None = None
     objective: float
     method: str
     reference: str
@@ -249,6 +254,26 @@ class Calibration:
         infinite if one is unknown. Those of ``sigmas`` are of rotations about the parent's axes.
         """
         return sigmas_rpy(self.T_parent_child, self.covariance)
+
+    @property
+    def covariance_with_floor(self) -> FloatArray:
+        """(6, 6) array: covariance and common-mode floor together."""
+        return self.covariance + (np.zeros((6, 6)) if self.floor is None else self.floor)
+
+    @property
+    def sigmas_of_floor(self) -> FloatArray:
+        """(6,) array: standard deviations of the common-mode floor along (m) and about (rad) the
+        axes of the parent sensor's frame.
+        """
+        if self.floor is None:
+            return np.zeros(6)
+        to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
+        return np.asarray(np.sqrt(np.diag(to_parent @ self.floor @ to_parent.T)))
+
+    @property
+    def sigmas_with_floor(self) -> FloatArray:
+        """(6,) array: :attr:`sigmas` and common-mode floor together."""
+        return np.hypot(self.sigmas, self.sigmas_of_floor)
 
     @property
     def weights(self) -> FloatArray:
@@ -307,6 +332,13 @@ class Calibration:
                 "of": "T_parent_child as the method solved it: nothing set, no prior added",
                 "matrix": self.T_method.tolist(),
             }
+        if self.floor is not None:
+            document["floor"] = {
+                "of": "errors of a whole recording, the same in every part; not in the covariance",
+                "frame": self.child_frame,
+                "units": "m, rad",
+                "matrix": self.floor.tolist(),
+            }
         plain = {
             name: getattr(self, name)
             for name in self.__dataclass_fields__
@@ -361,6 +393,7 @@ class Calibration:
             return cls(
                 T_parent_child=_transform(data["T_parent_child"]),
                 T_method=_transform(data["T_method"]) if "T_method" in data else None,
+                floor=_matrix(data["floor"], 6) if "floor" in data else None,
                 covariance=_matrix(data["covariance"], 6),
                 status=SolveStatus(data["status"]),
                 observability=tuple(

@@ -17,6 +17,7 @@ import numpy as np
 
 from hand_eye_calib.adaptive.resampling import answers_without
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
+from hand_eye_calib.adaptive.state_space import NormalEquations
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.lever_arm import HIDDEN_SHARE, ROUNDING_ANGLE, LeverArms
 from hand_eye_calib.calibration import DofObservability, DofVerdict
@@ -36,6 +37,10 @@ _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 # What the ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance
 # exceed once in ten times.
 _CHANCE = np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28])
+
+# What the squared distance of two halves in units of their joint covariance exceeds once in ten
+# recordings: a chi-squared with 6 degrees of freedom.
+_HALVES_BY_CHANCE = 10.64
 
 # Standard deviations that stand for "unknown" in the covariance: the distance between sensors on a
 # large machine. An unknown direction is never exactly an axis of the parent sensor, so that part of
@@ -116,6 +121,7 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
     if len(solution.jumps) >= _BLOCKS * _MIN_PAIRS_PER_BLOCK:
         steps = answers_without(solution.part_products, _BLOCKS)
         covariance = beyond_chance(covariance, _spread_of_blocks(steps))
+        covariance = widened_by_halves(covariance, solution.part_products, solution.misfit)
     unseen = [*solution.unseen.T, *_noise_driven_baselines(pose_pairs.Ts_pw_p, solution)]
     return _combine(solution.T_parent_child, covariance, None, _basis(unseen))
 
@@ -255,6 +261,33 @@ def beyond_chance(model: FloatArray, resampled: FloatArray) -> FloatArray:
     on average. They are divided by what they exceed in one recording of ten.
     """
     return _raised(model, resampled, _CHANCE)
+
+
+def widened_by_halves(model: FloatArray, products: FloatArray, misfit: float) -> FloatArray:
+    """The model's covariance (6, 6), widened along the direction in which both halves of the
+    recording disagree by more than chance.
+
+    Parameters
+    ----------
+    model : (6, 6) array
+    products : (K, p + 1, p + 1) array
+        What each part of the recording adds, see :mod:`~hand_eye_calib.adaptive.resampling`.
+    misfit : float
+        Factor of the covariances of the halves.
+    """
+    half = len(products) // 2
+    first, second = (
+        NormalEquations(part.sum(axis=0)) for part in (products[:half], products[half:])
+    )
+    if first.unseen.size or second.unseen.size:
+        return model
+    difference = (first.step - second.step)[:6]
+    away = np.linalg.solve(misfit * (first.covariance + second.covariance)[:6, :6], difference)
+    excess = float(difference @ away) / _HALVES_BY_CHANCE
+    if excess <= 1.0:
+        return model
+    error = model @ away
+    return model + (excess - 1.0) / float(error @ away) * np.outer(error, error)
 
 
 def _raised(first: FloatArray, second: FloatArray, limits: FloatArray) -> FloatArray:

@@ -29,7 +29,10 @@ _ROUNDING = 1e-6
 
 
 def why_not(
-    model: AdaptiveSolution, of_model: Assessment, dnlo: tuple[FloatArray, Assessment]
+    model: AdaptiveSolution,
+    of_model: Assessment,
+    dnlo: tuple[FloatArray, Assessment],
+    floor: FloatArray,
 ) -> str:
     """What speaks against the noise model, in words; empty if it fits.
 
@@ -40,6 +43,10 @@ def why_not(
         Of its answer.
     dnlo : (4, 4) array and Assessment
         DNLO's answer.
+    floor : (6, 6) array
+        Covariance of what neither covariance knows of, see
+        :func:`~hand_eye_calib.assessment.floor.common_mode_floor`. Errors of that kind, and they
+        are not the model's fault, move the answers apart: their weights differ.
     """
     T_dnlo, of_dnlo = dnlo
     difference = se3.log(se3.inverse(model.T_parent_child) @ T_dnlo)
@@ -53,7 +60,7 @@ def why_not(
     if not 1.0 / _MAX_MISFIT < model.misfit < _MAX_MISFIT:
         return f"its residuals have {model.misfit:.2g} times the variance that it predicts"
     joint = of_model.cov_parent_child_in_child + of_dnlo.cov_parent_child_in_child
-    apart = squared_distance(difference, joint)
+    apart = squared_distance(difference, joint + floor)
     if apart > _MAX_DISAGREEMENT:
         return (
             f"its answer is {np.sqrt(apart / 6):.1f} joint standard deviations (root mean square "

@@ -103,6 +103,7 @@ def as_text(calibration: Calibration) -> str:
         f"Pose of {parent} (parent) in {child} (child): maps coordinates of {parent} into {child}",
         *_transform_lines(document["T_child_parent"]),
         f"Along and about the axes of {parent}: {_observability(calibration)}",
+        *_floor_lines(calibration),
         *_scatter_lines(calibration.cross_check),
         *_solution_lines(calibration),
         *_publishing_lines(calibration),
@@ -152,6 +153,27 @@ def _observability(calibration: Calibration) -> str:
         if names:
             texts.append(f"{listing(names)} {words}")
     return "; ".join(texts)
+
+
+def _floor_lines(calibration: Calibration) -> Iterator[str]:
+    """Errors that nothing in the recording shows."""
+    if calibration.floor is not None:
+        from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
+
+        told = [
+            f"{dof.name} {np.degrees(sigma):.2g} deg"
+            if dof.name in _ROTATIONS
+            else f"{dof.name} {sigma:.2g} m"
+            for dof, sigma in zip(
+                calibration.observability, calibration.sigmas_of_floor, strict=True
+            )
+            if np.isfinite(dof.sigma)
+        ]
+        yield (
+            "Not in these standard deviations, because it is the same all the time: odometry that "
+            f"is off by {FLOOR_SCALE:.0%} in scale and {np.degrees(FLOOR_ROTATION):.2g} deg: "
+            f"{', '.join(told)}"
+        )
 
 
 def _scatter_lines(cross_check: Mapping[str, Mapping[str, Any]] | None) -> Iterator[str]:

@@ -12,13 +12,14 @@ from hand_eye_calib.adaptive.estimator import AdaptiveSolution
 from hand_eye_calib.alignment.scale import Scale, child_scaled, estimate_scale
 from hand_eye_calib.alignment.similarity import MAX_UNEXPLAINED_TRANSLATION
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import (
     TRANSLATIONS,
     Assessment,
     assess,
     assess_adaptive,
 )
+from hand_eye_calib.assessment.floor import common_mode_floor
 from hand_eye_calib.assessment.model_fit import MAX_JUMPS, why_not
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
@@ -32,13 +33,23 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
 
+# Poses between the ends of motion pairs that show the motion well: over one interval noise would
+# look like motion.
+_SPAN = 10
+
 # Tried in turn if the reference that auto chose leaves an axis unobservable.
 _LONGER_REFERENCES = ("B5", "B20")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Evaluation:
-    """Solution and assessment, of any method."""
+    """Solution and assessment, of any method.
+
+    Attributes
+    ----------
+    spans : MotionPairs and (K,) array
+        Pairs that are long enough to show the motion, and their weights, for the floor.
+    """
 
     solution: Solution | AdaptiveSolution
     assessment: Assessment
@@ -46,6 +57,7 @@ class _Evaluation:
     reference: str
     pairs: MotionPairs
     weights: FloatArray
+    spans: tuple[MotionPairs, FloatArray]
     method_reason: str = ""
     reference_reason: str = ""
     noise: dict[str, Any] | None = None
@@ -121,6 +133,7 @@ def _calibration(
         status=_status(solution.converged, fused),
         observability=fused.assessment.observability,
         T_method=solution.T_parent_child,
+        floor=common_mode_floor(*evaluation.spans, fused.T_parent_child),
         objective=solution.objective,
         method=evaluation.method,
         method_reason=evaluation.method_reason,
@@ -177,12 +190,13 @@ def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
     with_dnlo = replace(config, method="dnlo")
     dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
     by_model = _evaluated(pose_pairs, solution)
-    misfit = why_not(solution, by_model.assessment, _answer(dnlo))
+    floor = common_mode_floor(*by_model.spans, solution.T_parent_child)
+    misfit = why_not(solution, by_model.assessment, _answer(dnlo), floor)
     if misfit and solution.systematic != "none":
         # DNLO does not know of a scale or a time offset. Without them it may agree.
         corrected = _corrected(pose_pairs, solution)
         witness = _solve_pairs(corrected, replace(with_dnlo, reference=dnlo.reference))
-        misfit = why_not(solution, by_model.assessment, _answer(witness))
+        misfit = why_not(solution, by_model.assessment, _answer(witness), floor)
     compared = f"dnlo on reference {dnlo.reference}"
     if misfit:
         reason = f"auto: {compared} stands, because the noise model does not fit: {misfit}"
@@ -237,6 +251,7 @@ def _solve_reference(
         reference=reference,
         pairs=pairs,
         weights=solution.weights,
+        spans=(pairs, solution.weights),
         reference_reason=reason,
     )
 
@@ -293,10 +308,23 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         reference="increments",
         pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
         weights=(~solution.jumps).astype(float),
+        spans=_spans(pose_pairs.Ts_pw_p, Ts_cw_c, solution.left_out),
         noise=solution.describe(stamps_ns),
         scale_correction=solution.scale,
         time_correction_s=solution.time_offset_s,
     )
+
+
+def _spans(
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, left_out: BoolArray
+) -> tuple[MotionPairs, FloatArray]:
+    """Motion pairs over a tenth of a short recording, or ten poses, without those across an
+    increment that is left out.
+    """
+    baseline = min(_SPAN, max(len(left_out) // 10, 1))
+    pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{baseline}")
+    before = np.concatenate([[0], np.cumsum(left_out)])
+    return pairs, (before[pairs.i] == before[pairs.j]).astype(float)
 
 
 # Methods that do not only solve the motion pairs of a reference.

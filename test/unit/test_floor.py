@@ -1,0 +1,99 @@
+"""The common-mode floor, and the halves that widen a covariance."""
+
+import numpy as np
+import pytest
+from motions import as_trajectory, child_of, disturbed, wandering_poses
+
+import hand_eye_calib as hec
+from hand_eye_calib.assessment.covariance import widened_by_halves
+from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE, common_mode_floor
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.solvers.registry import Method
+
+
+def streams(scale=1.0):
+    parent = wandering_poses(120)
+    child = as_trajectory(disturbed(child_of(parent), 2, 1e-4, 1e-4)).scaled(scale)
+    return as_trajectory(disturbed(parent, 1, 1e-4, 1e-4)), child
+
+
+class TestFloor:
+    def test_its_translation_is_the_shift_that_a_wrong_scale_causes(self):
+        parent, child = streams()
+        answers = []
+        for poses in (child.poses, child.scaled(1 + FLOOR_SCALE).poses):
+            pairs = motion_pairs(parent.poses, poses, "B5")
+            answers.append(Method("dnl").solve(pairs))
+        pairs = motion_pairs(parent.poses, child.poses, "B5")
+        T = answers[0].T_parent_child
+        shift = se3.log(se3.inverse(T) @ answers[1].T_parent_child)[:3]
+        floor = common_mode_floor(pairs, answers[0].weights, T)
+        expected = np.outer(shift, shift)
+        np.testing.assert_allclose(floor[:3, :3], expected, atol=0.1 * np.trace(expected))
+        np.testing.assert_allclose(floor[3:, 3:], np.eye(3) * FLOOR_ROTATION**2)
+
+    @pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "park"])
+    def test_every_result_has_it_beside_the_covariance(self, method):
+        result = hec.calibrate(*streams(), method=method)
+        assert result.floor is not None
+        np.testing.assert_allclose(result.sigmas_of_floor[3:], FLOOR_ROTATION)
+        assert 1e-5 < result.sigmas_of_floor[:3].max() < 0.05
+        assert result.sigmas[3:].max() < FLOOR_ROTATION
+        np.testing.assert_allclose(
+            result.sigmas_with_floor**2, result.sigmas**2 + result.sigmas_of_floor**2
+        )
+        np.testing.assert_array_equal(
+            result.covariance_with_floor, result.covariance + result.floor
+        )
+
+    def test_it_is_about_the_same_for_all_methods(self):
+        by_method = [
+            hec.calibrate(*streams(), method=method).sigmas_of_floor
+            for method in ("adaptive", "dnlo")
+        ]
+        np.testing.assert_allclose(*by_method, atol=0.5 * np.max(by_method))
+
+    def test_files_keep_it_and_older_ones_have_none(self):
+        result = hec.calibrate(*streams())
+        document = result.to_dict()
+        np.testing.assert_array_equal(hec.Calibration.from_dict(document).floor, result.floor)
+        del document["floor"]
+        older = hec.Calibration.from_dict(document)
+        assert older.floor is None
+        np.testing.assert_array_equal(older.sigmas_with_floor, older.sigmas)
+        np.testing.assert_array_equal(older.covariance_with_floor, older.covariance)
+
+
+class TestHalves:
+    """Two halves of equal information, sigma of each 1, so that of the whole is sqrt(1/2)."""
+
+    whole = 0.5 * np.eye(6)
+
+    def products(self, apart):
+        found = np.zeros((2, 7, 7))
+        for products, sign in zip(found, (1, -1), strict=True):
+            products[:6, :6] = np.eye(6)
+            # The residuals at zero of a half whose answer is sign * apart / 2 along x.
+            products[0, 6] = products[6, 0] = -sign * apart / 2
+        return found
+
+    def test_nothing_changes_if_they_agree(self):
+        kept = widened_by_halves(self.whole, self.products(4.5), misfit=1.0)
+        np.testing.assert_array_equal(kept, self.whole)
+
+    def test_the_direction_of_their_difference_is_widened(self):
+        wide = widened_by_halves(self.whole, self.products(9.0), misfit=1.0)
+        assert wide[0, 0] / 0.5 == pytest.approx(9.0**2 / 2 / 10.64)
+        np.testing.assert_allclose(wide[1:, 1:], self.whole[1:, 1:])
+
+    def test_the_misfit_belongs_to_their_covariance(self):
+        kept = widened_by_halves(self.whole, self.products(9.0), misfit=5.0)
+        np.testing.assert_array_equal(kept, self.whole)
+
+    def test_a_half_that_does_not_know_all_says_nothing(self):
+        products = self.products(9.0)
+        products[1, 2, 2] = 0.0
+        np.testing.assert_array_equal(
+            widened_by_halves(self.whole, products, misfit=1.0), self.whole
+        )
