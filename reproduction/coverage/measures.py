@@ -88,6 +88,7 @@ KINDS = {
     "bound_r": Kind("rotation", _root_of_median(MEDIAN_3), _log_above(0.1), np.log(1.10)),
     "nees": Kind("median NEES", _median, _log_distance(MEDIAN_6), np.log(1.25)),
     "covers": Kind("90 % covers", _mean, lambda value: abs(value - COVERAGE), 0.03),
+    "covers_floor": Kind("with the floor", _mean, lambda value: max(COVERAGE - value, 0.0), 0.03),
     "covers_truth": Kind(
         "with the truth's own sigma", _mean, lambda value: max(COVERAGE - value, 0.0), 0.03
     ),

@@ -135,17 +135,21 @@ def truth_row(rig: Rig, name: str, method: str) -> Row:
     row_name = f"{rig.name} {name}".removesuffix(" whole")
     cases = {"answered": {"": 0.0}}
     if found.calibration is not None and rig.truth is not None:
-        cases = _truth_cases(found.calibration, rig.truth)
+        cases = truth_cases(found.calibration, rig.truth)
     return Row("known answer", row_name, method, cases, found.seconds)
 
 
-def _truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]]:
+def truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]]:
+    """Error of an answer over the axes that both know, and whether its intervals cover the truth:
+    without the common-mode floor, with it, and with the uncertainty of the truth.
+    """
     known = np.isfinite(truth.sigmas) & _knows(found)
     error = deviation(found.T_parent_child, truth.T_parent_child)
     # A rotation whose axis is not known to the truth has no small rotation vector.
     if not np.isfinite(truth.sigmas[3:]).all():
         error[3:] = _angle_differences(found.T_parent_child, truth.T_parent_child)
     sigmas = np.where(known, found.sigmas, 1.0)
+    with_floor = np.where(known, found.sigmas_with_floor, 1.0)
     apart = np.where(known, np.abs(error), 0.0)
     of_truth = np.where(known, truth.sigmas, 0.0)
     cases = {
@@ -155,6 +159,7 @@ def _truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]
         "deg_truth": {"": float(np.degrees(np.linalg.norm(of_truth[3:])))},
         "z": {"": float(np.max(apart / sigmas))},
         "covers": _by_axis(apart < _REACH * sigmas, known),
+        "covers_floor": _by_axis(apart < _REACH * with_floor, known),
         "covers_truth": _by_axis(apart < _REACH * np.hypot(sigmas, of_truth), known),
     }
     if known[3:].any():

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from published_data import data_folder
 
-from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.geometry import se3
 from reproduction.coverage import __main__ as command
 from reproduction.coverage import classes, measures, mixed, motions, study
 from reproduction.coverage.bound import ideal_estimate
 from reproduction.coverage.measures import Row, pooled, worsened
 from reproduction.coverage.page import page
-from reproduction.coverage.real_sets import CYCLE, real_rigs
-from reproduction.coverage.scores import misclosure
+from reproduction.coverage.real_sets import CYCLE, Truth, real_rigs
+from reproduction.coverage.scores import misclosure, truth_cases
 from reproduction.coverage.sensor_errors import (
     GaussMarkov,
     SensorErrors,
@@ -252,6 +253,20 @@ def _calibration(T_parent_child, covariance, scale):
         n_inliers=1,
         scale=scale,
     )
+
+
+def test_coverage_with_the_floor_is_told_apart():
+    observability = tuple(DofObservability(axis, DofVerdict.OBSERVED, 0.001) for axis in AXES)
+    found = dataclasses.replace(
+        _calibration(np.eye(4), 1e-6 * np.eye(6), 1.0),
+        observability=observability,
+        floor=0.01**2 * np.eye(6),
+    )
+    T_truth = np.eye(4)
+    T_truth[0, 3] = 0.01
+    cases = truth_cases(found, Truth.within(T_truth, 0.0, 0.0))
+    assert (cases["covers"]["x"], cases["covers_floor"]["x"]) == (0.0, 1.0)
+    assert cases["covers"]["y"] == cases["covers_floor"]["y"] == 1.0
 
 
 def test_one_class_from_end_to_end(monkeypatch):
