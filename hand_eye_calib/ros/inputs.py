@@ -188,6 +188,7 @@ class PoseInput:
         self._use(self.guard.flush(time.monotonic()), is_first)
 
     def _use(self, judgement: Judgement, is_first: bool) -> None:
+        self.monitor.restored += len(judgement.restored)
         for stamp_ns in judgement.dropped:
             text = "its stamp does not fit those before and after it"
             self._refuse(stamp_ns, "corrupt stamp", text)

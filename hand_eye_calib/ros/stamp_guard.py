@@ -2,8 +2,9 @@
 
 Most streams are regular: from the newest message taken, the next one is a whole number of periods
 away. A message that is elsewhere waits until those after it tell what it is. Six that follow each
-other are a real change: a gap, or a jump of the clock. Fewer have corrupt stamps and are dropped,
-unless their place in the regular sequence is free: then they were overtaken.
+other are a real change: a gap, or a jump of the clock. Fewer have only changed places with others,
+or have corrupt stamps. A corrupt stamp is restored if the messages around it leave exactly one
+place for it; otherwise the message is dropped.
 """
 
 from bisect import bisect_left, insort
@@ -70,13 +71,16 @@ class Judgement:
     verdict : Verdict
         JUMPED_BACK: the messages taken are the first of a new session.
     taken : list of (stamp_ns, message)
-        To be used now; held ones among them.
+        To be used now; held ones among them, some with a restored stamp.
+    restored : list of int
+        The corrupt stamps of those.
     dropped : list of int
-        Stamps, found to be corrupt, of messages that are not to be used.
+        Corrupt stamps of messages that are not to be used.
     """
 
     verdict: Verdict
     taken: list[Stamped] = field(default_factory=list)
+    restored: list[int] = field(default_factory=list)
     dropped: list[int] = field(default_factory=list)
 
 
@@ -112,6 +116,7 @@ class StampGuard:
         self._held: list[_Held] = []
         self._recent: list[tuple[int, int]] = []  # stamps taken, with their arrival
         self._since_last = 0  # messages held since the newest one taken
+        self._session_began = self._arrivals  # messages before are not of this session
 
     @property
     def held(self) -> int:
@@ -140,8 +145,10 @@ class StampGuard:
         if self._is_next(stamp_ns):
             self._take(stamp_ns, self._arrivals)
             self._sure_ns = self.last_ns
-            old, dropped = self._judge_old(_PATIENCE)
-            return Judgement(Verdict.TAKE, [(stamp_ns, message), *old], dropped)
+            judgement = self._judge_old(_PATIENCE)
+            judgement.verdict = Verdict.TAKE
+            judgement.taken.insert(0, (stamp_ns, message))
+            return judgement
         self._held.append(_Held(stamp_ns, message, self._arrivals))
         self._since_last += 1
         return self._believe(WITNESSES)
@@ -155,10 +162,10 @@ class StampGuard:
             return Judgement(Verdict.HOLD)
         if self.last_ns is None:  # a short stream: as good as it gets
             return self._believe(1)
-        taken, dropped = self._judge_old(0)
+        judgement = self._judge_old(0)
         if self._held and self._held[0].stamp_ns - self.last_ns <= _LONGEST_PAUSE_NS:
-            taken += self._believe(1).taken  # the last ones, after a pause
-        return Judgement(Verdict.TAKE if taken else Verdict.HOLD, taken, dropped)
+            judgement.taken += self._believe(1).taken  # the last ones, after a pause
+        return judgement
 
     def restart(self, now_s: float | None = None) -> None:
         """Begin a new session; with ``now_s`` (steady time) as another stream has jumped back."""
@@ -169,6 +176,7 @@ class StampGuard:
             follow_s = _OTHERS_FOLLOW_S + 2 * WITNESSES * self._period_ns * 1e-9
             self._outdated_until_s = now_s + follow_s
             self._recent = []  # the engine has forgotten them
+            self._session_began = self._arrivals
 
     # ------------------------------------------------------------- one message
 
@@ -233,15 +241,16 @@ class StampGuard:
         """Take the messages that wait if enough of them follow each other."""
         chain = _longest_chain([each.stamp_ns for each in self._held], self._follows_ns)
         if len(chain) < witnesses:
-            taken, dropped = self._judge_old(_PATIENCE)
-            return Judgement(Verdict.HOLD, taken, dropped)
+            return self._judge_old(_PATIENCE)
         members = [self._held[index] for index in chain]
         self._held = [each for index, each in enumerate(self._held) if index not in chain]
         newest_ns = self._sure_ns or self.last_ns
         jumped = newest_ns is not None and members[0].stamp_ns < newest_ns - BACKWARD_JUMP_NS
         followed, self._outdated_until_s = self._outdated_until_s is not None, None
         if jumped:
+            held, arrivals = self._held, members[0].number - 1
             self._begin()
+            self._held, self._session_began = held, arrivals
         self.last_ns = None  # what comes next follows these, also after a small step back
         for each in members:
             self._take(each.stamp_ns, each.number)
@@ -255,24 +264,60 @@ class StampGuard:
         verdict = Verdict.JUMPED_BACK if jumped and not followed else Verdict.TAKE
         return Judgement(verdict, [(each.stamp_ns, each.message) for each in members])
 
-    def _judge_old(self, patience: int) -> tuple[list[Stamped], list[int]]:
-        """Messages that have waited for so many others: those to take, and the corrupt stamps."""
+    def _judge_old(self, patience: int) -> Judgement:
+        """Judge the messages that have waited for so many others."""
+        judgement = Judgement(Verdict.HOLD)
         if self.last_ns is None:
-            return [], []
-        taken: list[Stamped] = []
-        dropped: list[int] = []
-        still: list[_Held] = []
-        for each in self._held:
+            return judgement
+        held, self._held = self._held, []
+        for each in held:
             waits_on = patience == 0 and each.stamp_ns > self.last_ns
             if self._arrivals - each.number < patience or waits_on:
-                still.append(each)
-            elif self._is_out_of_order(each):
-                self._take(each.stamp_ns, each.number)
-                taken.append((each.stamp_ns, each.message))
+                self._held.append(each)
             else:
-                dropped.append(each.stamp_ns)
-        self._held = still
-        return taken, dropped
+                self._settle(each, judgement)
+        return judgement
+
+    def _settle(self, held: _Held, judgement: Judgement) -> None:
+        """Take, restore or drop one message."""
+        place_ns = self._only_place(held)
+        if place_ns is not None:
+            judgement.restored.append(held.stamp_ns)
+        elif self._is_out_of_order(held):
+            place_ns = held.stamp_ns
+        else:
+            judgement.dropped.append(held.stamp_ns)
+            return
+        self._take(place_ns, held.number)
+        judgement.taken.append((place_ns, held.message))
+
+    def _only_place(self, held: _Held) -> int | None:
+        """The stamp that a message must have had, if the stream is regular and nothing is lost
+        around it: between its neighbours there are as many periods as messages.
+        """
+        if not self._is_regular or not self._recent:
+            return None
+        before = max((each for each in self._arrived(before=held.number)), default=None)
+        after_number, after_ns = min(self._arrived(after=held.number), default=(0, 0))
+        if not after_number:
+            return None
+        if before is None:
+            if held.number <= self._session_began:
+                return None
+            return round(after_ns - (after_number - held.number) * self._period_ns)
+        number, before_ns = before
+        count = after_number - number
+        if abs(after_ns - before_ns - count * self._period_ns) > self._tolerance_ns:
+            return None
+        return before_ns + round((after_ns - before_ns) * (held.number - number) / count)
+
+    def _arrived(self, before: int | None = None, after: int = 0) -> list[tuple[int, int]]:
+        """Arrival and stamp of messages taken that came before or after another one."""
+        return [
+            (number, stamp_ns)
+            for stamp_ns, number in self._recent
+            if number > after and (before is None or number < before)
+        ]
 
     def _is_out_of_order(self, held: _Held) -> bool:
         """Whether a message has only changed places with others, or repeats one of them."""
