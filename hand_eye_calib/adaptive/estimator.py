@@ -56,7 +56,7 @@ _DECISIVE = 0.7
 
 # Noise levels need no more poses than this, in bursts that are spread evenly: bursts show the fast
 # errors, the time between them the slow ones. Slow errors take more time and need fewer poses.
-_MOST_POSES, _MOST_POSES_LASTING, _BURST = 400, 250, 10
+_MOST_POSES, _MOST_POSES_LASTING, _BURST = 300, 200, 10
 
 # Systematic errors that are in the model while the noise levels are fitted: scale, bias, time. Both
 # biases at once would differ by noise alone.
@@ -67,6 +67,9 @@ _OUTLIER_ROUNDS, _TAIL_ROUNDS = 4, 3
 
 # No more than this share of the poses are wrong by themselves.
 _MOST_SPIKES = 0.1
+
+# Changes of this share of the evidence leave the noise levels as they are.
+_NEGLIGIBLE = 0.005
 
 # Rotation noise this large beside the rotation between poses is not small.
 _NOISY = 0.2
@@ -83,7 +86,7 @@ _MOST_GROWTH = 5.0
 
 # X is followed until it moves by less than this share of its sigma, at least one round.
 _MAX_ROUNDS = 6
-_SETTLED_SIGMAS, _SETTLED_STEP = 0.05, 1e-9
+_SETTLED_SIGMAS, _SETTLED_STEP = 0.1, 1e-9
 
 
 def solve(
@@ -267,9 +270,8 @@ def _fitted(state: _State, walks: tuple[str, ...] = ("time", "distance")) -> _St
         walks = (state.model.walk_by,)
     for walk_by in walks:
         model = dataclasses.replace(state.model, walk_by=walk_by)
-        start = model.raised(levels)
-        fits.append((model, reml.fit(state.space(kept, model), start, model.prior(start))))
-        levels = fits[0][1].levels
+        fits.append((model, reml.fit(state.space(kept, model), levels, model.prior(levels))))
+        levels = model.raised(fits[0][1].levels)
     model, fit = min(fits, key=lambda each: each[1].loss)
     step = NormalEquations(selected(fit.posterior.products, list(range(6)))).step
     T = state.T @ se3.exp(step)
@@ -288,7 +290,7 @@ def _without_outliers(state: _State) -> _State:
     """Jumps and spikes found, the noise fitted again, tails weighed if they are heavy."""
     walk = (state.model.walk_by,)
     found, of_white = _outliers_found(state, _OUTLIER_ROUNDS)
-    if not found.outliers.same_as(state.outliers):
+    if found.outliers.differs_by(state.outliers) > _NEGLIGIBLE:
         found = _fitted(found, walk)
         found, of_white = _outliers_found(found, 1)
     if np.mean(found.outliers.spikes) > _MOST_SPIKES:
@@ -310,7 +312,7 @@ def _outliers_found(state: _State, rounds: int) -> tuple[_State, FloatArray]:
     for _ in range(rounds):
         posterior = state.posterior()
         if _is_noisy(state):
-            state = _freed(state, posterior)
+            state = _freed(state, posterior.states_after(posterior.normal.step))
             posterior = state.posterior()
         of_walk, of_white = surprises(posterior, state.outliers.spikes)
         outliers = judged(state.outliers, of_walk, of_white, with_spikes=not state.heavy)
@@ -350,20 +352,21 @@ def _with_lasting_errors(plain: _State) -> _State:
 
 def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     """The model of systematic errors that Schwarz's criterion asks for, one step from where the
-    search stands. All models are judged under the same noise.
+    search stands, at poses freed of their errors. All models are judged under the same noise.
     """
     every = dataclasses.replace(state, columns=list(range(N_SYSTEMATIC)))
-    products = every.posterior().products
+    posterior = every.posterior()
     n_observations = 6 * int((~state.outliers.jumps).sum())
 
-    def normal(name: str) -> NormalEquations:
-        columns = [6 + column for column in parameters_of(name)]
-        return NormalEquations(selected(products, [*range(6), *columns]))
+    def columns_of(name: str) -> list[int]:
+        return [*range(6), *(6 + column for column in parameters_of(name))]
 
     def criterion(name: str) -> float:
         return fits[name].cost + len(parameters_of(name)) * np.log(max(n_observations, 2))
 
-    fits = {name: normal(name) for name in systematic}
+    fits = {
+        name: NormalEquations(selected(posterior.products, columns_of(name))) for name in systematic
+    }
     known = fits["none"].covariance
     credible = [name for name, fit in fits.items() if _is_credible(fit, name, known)]
     best = min(credible, key=criterion)
@@ -373,7 +376,8 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     chosen = dataclasses.replace(
         state, systematic=best, columns=parameters_of(best), other_sigmas=sigmas
     )
-    return chosen.moved(fits[best].step)
+    states = posterior.states_after(fits[best].step, columns_of(best))
+    return _freed(chosen.moved(fits[best].step), states)
 
 
 def _is_credible(fit: NormalEquations, name: str, known: FloatArray) -> bool:
@@ -389,28 +393,26 @@ def _is_credible(fit: NormalEquations, name: str, known: FloatArray) -> bool:
 def _polished(state: _State) -> AdaptiveSolution:
     """X followed to the end, derivatives taken from poses freed of their errors."""
     converged = False
-    posterior = state.posterior()
     for _ in range(_MAX_ROUNDS):
-        state = _relinearised(state, posterior)
         posterior = state.posterior()
         normal = posterior.normal
         settled = _SETTLED_SIGMAS * np.sqrt(np.diag(normal.covariance))
         converged = bool((np.abs(normal.step) < np.maximum(settled, _SETTLED_STEP)).all())
         if converged:
             break
+        state = _relinearised(state, posterior)
     return _solution(state.moved(posterior.normal.step), posterior, converged)
 
 
 def _relinearised(state: _State, posterior: Posterior) -> _State:
     """After a step, at poses freed of the errors that the posterior knows, tails weighed again."""
-    state = _freed(state.moved(posterior.normal.step), posterior)
     weights = student_weights(posterior) if state.heavy else state.weights
-    return dataclasses.replace(state, weights=weights, n_evaluations=state.n_evaluations + 1)
+    state = dataclasses.replace(state, weights=weights, n_evaluations=state.n_evaluations + 1)
+    return _freed(state.moved(posterior.normal.step), posterior.states_after(posterior.normal.step))
 
 
-def _freed(state: _State, posterior: Posterior) -> _State:
-    """With poses freed of the errors that the posterior knows."""
-    states = posterior.restricted()[0][:, :, 0]
+def _freed(state: _State, states: FloatArray) -> _State:
+    """With poses freed of the errors that latent states (N, d) make."""
     error = state.model.lasting(states, state.poses, state.T)
     white = noise_model.sensor_white(state.levels)
     given = bridged(state.streams, state.T, state.outliers.spikes)

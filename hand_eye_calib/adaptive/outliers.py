@@ -69,6 +69,11 @@ class Outliers:
         jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
         return Outliers(jumps, self.spikes[kept])
 
+    def differs_by(self, other: Outliers) -> float:
+        """Share of the evidence that counts in one but not in the other."""
+        differing = np.sum(self.jumps != other.jumps) + np.sum(self.spikes != other.spikes)
+        return float(differing) / len(self.spikes)
+
     def same_as(self, other: Outliers) -> bool:
         """Whether nothing differs."""
         return np.array_equal(self.jumps, other.jumps) and np.array_equal(self.spikes, other.spikes)

@@ -16,7 +16,7 @@ from hand_eye_calib.arrays import FloatArray
 
 # The search ends if a step promises to lower the loss by less: noise levels need no more than a few
 # per cent. Steps stay within a radius of the log levels.
-_SETTLED_LOSS, _SETTLED_STEP, _MAX_STEPS = 0.02, 1e-3, 20
+_SETTLED_LOSS, _SETTLED_STEP, _MAX_STEPS = 0.05, 1e-3, 20
 _FIRST_RADIUS, _LARGEST_RADIUS = 1.5, 3.0
 _GOOD, _POOR, _SHRINK = 0.5, 0.2, 0.3
 

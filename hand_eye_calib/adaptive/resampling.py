@@ -12,11 +12,11 @@ import numpy as np
 from hand_eye_calib.adaptive.state_space import WHITE, NormalEquations, Posterior
 from hand_eye_calib.arrays import FloatArray
 
-N_PARTS = 40
+N_PARTS = 20
 
 
 def part_products(posterior: Posterior) -> FloatArray:
-    """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 40."""
+    """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20."""
     space = posterior.space
     n, columns = len(space), posterior.columns
     ends = np.unique(np.linspace(0, n, min(N_PARTS, n) + 1).astype(int))[1:]

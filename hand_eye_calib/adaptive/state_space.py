@@ -269,6 +269,12 @@ class Posterior:
         """
         return self.factor.selected_inverse()
 
+    def states_after(self, step: FloatArray, columns: list[int] | None = None) -> FloatArray:
+        """States (N, d) expected after a step of the parameters, or of some of them."""
+        states = self.of_columns[0]
+        moving = states[:, :, :-1] if columns is None else states[:, :, columns]
+        return states[:, :, -1] + moving @ step
+
     def restricted(self) -> tuple[FloatArray, FloatArray]:
         """States (N, d, 1 + q) and walk (n, 6, 1 + q): expected values and, behind them, what the
         parameters' uncertainty adds, as columns whose squares sum to it.
