@@ -188,10 +188,11 @@ class Calibration:
     n_poses, n_pairs, n_inliers : int
         Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
     time_offset_s, time_offset_sigma_s : float
-        Seconds added to the child's stamps, and one standard deviation: 0 if the offset was given.
+        Seconds added to the child's stamps, and one standard deviation: 0 if the method took the
+        offset as given.
     scale, scale_sigma : float
-        Factor applied to the child's translations, and one standard deviation: 0 if the scale was
-        given.
+        Factor applied to the child's translations, and one standard deviation: 0 if the method took
+        the scale as given.
     method_reason, reference_reason : str
         Why ``auto`` chose the method, the reference; empty if it was given.
     noise : dict or None

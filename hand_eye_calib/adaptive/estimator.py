@@ -39,7 +39,7 @@ from hand_eye_calib.adaptive.outliers import (
     with_jumps_across_spikes,
 )
 from hand_eye_calib.adaptive.relinearise import corrected, restored
-from hand_eye_calib.adaptive.resampling import part_products
+from hand_eye_calib.adaptive.resampling import answers_without, part_products
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.adaptive.state_space import NormalEquations, Posterior, StateSpace, selected
 from hand_eye_calib.arrays import FloatArray, IntArray
@@ -83,6 +83,10 @@ _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
 # child that slips sideways looks like one that is mounted askew.
 _LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5])
 _MOST_GROWTH = 5.0
+
+# Blocks of the jackknife of systematic errors, and what chi-square with nine degrees of freedom, per
+# degree, exceeds once in ten times.
+_BLOCKS, _CHANCE = 10, 1.63
 
 # X is followed until it moves by less than this share of its sigma, at least one round.
 _MAX_ROUNDS = 6
@@ -426,6 +430,7 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
     misfit = normal.cost / max(freedom, 1)
     covariance = misfit * normal.covariance
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
+    parts = part_products(posterior)
     return AdaptiveSolution(
         T_parent_child=state.T,
         cov_parent_child_in_child=covariance[:6, :6],
@@ -435,23 +440,28 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
         weights=state.weights,
         systematic=state.systematic,
         parameters=state.parameters,
-        parameter_sigmas=_sigmas(state, covariance[6:, 6:]),
+        parameter_sigmas=_sigmas(state, covariance[6:, 6:], parts),
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
         heavy_tails=state.heavy,
         misfit=misfit,
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
-        part_products=part_products(posterior),
+        part_products=parts,
         objective=0.5 * (posterior.log_determinant + normal.cost),
         converged=converged,
         iterations=state.n_evaluations,
     )
 
 
-def _sigmas(state: _State, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (8,) of all parameters: of those in the model by their covariance, of
-    the scale and the time offset otherwise by the models that have them.
+def _sigmas(state: _State, covariance: FloatArray, parts: FloatArray) -> FloatArray:
+    """Standard deviations (8,) of all parameters: of those in the model by their covariance or, if
+    that is larger beyond chance, the jackknife over ten blocks; of the scale and the time offset
+    otherwise by the models that have them.
     """
     sigmas = state.other_sigmas.copy()
-    sigmas[state.columns] = np.sqrt(np.diag(covariance))
+    variances = np.diag(covariance)
+    if len(parts) >= _BLOCKS:
+        spread = answers_without(parts, _BLOCKS)[:, 6:].var(axis=0) * (_BLOCKS - 1)
+        variances = np.maximum(variances, spread / _CHANCE)
+    sigmas[state.columns] = np.sqrt(variances)
     return sigmas

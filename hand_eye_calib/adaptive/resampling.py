@@ -55,8 +55,10 @@ def _up_to(
 
 
 def answers_without(products: FloatArray, n_blocks: int) -> FloatArray:
-    """Steps (B, 6) of xi when each of B blocks of parts (K, p + 1, p + 1) is left out in turn."""
+    """Steps (B, p) of xi, first, and of the systematic errors when each of B blocks of parts (K, p +
+    1, p + 1) is left out in turn.
+    """
     block_of_part = np.arange(len(products)) * n_blocks // len(products)
     total = products.sum(axis=0)
     blocks = [products[block_of_part == block].sum(axis=0) for block in range(n_blocks)]
-    return np.array([NormalEquations(total - block).step[:6] for block in blocks])
+    return np.array([NormalEquations(total - block).step for block in blocks])

@@ -119,7 +119,7 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
     """
     covariance = solution.cov_parent_child_in_child
     if len(solution.jumps) >= _BLOCKS * _MIN_PAIRS_PER_BLOCK:
-        steps = answers_without(solution.part_products, _BLOCKS)
+        steps = answers_without(solution.part_products, _BLOCKS)[:, :6]
         covariance = beyond_chance(covariance, _spread_of_blocks(steps))
         covariance = widened_by_halves(covariance, solution.part_products, solution.misfit)
     unseen = [*solution.unseen.T, *_noise_driven_baselines(pose_pairs.Ts_pw_p, solution)]

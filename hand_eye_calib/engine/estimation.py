@@ -62,7 +62,9 @@ class _Evaluation:
     reference_reason: str = ""
     noise: dict[str, Any] | None = None
     scale_correction: float = 1.0
+    scale_sigma: float = 0.0
     time_correction_s: float = 0.0
+    time_sigma_s: float = 0.0
     warnings: tuple[str, ...] = ()
 
 
@@ -114,9 +116,10 @@ def estimate_extrinsic(
     return replace(
         result,
         time_offset_s=offset_s + evaluation.time_correction_s,
-        time_offset_sigma_s=time_offset.sigma_s if time_offset else 0.0,
+        time_offset_sigma_s=evaluation.time_sigma_s or (time_offset.sigma_s if time_offset else 0.0),
         scale=scale.value * evaluation.scale_correction,
-        scale_sigma=scale.estimate.sigma if scale.estimate else 0.0,
+        scale_sigma=scale.value * evaluation.scale_sigma
+        or (scale.estimate.sigma if scale.estimate else 0.0),
         warnings=scale.warnings + result.warnings,
     )
 
@@ -311,7 +314,9 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         spans=_spans(pose_pairs.Ts_pw_p, Ts_cw_c, solution.left_out),
         noise=solution.describe(stamps_ns),
         scale_correction=solution.scale,
+        scale_sigma=solution.scale_sigma,
         time_correction_s=solution.time_offset_s,
+        time_sigma_s=solution.time_offset_sigma_s,
     )
 
 
