@@ -28,7 +28,6 @@ from hand_eye_calib.adaptive.increments import (
 )
 from hand_eye_calib.adaptive.noise_model import CENTRES, SCALE_DRIFT, Extent, NoiseModel
 from hand_eye_calib.adaptive.outliers import (
-    NO_WEIGHT,
     Outliers,
     bridged,
     first_outliers,
@@ -42,7 +41,7 @@ from hand_eye_calib.adaptive.relinearise import corrected, restored
 from hand_eye_calib.adaptive.resampling import answers_without, part_products
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.adaptive.state_space import NormalEquations, Posterior, StateSpace, selected
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.registry import Method
@@ -71,8 +70,11 @@ _MOST_SPIKES = 0.1
 # Changes of this share of the evidence leave the noise levels as they are.
 _NEGLIGIBLE = 0.005
 
-# Rotation noise this large beside the rotation between poses is not small.
-_NOISY = 0.2
+# Strides where a target's camera is noisy, if so many poses remain.
+_STRIDES, _FEWEST_STRIDES = (3, 10, 30), 50
+
+# Rotation noise this large beside the rotation between poses is not small; rounds of fitting then.
+_NOISY, _FREED_ROUNDS = 0.2, 2
 
 # Errors that last are looked for if a first step promises to lower the loss by so much, and part of
 # the model if it is so much lower in the end.
@@ -115,12 +117,48 @@ def solve(
     """
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     streams = Streams(stamps_s, Ts_pw_p, Ts_cw_c)
-    plain = _without_outliers(_fitted(_start(streams, len(systematic) > 1)))
-    rich = _with_lasting_errors(plain)
-    solution = _polished(_with_systematic_errors(rich, systematic))
+    start = _start(streams, len(systematic) > 1)
+    plain = _fitted(start)
+    if _is_noisy(plain):
+        plain = _fitted_at_freed_poses(start, plain)
+    plain = _without_outliers(plain)
+    kept = _strided(plain)
+    if len(kept) < len(streams):
+        fewer = solve(stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept], systematic)
+        return _at_all_poses(fewer, kept, plain.outliers.spikes)
+    solution = _polished(_with_systematic_errors(_with_lasting_errors(plain), systematic))
     if not solution.converged:
         solution = _polished(_with_systematic_errors(plain, ("none",)))
     return solution
+
+
+def _strided(state: _State) -> IntArray:
+    """Poses to keep: all, but of a camera that sees a target, whose errors repeat from pose to pose
+    and drown the rotation between them, only every so many.
+    """
+    every = np.arange(len(state.streams))
+    if state.model.centre == "sensors" or not _is_noisy(state):
+        return every
+    every = every[~state.outliers.spikes]
+    stride = max((s for s in _STRIDES if len(every) >= s * _FEWEST_STRIDES), default=1)
+    noise = np.exp(0.5 * state.levels[noise_model.ROTATION])
+    rotations = state.streams.Ts_pw_p[every, :3, :3]
+    for rival in _STRIDES:
+        back = np.swapaxes(rotations[:-rival], 1, 2)
+        if noise < _NOISY * np.median(se3.rotation_angle(back @ rotations[rival:])):
+            stride = min(stride, rival)
+            break
+    return every[::stride]
+
+
+def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) -> AdaptiveSolution:
+    """The solution of some poses, jumps and spikes told of all."""
+    jumps, spikes = np.zeros(len(spikes) - 1, dtype=bool), spikes.copy()
+    jumps[kept[1:][fewer.jumps] - 1] = True
+    spikes[kept[fewer.spikes]] = True
+    weights = np.ones(len(spikes))
+    weights[kept] = fewer.weights
+    return dataclasses.replace(fewer, jumps=jumps, spikes=spikes, weights=weights)
 
 
 @dataclass(frozen=True)
@@ -179,7 +217,7 @@ class _State:
             course.twists,
             self.T,
             self.columns,
-            np.where(outliers.spikes, NO_WEIGHT, self.weights[index]),
+            np.where(outliers.spikes, 0.0, self.weights[index]),
             outliers.jumps,
         )
 
@@ -288,6 +326,18 @@ def _fitted(state: _State, walks: tuple[str, ...] = ("time", "distance")) -> _St
         course=course_of(state.streams, T, model.step_noise(fit.levels)),
         n_evaluations=n_evaluations,
     )
+
+
+def _fitted_at_freed_poses(start: _State, fitted: _State) -> _State:
+    """The fit again, with derivatives from poses freed of their errors, from the robust answer on:
+    noise has drawn that of the first fit.
+    """
+    fitted = dataclasses.replace(fitted, T=start.T)
+    for _ in range(_FREED_ROUNDS):
+        posterior = fitted.posterior()
+        freed = _freed(fitted, posterior.states_after(posterior.normal.step))
+        fitted = _fitted(freed, (fitted.model.walk_by,))
+    return fitted
 
 
 def _without_outliers(state: _State) -> _State:
@@ -418,7 +468,7 @@ def _relinearised(state: _State, posterior: Posterior) -> _State:
 def _freed(state: _State, states: FloatArray) -> _State:
     """With poses freed of the errors that latent states (N, d) make."""
     error = state.model.lasting(states, state.poses, state.T)
-    white = noise_model.sensor_white(state.levels)
+    white = state.model.sensor_white(state.levels, state.poses, state.T)
     given = bridged(state.streams, state.T, state.outliers.spikes)
     return dataclasses.replace(state, poses=corrected(given, error, state.T, white), error=error)
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive.increments import Linearisation, Streams
+from hand_eye_calib.adaptive.relinearise import SensorWhite
 from hand_eye_calib.adaptive.reml import Fit, Prior
 from hand_eye_calib.adaptive.state_space import WHITE, Group, StateSpace
 from hand_eye_calib.arrays import BoolArray, FloatArray
@@ -192,6 +193,24 @@ class NoiseModel:
             swing = to_child @ swing
         return swing @ np.swapaxes(swing, 1, 2)
 
+    def sensor_white(
+        self, levels: FloatArray, streams: Streams, T_parent_child: FloatArray
+    ) -> SensorWhite:
+        """White errors of either sensor: half of both sensors', or all of the rotation noise of the
+        one that it turns about a world's origin.
+        """
+        to_child = se3.adjoint(se3.inverse(T_parent_child))
+        translation, rotation = np.exp(levels[[TRANSLATION, ROTATION]])
+        half = 0.5 * translation * _TRANSLATIONS
+        of_child, of_parent = half[None], (to_child @ half @ to_child.T)[None]
+        if self.centre == "sensors":
+            turning = 0.5 * rotation * _ROTATIONS
+            return SensorWhite(of_parent + to_child @ turning @ to_child.T, of_child + turning)
+        turning = rotation * self._white_rotation(streams, to_child)
+        if self.centre == "child":
+            return SensorWhite(of_parent, of_child + turning)
+        return SensorWhite(of_parent + turning, of_child)
+
     def richer(self, slow: tuple[Slow, ...]) -> NoiseModel:
         """The same with other slow processes."""
         return dataclasses.replace(self, slow=slow)
@@ -315,12 +334,6 @@ def slow_directions(process: Slow, streams: Streams, to_child: FloatArray) -> Fl
     if process.kind == "body":
         return np.broadcast_to(np.eye(6)[:, part], (len(streams), 6, 3))
     return to_child[:, part] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
-
-
-def sensor_white(levels: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of one sensor's white errors, half of both sensors'."""
-    white = np.exp(levels[[TRANSLATION, ROTATION]])
-    return 0.5 * (white[0] * _TRANSLATIONS + white[1] * _ROTATIONS)
 
 
 def _both_rotations(to_child: FloatArray) -> FloatArray:

@@ -18,9 +18,6 @@ from hand_eye_calib.adaptive.state_space import WHITE, Posterior
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 
-# Precision, as a share, of a pose's white error that is no evidence.
-NO_WEIGHT = 1e-7
-
 # False alarms expected in a whole recording; and what is given up again as probable enough.
 _FALSE_ALARMS, _PROBABLE = 0.01, 0.01
 
@@ -126,7 +123,7 @@ def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Floa
 
     own = states[:, :WHITE]
     whites = np.linalg.inv(posterior.white_precision)
-    whites = np.where(spikes, 1.0, 1.0 / space.weights)[:, None, None] * whites
+    whites = np.where(spikes, 1.0, 1.0 / np.where(spikes, 1.0, space.weights))[:, None, None] * whites
     known = posterior.selected_inverse[0][:, :WHITE, :WHITE]
     known = known + own[:, :, 1:] @ own[:, :, 1:].transpose(0, 2, 1)
     return of_walk, _chi_squares(own[:, :, 0], whites, known, spikes)
@@ -197,8 +194,9 @@ def student_weights(posterior: Posterior) -> FloatArray:
     states = posterior.restricted()[0][:, :WHITE, 0]
     pulled = (posterior.white_precision @ states[:, :, None])[:, :, 0]
     squares = (states * pulled).sum(axis=1)
-    kept = min(float(np.mean(posterior.space.weights * squares)) / 6.0, 1.0)
-    hidden = 6.0 * (1.0 - kept) / posterior.space.weights
+    weights, free = posterior.space.weights, posterior.space.is_free
+    kept = min(float(np.mean((weights * squares)[~free])) / 6.0, 1.0)
+    hidden = 6.0 * (1.0 - kept) / np.where(free, 1.0, weights)
     return (_STUDENT + 6.0) / (_STUDENT + squares + hidden)
 
 

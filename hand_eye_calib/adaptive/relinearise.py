@@ -4,15 +4,16 @@ Everything else is of first order in the errors. Where noise is not small beside
 pose to pose, the derivatives themselves are noise, and draw the answer (errors in variables). So
 the errors c are smoothed and split between the sensors,
 
-    a = Ad(X) S' (S' + S)^-1 c,     b = -S (S' + S)^-1 c,     S' = Ad(X^-1) S Ad(X^-1)',
+    Ad(X^-1) a = S' (S' + S)^-1 c,     b = -S (S' + S)^-1 c
 
-S being the white covariance of one sensor; the poses are corrected by ``Exp(-a)`` and ``Exp(-b)``,
+with the white covariances S' of the parent and S of the child, in the child's frame; the poses are corrected by ``Exp(-a)`` and ``Exp(-b)``,
 derivatives are taken there, and what was taken out of the residuals is put back.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,13 +22,20 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 
 
+@dataclass(frozen=True)
+class SensorWhite:
+    """Covariances (1 or N, 6, 6) of the white errors of both sensors, in the child's frame."""
+
+    of_parent: FloatArray
+    of_child: FloatArray
+
+
 def corrected(
-    streams: Streams, error: FloatArray, T_parent_child: FloatArray, white: FloatArray
+    streams: Streams, error: FloatArray, T_parent_child: FloatArray, white: SensorWhite
 ) -> Streams:
-    """Streams without the error c (N, 6), split by the white covariance (6, 6) of one sensor."""
-    to_child = se3.adjoint(se3.inverse(T_parent_child))
-    of_parent = to_child @ white @ to_child.T
-    by_parent = error @ np.linalg.solve(of_parent + white, of_parent)
+    """Streams without the error c (N, 6), split by the white errors of both sensors."""
+    both = white.of_parent + white.of_child
+    by_parent = (white.of_parent @ np.linalg.solve(both, error[:, :, None]))[:, :, 0]
     by_child = by_parent - error
     at_parent = by_parent @ se3.adjoint(T_parent_child).T
     return Streams(

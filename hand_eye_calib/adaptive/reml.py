@@ -141,11 +141,12 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
 
 def _white_gradient(posterior: Posterior, second: FloatArray) -> FloatArray:
     space, precision = posterior.space, posterior.white_precision
+    given = ~space.is_free
     moments = second[:, :WHITE, :WHITE] * space.weights[:, None, None]
     if len(precision) == 1:
-        excess = len(moments) * precision - precision @ moments.sum(axis=0) @ precision
+        excess = given.sum() * precision - precision @ moments.sum(axis=0) @ precision
     else:
-        excess = precision - precision @ moments @ precision
+        excess = (precision - precision @ moments @ precision) * given[:, None, None]
     total = excess.sum(axis=0)
     traces = [
         float((total * basis[0]).sum() if len(basis) == 1 else (excess * basis).sum())
@@ -198,6 +199,7 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     variances = np.exp(posterior.levels)
     columns = np.empty((len(space), 6, len(variances)))
     pulled = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
+    pulled[space.is_free] = 0.0
     for index, basis in enumerate(space.white):
         parts = variances[index] * (basis @ pulled[:, :, None])
         columns[:, :, index] = (parts[1:] - space.behind[:, :, :WHITE] @ parts[:-1])[:, :, 0]

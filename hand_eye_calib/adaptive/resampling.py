@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hand_eye_calib.adaptive.state_space import WHITE, NormalEquations, Posterior
+from hand_eye_calib.adaptive.state_space import FREE, WHITE, NormalEquations, Posterior
 from hand_eye_calib.arrays import FloatArray
 
 N_PARTS = 20
@@ -45,7 +45,8 @@ def _up_to(
     precision = ahead.T @ (posterior.walk_precision * posterior.evidence[end - 1]) @ ahead
     precision -= before @ before.T
     white = posterior.white_precision
-    precision[:WHITE, :WHITE] += space.weights[end] * white[end if len(white) > 1 else 0]
+    of_pose = space.weights[end] * white[end if len(white) > 1 else 0]
+    precision[:WHITE, :WHITE] += FREE * np.eye(WHITE) if space.is_free[end] else of_pose
     for process in posterior.markov:
         states = np.arange(process.group.states.start, process.group.states.stop)
         precision[states, states] += 1.0 / (process.variance * process.rest[end - 1])

@@ -27,6 +27,9 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 
 WHITE = 6
 
+# Precision (1/m^2, 1/rad^2) of poses that may be anywhere.
+FREE = 1.0
+
 # Diagonals are raised by this share, so that rounding cannot make them negative.
 _ROUNDING = 1e-13
 
@@ -75,7 +78,7 @@ class StateSpace:
         What log levels scale: the covariances are ``sum exp(level) basis``.
     groups : tuple of Group
     weights : (N,) array
-        Factors of the precision of each pose's white error.
+        Factors of the precision of each pose's white error; zero for poses that may be anywhere.
     cut : (n,) bool array
         Increments that are no evidence.
     """
@@ -94,6 +97,11 @@ class StateSpace:
 
     def __len__(self) -> int:
         return len(self.residuals)
+
+    @property
+    def is_free(self) -> BoolArray:
+        """(N,) whether each pose may be anywhere."""
+        return self.weights == 0.0
 
     @property
     def n_states(self) -> int:
@@ -202,7 +210,9 @@ class Posterior:
             add_diagonal(bands[after], ahead @ self.weighed(space.ahead[part], part))
             add_diagonal(bands[part], behind @ weighed_behind)
             set_below(bands[part], -ahead @ weighed_behind)
-        add_diagonal(bands, space.weights[:, None, None] * self.white_precision)
+        white = space.weights[:, None, None] * self.white_precision
+        white[space.is_free] = FREE * np.eye(WHITE)
+        add_diagonal(bands, white)
         for process in self.markov:
             diagonal, beside = process.tridiagonal()
             states = process.group.states
@@ -219,9 +229,10 @@ class Posterior:
     def log_determinant(self) -> float:
         """log|V|, increments that are no evidence left out."""
         space = self.space
-        n_poses, kept = len(space) + 1, ~space.cut
+        n_poses, kept, given = len(space) + 1, ~space.cut, ~space.is_free
         white = np.linalg.slogdet(self.white_precision)[1]
-        prior = n_poses / len(white) * white.sum() + WHITE * np.log(space.weights).sum()
+        white = np.broadcast_to(white, n_poses) + WHITE * np.log(np.where(given, space.weights, 1.0))
+        prior = float(white[given].sum()) + WHITE * np.log(FREE) * int((~given).sum())
         for process in self.markov:
             of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
             prior -= process.group.size * of_one
