@@ -55,7 +55,8 @@ _DECISIVE = 0.7
 
 # Noise levels need no more poses than this, in bursts that are spread evenly: bursts show the fast
 # errors, the time between them the slow ones. Slow errors take more time and need fewer poses.
-_MOST_POSES, _MOST_POSES_LASTING, _BURST = 300, 200, 10
+_MOST_POSES, _MOST_POSES_LASTING = 300, 200
+_BURST = np.array([0, 1, 2, 3, 5, 8, 13, 21, 34, 55])
 
 # Systematic errors that are in the model while the noise levels are fitted: scale, bias, time. Both
 # biases at once would differ by noise alone.
@@ -296,11 +297,12 @@ def _rough_levels(residuals: FloatArray, left_out: np.ndarray) -> tuple[FloatArr
 
 
 def _sample(n_poses: int, most: int) -> IntArray | None:
-    """Evenly spread bursts of poses; None for all of them."""
+    """Evenly spread bursts of poses, ever farther apart within each; None for all of them."""
     if n_poses <= most:
         return None
-    starts = np.linspace(0, n_poses - _BURST, most // _BURST).astype(int)
-    return np.unique((starts[:, None] + np.arange(_BURST)).ravel())
+    offsets = _BURST[_BURST < 2 * len(_BURST) * n_poses // most]
+    starts = np.linspace(0, n_poses - 1 - offsets[-1], most // len(_BURST)).astype(int)
+    return np.unique((starts[:, None] + offsets).ravel())
 
 
 def _fitted(state: _State, walks: tuple[str, ...] = ("time", "distance")) -> _State:

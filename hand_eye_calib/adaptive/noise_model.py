@@ -43,6 +43,9 @@ _JITTER_PRECISION, _SCALE_PRECISION, _TAU_PRECISION = 0.05, 0.02, 0.3
 # Time constants are between an interval and this share of the recording.
 _LONGEST_SHARE = 0.25
 
+# A scale drifts no faster than within this share of the recording.
+_SLOWEST_SCALE = 0.02
+
 # A walk's variance over an increment, in units of a typical one: bounded, so that neither a gap nor
 # twin stamps nor a halt dominate.
 _LEAST_INTERVAL, _MOST_INTERVAL, _LEAST_METRES, _MOST_METRES = 0.1, 100.0, 0.05, 1e3
@@ -232,6 +235,7 @@ class NoiseModel:
             lower[group.tau] = np.log(extent.interval_s)
             upper[group.tau] = np.log(max(_LONGEST_SHARE * extent.duration_s, extent.interval_s))
             if process.kind == "scale":
+                lower[group.tau] = min(np.log(_SLOWEST_SCALE * extent.duration_s), upper[group.tau])
                 mean[group.variance] = np.log(_SCALE_VARIANCE)
                 precision[group.variance] = _SCALE_PRECISION
         return Prior(mean, precision, lower, upper)

@@ -21,6 +21,9 @@ from hand_eye_calib.geometry import se3
 # False alarms expected in a whole recording; and what is given up again as probable enough.
 _FALSE_ALARMS, _PROBABLE = 0.01, 0.01
 
+# Large steps of a walk are no jumps: these exceed the level of false alarms by this factor.
+_DECISIVE = 2.5
+
 # No more than this share of the increments can be jumps: otherwise the noise levels are wrong.
 _MOST_JUMPS = 0.5
 
@@ -123,7 +126,9 @@ def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Floa
 
     own = states[:, :WHITE]
     whites = np.linalg.inv(posterior.white_precision)
-    whites = np.where(spikes, 1.0, 1.0 / np.where(spikes, 1.0, space.weights))[:, None, None] * whites
+    whites = (
+        np.where(spikes, 1.0, 1.0 / np.where(spikes, 1.0, space.weights))[:, None, None] * whites
+    )
     known = posterior.selected_inverse[0][:, :WHITE, :WHITE]
     known = known + own[:, :, 1:] @ own[:, :, 1:].transpose(0, 2, 1)
     return of_walk, _chi_squares(own[:, :, 0], whites, known, spikes)
@@ -147,7 +152,9 @@ def judged(
     alarming = chi_square_quantile(_FALSE_ALARMS / len(of_white))
     probable = chi_square_quantile(_PROBABLE)
     beside = np.maximum(of_white[1:], of_white[:-1])
-    found = (of_walk > alarming) & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
+    found = (
+        (of_walk > _DECISIVE * alarming) & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
+    )
     jumps = outliers.jumps & (of_walk >= probable)
     if np.sum(jumps | found) <= _MOST_JUMPS * len(jumps):
         jumps = jumps | found

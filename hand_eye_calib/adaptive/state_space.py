@@ -231,7 +231,9 @@ class Posterior:
         space = self.space
         n_poses, kept, given = len(space) + 1, ~space.cut, ~space.is_free
         white = np.linalg.slogdet(self.white_precision)[1]
-        white = np.broadcast_to(white, n_poses) + WHITE * np.log(np.where(given, space.weights, 1.0))
+        white = np.broadcast_to(white, n_poses) + WHITE * np.log(
+            np.where(given, space.weights, 1.0)
+        )
         prior = float(white[given].sum()) + WHITE * np.log(FREE) * int((~given).sum())
         for process in self.markov:
             of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
