@@ -87,8 +87,8 @@ _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
 _LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5])
 _MOST_GROWTH = 5.0
 
-# Blocks of the jackknife of systematic errors, and what chi-square with nine degrees of freedom, per
-# degree, exceeds once in ten times.
+# Blocks of the jackknife of systematic errors, and what chi-square with nine degrees of freedom,
+# per degree, exceeds once in ten times.
 _BLOCKS, _CHANCE = 10, 1.63
 
 # X is followed until it moves by less than this share of its sigma, at least one round.
@@ -300,7 +300,7 @@ def _sample(n_poses: int, most: int) -> IntArray | None:
     """Evenly spread bursts of poses, ever farther apart within each; None for all of them."""
     if n_poses <= most:
         return None
-    offsets = _BURST[_BURST < 2 * len(_BURST) * n_poses // most]
+    offsets = _BURST[2 * len(_BURST) * n_poses // most > _BURST]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], most // len(_BURST)).astype(int)
     return np.unique((starts[:, None] + offsets).ravel())
 

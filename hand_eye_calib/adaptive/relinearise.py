@@ -6,8 +6,9 @@ the errors c are smoothed and split between the sensors,
 
     Ad(X^-1) a = S' (S' + S)^-1 c,     b = -S (S' + S)^-1 c
 
-with the white covariances S' of the parent and S of the child, in the child's frame; the poses are corrected by ``Exp(-a)`` and ``Exp(-b)``,
-derivatives are taken there, and what was taken out of the residuals is put back.
+with the white covariances S' of the parent and S of the child, in the child's frame. The poses are
+corrected by ``Exp(-a)`` and ``Exp(-b)``, derivatives are taken there, and what was taken out of the
+residuals is put back.
 """
 
 from __future__ import annotations

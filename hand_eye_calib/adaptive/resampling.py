@@ -56,8 +56,13 @@ def _up_to(
 
 
 def answers_without(products: FloatArray, n_blocks: int) -> FloatArray:
-    """Steps (B, p) of xi, first, and of the systematic errors when each of B blocks of parts (K, p +
-    1, p + 1) is left out in turn.
+    """Steps (B, p) of xi and then the systematic errors, each without one of B blocks of parts.
+
+    Parameters
+    ----------
+    products : (K, p + 1, p + 1) array
+        Of :func:`part_products`.
+    n_blocks : int
     """
     block_of_part = np.arange(len(products)) * n_blocks // len(products)
     total = products.sum(axis=0)

@@ -116,7 +116,8 @@ def estimate_extrinsic(
     return replace(
         result,
         time_offset_s=offset_s + evaluation.time_correction_s,
-        time_offset_sigma_s=evaluation.time_sigma_s or (time_offset.sigma_s if time_offset else 0.0),
+        time_offset_sigma_s=evaluation.time_sigma_s
+        or (time_offset.sigma_s if time_offset else 0.0),
         scale=scale.value * evaluation.scale_correction,
         scale_sigma=scale.value * evaluation.scale_sigma
         or (scale.estimate.sigma if scale.estimate else 0.0),
