@@ -170,7 +170,10 @@ class TestNode:
         robot(("base_link", "lidar"))
         heard, extrinsics = listen(), peer.listen(TransformStamped, "extrinsic")
         start_node(*self.ON)
-        edges = lambda found: [each for each in found if each.child_frame_id == "camera"]  # noqa: E731
+
+        def edges(found):
+            return [each for each in found if each.child_frame_id == "camera"]
+
         self.play(peer, lambda: edges(heard), "the edge")
         assert edges(heard)[0].header.frame_id == "lidar"
         assert len(extrinsics) >= RESULTS  # those before were not broadcast
