@@ -95,6 +95,9 @@ _BLOCKS, _CHANCE = 10, 1.63
 _MAX_ROUNDS = 6
 _SETTLED_SIGMAS, _SETTLED_STEP = 0.1, 1e-9
 
+# A translation whose variance is this many times that of the next one need not settle.
+_MOST_UNEVEN = 9.0
+
 
 def solve(
     stamps_ns: IntArray,
@@ -452,12 +455,23 @@ def _polished(state: _State) -> AdaptiveSolution:
     for _ in range(_MAX_ROUNDS):
         posterior = state.posterior()
         normal = posterior.normal
-        settled = _SETTLED_SIGMAS * np.sqrt(np.diag(normal.covariance))
-        converged = bool((np.abs(normal.step) < np.maximum(settled, _SETTLED_STEP)).all())
+        converged = _is_settled(normal)
         if converged:
             break
         state = _relinearised(state, posterior)
     return _solution(state.moved(posterior.normal.step), posterior, converged)
+
+
+def _is_settled(normal: NormalEquations) -> bool:
+    """Whether the step is small beside its sigmas, but for a translation that the rotations hardly
+    reveal: noise moves it on and on.
+    """
+    variances, axes = np.linalg.eigh(normal.covariance[:3, :3])
+    known = axes if variances[2] < _MOST_UNEVEN * variances[1] else axes[:, :2]
+    steps = np.concatenate([known.T @ normal.step[:3], normal.step[3:]])
+    of_axes = np.diag(known.T @ normal.covariance[:3, :3] @ known)
+    sigmas = np.sqrt(np.concatenate([of_axes, np.diag(normal.covariance)[3:]]))
+    return bool((np.abs(steps) < np.maximum(_SETTLED_SIGMAS * sigmas, _SETTLED_STEP)).all())
 
 
 def _relinearised(state: _State, posterior: Posterior) -> _State:
