@@ -470,7 +470,7 @@ def _is_settled(normal: NormalEquations) -> bool:
     known = axes if variances[2] < _MOST_UNEVEN * variances[1] else axes[:, :2]
     steps = np.concatenate([known.T @ normal.step[:3], normal.step[3:]])
     of_axes = np.diag(known.T @ normal.covariance[:3, :3] @ known)
-    sigmas = np.sqrt(np.concatenate([of_axes, np.diag(normal.covariance)[3:]]))
+    sigmas = np.sqrt(np.maximum(np.r_[of_axes, np.diag(normal.covariance)[3:]], 0.0))
     return bool((np.abs(steps) < np.maximum(_SETTLED_SIGMAS * sigmas, _SETTLED_STEP)).all())
 
 

@@ -34,9 +34,8 @@ SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
 _BLOCKS = 10
 _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 
-# What the ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance
-# exceed once in ten times.
-_CHANCE = np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28])
+# Expected ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance.
+_CHANCE = np.array([0.10, 0.29, 0.58, 0.98, 1.56, 2.49])
 
 # What the squared distance of two halves in units of their joint covariance exceeds once in ten
 # recordings: a chi-squared with 6 degrees of freedom.
@@ -255,10 +254,10 @@ def larger_by_direction(first: FloatArray, second: FloatArray | None) -> FloatAr
 
 def beyond_chance(model: FloatArray, resampled: FloatArray) -> FloatArray:
     """The model's covariance, raised in the directions in which that of ten blocks exceeds what
-    chance would make of it.
+    chance makes of it.
 
-    The ratios of a right model to its jackknife scatter: with ten blocks the largest of six is 2.5
-    on average. They are divided by what they exceed in one recording of ten.
+    The ratios of the jackknife to a model that is right scatter: with ten blocks the largest of six
+    is 2.5 on average. They are divided by what is expected.
     """
     return _raised(model, resampled, _CHANCE)
 
