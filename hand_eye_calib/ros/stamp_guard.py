@@ -38,7 +38,7 @@ _INTERVALS, _LEARN_EVERY = 64, 16
 # How far a regular stamp may be from its place: this many times the jitter (its 80th percentile, as
 # corrupt stamps have a part in it), and at least so much (ns, share of the period). A stream that
 # needs more than the last share is irregular: there, only the order of the stamps tells.
-_JITTERS, _LEAST_TOLERANCE_NS, _LEAST_TOLERANCE, _MOST_TOLERANCE = 4.0, 2_000_000, 0.02, 0.25
+_JITTERS, _LEAST_TOLERANCE_NS, _LEAST_TOLERANCE, _MOST_TOLERANCE = 4.0, 2_000_000, 0.02, 0.4
 
 # In an irregular stream the next message is at most so many periods away.
 _NEXT_PERIODS = 5
