@@ -26,6 +26,9 @@ _QOS = QoSProfile(
 )
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
+# Messages taken in one callback beyond the first; services and timers have their turn then.
+_MOST_AT_ONCE = 50
+
 _BAD_QOS = (
     ParameterException,
     InvalidQosOverridesError,
@@ -142,6 +145,7 @@ class PoseInput:
 
         def on_message(message: Any, info: dict[str, Any]) -> None:
             self.receive(pose_type, message, info)
+            self._receive_queued(pose_type)
 
         # rclpy looks at the signature: with two arguments it passes the info as well, which its
         # annotations do not know.
@@ -162,6 +166,20 @@ class PoseInput:
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
     # -------------------------------------------------------------- messages
+
+    def _receive_queued(self, pose_type: PoseType) -> None:
+        """Take the messages that wait as well: the executor needs several times as long for a
+        message as the callback, and on a slow computer falls behind.
+        """
+        subscription = self._subscription
+        if subscription is None:
+            return
+        with subscription.handle:
+            for _ in range(_MOST_AT_ONCE):
+                taken = subscription.handle.take_message(pose_type.message, False)
+                if taken is None:
+                    return
+                self.receive(pose_type, *taken)
 
     def receive(self, pose_type: PoseType, message: Any, info: dict[str, Any]) -> None:
         """Take a message: the callback of the subscription."""
