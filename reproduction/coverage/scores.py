@@ -74,9 +74,8 @@ def class_row(name: str, method: str, seeds: int) -> Row:
 def _class_case(
     name: str, recording: classes.Simulated, found: Calibration | None
 ) -> dict[str, float]:
-    refused = found is not None and found.status is SolveStatus.UNOBSERVABLE
     if name in classes.REFUSED:
-        return {"refused": float(refused)}
+        return {"refused": float(found is None or bool(found.unobservable()))}
     if found is None:
         return {"answered": 0.0}
     xi = se3.log(se3.inverse(found.T_parent_child) @ recording.T_parent_child)
