@@ -66,7 +66,7 @@ _WHILE_FITTING = [0, 1, 2, 3, 7]
 _OUTLIER_ROUNDS, _TAIL_ROUNDS = 4, 3
 
 # No more than this share of the poses are wrong by themselves.
-_MOST_SPIKES = 0.1
+_MOST_SPIKES = 0.2
 
 # Changes of this share of the evidence leave the noise levels as they are.
 _NEGLIGIBLE = 0.005
@@ -104,6 +104,7 @@ def solve(
     Ts_pw_p: FloatArray,
     Ts_cw_c: FloatArray,
     systematic: Sequence[str] = SYSTEMATIC,
+    quick: bool = False,
 ) -> AdaptiveSolution:
     """Estimate T_parent_child, the noise of the trajectories, and their covariance.
 
@@ -114,6 +115,8 @@ def solve(
         Poses of both sensors in their own worlds at these stamps.
     systematic : sequence of str
         Systematic errors to choose from, by Schwarz's criterion (BIC); "none" must be among them.
+    quick : bool
+        Stop at white noise, drift and outliers: neither errors that last nor heavy tails.
 
     Returns
     -------
@@ -125,12 +128,13 @@ def solve(
     plain = _fitted(start)
     if _is_noisy(plain):
         plain = _fitted_at_freed_poses(start, plain)
-    plain = _without_outliers(plain)
+    plain = _without_outliers(plain, quick)
     kept = _strided(plain)
     if len(kept) < len(streams):
-        fewer = solve(stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept], systematic)
+        fewer = solve(stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept], systematic, quick)
         return _at_all_poses(fewer, kept, plain.outliers.spikes)
-    solution = _polished(_with_systematic_errors(_with_lasting_errors(plain), systematic))
+    found = plain if quick else _with_lasting_errors(plain)
+    solution = _polished(_with_systematic_errors(found, systematic))
     if not solution.converged:
         solution = _polished(_with_systematic_errors(plain, ("none",)))
     return solution
@@ -345,7 +349,7 @@ def _fitted_at_freed_poses(start: _State, fitted: _State) -> _State:
     return fitted
 
 
-def _without_outliers(state: _State) -> _State:
+def _without_outliers(state: _State, quick: bool) -> _State:
     """Jumps and spikes found, the noise fitted again, tails weighed if they are heavy."""
     walk = (state.model.walk_by,)
     found, of_white = _outliers_found(state, _OUTLIER_ROUNDS)
@@ -356,7 +360,7 @@ def _without_outliers(state: _State) -> _State:
         # Whole stretches are noisy, not single poses wrong: they count less, and none is left out.
         outliers = Outliers(found.outliers.jumps, np.zeros_like(found.outliers.spikes))
         found = dataclasses.replace(found, outliers=outliers, poses=found.streams)
-    elif not tails_are_heavy(found.outliers, of_white):
+    elif quick or not tails_are_heavy(found.outliers, of_white):
         return found
     state = dataclasses.replace(found, heavy=True)
     for _ in range(2):

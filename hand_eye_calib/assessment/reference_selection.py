@@ -131,7 +131,8 @@ def select_reference(
             f"found {len(pose_pairs)}; drive on, or name a reference"
         )
     poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
-    solution = solution or estimator.solve(*poses)
+    # The choice of a pair's length asks for the fast errors: white noise, drift, jumps.
+    solution = solution or estimator.solve(*poses, quick=True)
     predictor = ReferencePredictor(*poses, solution, *method.rejection)
     predicted = {reference: predictor.covariance(reference) for reference in candidates}
     covariances = {name: found for name, found in predicted.items() if found is not None}
