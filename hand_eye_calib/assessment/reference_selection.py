@@ -100,13 +100,13 @@ def select_reference(
 ) -> ReferenceChoice:
     """Choose the reference for a method.
 
-    The residual cannot tell which reference is best (Välimäki et al. 2023, section 4.2). The noise
-    can: the adaptive estimator identifies its level and drift, and the expected error of every
-    reference follows from them, in translation and rotation together. If several references have
-    about the same expected error, chance decides which of them does best on these poses. The best
-    guess is then the one whose answer is nearest to the adaptive estimator's: the error of that
-    estimator is smaller and, as that of the best linear estimator, uncorrelated with the distance
-    of the other answers from it.
+    The residual cannot tell which reference is best (Välimäki et al. 2023, section 4.2). The
+    noise can: the adaptive estimator identifies its level and drift, and the expected error of
+    every reference follows from them, in translation and rotation together. If several references
+    have about the same expected error, chance decides which of them does best on these poses. The
+    best guess is then the one whose answer is nearest to the adaptive estimator's: the error of
+    that estimator is smaller and, as that of the best linear estimator, uncorrelated with the
+    distance of the other answers from it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""References: which index pairs (i, j) become motion pairs (Välimäki et al. 2023, section 3.4)."""
+"""References: which index pairs (i, j) become motion pairs (Välimäki et al. 2023, sect. 3.4)."""
 
 import re
 

@@ -3,8 +3,8 @@
 Cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E. R. Morales, *Methods for simultaneous
 robot-world-hand-eye calibration: a comparative study*, Sensors 19(12), 2019, as its authors'
 program computes it: the rotation residual of a motion pair enters only as the norm of a unit
-quaternion, a constant (Välimäki et al. 2023, section 2). The rest is the translation of AX - XB, a
-quadratic form in the same thirteen variables as dnl's cost. It is minimised in the same way over
+quaternion, a constant (Välimäki et al. 2023, section 2). The rest is the translation of AX - XB,
+a quadratic form in the same thirteen variables as dnl's cost. It is minimised in the same way over
 proper rotations.
 """
 

@@ -218,19 +218,19 @@ def exercise(name, seed, folder):
     os.environ["MPLCONFIGDIR"] = str(Path(folder).parent)  # its list of fonts is written once
     os.environ |= {"TMPDIR": str(case / "tmp"), "HOME": str(case / "home")}
     tempfile.tempdir = None
-    (case / "work").mkdir()
+    (case / "inside").mkdir()
     before = snapshot(case)
     try:
-        code = FORMATS[name](Chaos(f"{name} {seed}"), case / "work")
+        code = FORMATS[name](Chaos(f"{name} {seed}"), case / "inside")
     finally:
         for key, value in kept.items():
             os.environ.pop(key) if value is None else os.environ.update({key: value})
         tempfile.tempdir = None
-    changed = {path for path in snapshot(case) if "/work/" not in path} - before.keys()
+    changed = {path for path in snapshot(case) if "/inside/" not in path} - before.keys()
     changed |= {path for path in before if snapshot(case).get(path) != before[path]}
     inputs = ("bag", "a%31#?.db3", "parent", "child", "times", "file.yaml", "extrinsic.yaml",
               "fleet.yaml", "session-000001.journal")  # fmt: skip
-    changed |= {path.name for path in (case / "work").iterdir()
+    changed |= {path.name for path in (case / "inside").iterdir()
                 if path.stem != "bag" and path.name not in (*inputs, "out")}  # fmt: skip
     if changed:
         raise Finding(f"written outside the directory of the results: {sorted(changed)}")
