@@ -220,8 +220,15 @@ def read_journal(directory: str | Path) -> tuple[dict[str, NDArray[Any]], list[E
 
 
 def _segments(directory: Path) -> list[Path]:
-    """Segments in their order; files of other names, such as copies, are not looked at."""
-    found = [path for path in directory.glob("*") if _SEGMENT_NAME.fullmatch(path.name)]
+    """Segments in their order; files of other names, such as copies, are not looked at.
+
+    None in a directory that cannot be read, or that is renamed while it is read (a reset).
+    """
+    try:
+        names = os.listdir(directory)
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return []
+    found = [directory / name for name in names if _SEGMENT_NAME.fullmatch(name)]
     return sorted(found, key=_number)
 
 

@@ -145,6 +145,20 @@ def test_a_half_written_new_segment_leaves_the_old_one_in_force(tmp_path):
     assert resumed(tmp_path)[1] == 40
 
 
+def test_a_journal_renamed_while_it_is_looked_for_is_no_error(tmp_path):
+    journal = tmp_path / "journal"
+    journal.mkdir()
+    (journal / "session-000001.journal").write_bytes(b"")
+    rename = "import os, sys\nwhile True:\n    os.rename(sys.argv[1], sys.argv[1] + 'x')\n"
+    rename += "    os.rename(sys.argv[1] + 'x', sys.argv[1])\n"
+    with subprocess.Popen([sys.executable, "-c", rename, journal]) as process:
+        try:
+            answers = {has_session(journal) for _ in range(20_000)}
+        finally:
+            process.kill()
+    assert True in answers
+
+
 def test_kill_at_any_moment_costs_only_what_was_not_flushed(tmp_path):
     """A child process journals with small segments and reports each flush; it is killed at moments
     of its own making.
