@@ -43,6 +43,11 @@ _INTERVALS = (
     "Mean and 95 % confidence interval; mixed noise: median, quartiles, whiskers to 1.5 "
     "interquartile ranges. Axes linear near zero, then logarithmic."
 )
+# Columns of a figure's points.
+_COLUMNS = (
+    *("dataset", "level", "method", "reference", "metric"),
+    *("statistic", "centre", "low", "high", "runs"),
+)
 _COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -70,18 +75,7 @@ def write_error_figure(name: str, results: Results) -> list[Path]:
     paths.append(
         write_csv(
             results.out / f"{name}.csv",
-            [
-                "dataset",
-                "level",
-                "method",
-                "reference",
-                "metric",
-                "statistic",
-                "centre",
-                "low",
-                "high",
-                "runs",
-            ],
+            _COLUMNS,
             (_numbers(point, results.ours.summary(*point)) for point in points),
         )
     )
@@ -205,16 +199,7 @@ def _compare(
         why = "" if same else _why(point, rows, results.same_cases)
         compared.append([*_numbers(point, ours), theirs.centre, theirs.low, theirs.high, same, why])
     header = [
-        "dataset",
-        "level",
-        "method",
-        "reference",
-        "metric",
-        "statistic",
-        "centre",
-        "low",
-        "high",
-        "runs",
+        *_COLUMNS,
         "published_centre",
         "published_low",
         "published_high",

@@ -106,10 +106,6 @@ class Table:
         found = {key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)}
         return tuple(sorted(found, key=lambda level: level or 0.0))
 
-    def has(self, dataset: str, method: str) -> bool:
-        """Whether the table has a method on a data set."""
-        return bool(self.levels(dataset, method))
-
     def summary(
         self, dataset: str, level: float | None, method: str, reference: str, metric: str
     ) -> Summary:

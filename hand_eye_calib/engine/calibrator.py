@@ -281,19 +281,7 @@ class Calibrator:
         )
 
     def estimate(self) -> Calibration:
-        """Estimate the extrinsic from all poses so far.
-
-        Returns
-        -------
-        Calibration
-
-        Raises
-        ------
-        NotEnoughDataError
-            If fewer than ``min_pairs`` poses can be paired; the message says what is missing.
-        InputError
-            If both streams have the same sensor frame.
-        """
+        """Estimate the extrinsic from all poses so far; errors as of `Snapshot.estimate`."""
         return self.snapshot().estimate()
 
     def adopt(self, found: TimeOffset | None) -> None:
