@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 class Severity(str, Enum):
     """How much a finding matters.
 
-    A note is good to know, a warning spoils the result, an error makes a result impossible.
+    With an error, a result from these streams as they are is unusable. With a warning it may be
+    used with care. A note is good to know.
     """
 
     NOTE = "note"
@@ -50,8 +51,12 @@ class Finding:
         What was found, with its values.
     advice : str
         What to do.
+    cause : str
+        Usual cause, if ``what`` does not name it.
+    evidence : tuple of (str, float)
+        Measured values by name, in SI units, each name with its unit.
     options : tuple of (str, value)
-        Options that do it, by their public names; empty if none can.
+        Options that do it, by their names in :mod:`hand_eye_calib.config`; empty if none can.
     """
 
     code: str
@@ -60,7 +65,14 @@ class Finding:
     confidence: Confidence
     what: str
     advice: str
+    cause: str = ""
+    evidence: tuple[tuple[str, float], ...] = ()
     options: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def makes_unusable(self) -> bool:
+        """Whether a result from these streams as they are is unusable."""
+        return self.severity is Severity.ERROR
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values."""
@@ -71,11 +83,14 @@ class Finding:
             "confidence": self.confidence.value,
             "what": self.what,
             "advice": self.advice,
+            "cause": self.cause,
+            "evidence": dict(self.evidence),
             "options": dict(self.options),
         }
 
     def __str__(self) -> str:
-        return f"{self.what}; {self.advice}"
+        cause = f" ({self.cause})" if self.cause else ""
+        return f"{self.what}{cause}; {self.advice}"
 
 
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
