@@ -279,6 +279,39 @@ def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
     return prior
 
 
+def split_frames(text: str) -> tuple[str, str]:
+    """The fixed frame and the sensor's frame of ``WORLD:SENSOR``.
+
+    Raises
+    ------
+    ConfigError
+        If these are not two different frames.
+    """
+    frames = [frame.strip().lstrip("/") for frame in text.split(":")]
+    if len(frames) != 2 or not all(frames) or frames[0] == frames[1]:
+        raise ConfigError(
+            f"expected two frames as WORLD:SENSOR, such as odom:lidar; got {_shown(text)}"
+        )
+    return frames[0], frames[1]
+
+
+def _check_frames(name: str, text: str) -> None:
+    try:
+        split_frames(text or "world:sensor")
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
+
+
+def _tf_source(stream: str) -> Any:
+    return option(
+        "",
+        f"Take the poses of the {stream} sensor from /tf and /tf_static instead of {stream}_odom: "
+        "WORLD:SENSOR, the fixed frame and the sensor's, such as odom:lidar. Empty for the topic.",
+        read_only=True,
+        parse=_check_frames,
+    )
+
+
 def _quantity(name: str, text: str, unit: str) -> float:
     match = _QUANTITY.fullmatch(text)
     if not match or (match[2] or unit) not in _IN_SI[unit]:
@@ -448,6 +481,8 @@ class NodeConfig(OptionSet):
         choices=POSE_TYPES,
         read_only=True,
     )
+    parent_tf: str = _tf_source("parent")
+    child_tf: str = _tf_source("child")
     output_directory: str = option(
         "",
         "Directory of the journal and of the result files, which ~/save and the end of the node "

@@ -10,7 +10,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.config import split_frames
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.limits import MOST_FRAMES
@@ -38,12 +39,7 @@ class TfSource(NamedTuple):
         ConfigError
             If these are not two different frames.
         """
-        frames = [frame.strip().lstrip("/") for frame in text.split(":")]
-        if len(frames) != 2 or not all(frames) or frames[0] == frames[1]:
-            raise ConfigError(
-                f"expected two frames as WORLD:SENSOR, such as odom:lidar; got {text!r}"
-            )
-        return cls(*frames)
+        return cls(*split_frames(text))
 
 
 class Transform(Protocol):

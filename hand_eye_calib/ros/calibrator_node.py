@@ -19,7 +19,7 @@ from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
-from hand_eye_calib.ros.inputs import PoseInput, qos_parameter_names
+from hand_eye_calib.ros.inputs import PoseInput, TopicInput, qos_parameter_names
 from hand_eye_calib.ros.live_session import LiveSession, check_below, output_path
 from hand_eye_calib.ros.log import LOG_PERIOD_S, NodeLog
 from hand_eye_calib.ros.parameters import Parameters
@@ -27,6 +27,7 @@ from hand_eye_calib.ros.results import ResultFiles, ResultTopics
 from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S
 from hand_eye_calib.ros.solve_cycle import ANSWER_PERIOD_S, SolveCycle
 from hand_eye_calib.ros.tf import TfBroadcaster, message_type
+from hand_eye_calib.ros.tf_input import TfInput, tf_source
 
 _DISCOVERY_PERIOD_S = 0.2
 _DIAGNOSTICS_PERIOD_S = 1.0
@@ -104,7 +105,9 @@ class CalibratorNode(Node):
     # ---------------------------------------------------------------- set-up
 
     def _make_input(self, name: str) -> PoseInput:
-        made = PoseInput(self, name, self._session, self._log, self._begin_session)
+        frames = tf_source(self._options.node, name)
+        parts = self._session, self._log, self._begin_session
+        made = TfInput(self, name, frames, *parts) if frames else TopicInput(self, name, *parts)
         made.configure(self._options)
         return made
 
@@ -229,6 +232,9 @@ class CalibratorNode(Node):
         """Raise ConfigError if options cannot be had together, or not on this machine."""
         if options.publish_tf:
             message_type()
+        for name in ("parent", "child"):
+            if tf_source(options, name):
+                message_type(f"{name}_tf")
         if self._output_base is not None and options.output_directory:
             check_below(self._output_base, options.output_directory)
         self._session.check_journal(options)

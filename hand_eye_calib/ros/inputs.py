@@ -1,4 +1,4 @@
-"""One of the node's two inputs: from a topic to poses in the session."""
+"""The node's two inputs: from a topic, or from transforms, to poses in the session."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -39,12 +39,14 @@ _BAD_QOS = (
 
 
 class PoseInput:
-    """Subscribes to the poses of one sensor and hands them to the session.
+    """Hands the poses of one sensor to the session, wherever they come from.
 
     Parameters
     ----------
     node : rclpy.node.Node
     name : {"parent", "child"}
+    topic : str
+        Where they come from, for messages.
     session : LiveSession
     log : NodeLog
     on_jump_back : callable
@@ -53,7 +55,7 @@ class PoseInput:
     Attributes
     ----------
     topic : str
-        Resolved name.
+        Where they come from.
     is_enabled : bool
         Whether poses are taken.
     monitor : InputMonitor
@@ -64,20 +66,18 @@ class PoseInput:
         self,
         node: Node,
         name: str,
+        topic: str,
         session: LiveSession,
         log: NodeLog,
         on_jump_back: Callable[["PoseInput"], None],
     ) -> None:
         self.name = name
-        self.relative_topic = relative_topic(name)
-        self.topic = node.resolve_topic_name(self.relative_topic)
+        self.topic = topic
         self.is_enabled = True
         self.monitor = InputMonitor()
         self.guard = StampGuard()
         self._node, self._session, self._log = node, session, log
         self._on_jump_back = on_jump_back
-        self._subscription: Subscription | None = None
-        self._type_name = ""
         self._sensor_frame = ""
         self._max_gap_ns = 0.0
 
@@ -103,92 +103,22 @@ class PoseInput:
         """Go on where a session on disk has ended."""
         self.guard.last_ns = self.statistics.last_stamp_ns
 
-    # ---------------------------------------------------------- subscription
-
     def discover(self, wanted_type: str) -> None:
-        """Subscribe as soon as the type is known, and again if the publisher changes it."""
-        offered = self._offered_types()
-        type_name = self._choose_type(offered) if wanted_type == "auto" else wanted_type
-        if type_name is not None and type_name != self._type_name:
-            self._subscribe(type_name)
-        publishers = self._node.count_publishers(self.relative_topic)
-        self.monitor.delivery.has_one_publisher = publishers == 1
+        """Look for publishers; to be called often."""
+        raise NotImplementedError
 
     def describe_silence(self) -> str:
         """Why nothing has come yet, as far as the graph tells."""
-        publishers = self._node.count_publishers(self.relative_topic)
-        count = f"{publishers or 'no'} publisher{'s' * (publishers != 1)}"
-        return f"no pose yet on {self.topic} ({count})"
-
-    def _offered_types(self) -> list[str]:
-        infos = self._node.get_publishers_info_by_topic(self.relative_topic)
-        return sorted({info.topic_type for info in infos})
-
-    def _choose_type(self, offered: list[str]) -> str | None:
-        """The type of the publishers; None if there is none that can be used."""
-        if self._type_name in offered:
-            return self._type_name
-        usable = [name for name in offered if name in POSE_TYPES]
-        if offered and not usable:
-            self._log.warning(
-                f"{self.topic} has type {', '.join(offered)}; expected {', '.join(POSE_TYPES)}: "
-                f"remap {self.relative_topic} to a topic with poses",
-                ("type", self.name),
-            )
-        return usable[0] if usable else None
-
-    def _subscribe(self, type_name: str) -> None:
-        if self._subscription is not None:
-            self._log.warning(f"{self.topic} has changed its type from {self._type_name}")
-            self._node.destroy_subscription(self._subscription)
-        pose_type = POSE_TYPES[type_name]
-
-        def on_message(message: Any, info: dict[str, Any]) -> None:
-            self.receive(pose_type, message, info)
-            self._receive_queued(pose_type)
-
-        # rclpy looks at the signature: with two arguments it passes the info as well, which its
-        # annotations do not know.
-        callback: Any = on_message
-        try:
-            self._subscription = self._node.create_subscription(
-                pose_type.message,
-                self.relative_topic,
-                callback,
-                _QOS,
-                qos_overriding_options=QoSOverridingOptions(_QOS_OVERRIDES),
-            )
-        except _BAD_QOS as error:
-            raise ConfigError(
-                f"cannot subscribe to {self.topic} with the QoS overrides given: {error}"
-            ) from error
-        self._type_name = type_name
-        self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
+        raise NotImplementedError
 
     # -------------------------------------------------------------- messages
 
-    def _receive_queued(self, pose_type: PoseType) -> None:
-        """Take the messages that wait as well: the executor needs several times as long for a
-        message as the callback, and on a slow computer falls behind.
-        """
-        subscription = self._subscription
-        if subscription is None:
-            return
-        with subscription.handle:
-            for _ in range(_MOST_AT_ONCE):
-                taken = subscription.handle.take_message(pose_type.message, False)
-                if taken is None:
-                    return
-                self.receive(pose_type, *taken)
-
-    def receive(self, pose_type: PoseType, message: Any, info: dict[str, Any]) -> None:
-        """Take a message: the callback of the subscription."""
-        waited_ns = time.time_ns() - info["received_timestamp"]
-        self.monitor.delivery.note(info["publication_sequence_number"], waited_ns * 1e-9)
+    def accept(self, pose_type: PoseType, stamp_ns: int, message: Any) -> None:
+        """Take a message with a pose."""
         if not self.is_enabled:
             self.monitor.ignored += 1
             return
-        stamp_ns, steady_s = to_ns(message.header.stamp), time.monotonic()
+        steady_s = time.monotonic()
         clock_ns = self._node.get_clock().now().nanoseconds
         self.monitor.note(stamp_ns, clock_ns, steady_s, self._max_gap_ns)
         last_ns = self.guard.last_ns
@@ -246,6 +176,103 @@ class PoseInput:
             f"({self.monitor.refused.total()} refused so far)",
             ("refused", self.name),
         )
+
+
+class TopicInput(PoseInput):
+    """Subscribes to the poses of one sensor.
+
+    The parameters are those of :class:`PoseInput`; the topic is known by the name of the sensor.
+    """
+
+    def __init__(self, node: Node, name: str, *arguments: Any) -> None:
+        self.relative_topic = relative_topic(name)
+        topic = node.resolve_topic_name(self.relative_topic)
+        super().__init__(node, name, topic, *arguments)
+        self._subscription: Subscription | None = None
+        self._type_name = ""
+
+    def discover(self, wanted_type: str) -> None:
+        """Subscribe as soon as the type is known, and again if the publisher changes it."""
+        offered = self._offered_types()
+        type_name = self._choose_type(offered) if wanted_type == "auto" else wanted_type
+        if type_name is not None and type_name != self._type_name:
+            self._subscribe(type_name)
+        publishers = self._node.count_publishers(self.relative_topic)
+        self.monitor.delivery.has_one_publisher = publishers == 1
+
+    def describe_silence(self) -> str:
+        """Why nothing has come yet, as far as the graph tells."""
+        publishers = self._node.count_publishers(self.relative_topic)
+        count = f"{publishers or 'no'} publisher{'s' * (publishers != 1)}"
+        return f"no pose yet on {self.topic} ({count})"
+
+    def _offered_types(self) -> list[str]:
+        infos = self._node.get_publishers_info_by_topic(self.relative_topic)
+        return sorted({info.topic_type for info in infos})
+
+    def _choose_type(self, offered: list[str]) -> str | None:
+        """The type of the publishers; None if there is none that can be used."""
+        if self._type_name in offered:
+            return self._type_name
+        usable = [name for name in offered if name in POSE_TYPES]
+        if offered and not usable:
+            self._log.warning(
+                f"{self.topic} has type {', '.join(offered)}; expected {', '.join(POSE_TYPES)}: "
+                f"remap {self.relative_topic} to a topic with poses",
+                ("type", self.name),
+            )
+        return usable[0] if usable else None
+
+    def _subscribe(self, type_name: str) -> None:
+        if self._subscription is not None:
+            self._log.warning(f"{self.topic} has changed its type from {self._type_name}")
+            self._node.destroy_subscription(self._subscription)
+        pose_type = POSE_TYPES[type_name]
+
+        def on_message(message: Any, info: dict[str, Any]) -> None:
+            self.receive(pose_type, message, info)
+            for queued in waiting_messages(self._subscription):
+                self.receive(pose_type, *queued)
+
+        # rclpy looks at the signature: with two arguments it passes the info as well, which its
+        # annotations do not know.
+        callback: Any = on_message
+        try:
+            self._subscription = self._node.create_subscription(
+                pose_type.message,
+                self.relative_topic,
+                callback,
+                _QOS,
+                qos_overriding_options=QoSOverridingOptions(_QOS_OVERRIDES),
+            )
+        except _BAD_QOS as error:
+            raise ConfigError(
+                f"cannot subscribe to {self.topic} with the QoS overrides given: {error}"
+            ) from error
+        self._type_name = type_name
+        self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
+
+    def receive(self, pose_type: PoseType, message: Any, info: dict[str, Any]) -> None:
+        """Take a message: the callback of the subscription."""
+        waited_ns = time.time_ns() - info["received_timestamp"]
+        self.monitor.delivery.note(info["publication_sequence_number"], waited_ns * 1e-9)
+        self.accept(pose_type, to_ns(message.header.stamp), message)
+
+
+def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Messages that wait in a subscription's queue, each with its info.
+
+    To be taken in the callback: the executor needs several times as long for a message as the
+    callback, and on a slow computer falls behind.
+    """
+    if subscription is None:
+        return
+    with subscription.handle:
+        for _ in range(_MOST_AT_ONCE):
+            taken = subscription.handle.take_message(subscription.msg_type, False)
+            if taken is None:
+                return
+            yield taken
 
 
 def relative_topic(name: str) -> str:

@@ -33,6 +33,13 @@ _DYNAMIC_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 # to 2.4 s.
 LOOK_S = 5.0
 
+# What to do without tf2_msgs.
+_INSTEAD = {
+    "publish_tf": "leave publish_tf off and use the launch file that ~/save writes",
+    "parent_tf": "give the poses of the parent sensor as a topic, parent_odom",
+    "child_tf": "give the poses of the child sensor as a topic, child_odom",
+}
+
 # Own broadcasts that are recognised when they are heard.
 _MOST_OWN = 100
 
@@ -199,8 +206,13 @@ class TfBroadcaster:
             )
 
 
-def message_type() -> type[Any]:
+def message_type(wanted_by: str = "publish_tf") -> type[Any]:
     """tf2_msgs/TFMessage.
+
+    Parameters
+    ----------
+    wanted_by : str
+        The parameter that needs it.
 
     Raises
     ------
@@ -211,7 +223,7 @@ def message_type() -> type[Any]:
         from tf2_msgs.msg import TFMessage
     except ImportError:
         raise ConfigError(
-            "publish_tf needs the message package tf2_msgs, which is not installed: install "
-            "ros-jazzy-tf2-msgs, or leave publish_tf off and use the launch file that ~/save writes"
+            f"{wanted_by} needs the message package tf2_msgs, which is not installed: install "
+            f"ros-jazzy-tf2-msgs, or {_INSTEAD[wanted_by]}"
         ) from None
     return TFMessage

@@ -145,11 +145,26 @@ def publish_tf_is_used(start_node, peer, tmp_path):
     peer.spin_until(lambda: peer.node.count_subscribers("/tf") == 0, "the node to stop that")
 
 
+def tf_is_used(start_node, peer, tmp_path, stream):
+    if importlib.util.find_spec("tf2_msgs") is None:
+        node = start_node(*QUIET, f"-p {stream}_tf:=odom:lidar")
+        assert node.wait() == 1
+        assert node.log.startswith(
+            f"calibrator: {stream}_tf needs the message package tf2_msgs, which is not installed"
+        )
+        return
+    node = start_node(*QUIET, f"-p {stream}_tf:=odom:lidar")
+    node.wait_for_log(f"transform odom:lidar is taken from /tf for the {stream} sensor")
+    peer.spin_until(lambda: peer.node.count_subscribers("/tf") == 1, "the node to listen to /tf")
+
+
 EFFECTS = {
     "parent_frame": lambda *fixtures: frame_is_used(*fixtures, "parent", "camera in chosen: "),
     "child_frame": lambda *fixtures: frame_is_used(*fixtures, "child", "chosen in lidar: "),
     "parent_type": lambda *fixtures: type_is_used(*fixtures, "parent"),
     "child_type": lambda *fixtures: type_is_used(*fixtures, "child"),
+    "parent_tf": lambda *fixtures: tf_is_used(*fixtures, "parent"),
+    "child_tf": lambda *fixtures: tf_is_used(*fixtures, "child"),
     "solve_period": solve_period_is_used,
     "output_directory": output_directory_is_used,
     "journal": journal_is_used,
