@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from hand_eye_calib.alignment.motions import pairs_over
 from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
 from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
 
 # Motions over these times (s) are compared; the lag with the smallest relative standard deviation

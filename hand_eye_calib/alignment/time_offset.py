@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
-from hand_eye_calib.alignment.motions import pairs_over
 from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
@@ -13,6 +12,7 @@ from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.leaps import find_leap
+from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import synchronise
 
 # Motions over these times (s) are compared; the lag with the smallest standard deviation wins.

@@ -19,7 +19,6 @@ from hand_eye_calib.alignment.angular_rates import (
     Correlation,
     correlate_rates,
 )
-from hand_eye_calib.alignment.motions import pairs_over
 from hand_eye_calib.alignment.scale import Scale, estimate_scale
 from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
@@ -40,6 +39,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
 # Time offsets (s) from which on a warning, a note is given; a note also needs this many standard

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hand_eye_calib.alignment.motions import pairs_over
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.checks import findings as wording
@@ -29,6 +28,7 @@ from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.solvers.separable import align_rotation_vectors
 
