@@ -16,7 +16,7 @@ from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 
-NOISE = NoiseConfig(gaussian=0.003, drift=0.01)
+NOISE = NoiseConfig(gaussian=0.003)
 SHIFT = np.r_[0.03, -0.02, 0.01, np.radians([1.0, -0.5, 1.5])]
 
 
