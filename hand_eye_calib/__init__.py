@@ -17,9 +17,11 @@ _HOMES = {
     "Calibrator": "engine.calibrator",
     "CalibratorConfig": "config",
     "HandEyeCalibError": "errors",
+    "Reason": "verdict",
     "Residuals": "calibration",
-    "SolveStatus": "calibration",
+    "SolveStatus": "status",
     "Trajectory": "geometry.trajectory",
+    "Verdict": "verdict",
     "calibrate": "engine.offline",
     "cross_check": "engine.cross_check",
     "load": "io.results",
@@ -35,9 +37,11 @@ __all__ = [
     "Calibrator",
     "CalibratorConfig",
     "HandEyeCalibError",
+    "Reason",
     "Residuals",
     "SolveStatus",
     "Trajectory",
+    "Verdict",
     "calibrate",
     "cross_check",
     "load",
@@ -48,7 +52,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     # The same for editors and type checkers.
-    from hand_eye_calib.calibration import Calibration, Residuals, SolveStatus
+    from hand_eye_calib.calibration import Calibration, Residuals
     from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.engine.calibrator import Calibrator
     from hand_eye_calib.engine.cross_check import cross_check
@@ -58,6 +62,8 @@ if TYPE_CHECKING:
     from hand_eye_calib.io.results import load_result as load
     from hand_eye_calib.io.results import save_result as save
     from hand_eye_calib.io.trajectory_files import read_trajectory, write_trajectory
+    from hand_eye_calib.status import SolveStatus
+    from hand_eye_calib.verdict import Reason, Verdict
 
     __version__: str
 else:

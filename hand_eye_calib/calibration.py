@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from enum import Enum
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.printed_angles import (
@@ -18,6 +19,18 @@ from hand_eye_calib.geometry.printed_angles import (
     sigmas_translation,
 )
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
+from hand_eye_calib.status import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.verdict import Reason, Verdict, headline, reasons, verdict_of
+
+__all__ = [
+    "Calibration",
+    "DofObservability",
+    "DofVerdict",
+    "Reason",
+    "Residuals",
+    "SolveStatus",
+    "Verdict",
+]
 
 # Format and version of to_dict. A change that an older reader cannot understand raises the version.
 _FORMAT = "hand_eye_calib/extrinsic"
@@ -45,6 +58,9 @@ _PLAIN_LATER = (
     "reference_reason",
     "noise",
     "cross_check",
+    "contradictions",
+    "target_translation",
+    "target_rotation",
 )
 
 # Of other values than numbers.
@@ -53,6 +69,7 @@ _KINDS: dict[str, Any] = (
     | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
     | dict.fromkeys(("method_reason", "reference_reason"), str)
     | dict.fromkeys(("noise", "cross_check"), (dict, type(None)))
+    | {"contradictions": dict}
 )
 
 # Motion pairs with more weight than this count as inliers.
@@ -60,58 +77,6 @@ INLIER_WEIGHT = 0.5
 
 # With a direction unobservable, a larger standard deviation (m) of the inverse comes from that.
 _UNKNOWN_M = 0.9
-
-
-class SolveStatus(str, Enum):
-    """How a solve ended. Only an OK result may be used as it is.
-
-    Of an UNOBSERVABLE one the other directions may be used. NOT_CONVERGED and CONTRADICTED (a prior
-    contradicts the motion) are failures.
-    """
-
-    OK = "ok"
-    UNOBSERVABLE = "unobservable"
-    NOT_CONVERGED = "not_converged"
-    CONTRADICTED = "contradicted"
-
-    @property
-    def failure(self) -> str:
-        """Why nothing of a result may be used; empty unless the solve failed."""
-        return _FAILURES.get(self, "")
-
-
-_FAILURES = {
-    SolveStatus.NOT_CONVERGED: "the solver did not converge",
-    SolveStatus.CONTRADICTED: "a prior contradicts the motion",
-}
-
-
-class DofVerdict(str, Enum):
-    """How well one degree of freedom is known; PRIOR if mostly or only from a prior."""
-
-    OBSERVED = "observed"
-    WEAK = "weak"
-    UNOBSERVABLE = "unobservable"
-    PRIOR = "prior"
-
-
-@dataclass(frozen=True)
-class DofObservability:
-    """Observability of one degree of freedom of the child sensor's pose, along or about an axis of
-    the parent sensor's frame.
-
-    Attributes
-    ----------
-    name : str
-        x, y, z (translation) or roll, pitch, yaw (rotation about x, y, z).
-    verdict : DofVerdict
-    sigma : float
-        One standard deviation, in m or rad; ``inf`` if unobservable.
-    """
-
-    name: str
-    verdict: DofVerdict
-    sigma: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +128,8 @@ class Residuals:
 class Calibration:
     """An extrinsic with its quality.
 
+    :attr:`verdict` says whether it may be used, and :attr:`reasons` why not.
+
     Attributes
     ----------
     T_parent_child : (4, 4) array
@@ -201,6 +168,13 @@ class Calibration:
         Per axis, the scatter of the answers of other methods and references and of both halves of
         the recording about this one (:class:`~hand_eye_calib.engine.cross_check.CrossCheck`); None
         without that cross-check.
+    findings : tuple of dict
+        What the stream checks found, in plain values
+        (:meth:`~hand_eye_calib.checks.findings.Finding.to_dict`).
+    contradictions : dict
+        Axis to the distance, in joint standard deviations, of a prior that contradicts the motion.
+    target_translation, target_rotation : float
+        Standard deviations (m, rad) that are good enough for the use that is made of the result.
     stamp_ns : int
         Stamp of the newest pose used, parent clock.
     parent_frame, child_frame : str
@@ -231,11 +205,47 @@ class Calibration:
     reference_reason: str = ""
     noise: dict[str, Any] | None = None
     cross_check: dict[str, Any] | None = None
+    findings: tuple[Mapping[str, Any], ...] = ()
+    contradictions: dict[str, float] = field(default_factory=dict)
+    target_translation: float = CalibratorConfig.target_translation
+    target_rotation: float = CalibratorConfig.target_rotation
     stamp_ns: int = 0
     parent_frame: str = "parent"
     child_frame: str = "child"
     warnings: tuple[str, ...] = ()
     motion_residuals: Residuals | None = field(default=None, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        frames = f"{self.child_frame} in {self.parent_frame}"
+        values = ", ".join(
+            f"{dof.name} {value:.6g} +/- {dof.sigma:.2g}"
+            for dof, value in zip(self.observability, self._printed(), strict=True)
+        )
+        return (
+            f"<Calibration: {self.headline}\n {frames}: {values} (m, rad), "
+            f"{self.method} {self.reference}, {self.n_poses} poses>"
+        )
+
+    def _printed(self) -> list[float]:
+        angles = se3.rotation_to_rpy(self.T_parent_child[:3, :3])
+        return [*self.T_parent_child[:3, 3].tolist(), *angles.tolist()]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result may be used: ``Verdict.USE``, ``USE_WITH_CARE`` or ``DO_NOT_USE``."""
+        return verdict_of(self.reasons)
+
+    @cached_property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Why the result may not be used as it is, the gravest first; empty if it may. The rules
+        are :data:`hand_eye_calib.verdict.RULES`.
+        """
+        return reasons(self)
+
+    @property
+    def headline(self) -> str:
+        """The verdict with its gravest reason, or with what is known, in one line."""
+        return headline(self, self.reasons)
 
     @property
     def T_child_parent(self) -> FloatArray:
@@ -304,6 +314,9 @@ class Calibration:
         JSON or YAML (infinite sigmas as None).
         """
         document: dict[str, Any] = {
+            "verdict": self.verdict.value,
+            "headline": self.headline,
+            "reasons": [reason.to_dict() for reason in self.reasons],
             "format": _FORMAT,
             "version": _VERSION,
             "parent_frame": self.parent_frame,
@@ -346,7 +359,8 @@ class Calibration:
             if name in _PLAIN or name in _PLAIN_LATER
         }
         plain["objective"] = float(self.objective)
-        return document | plain | {"warnings": list(self.warnings)}
+        findings = [dict(finding) for finding in self.findings]
+        return document | plain | {"findings": findings, "warnings": list(self.warnings)}
 
     def _transform_dict(self) -> dict[str, Any]:
         return _transform_dict(
@@ -404,6 +418,7 @@ class Calibration:
                     for dof in data["observability"]
                 ),
                 warnings=tuple(data["warnings"]),
+                findings=tuple(data.get("findings", ())),
                 **{name: data[name] for name in _PLAIN},
                 **{name: later[name] for name in _PLAIN_LATER if name in later},
             )
@@ -434,6 +449,12 @@ def _check_values(data: Mapping[str, Any]) -> None:
     for name, values in (("noise", words), ("warnings", data["warnings"]), ("an axis", texts)):
         if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
             raise TypeError(f"{name} is not text")
+    for finding in data.get("findings", ()):
+        values = [finding[name] for name in ("code", "severity", "what", "advice")]
+        if not all(isinstance(value, str) for value in values):
+            raise TypeError("a finding is not text")
+        dict(finding.get("options", {}))
+    _infinite(data.get("contradictions", {}).values())
     for row in (data["cross_check"] or {}).values():
         if not {*row} >= {"sigma", "of_methods", "of_halves"}:
             raise TypeError("cross_check lacks values")

@@ -445,6 +445,24 @@ class CalibratorConfig(OptionSet):
         name="prior.transform",
         parse=parse_prior,
     )
+    target_translation: float = option(
+        0.02,
+        "Standard deviation along each axis that is good enough; the verdict and the stop rule use "
+        "it.",
+        unit="m",
+        minimum=1e-6,
+        maximum=100.0,
+        name="target.translation",
+    )
+    target_rotation: float = option(
+        0.00524,
+        "Standard deviation about each axis that is good enough, 0.3 deg unless set; the verdict "
+        "and the stop rule use it.",
+        unit="rad",
+        minimum=1e-6,
+        maximum=math.pi,
+        name="target.rotation",
+    )
     parent_frame: str = option(
         "", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True
     )

@@ -32,8 +32,9 @@ def with_findings(
     """
     findings = snapshot.check(calibration).findings
     serious = [str(finding) for finding in findings if finding.severity is not Severity.NOTE]
-    calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *serious))
-    return calibration, [finding.to_dict() for finding in findings]
+    plain = [finding.to_dict() for finding in findings]
+    warnings = (*calibration.warnings, *serious)
+    return dataclasses.replace(calibration, warnings=warnings, findings=tuple(plain)), plain
 
 
 def with_options_set(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:

@@ -29,6 +29,8 @@ def calibrate(
     time_offset: float | str | None = None,
     scale: float | str | None = None,
     prior: Prior | None = None,
+    target_translation: float | None = None,
+    target_rotation: float | None = None,
     parent_frame: str | None = None,
     child_frame: str | None = None,
 ) -> Calibration:

@@ -95,7 +95,7 @@ def describe(calibration: Calibration, seen: Excitation | None = None) -> str:
     sigmas_deg = ", ".join(_sigma(value, 3) for value in np.degrees(calibration.sigmas_rpy))
     backend = " ipopt" * (calibration.backend == "ipopt")
     return (
-        f"{calibration.child_frame} in {calibration.parent_frame}: "
+        f"{calibration.headline}. {calibration.child_frame} in {calibration.parent_frame}: "
         f"xyz = ({xyz}) m +/- ({sigmas_mm}) mm, rpy = ({rpy}) deg +/- ({sigmas_deg}) deg; "
         f"status {status_in_words(calibration, seen)}; "
         f"{calibration.method} {calibration.reference}{backend}: "

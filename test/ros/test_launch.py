@@ -33,6 +33,8 @@ GIVEN = {
     "max_gap": ("1", 1.0),
     "time_offset": ("estimate", "estimate"),
     "scale": ("0.5", 0.5),
+    "target.translation": ("0.1", 0.1),
+    "target.rotation": ("0.01", 0.01),
     "prior.x": ("1+/-0.1", "1+/-0.1"),
     "prior.y": ("2+/-0.1", "2+/-0.1"),
     "prior.z": ("185cm+/-2cm", "185cm+/-2cm"),

@@ -31,6 +31,8 @@ CHANGES = {
     "max_gap": (0.05, {}),
     "time_offset": (0.03, {}),
     "scale": (1.5, {}),
+    "target.translation": (1e-5, {}),
+    "target.rotation": (1e-5, {}),
     "prior.x": ("1+/-0.001", {}),
     "prior.y": ("1+/-0.001", {}),
     "prior.z": ("1+/-0.001", {}),

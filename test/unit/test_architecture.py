@@ -25,20 +25,28 @@ ENGINE = {
     "methods": {"errors"},
     "config": {"errors", "methods"},
     "geometry": GROUND,
-    "calibration": GROUND | {"geometry"},
+    "status": set(),
+    "verdict": {"status"},
+    "calibration": GROUND | {"geometry", "status", "verdict"},
     "pairing": GROUND | {"geometry"},
 }
 ENGINE["solvers"] = GROUND | {"geometry", "pairing"}
 ENGINE["adaptive"] = ENGINE["solvers"] | {"solvers"}
-ENGINE["assessment"] = ENGINE["adaptive"] | {"calibration", "adaptive"}
+ENGINE["assessment"] = ENGINE["adaptive"] | {"calibration", "status", "verdict", "adaptive"}
 ENGINE["alignment"] = ENGINE["solvers"] | {"solvers"}
-ENGINE["checks"] = ENGINE["alignment"] | {"calibration", "assessment", "alignment"}
+ENGINE["checks"] = ENGINE["alignment"] | {
+    "calibration",
+    "status",
+    "verdict",
+    "assessment",
+    "alignment",
+}
 ENGINE["engine"] = set(ENGINE)
 ALLOWED = ENGINE | {
-    "io": GROUND | {"geometry", "calibration"},
+    "io": GROUND | {"geometry", "calibration", "status", "verdict"},
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
-    "root": GROUND | {"geometry", "calibration", "engine", "io"},
+    "root": GROUND | {"geometry", "calibration", "status", "verdict", "engine", "io"},
     "ros": {"io", *ENGINE},
     "cli": {"io", "report", "simulation", "ros", *ENGINE},
     "__main__": {"cli"},

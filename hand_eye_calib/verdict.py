@@ -1,0 +1,372 @@
+"""The verdict on a result, and the rules that lead to it.
+
+Each rule of :data:`RULES` looks at what is known of a result and gives reasons why it may not be
+used as it is. The gravest reason decides. docs/verdict.md has the same table; a test compares them.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Protocol, TypeAlias
+
+from hand_eye_calib.status import (
+    ROTATIONS,
+    TRANSLATIONS,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+    amount,
+    listing,
+)
+
+
+class Verdict(str, Enum):
+    """Whether a result may be used."""
+
+    USE = "USE"
+    USE_WITH_CARE = "USE WITH CARE"
+    DO_NOT_USE = "DO NOT USE"
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a result may not be used as it is.
+
+    Attributes
+    ----------
+    rule : str
+        Name of the rule in :data:`RULES`, stable over versions.
+    verdict : Verdict
+        What this reason alone leads to.
+    sentence : str
+        What was found, with its values.
+    what_to_do : str
+    axes : tuple of str
+        x, y, z, roll, pitch, yaw; empty if it is about the whole result.
+    options : tuple of (str, value)
+        Options that mend it, by their public names.
+    """
+
+    rule: str
+    verdict: Verdict
+    sentence: str
+    what_to_do: str
+    axes: tuple[str, ...] = ()
+    options: tuple[tuple[str, Any], ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values."""
+        return {
+            "rule": self.rule,
+            "verdict": self.verdict.value,
+            "axes": list(self.axes),
+            "sentence": self.sentence,
+            "what_to_do": self.what_to_do,
+            "options": dict(self.options),
+        }
+
+
+class Judged(Protocol):
+    """What the rules look at: attributes of a Calibration."""
+
+    @property
+    def status(self) -> SolveStatus: ...
+    @property
+    def observability(self) -> tuple[DofObservability, ...]: ...
+    @property
+    def sigmas_of_floor(self) -> Any: ...
+    @property
+    def contradictions(self) -> Mapping[str, float]: ...
+    @property
+    def cross_check(self) -> Mapping[str, Mapping[str, float | None]] | None: ...
+    @property
+    def findings(self) -> Sequence[Mapping[str, Any]]: ...
+    @property
+    def n_pairs(self) -> int: ...
+    @property
+    def n_inliers(self) -> int: ...
+    @property
+    def target_translation(self) -> float: ...
+    @property
+    def target_rotation(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A row of the table of rules.
+
+    Attributes
+    ----------
+    name : str
+    verdict : Verdict
+        What its reasons lead to.
+    when : str
+        The condition in words.
+    find : callable
+        ``find(result)`` gives sentence, what to do, axes and options of each reason.
+    """
+
+    name: str
+    verdict: Verdict
+    when: str
+    find: "Callable[[Judged], Iterator[_Found]]"
+
+
+_Found: TypeAlias = tuple[str, str, tuple[str, ...], tuple[tuple[str, Any], ...]]
+
+# Other answers contradict a result if they lie farther away than so many joint standard deviations
+# and than this share of the target. From so many targets on nothing of it may be used.
+CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, HOPELESS_TARGETS = 3.0, 0.25, 10.0
+
+# Smallest share of the motion pairs that are inliers in a recording whose noise is understood.
+FEWEST_INLIERS = 0.6
+
+_OTHERS = {
+    "halves": "the two halves of the recording",
+    "methods": "other methods and references",
+}
+_WHAT_TO_DO = {
+    "halves": "check that both mounts are tight and record again; what the halves agree on holds",
+    "methods": "take the scatter as the standard deviation, or record longer with more varied "
+    "motion",
+}
+
+
+def reasons(result: Judged) -> tuple[Reason, ...]:
+    """Why a result may not be used as it is, the gravest first; empty if nothing speaks against it.
+
+    Parameters
+    ----------
+    result : Calibration
+    """
+    return tuple(
+        Reason(rule.name, rule.verdict, sentence, what_to_do, axes, options)
+        for rule in RULES
+        for sentence, what_to_do, axes, options in rule.find(result)
+    )
+
+
+def verdict_of(found: Sequence[Reason]) -> Verdict:
+    """The verdict that reasons lead to."""
+    for graver in (Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE):
+        if any(reason.verdict is graver for reason in found):
+            return graver
+    return Verdict.USE
+
+
+def headline(result: Judged, found: Sequence[Reason]) -> str:
+    """The verdict with its gravest reason, or with what is known, in one line."""
+    decided = verdict_of(found)
+    if not found:
+        return f"{decided.value}: {_known(result)}"
+    gravest = [reason for reason in found if reason.verdict is decided]
+    if decided is Verdict.USE_WITH_CARE and gravest[0].rule == "unobservable":
+        hidden = listing(gravest[0].axes)
+        it = hidden if len(gravest[0].axes) == 1 else "them"
+        texts = [f"all but {hidden}; measure {it} by hand"]
+        texts += [reason.sentence for reason in gravest[1:2]]
+        return f"{decided.value}: {'; '.join(texts)}"
+    more = len(gravest) - 1
+    rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
+    return f"{decided.value}: {gravest[0].sentence}{rest}"
+
+
+def target_of(axis: str, result: Judged) -> float:
+    """The standard deviation (m or rad) that is good enough for an axis."""
+    return result.target_rotation if axis in ROTATIONS else result.target_translation
+
+
+# ---------------------------------------------------------------- the rules
+
+
+def _not_converged(result: Judged) -> Iterator[_Found]:
+    if result.status is SolveStatus.NOT_CONVERGED:
+        yield "the solver did not converge", "record more varied motion", (), ()
+
+
+def _contradicted(result: Judged) -> Iterator[_Found]:
+    if result.status is not SolveStatus.CONTRADICTED:
+        return
+    axes = tuple(result.contradictions)
+    apart = [
+        f"on {axis} is {far:.1f} standard deviations from"
+        for axis, far in result.contradictions.items()
+    ]
+    which = f"the prior {listing(apart)}" if apart else "a prior contradicts"
+    names = listing([f"prior.{axis}" for axis in axes]) or "the prior"
+    yield f"{which} what the motion shows", f"check value, unit and sign of {names}", axes, ()
+
+
+def _nothing_known(result: Judged) -> Iterator[_Found]:
+    if len(_unobservable(result)) == len(result.observability):
+        text = "the motion shows nothing of how the sensors are mounted"
+        yield text, "record motion with rotations about all axes", (), ()
+
+
+def _findings_of(severity: str) -> Callable[[Judged], Iterator[_Found]]:
+    def find(result: Judged) -> Iterator[_Found]:
+        for finding in result.findings:
+            if finding["severity"] == severity:
+                options = tuple(finding.get("options", {}).items())
+                yield finding["what"], finding["advice"], (), options
+
+    return find
+
+
+def _contradiction(kind: str, is_hopeless: bool) -> Callable[[Judged], Iterator[_Found]]:
+    """Other answers (``kind``: halves or methods) that lie farther away than they may."""
+
+    def find(result: Judged) -> Iterator[_Found]:
+        far = {
+            axis: scatter
+            for axis, scatter in _far(result, kind).items()
+            if (scatter > HOPELESS_TARGETS * target_of(axis, result)) == is_hopeless
+        }
+        if far:
+            told = [f"{axis} by {amount(axis, scatter)}" for axis, scatter in far.items()]
+            sigmas = [
+                amount(dof.name, dof.sigma) for dof in result.observability if dof.name in far
+            ]
+            text = (
+                f"{_OTHERS[kind]} scatter in {listing(told)} about this result, which states "
+                f"{listing(sigmas)}"
+            )
+            yield text, _WHAT_TO_DO[kind], tuple(far), ()
+
+    return find
+
+
+def _far(result: Judged, kind: str) -> dict[str, float]:
+    """Axis to the scatter of other answers about the result, if it is larger than allowed."""
+    far = {}
+    sigmas = {dof.name: dof.sigma for dof in result.observability}
+    for axis, row in (result.cross_check or {}).items():
+        scatter = row.get(f"of_{kind}")
+        if scatter is None or not math.isfinite(sigmas[axis]):
+            continue
+        # Older files have no distances.
+        excess = row.get(f"excess_of_{kind}") or scatter / max(sigmas[axis], 1e-12)
+        is_large = scatter > CONTRADICTED_SHARE * target_of(axis, result)
+        if excess > CONTRADICTED_SIGMAS and is_large:
+            far[axis] = scatter
+    return far
+
+
+def _hidden(result: Judged) -> Iterator[_Found]:
+    axes = _unobservable(result)
+    if axes and len(axes) < len(result.observability):
+        priors = listing([f"prior.{axis}=VALUE+/-SIGMA" for axis in axes])
+        it = "it" if len(axes) == 1 else "them"
+        text = f"the motion does not show {listing(axes)}"
+        yield text, f"measure {it} by hand and give {priors}", axes, ()
+
+
+def _few_inliers(result: Judged) -> Iterator[_Found]:
+    share = result.n_inliers / max(result.n_pairs, 1)
+    if share < FEWEST_INLIERS:
+        text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
+        yield text, "find out why the odometry jumps, and record again", (), ()
+
+
+def _worse_than_target(result: Judged) -> Iterator[_Found]:
+    rough = [
+        dof
+        for dof in result.observability
+        if math.isfinite(dof.sigma) and dof.sigma > target_of(dof.name, result)
+    ]
+    if rough:
+        told = listing([f"{dof.name} to {amount(dof.name, dof.sigma)}" for dof in rough])
+        text = f"known is {told} (one standard deviation), which is worse than the target"
+        axes = tuple(dof.name for dof in rough)
+        yield text, f"record longer, with {_motion_for(axes)}", axes, ()
+
+
+def _floor(result: Judged) -> Iterator[_Found]:
+    rough = {}
+    for dof, floor in zip(result.observability, result.sigmas_of_floor, strict=True):
+        target = target_of(dof.name, result)
+        if dof.sigma <= target < math.hypot(dof.sigma, float(floor)):
+            rough[dof.name] = float(floor)
+    if rough:
+        told = listing([f"{axis} by {amount(axis, floor)}" for axis, floor in rough.items()])
+        text = (
+            "an odometry that is off by 1% in scale, which no recording shows, moves "
+            f"{told}: more than the target"
+        )
+        yield text, "check the scale of both odometries on a known distance", tuple(rough), ()
+
+
+def _unobservable(result: Judged) -> tuple[str, ...]:
+    return tuple(dof.name for dof in result.observability if dof.verdict is DofVerdict.UNOBSERVABLE)
+
+
+def _motion_for(axes: Sequence[str]) -> str:
+    return "more rotation about other axes" if set(axes) & {*TRANSLATIONS} else "more rotation"
+
+
+def _known(result: Judged) -> str:
+    """The largest standard deviations of a translation and of a rotation."""
+    texts = []
+    for names in (TRANSLATIONS, ROTATIONS):
+        worst = max(
+            (dof for dof in result.observability if dof.name in names), key=lambda dof: dof.sigma
+        )
+        texts.append(amount(worst.name, worst.sigma))
+    return f"all six axes are known to {texts[0]} and {texts[1]} or better, one standard deviation"
+
+
+_NEVER, _CARE = Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE
+
+RULES = (
+    Rule("not_converged", _NEVER, "the solver did not converge", _not_converged),
+    Rule(
+        "prior",
+        _NEVER,
+        "a prior is more than 4 joint standard deviations from what the motion shows, or a lever "
+        "arm of more than 50 m",
+        _contradicted,
+    ),
+    Rule("error_finding", _NEVER, "a stream check found an error", _findings_of("error")),
+    Rule("nothing_known", _NEVER, "all six axes are unobservable", _nothing_known),
+    *(
+        Rule(
+            f"{kind}_far",
+            _NEVER,
+            f"{others} contradict the result, and scatter by more than {HOPELESS_TARGETS:g} "
+            "targets about it",
+            _contradiction(kind, is_hopeless=True),
+        )
+        for kind, others in _OTHERS.items()
+    ),
+    Rule("unobservable", _CARE, "the motion does not show an axis", _hidden),
+    Rule("warning_finding", _CARE, "a stream check gave a warning", _findings_of("warning")),
+    *(
+        Rule(
+            kind,
+            _CARE,
+            f"{others} contradict the result: they scatter by more than {CONTRADICTED_SIGMAS:g} "
+            f"joint standard deviations and {CONTRADICTED_SHARE:g} of the target about it",
+            _contradiction(kind, is_hopeless=False),
+        )
+        for kind, others in _OTHERS.items()
+    ),
+    Rule(
+        "outliers",
+        _CARE,
+        f"more than {1 - FEWEST_INLIERS:.0%} of the motion pairs are outliers",
+        _few_inliers,
+    ),
+    Rule(
+        "target",
+        _CARE,
+        "the standard deviation of an axis is above target.translation or target.rotation",
+        _worse_than_target,
+    ),
+    Rule(
+        "floor",
+        _CARE,
+        "an axis is worse than its target only together with the common-mode floor",
+        _floor,
+    ),
+)

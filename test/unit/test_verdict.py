@@ -1,0 +1,187 @@
+"""The verdict: each rule alone, the order of reasons, and the table in docs/verdict.md.
+
+``PYTHONPATH=test:. python test/unit/test_verdict.py`` writes the table after a change of the rules.
+"""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from result_making import NAMES, calibration
+
+from hand_eye_calib import verdict as rules
+from hand_eye_calib.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
+from hand_eye_calib.verdict import RULES
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "verdict.md"
+TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)")
+
+
+def table():
+    rows = [f"| `{rule.name}` | {rule.when} | `{rule.verdict.value}` |\n" for rule in RULES]
+    return "".join(["\n| Rule | If | Verdict |\n| --- | --- | --- |\n", *rows, "\n"])
+
+
+def test_the_page_has_the_rules_of_the_code():
+    assert table() in PAGE.read_text(encoding="utf-8"), (
+        "run PYTHONPATH=test:. python test/unit/test_verdict.py"
+    )
+
+
+def observed(sigma_m=0.003, sigma_rad=0.001, **changes):
+    """Verdicts of six axes; ``changes`` names axes with another sigma (inf: unobservable)."""
+    sigmas = dict(zip(NAMES, np.repeat([sigma_m, sigma_rad], 3).tolist(), strict=True)) | changes
+    return tuple(
+        DofObservability(
+            name,
+            DofVerdict.OBSERVED if np.isfinite(sigma) else DofVerdict.UNOBSERVABLE,
+            sigma,
+        )
+        for name, sigma in sigmas.items()
+    )
+
+
+def good(**changes):
+    values = {"status": SolveStatus.OK, "observability": observed(), "covariance": np.eye(6) * 1e-6}
+    return calibration(**values | changes)
+
+
+def checked(axis, scatter, excess, kind):
+    nothing = dict.fromkeys(("of_methods", "of_halves", "excess_of_methods", "excess_of_halves"))
+    rows = {name: {"sigma": 0.003} | nothing for name in NAMES}
+    rows[axis] |= {f"of_{kind}": scatter, f"excess_of_{kind}": excess}
+    return rows
+
+
+FINDING = {
+    "code": "units",
+    "severity": "error",
+    "what": "lengths are in mm",
+    "advice": "convert them",
+    "options": {"scale": 0.001},
+}
+FLOOR = np.diag([0.03, 0, 0, 0, 0, 0]) ** 2
+
+# Rule to a result in which it alone applies.
+CASES = {
+    "not_converged": dict(status=SolveStatus.NOT_CONVERGED),
+    "prior": dict(status=SolveStatus.CONTRADICTED, contradictions={"x": 5.5}),
+    "error_finding": dict(findings=(FINDING,)),
+    "nothing_known": dict(observability=observed(np.inf, np.inf)),
+    "halves_far": dict(cross_check=checked("yaw", 0.2, 9.0, "halves")),
+    "methods_far": dict(cross_check=checked("x", 0.5, 9.0, "methods")),
+    "unobservable": dict(observability=observed(z=np.inf)),
+    "warning_finding": dict(findings=(FINDING | {"severity": "warning"},)),
+    "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
+    "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),
+    "outliers": dict(n_pairs=100, n_inliers=55),
+    "target": dict(observability=observed(x=0.04, yaw=0.02)),
+    "floor": dict(T_parent_child=np.eye(4), floor=FLOOR),
+}
+
+
+def test_every_rule_has_a_case():
+    assert list(CASES) == [rule.name for rule in RULES]
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+def test_each_rule_alone_decides(rule):
+    result = good(**CASES[rule.name])
+    assert [reason.rule for reason in result.reasons] == [rule.name]
+    (reason,) = result.reasons
+    assert reason.sentence
+    assert reason.what_to_do
+    assert result.verdict is reason.verdict is rule.verdict
+    assert result.headline.startswith(f"{rule.verdict.value}: ")
+
+
+def test_nothing_against_it_is_use():
+    result = good()
+    assert (result.verdict, result.reasons) == (Verdict.USE, ())
+    assert result.headline == (
+        "USE: all six axes are known to 3.0 mm and 0.057 deg or better, one standard deviation"
+    )
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(findings=(FINDING | {"severity": "note"},)),
+        dict(cross_check=checked("x", 0.002, 9.0, "halves")),
+        dict(cross_check=checked("x", 0.05, 2.9, "methods")),
+        dict(observability=observed(x=0.0199, yaw=0.0052)),
+        dict(
+            observability=observed(x=0.04, yaw=0.02), target_translation=0.05, target_rotation=0.1
+        ),
+        dict(n_pairs=100, n_inliers=60),
+    ],
+)
+def test_what_does_not_count(changes):
+    assert good(**changes).verdict is Verdict.USE
+
+
+def test_the_gravest_reason_comes_first_and_decides():
+    result = good(**CASES["target"] | CASES["error_finding"] | CASES["outliers"])
+    assert [reason.rule for reason in result.reasons] == ["error_finding", "outliers", "target"]
+    assert result.headline == "DO NOT USE: lengths are in mm"
+
+
+def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
+    assert good(**CASES["unobservable"]).headline == ("USE WITH CARE: all but z; measure z by hand")
+    both = good(observability=observed(y=np.inf, z=np.inf))
+    assert both.headline == "USE WITH CARE: all but y and z; measure them by hand"
+    assert both.reasons[0].what_to_do == (
+        "measure them by hand and give prior.y=VALUE+/-SIGMA and prior.z=VALUE+/-SIGMA"
+    )
+
+
+def test_other_findings_make_another_verdict():
+    assert dataclasses.replace(good(), findings=(FINDING,)).verdict is Verdict.DO_NOT_USE
+
+
+def test_a_result_of_version_0_1_has_a_verdict():
+    document = good(cross_check=checked("x", 0.012, None, "halves")).to_dict()
+    for name in ("verdict", "headline", "reasons", "findings", "contradictions"):
+        del document[name]
+    for row in document["cross_check"].values():
+        del row["excess_of_methods"], row["excess_of_halves"]
+    read = Calibration.from_dict(document)
+    assert [reason.rule for reason in read.reasons] == ["halves"]
+
+
+def test_a_file_keeps_what_the_verdict_comes_from():
+    result = good(**CASES["error_finding"] | CASES["target"])
+    document = result.to_dict()
+    assert list(document)[0] == "verdict"
+    assert document["verdict"] == "DO NOT USE"
+    assert Calibration.from_dict(document).reasons == result.reasons
+    assert document["reasons"][0] == {
+        "rule": "error_finding",
+        "verdict": "DO NOT USE",
+        "axes": [],
+        "sentence": "lengths are in mm",
+        "what_to_do": "convert them",
+        "options": {"scale": 0.001},
+    }
+
+
+def test_python_shows_the_verdict_first():
+    assert repr(good(**CASES["unobservable"])).startswith(
+        "<Calibration: USE WITH CARE: all but z; measure z by hand\n"
+    )
+
+
+def test_reasons_give_the_verdict():
+    assert rules.verdict_of(()) is Verdict.USE
+
+
+if __name__ == "__main__":
+    PAGE.write_text(TABLE.sub(lambda _: table(), PAGE.read_text("utf-8")), encoding="utf-8")
