@@ -54,6 +54,7 @@ _PLAIN = (
 _PLAIN_LATER = (
     "time_offset_sigma_s",
     "scale_sigma",
+    "proved_global",
     "method_reason",
     "reference_reason",
     "noise",
@@ -67,7 +68,7 @@ _PLAIN_LATER = (
 _KINDS: dict[str, Any] = (
     dict.fromkeys(("method", "reference", "backend", "parent_frame", "child_frame"), str)
     | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
-    | dict.fromkeys(("method_reason", "reference_reason"), str)
+    | dict.fromkeys(("method_reason", "reference_reason", "proved_global"), str)
     | dict.fromkeys(("noise", "cross_check"), (dict, type(None)))
     | {"contradictions": dict}
 )
@@ -146,6 +147,9 @@ class Calibration:
         priors are added. None in a result read from a file that does not have it.
     objective : float
         Value of the method's cost at ``T_method``; for dnlo eq. (5), the outliers' share included.
+    proved_global : str
+        Whether no other transform has a smaller cost over the motion pairs that count: "yes", "no",
+        or "not tried" (:mod:`hand_eye_calib.solvers.certificate`).
     method, reference, backend : str
         How it was solved; ``method`` and ``reference`` are those that ``auto`` chose.
     floor : (6, 6) array or None
@@ -201,6 +205,7 @@ class Calibration:
     time_offset_sigma_s: float = 0.0
     scale: float = 1.0
     scale_sigma: float = 0.0
+    proved_global: str = "not tried"
     method_reason: str = ""
     reference_reason: str = ""
     noise: dict[str, Any] | None = None

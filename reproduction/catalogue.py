@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from hand_eye_calib.errors import ConfigError, InputError
 from reproduction import (
+    certificate,
     conclusions,
     figures,
     findings,
@@ -79,6 +80,7 @@ def _artefacts() -> dict[str, Artefact]:
         Artefact("findings", everything, findings.write),
         Artefact("adaptive", [], hindsight.write),
         Artefact("repeats", [], repeats.write, ("published",)),
+        Artefact("certificate", [], certificate.write),
         Artefact("unlike", [], unlike.write, ("simulated",)),
     ]
     return {artefact.name: artefact for artefact in found}
@@ -93,6 +95,7 @@ EXPERIMENTS = {
     "adaptive": ("adaptive",),
     "repeats": ("repeats",),
     "unlike": ("unlike",),
+    "certificate": ("certificate",),
     "all": (
         "fig3",
         "fig4",

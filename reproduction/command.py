@@ -39,13 +39,14 @@ EXPERIMENTS = {
     "adaptive": "study: adaptive and reference auto against the best choice with hindsight",
     "repeats": "study: stated sigmas against the spread of repeats on real recordings",
     "unlike": "study: simulations unlike the paper's (--data simulated)",
+    "certificate": "study: which answers are proved to be global minima",
     "all": "all figures and tables of the paper, its conclusions and our findings",
 }
 
-STUDIES = ("adaptive", "repeats", "unlike")
+STUDIES = ("adaptive", "repeats", "unlike", "certificate")
 
 _EPILOG = (
-    "\n".join(f"{name:<11}{about}" for name, about in EXPERIMENTS.items())
+    "\n".join(f"{name:<13}{about}" for name, about in EXPERIMENTS.items())
     + """
 
 Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV. Beside each,

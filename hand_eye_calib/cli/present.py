@@ -190,11 +190,18 @@ def _scatter_lines(cross_check: Mapping[str, Mapping[str, Any]] | None) -> Itera
             yield f"Scatter of {title} (one standard deviation): {', '.join(told)}"
 
 
+_PROOF = {
+    "yes": ", proved to be the global minimum over them",
+    "no": ", not proved to be the global minimum over them",
+}
+
+
 def _solution_lines(calibration: Calibration) -> Iterator[str]:
     yield (
         f"Solved with {calibration.method} ({calibration.backend}) on reference "
         f"{calibration.reference}: {calibration.n_inliers} of {calibration.n_pairs} motion pairs "
         f"are inliers, from {calibration.n_poses} poses; objective {calibration.objective:.6g}"
+        f"{_PROOF.get(calibration.proved_global, '')}"
     )
     if calibration.method_reason:
         yield f"  method {calibration.method_reason}"

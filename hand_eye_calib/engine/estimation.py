@@ -37,6 +37,8 @@ from hand_eye_calib.solvers.solution import Solution
 # look like motion.
 _SPAN = 10
 
+_PROVED = {True: "yes", False: "no", None: "not tried"}
+
 # Tried in turn if the reference that auto chose leaves an axis unobservable.
 _LONGER_REFERENCES = ("B5", "B20")
 
@@ -60,6 +62,7 @@ class _Evaluation:
     spans: tuple[MotionPairs, FloatArray]
     method_reason: str = ""
     reference_reason: str = ""
+    proved_global: str = "not tried"
     noise: dict[str, Any] | None = None
     scale_correction: float = 1.0
     scale_sigma: float = 0.0
@@ -139,6 +142,7 @@ def _calibration(
         T_method=solution.T_parent_child,
         floor=common_mode_floor(*evaluation.spans, fused.T_parent_child),
         objective=solution.objective,
+        proved_global=evaluation.proved_global,
         method=evaluation.method,
         method_reason=evaluation.method_reason,
         reference=evaluation.reference,
@@ -247,7 +251,7 @@ def _solve_reference(
     pose_pairs: PosePairs, method: Method, reference: str, reason: str = ""
 ) -> _Evaluation:
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-    solution = method.solve(pairs)
+    solution = method.prove(pairs, method.solve(pairs))
     assessment = assess(
         pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)
     )
@@ -260,6 +264,7 @@ def _solve_reference(
         weights=solution.weights,
         spans=(pairs, solution.weights),
         reference_reason=reason,
+        proved_global=_PROVED[solution.is_proved_global],
     )
 
 

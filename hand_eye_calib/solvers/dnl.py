@@ -25,10 +25,18 @@ def solve(pairs: MotionPairs) -> Solution:
     -------
     Solution
     """
+    return _solve_from(pairs, start_rotations(pairs))
+
+
+def solve_from(pairs: MotionPairs, T_parent_child: FloatArray) -> Solution:
+    """Minimise the same from a transform (4, 4)."""
+    return _solve_from(pairs, T_parent_child[None, :3, :3])
+
+
+def _solve_from(pairs: MotionPairs, rotations: FloatArray) -> Solution:
+    """The lowest of the minima from several rotations."""
     coefficients, weights = quadratic_form.coefficients(pairs), np.ones(len(pairs))
-    minimum = quadratic_form.minimise(
-        quadratic_form.weighted_sum(coefficients, weights), start_rotations(pairs)
-    )
+    minimum = quadratic_form.minimise(quadratic_form.weighted_sum(coefficients, weights), rotations)
     best = int(np.argmin(minimum.value))
     T_parent_child = minimum.T_parent_child[best]
     return Solution(

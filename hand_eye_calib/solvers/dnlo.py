@@ -79,7 +79,40 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
     """
     searched = pairs[_searched(len(pairs))]
     T_found = _search(searched, threshold, min_inlier_fraction * len(searched))
-    return _finish(pairs, T_found, threshold, min_inlier_fraction * len(pairs))
+    return solve_from(pairs, T_found, threshold, min_inlier_fraction)
+
+
+def solve_from(
+    pairs: MotionPairs, T_parent_child: FloatArray, threshold: float, min_inlier_fraction: float
+) -> Solution:
+    """Improve weights and X in turn on all pairs, from a transform (4, 4).
+
+    Ends when the objective falls no more. Parameters as for :func:`solve`. The costs come from the
+    matrices, which cancel least.
+    """
+    T, floor = T_parent_child, min_inlier_fraction * len(pairs)
+    coefficients = quadratic_form.coefficients(pairs)
+    weights, objective = truncate(quadratic_form.costs(coefficients, T), threshold, floor)
+    Q = quadratic_form.weighted_sum(coefficients, weights)
+    converged, iterations = False, 0
+    while not converged and iterations < _MAX_ROUNDS:
+        iterations += 1
+        T_new = quadratic_form.gauss_newton_step(Q, T[None])[0]
+        # Without a predicted decrease, no pass over the pairs is needed.
+        converged = bool(quadratic_form.decrease(Q, T, T_new) < _CONVERGED * objective)
+        if converged:
+            break
+        weights_new, objective_new = truncate(
+            quadratic_form.costs(coefficients, T_new), threshold, floor
+        )
+        converged = bool(objective_new >= objective * (1 - _CONVERGED))
+        if objective_new <= objective:
+            changed = np.flatnonzero(weights_new != weights)
+            Q = Q + quadratic_form.weighted_sum(
+                coefficients[changed], weights_new[changed] - weights[changed]
+            )
+            T, weights, objective = T_new, weights_new, objective_new
+    return Solution(T, float(objective), converged, iterations, weights)
 
 
 def solve_without(
@@ -313,32 +346,3 @@ def _settle(
         if settled.all():
             break
     return Ts, objectives
-
-
-def _finish(pairs: MotionPairs, T_start: FloatArray, threshold: float, floor: float) -> Solution:
-    """Improve weights and X in turn on all pairs until the objective falls no more. The costs come
-    from the matrices, which cancel least.
-    """
-    coefficients = quadratic_form.coefficients(pairs)
-    T = T_start
-    weights, objective = truncate(quadratic_form.costs(coefficients, T), threshold, floor)
-    Q = quadratic_form.weighted_sum(coefficients, weights)
-    converged, iterations = False, 0
-    while not converged and iterations < _MAX_ROUNDS:
-        iterations += 1
-        T_new = quadratic_form.gauss_newton_step(Q, T[None])[0]
-        # Without a predicted decrease, no pass over the pairs is needed.
-        converged = bool(quadratic_form.decrease(Q, T, T_new) < _CONVERGED * objective)
-        if converged:
-            break
-        weights_new, objective_new = truncate(
-            quadratic_form.costs(coefficients, T_new), threshold, floor
-        )
-        converged = bool(objective_new >= objective * (1 - _CONVERGED))
-        if objective_new <= objective:
-            changed = np.flatnonzero(weights_new != weights)
-            Q = Q + quadratic_form.weighted_sum(
-                coefficients[changed], weights_new[changed] - weights[changed]
-            )
-            T, weights, objective = T_new, weights_new, objective_new
-    return Solution(T, float(objective), converged, iterations, weights)

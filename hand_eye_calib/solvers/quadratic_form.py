@@ -262,6 +262,24 @@ class _Reduced:
 
 def _eliminate_translation(Q: FloatArray) -> _Reduced:
     """The forms (B, 13, 13) at the best translation for each rotation."""
+    reduced, to_translation = without_translation(Q)
+    return _Reduced(reduced[:, :9, :9], reduced[:, :9, 9], reduced[:, 9, 9], to_translation)
+
+
+def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Forms of the rotation alone, at the best translation for it.
+
+    Parameters
+    ----------
+    Q : (B, 13, 13) array
+
+    Returns
+    -------
+    reduced : (B, 10, 10) array
+        Forms of ``(vec R, 1)``.
+    to_translation : (B, 3, 10) array
+        Minus the best translation, m, is this times ``(vec R, 1)``.
+    """
     gain = _pseudo_inverse(Q[:, _TRANSLATION, _TRANSLATION])
     Q_translation_rest = np.concatenate(
         [Q[:, _TRANSLATION, _ROTATION], Q[:, _TRANSLATION, _ONE, None]], axis=2
@@ -271,9 +289,7 @@ def _eliminate_translation(Q: FloatArray) -> _Reduced:
     reduced[:, :9, 9] = reduced[:, 9, :9] = Q[:, _ROTATION, _ONE]
     reduced[:, 9, 9] = Q[:, _ONE, _ONE]
     reduced -= np.swapaxes(Q_translation_rest, 1, 2) @ gain @ Q_translation_rest
-    return _Reduced(
-        reduced[:, :9, :9], reduced[:, :9, 9], reduced[:, 9, 9], gain @ Q_translation_rest
-    )
+    return reduced, gain @ Q_translation_rest
 
 
 def _newton_step(

@@ -10,7 +10,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
 from hand_eye_calib.methods import METHODS, MethodRecord
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import ali, dnl, dnlo, park, taylor, zhuang
+from hand_eye_calib.solvers import ali, certificate, dnl, dnlo, park, taylor, zhuang
 from hand_eye_calib.solvers.solution import Solution
 
 # ``solve(pairs, *rejection)``; for rejection see Method.rejection.
@@ -28,6 +28,13 @@ _SOLVE: dict[str, Callable[..., Solution]] = {
 _SOLVE_WITHOUT: dict[str, Callable[..., FloatArray]] = {
     "dnlo": dnlo.solve_without,
     "dnl": dnl.solve_without,
+}
+
+# ``solve_from(pairs, T_parent_child, *rejection)`` of the methods whose cost is the quadratic form,
+# over the pairs that count.
+_SOLVE_FROM: dict[str, Callable[..., Solution]] = {
+    "dnlo": dnlo.solve_from,
+    "dnl": dnl.solve_from,
 }
 
 
@@ -94,6 +101,29 @@ class Method:
             )
         solve = _SOLVE[self.name] if self.backend == "fast" else _ipopt_solve(self.name)
         return solve(pairs, *self.rejection)
+
+    def prove(self, pairs: MotionPairs, solution: Solution) -> Solution:
+        """Prove that a solution is the global minimum over the pairs it counts.
+
+        Parameters
+        ----------
+        pairs : MotionPairs
+        solution : Solution
+            Of these pairs.
+
+        Returns
+        -------
+        Solution
+            With ``is_proved_global``, which stays None for methods that have no proof. A better one
+            if the search that follows a failed proof finds it.
+        """
+        if self.name not in _SOLVE_FROM:
+            return solution
+
+        def solve_from(T_parent_child: FloatArray) -> Solution:
+            return _SOLVE_FROM[self.name](pairs, T_parent_child, *self.rejection)
+
+        return certificate.prove(pairs, solution, solve_from)
 
     def solve_without(
         self, pairs: MotionPairs, solution: Solution, left_out: BoolArray

@@ -1,0 +1,150 @@
+"""``python -m reproduction certificate``: which answers are proved to be global minima."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
+from hand_eye_calib.solvers import quadratic_form
+from hand_eye_calib.solvers.certificate import certify
+from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.solvers.solution import Solution
+from reproduction.published import KITTI, LEVELS, REFERENCES, SIMULATED
+from reproduction.runner import in_parallel
+from reproduction.writing import markdown_table, write_csv, write_text
+
+if TYPE_CHECKING:
+    from reproduction.catalogue import Results
+    from reproduction.published import Case
+    from reproduction.sources import Source
+
+_COLUMNS = (
+    *("data set", "answer", "answers", "proved", "better found", "no proof"),
+    *("false minima near", "of them proved", "median (ms)", "largest (ms)"),
+)
+
+_HALF_TURNS = np.array([np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
+
+# A minimum counts as false if its cost is higher by this share.
+_HIGHER = 1e-3
+
+
+@dataclass(frozen=True)
+class Proof:
+    """One answer: whether it was proved at once, whether the search found a better, whether that
+    was proved, and the time of the first proof.
+
+    ``n_false`` counts other local minima, from rotations by pi beside it, and ``n_false_proved``
+    those that the certificate let pass.
+    """
+
+    dataset: str
+    answer: str
+    at_once: bool
+    is_better_found: bool
+    in_the_end: bool
+    n_false: int
+    n_false_proved: int
+    seconds: float
+
+
+def write(name: str, results: Results) -> list[Path]:
+    """Try to prove every answer and write ``NAME.md`` and ``NAME.csv``; returns their paths."""
+    datasets = [dataset for dataset in (*SIMULATED, *KITTI) if dataset in results.source.datasets]
+    tasks = [
+        (results.source, dataset, level)
+        for dataset in datasets
+        for level in LEVELS.get(dataset, (None,))
+    ]
+    proofs = [proof for found in in_parallel(prove_level, tasks, results.jobs) for proof in found]
+    rows = list(_rows(proofs))
+    return [
+        write_csv(results.out / f"{name}.csv", _COLUMNS, rows),
+        write_text(
+            results.out / f"{name}.md",
+            "# Proofs of global minima",
+            "Every case with the six references of the paper. DNLO: over the pairs it counts. "
+            "Park: the local minimum of DNL's cost from Park's rotation. False minima are other "
+            "local minima of the same cost, found from rotations by pi beside the answer. "
+            "Processor time of one certificate.",
+            markdown_table(_COLUMNS, rows),
+        ),
+    ]
+
+
+def prove_level(source: Source, dataset: str, level: float | None) -> list[Proof]:
+    """Proofs of the cases of a data set at a level."""
+    return [
+        _proof(dataset, answer, pairs, solution, method)
+        for case in source.cases(dataset, level)
+        for pairs in _pairs(case)
+        for answer, method, solution in _answers(pairs)
+    ]
+
+
+def _pairs(case: Case) -> Iterator[MotionPairs]:
+    for reference in REFERENCES:
+        yield motion_pairs(case.parent.poses, case.child.poses, reference)
+
+
+def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Method, Solution]]:
+    from hand_eye_calib.solvers import dnl
+
+    for name in ("dnl", "dnlo"):
+        yield name, Method(name), Method(name).solve(pairs)
+    park = Method("park").solve(pairs).T_parent_child
+    yield "dnl from park", Method("dnl"), dnl.solve_from(pairs, park)
+
+
+def _proof(
+    dataset: str, answer: str, pairs: MotionPairs, solution: Solution, method: Method
+) -> Proof:
+    Q = quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), solution.weights)
+    start = time.process_time()
+    at_once = certify(Q, solution.T_parent_child).is_global
+    seconds = time.process_time() - start
+    found = method.prove(pairs, solution)
+    false = list(_false_minima(Q, solution.T_parent_child))
+    return Proof(
+        dataset,
+        answer,
+        at_once,
+        found.objective < solution.objective,
+        bool(found.is_proved_global),
+        len(false),
+        sum(certify(Q, T).is_global for T in false),
+        seconds,
+    )
+
+
+def _false_minima(Q: FloatArray, T_parent_child: FloatArray) -> Iterator[FloatArray]:
+    value = float(quadratic_form.minimise(Q, T_parent_child[None, :3, :3]).value[0])
+    minimum = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ _HALF_TURNS)
+    for T, other in zip(minimum.T_parent_child, minimum.value, strict=True):
+        if other > value * (1 + _HIGHER) + 1e-9 * np.trace(Q):
+            yield T
+
+
+def _rows(proofs: list[Proof]) -> Iterator[list[object]]:
+    for dataset, answer in dict.fromkeys((proof.dataset, proof.answer) for proof in proofs):
+        some = [proof for proof in proofs if (proof.dataset, proof.answer) == (dataset, answer)]
+        milliseconds = [1e3 * proof.seconds for proof in some]
+        yield [
+            dataset,
+            answer,
+            len(some),
+            sum(proof.at_once for proof in some),
+            sum(proof.is_better_found and proof.in_the_end for proof in some),
+            sum(not proof.in_the_end for proof in some),
+            sum(proof.n_false for proof in some),
+            sum(proof.n_false_proved for proof in some),
+            f"{np.median(milliseconds):.2f}",
+            f"{max(milliseconds):.1f}",
+        ]
