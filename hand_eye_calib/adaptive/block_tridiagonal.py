@@ -1,39 +1,102 @@
-"""Symmetric matrices of d x d blocks on the diagonal and beside it, in LAPACK's band storage: time
-and memory linear in their size.
+"""Symmetric positive definite matrices of d x d blocks on the diagonal and beside it: time and
+memory linear in their size.
 
-``bands[k, c, r]`` is the element r rows below the diagonal in column c of block k: an (n, d, 2 d)
-array.
+Cyclic reduction (Golub; Heller, SIAM J. Numer. Anal. 13, 1976): every other block is eliminated,
+all of them at once, and what is left is block tridiagonal again, half as long. It is a Cholesky
+factorisation in another order. Each level is a few products of stacked matrices, so that numpy's
+overhead grows with the logarithm of the number of blocks. The order of time is kept only where it
+matters, see :class:`InOrder`.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from hand_eye_calib.adaptive import lapack
 from hand_eye_calib.arrays import FloatArray
 
-
-def empty_bands(n_blocks: int, size: int) -> FloatArray:
-    """Bands (n, d, 2 d) of a matrix of zeros."""
-    return np.zeros((n_blocks, size, 2 * size))
+# So few matrices are inverted faster by LAPACK, one by one, than by stacked rows.
+_FEW = 32
 
 
-def add_diagonal(bands: FloatArray, blocks: FloatArray) -> None:
-    """Add symmetric blocks (n, k, k), k <= d, to the upper left of the diagonal blocks."""
-    size = blocks.shape[-1]
-    for column in range(size):
-        bands[:, column, : size - column] += blocks[..., column:, column]
+def transposed(blocks: FloatArray) -> FloatArray:
+    """The transposes (..., k, d) of matrices (..., d, k)."""
+    return blocks.swapaxes(-1, -2)
 
 
-def set_below(bands: FloatArray, blocks: FloatArray) -> None:
-    """Set the blocks (n, d, d) below the diagonal ones; the last row of bands has none."""
-    size = bands.shape[1]
-    for column in range(size):
-        bands[:, column, size - column : 2 * size - column] = blocks[:, :, column]
+def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverses (n, d, d) of the lower Cholesky factors of positive definite matrices (n, d, d), and
+    the logarithms (n,) of the matrices' determinants.
+    """
+    lower = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
+    pivots = np.diagonal(lower, axis1=1, axis2=2)
+    log_determinants = 2.0 * np.log(pivots).sum(axis=1)
+    if len(lower) < _FEW:
+        return np.asarray(np.linalg.inv(lower), dtype=np.float64), log_determinants
+    inverse: FloatArray = np.zeros_like(lower)
+    inverse[:, 0, 0] = 1.0 / pivots[:, 0]
+    for row in range(1, lower.shape[1]):
+        scaled = lower[:, row : row + 1, :row] / -pivots[:, row, None, None]
+        inverse[:, row : row + 1, :row] = scaled @ inverse[:, :row, :row]
+        inverse[:, row, row] = 1.0 / pivots[:, row]
+    return inverse, log_determinants
+
+
+@dataclass(frozen=True)
+class _Level:
+    """What eliminating every other block, the second first, needs: the inverse root of its own
+    block, and that times its coupling to the block before and, if there is one, behind.
+    """
+
+    inverse: FloatArray
+    before: FloatArray
+    behind: FloatArray
+
+    def whiten(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Whitened columns of the eliminated blocks, and the columns of the blocks that stay."""
+        n_before, n_behind = len(self.before), len(self.behind)
+        whitened, rest = self.inverse @ right[1::2], right[::2].copy()
+        rest[:n_before] -= transposed(self.before) @ whitened
+        rest[1 : 1 + n_behind] -= transposed(self.behind) @ whitened[:n_behind]
+        return whitened, rest
+
+    def restore(self, whitened: FloatArray, rest: FloatArray) -> FloatArray:
+        """Solution of all blocks from that of those that stay."""
+        n_behind = len(self.behind)
+        own = whitened - self.before @ rest[: len(self.before)]
+        own[:n_behind] -= self.behind @ rest[1 : 1 + n_behind]
+        solved = np.empty((len(own) + len(rest), *rest.shape[1:]))
+        solved[::2], solved[1::2] = rest, transposed(self.inverse) @ own
+        return solved
+
+    def extend(self, diagonal: FloatArray, below: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Blocks of the inverse on the diagonal and below it from those of the blocks that stay."""
+        n_before, n_behind = len(self.before), len(self.behind)
+        root = transposed(self.inverse)
+        to_before, to_behind = -root @ self.before, -root[:n_behind] @ self.behind
+        with_before = to_before @ diagonal[:n_before]
+        with_before[:n_behind] += to_behind @ below[:n_behind]
+        with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
+        with_behind += below[:n_behind] @ transposed(to_before[:n_behind])
+        own = root @ self.inverse + with_before @ transposed(to_before)
+        own[:n_behind] += transposed(to_behind @ with_behind)
+        all_diagonal = np.empty((len(diagonal) + n_before, *diagonal.shape[1:]))
+        all_diagonal[::2], all_diagonal[1::2] = diagonal, own
+        all_below = np.empty((len(all_diagonal) - 1, *diagonal.shape[1:]))
+        all_below[::2], all_below[1::2] = with_before, with_behind
+        return all_diagonal, all_below
 
 
 class Factor:
-    """Cholesky factor L of a positive definite matrix, whose bands (n, d, 2 d) it overwrites.
+    """Cholesky factor L of a positive definite matrix with permuted rows and columns.
+
+    Parameters
+    ----------
+    diagonal : (n, d, d) array
+    below : (n - 1, d, d) array
+        Block k stands in row k + 1 and column k.
 
     Raises
     ------
@@ -41,72 +104,88 @@ class Factor:
         If the matrix is not positive definite.
     """
 
-    def __init__(self, bands: FloatArray) -> None:
-        self._n_blocks, self._size, _ = bands.shape
-        self._bands, info = lapack.dpbtrf(
-            bands.reshape(-1, 2 * self._size).T, lower=1, overwrite_ab=1
-        )
-        if info != 0:
-            raise np.linalg.LinAlgError(f"not positive definite at row {info}")
+    def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
+        self._levels: list[_Level] = []
+        self._log_determinant = 0.0
+        while len(diagonal) > 1:
+            inverse = self._inverse_root(diagonal[1::2])
+            n_behind = (len(diagonal) - 1) // 2
+            before = inverse @ below[::2]
+            behind = inverse[:n_behind] @ transposed(below[1::2])
+            diagonal = diagonal[::2].copy()
+            diagonal[: len(before)] -= transposed(before) @ before
+            diagonal[1 : 1 + n_behind] -= transposed(behind) @ behind
+            below = -transposed(behind) @ before[:n_behind]
+            self._levels.append(_Level(inverse, before, behind))
+        self._last = self._inverse_root(diagonal)
+
+    def _inverse_root(self, blocks: FloatArray) -> FloatArray:
+        inverse, log_determinants = inverse_roots(blocks)
+        self._log_determinant += float(log_determinants.sum())
+        return inverse
 
     def log_determinant(self) -> float:
         """Logarithm of the matrix's determinant."""
-        return 2.0 * float(np.log(self._bands[0]).sum())
+        return self._log_determinant
 
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Inverse of the matrix times columns (n, d, k)."""
-        solved, _ = lapack.dpbtrs(self._bands, self._as_columns(right), lower=1, overwrite_b=1)
-        return solved.reshape(right.shape)
+    def whiten(self, right: FloatArray) -> FloatArray:
+        """``L^-1`` times columns (n, d, k), in the order of the elimination."""
+        whitened, start = np.empty(right.shape), 0
+        for level in self._levels:
+            part = slice(start, start + len(level.inverse))
+            whitened[part], right = level.whiten(right)
+            start = part.stop
+        whitened[start:] = self._last @ right
+        return whitened
+
+    def restore(self, whitened: FloatArray) -> FloatArray:
+        """``L^-T`` times columns of :meth:`whiten`, or combinations of them."""
+        start = len(whitened) - 1
+        solved = transposed(self._last) @ whitened[start:]
+        for level in reversed(self._levels):
+            part = slice(start - len(level.inverse), start)
+            solved = level.restore(whitened[part], solved)
+            start = part.start
+        return solved
+
+    def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
+        """Blocks of the inverse on the diagonal (n, d, d) and below it (n - 1, d, d)."""
+        diagonal = transposed(self._last) @ self._last
+        below = np.empty((0, *diagonal.shape[1:]))
+        for level in reversed(self._levels):
+            diagonal, below = level.extend(diagonal, below)
+        return diagonal, below
+
+
+class InOrder:
+    """Cholesky factor L of the same matrices in the order of their blocks: what is whitened up to a
+    block does not depend on the blocks behind it.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the matrix is not positive definite.
+    """
+
+    def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
+        self._n_blocks, self._size, _ = diagonal.shape
+        size = self._size
+        bands = np.zeros((self._n_blocks, size, 2 * size))
+        for column in range(size):
+            bands[:, column, : size - column] = diagonal[:, column:, column]
+            bands[:-1, column, size - column : 2 * size - column] = below[:, :, column]
+        self._bands, info = lapack.dpbtrf(bands.reshape(-1, 2 * size).T, lower=1, overwrite_ab=1)
+        if info != 0:
+            raise np.linalg.LinAlgError(f"not positive definite at row {info}")
 
     def whiten(self, right: FloatArray) -> FloatArray:
         """``L^-1`` times columns (n, d, k)."""
-        solved, _ = lapack.dtbtrs(self._bands, self._as_columns(right), uplo="L", overwrite_b=1)
-        return solved.reshape(right.shape)
-
-    def _as_columns(self, right: FloatArray) -> FloatArray:
-        return np.asfortranarray(right.reshape(self._n_blocks * self._size, -1))
+        columns = np.asfortranarray(right.reshape(self._n_blocks * self._size, -1))
+        whitened, _ = lapack.dtbtrs(self._bands, columns, uplo="L", overwrite_b=1)
+        return whitened.reshape(right.shape)
 
     def below(self, block: int) -> FloatArray:
         """Block (d, d) of L below its diagonal block of this number."""
-        size, rows = self._size, self._blocks()[block]
+        size = self._size
+        rows = self._bands.T.reshape(self._n_blocks, size, 2 * size)[block]
         return np.stack([rows[c, size - c : 2 * size - c] for c in range(size)], axis=1)
-
-    def _blocks(self) -> FloatArray:
-        return self._bands.T.reshape(self._n_blocks, self._size, 2 * self._size)
-
-    def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
-        """Blocks of the inverse on the diagonal (n, d, d) and below it (n - 1, d, d).
-
-        With ``G_i = L_ii^-T L_{i+1,i}'`` they are ``S_ii = L_ii^-T L_ii^-1 + G_i S_{i+1,i+1} G_i'``
-        and ``S_{i+1,i} = -S_{i+1,i+1} G_i'`` (Takahashi, Fagan, Chen, 1973).
-        """
-        inverse = self._inverse_of_diagonal_blocks()
-        upright = np.ascontiguousarray(inverse.transpose(0, 2, 1))
-        diagonal = upright @ inverse
-        gains = upright[:-1] @ self._all_below().transpose(0, 2, 1)
-        gains_transposed = np.ascontiguousarray(gains.transpose(0, 2, 1))
-        below = np.empty_like(gains)
-        for i in range(self._n_blocks - 2, -1, -1):
-            below[i] = diagonal[i + 1] @ gains_transposed[i]
-            diagonal[i] += gains[i] @ below[i]
-        np.negative(below, out=below)
-        return diagonal, below
-
-    def _all_below(self) -> FloatArray:
-        size, blocks = self._size, self._blocks()
-        below = np.empty((self._n_blocks - 1, size, size))
-        for column in range(size):
-            below[:, :, column] = blocks[:-1, column, size - column : 2 * size - column]
-        return below
-
-    def _inverse_of_diagonal_blocks(self) -> FloatArray:
-        """``L_ii^-1`` (n, d, d), by one solve with the diagonal blocks alone."""
-        n, size, blocks = self._n_blocks, self._size, self._blocks()
-        alone = np.zeros((n, size, size))
-        for column in range(size):
-            alone[:, column, : size - column] = blocks[:, column, : size - column]
-        identity = np.asfortranarray(np.tile(np.eye(size), (n, 1)))
-        inverse, _ = lapack.dtbtrs(
-            alone.reshape(n * size, size).T, identity, uplo="L", overwrite_b=1
-        )
-        return inverse.reshape(n, size, size)

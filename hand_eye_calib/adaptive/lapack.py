@@ -12,7 +12,7 @@ from importlib.machinery import PathFinder
 from types import ModuleType
 
 _WRAPPER = "scipy.linalg._flapack"
-_USED = ("dpbtrf", "dpbtrs", "dtbtrs", "dpttrf", "dpttrs")
+_USED = ("dpbtrf", "dtbtrs", "dpttrf", "dpttrs")
 
 
 def _load_wrapper() -> ModuleType:
@@ -39,4 +39,4 @@ def _load_wrapper() -> ModuleType:
 
 
 _wrapper = _load_wrapper()
-dpbtrf, dpbtrs, dtbtrs, dpttrf, dpttrs = (getattr(_wrapper, name) for name in _USED)
+dpbtrf, dtbtrs, dpttrf, dpttrs = (getattr(_wrapper, name) for name in _USED)

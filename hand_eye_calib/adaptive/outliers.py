@@ -120,15 +120,13 @@ def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Floa
     """Chi-squares of all increments (n,) and of all poses' white errors (N,)."""
     space = posterior.space
     states, walk = posterior.restricted()
-    walks = np.linalg.inv(posterior.walk_precision) * space.relative[:, None, None]
+    walks = posterior.walk * space.relative[:, None, None]
     known = walk_covariance(posterior) + walk[:, :, 1:] @ walk[:, :, 1:].transpose(0, 2, 1)
     of_walk = _chi_squares(walk[:, :, 0], walks, known, space.cut)
 
     own = states[:, :WHITE]
-    whites = np.linalg.inv(posterior.white_precision)
-    whites = (
-        np.where(spikes, 1.0, 1.0 / np.where(spikes, 1.0, space.weights))[:, None, None] * whites
-    )
+    weights = np.where(spikes, 1.0, space.weights)
+    whites = posterior.white / weights[:, None, None]
     known = posterior.selected_inverse[0][:, :WHITE, :WHITE]
     known = known + own[:, :, 1:] @ own[:, :, 1:].transpose(0, 2, 1)
     return of_walk, _chi_squares(own[:, :, 0], whites, known, spikes)

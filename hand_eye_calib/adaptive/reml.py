@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.state_space import WHITE, Markov, Posterior, StateSpace
+from hand_eye_calib.adaptive.state_space import WHITE, Markov, Posterior, StateSpace, multiplied
 from hand_eye_calib.arrays import FloatArray
 
 # The search ends if a step promises to lower the loss by less: noise levels need no more than a few
@@ -214,9 +214,10 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
             behind = space.behind[:, :, group.states] @ part[:-1, :, None]
             columns[:, :, index] = (ahead - behind)[:, :, 0]
     columns[space.cut] = 0.0
-    weighed = posterior.weighed(posterior.smoothed(columns)[1]).reshape(-1, len(variances))
-    own = columns.reshape(weighed.shape).T @ weighed
-    shared = space.jacobian.reshape(len(weighed), -1).T @ weighed
+    weighed, whitened = posterior.halves(columns)
+    own = multiplied(columns, weighed) - multiplied(whitened, whitened)
+    of_jacobian = posterior.of_columns[1][:, :, :-1]
+    shared = multiplied(space.jacobian, weighed) - multiplied(of_jacobian, whitened)
     information = 0.5 * (own - shared.T @ posterior.normal.covariance @ shared)
     return 0.5 * (information + information.T)
 

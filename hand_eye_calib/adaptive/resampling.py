@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hand_eye_calib.adaptive.block_tridiagonal import InOrder
 from hand_eye_calib.adaptive.state_space import FREE, WHITE, NormalEquations, Posterior
 from hand_eye_calib.arrays import FloatArray
 
@@ -19,10 +20,11 @@ def part_products(posterior: Posterior) -> FloatArray:
     """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20."""
     space = posterior.space
     n, columns = len(space), posterior.columns
+    factor = InOrder(*posterior.precision())
     ends = np.unique(np.linspace(0, n, min(N_PARTS, n) + 1).astype(int))[1:]
-    weighed = posterior.weighed(columns)
-    whitened = posterior.factor.whiten(space.gathered(weighed))
-    totals = np.array([_up_to(end, posterior, columns, weighed, whitened) for end in ends])
+    weighed = posterior.of_columns[0]
+    whitened = factor.whiten(space.gathered(weighed))
+    totals = np.array([_up_to(end, posterior, factor, weighed, whitened) for end in ends])
     own = np.add.reduceat(np.swapaxes(columns, 1, 2) @ weighed, np.r_[0, ends[:-1]], axis=0)
     passed = np.add.reduceat(
         np.swapaxes(whitened[:-1], 1, 2) @ whitened[:-1], np.r_[0, ends[:-1]], axis=0
@@ -34,13 +36,13 @@ def part_products(posterior: Posterior) -> FloatArray:
 def _up_to(
     end: int,
     posterior: Posterior,
-    columns: FloatArray,
+    factor: InOrder,
     weighed: FloatArray,
     whitened: FloatArray,
 ) -> FloatArray:
     """Products of the last state's whitened columns if the recording ended at this pose."""
     space = posterior.space
-    before = posterior.factor.below(end - 1)
+    before = factor.below(end - 1)
     ahead = space.ahead[end - 1]
     precision = ahead.T @ (posterior.walk_precision * posterior.evidence[end - 1]) @ ahead
     precision -= before @ before.T

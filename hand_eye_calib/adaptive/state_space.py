@@ -10,8 +10,9 @@ the random walk. In information form the posterior precision of all states is bl
 
     P = Pi + U' W U,       log|V| = log|P| - log|Pi| - log|W|,       V^-1 Z = W (Z - U P^-1 U' W Z)
 
-so that one band factorisation gives the likelihood and everything else, in time linear in the
-poses.
+so that one factorisation P = L L' gives the likelihood and everything else, in time linear in the
+poses. Products need only the forward half of the solution: ``Z' V^-1 Z = Z' W Z - Y' Y`` with the
+whitened columns ``Y = L^-1 U' W Z``.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.adaptive import lapack
-from hand_eye_calib.adaptive.block_tridiagonal import Factor, add_diagonal, empty_bands, set_below
+from hand_eye_calib.adaptive.block_tridiagonal import Factor, inverse_roots, transposed
 from hand_eye_calib.arrays import BoolArray, FloatArray
 
 WHITE = 6
@@ -32,9 +33,6 @@ FREE = 1.0
 
 # Diagonals are raised by this share, so that rounding cannot make them negative.
 _ROUNDING = 1e-13
-
-# Increments whose blocks are computed at a time, to bound memory.
-_CHUNK = 4096
 
 
 @dataclass(frozen=True)
@@ -115,8 +113,8 @@ class StateSpace:
     def gathered(self, columns: FloatArray) -> FloatArray:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
         states = np.zeros((len(self) + 1, self.n_states, columns.shape[2]))
-        states[1:] = self.ahead.transpose(0, 2, 1) @ columns
-        states[:-1] -= self.behind.transpose(0, 2, 1) @ columns
+        states[1:] = transposed(self.ahead) @ columns
+        states[:-1] -= transposed(self.behind) @ columns
         return states
 
 
@@ -190,50 +188,44 @@ class Posterior:
         self.space, self.levels = space, levels
         variances = np.exp(levels)
         n_white = len(space.white)
-        walk = _combined(variances[n_white : n_white + len(space.walk)], space.walk)
-        self.white_precision = np.linalg.inv(_combined(variances[:n_white], space.white))
-        self.walk_precision = np.linalg.inv(walk)
+        self.white = _combined(variances[:n_white], space.white)
+        self.walk = _combined(variances[n_white : n_white + len(space.walk)], space.walk)
+        self.white_precision, self._white_log_determinants = _inverse(self.white)
+        (self.walk_precision,), (self._walk_log_determinant,) = _inverse(self.walk[None])
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
+        self._weights = self.evidence[:, None, None] * self.walk_precision
         self.markov = [markov(group, levels, space.intervals_s) for group in space.groups]
-        self.factor = Factor(self._precision())
-        self._walk_log_determinant = np.linalg.slogdet(walk)[1]
+        self.factor = Factor(*self.precision())
 
-    def _precision(self) -> FloatArray:
-        space, n = self.space, len(self.space)
-        bands = empty_bands(n + 1, space.n_states)
-        for start in range(0, n, _CHUNK):
-            part = slice(start, min(start + _CHUNK, n))
-            after = slice(part.start + 1, part.stop + 1)
-            ahead = space.ahead[part].transpose(0, 2, 1)
-            behind = space.behind[part].transpose(0, 2, 1)
-            weighed_behind = self.weighed(space.behind[part], part)
-            add_diagonal(bands[after], ahead @ self.weighed(space.ahead[part], part))
-            add_diagonal(bands[part], behind @ weighed_behind)
-            set_below(bands[part], -ahead @ weighed_behind)
+    def precision(self) -> tuple[FloatArray, FloatArray]:
+        """Blocks of P on the diagonal (N, d, d) and below it (n, d, d)."""
+        space, size = self.space, self.space.n_states
+        ahead, weighed = transposed(space.ahead), self.weighed(space.behind)
+        diagonal = np.zeros((len(space) + 1, size, size))
+        diagonal[1:] = ahead @ self.weighed(space.ahead)
+        diagonal[:-1] += transposed(space.behind) @ weighed
+        below = ahead @ -weighed
         white = space.weights[:, None, None] * self.white_precision
         white[space.is_free] = FREE * np.eye(WHITE)
-        add_diagonal(bands, white)
+        diagonal[:, :WHITE, :WHITE] += white
         for process in self.markov:
-            diagonal, beside = process.tridiagonal()
-            states = process.group.states
-            bands[:, states, 0] += (diagonal / process.variance)[:, None]
-            bands[:-1, states, space.n_states] += (beside / process.variance)[:, None]
-        bands[:, :, 0] *= 1.0 + _ROUNDING
-        return bands
+            own, beside = process.tridiagonal()
+            states = range(process.group.states.start, process.group.states.stop)
+            diagonal[:, states, states] += (own / process.variance)[:, None]
+            below[:, states, states] += (beside / process.variance)[:, None]
+        diagonal[:, range(size), range(size)] *= 1.0 + _ROUNDING
+        return diagonal, below
 
-    def weighed(self, columns: FloatArray, part: slice = slice(None)) -> FloatArray:
+    def weighed(self, columns: FloatArray) -> FloatArray:
         """W times columns (n, 6, k)."""
-        return (self.walk_precision @ columns) * self.evidence[part, None, None]
+        return self._weights @ columns
 
     @cached_property
     def log_determinant(self) -> float:
         """log|V|, increments that are no evidence left out."""
         space = self.space
         n_poses, kept, given = len(space) + 1, ~space.cut, ~space.is_free
-        white = np.linalg.slogdet(self.white_precision)[1]
-        white = np.broadcast_to(white, n_poses) + WHITE * np.log(
-            np.where(given, space.weights, 1.0)
-        )
+        white = WHITE * np.log(np.where(given, space.weights, 1.0)) - self._white_log_determinants
         prior = float(white[given].sum()) + WHITE * np.log(FREE) * int((~given).sum())
         for process in self.markov:
             of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
@@ -241,26 +233,26 @@ class Posterior:
         walk = kept.sum() * self._walk_log_determinant + 6 * np.log(space.relative[kept]).sum()
         return float(walk + self.factor.log_determinant() - prior)
 
-    def smoothed(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (N, d, k) expected from columns (n, 6, k) of increments, and what these leave."""
-        states = self.factor.solve(self.space.gathered(self.weighed(columns)))
-        return states, columns - self.space.observed(states)
-
     @cached_property
     def columns(self) -> FloatArray:
         """J and, last, e: (n, 6, p + 1)."""
         return np.concatenate([self.space.jacobian, self.space.residuals[:, :, None]], axis=2)
 
+    def halves(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """W Z and Y, (n, 6, k) and (N, d, k), of columns Z (n, 6, k)."""
+        weighed = self.weighed(columns)
+        return weighed, self.factor.whiten(self.space.gathered(weighed))
+
     @cached_property
     def of_columns(self) -> tuple[FloatArray, FloatArray]:
-        """:meth:`smoothed` of :attr:`columns`."""
-        return self.smoothed(self.columns)
+        """:meth:`halves` of :attr:`columns`."""
+        return self.halves(self.columns)
 
     @cached_property
     def products(self) -> FloatArray:
         """(p + 1, p + 1) array: products of J and, last, e, weighed with V^-1."""
-        columns, left = self.columns, self.weighed(self.of_columns[1])
-        products = columns.reshape(-1, columns.shape[2]).T @ left.reshape(-1, columns.shape[2])
+        weighed, whitened = self.of_columns
+        products = multiplied(self.columns, weighed) - multiplied(whitened, whitened)
         return 0.5 * (products + products.T)
 
     @cached_property
@@ -284,16 +276,17 @@ class Posterior:
 
     def states_after(self, step: FloatArray, columns: list[int] | None = None) -> FloatArray:
         """States (N, d) expected after a step of the parameters, or of some of them."""
-        states = self.of_columns[0]
-        moving = states[:, :, :-1] if columns is None else states[:, :, columns]
-        return states[:, :, -1] + moving @ step
+        mixing = np.zeros((self.columns.shape[2], 1))
+        mixing[slice(-1) if columns is None else columns, 0] = step
+        mixing[-1] = 1.0
+        return self.factor.restore(_mixed(self.of_columns[1], mixing))[:, :, 0]
 
     def restricted(self) -> tuple[FloatArray, FloatArray]:
         """States (N, d, 1 + q) and walk (n, 6, 1 + q): expected values and, behind them, what the
         parameters' uncertainty adds, as columns whose squares sum to it.
         """
-        states, left = self.of_columns
-        return states @ self.normal.mixing, left @ self.normal.mixing
+        states = self.factor.restore(_mixed(self.of_columns[1], self.normal.mixing))
+        return states, _mixed(self.columns, self.normal.mixing) - self.space.observed(states)
 
 
 # Information below this share of what a parameter's own diagonal promises is rounding; no diagonal
@@ -341,6 +334,23 @@ def selected(products: FloatArray, columns: list[int]) -> FloatArray:
     """The products of some parameters."""
     rows = [*columns, len(products) - 1]
     return products[np.ix_(rows, rows)]
+
+
+def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Products (k, l) of columns (n, d, k) with columns (n, d, l)."""
+    return first.reshape(-1, first.shape[2]).T @ second.reshape(-1, second.shape[2])
+
+
+def _mixed(columns: FloatArray, mixing: FloatArray) -> FloatArray:
+    """Combinations (n, d, l) of columns (n, d, k)."""
+    n, size, _ = columns.shape
+    return (columns.reshape(n * size, -1) @ mixing).reshape(n, size, -1)
+
+
+def _inverse(covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverses (n, 6, 6), and logarithms (n,) of the determinants, of covariances (n, 6, 6)."""
+    roots, log_determinants = inverse_roots(covariances)
+    return transposed(roots) @ roots, log_determinants
 
 
 def _combined(variances: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hand_eye_calib.adaptive import reml
-from hand_eye_calib.adaptive.block_tridiagonal import Factor, add_diagonal, empty_bands, set_below
+from hand_eye_calib.adaptive.block_tridiagonal import Factor, InOrder
 from hand_eye_calib.adaptive.outliers import surprises
 from hand_eye_calib.adaptive.resampling import answers_without, part_products
 from hand_eye_calib.adaptive.state_space import (
@@ -170,8 +170,9 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
     np.testing.assert_allclose(steps[1], NormalEquations(parts[:7].sum(axis=0)).step, atol=1e-9)
 
 
-def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix():
-    random, n, d = np.random.default_rng(0), 5, 4
+@pytest.mark.parametrize("n", [1, 2, 5, 90])
+def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
+    random, d = np.random.default_rng(0), 4
     diagonal = random.normal(size=(n, d, d))
     diagonal = diagonal @ np.swapaxes(diagonal, 1, 2) + 20 * np.eye(d)
     below = random.normal(size=(n - 1, d, d))
@@ -182,23 +183,29 @@ def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix():
         matrix[k + 1, :, k], matrix[k, :, k + 1] = below[k], below[k].T
     matrix = matrix.reshape(n * d, n * d)
 
-    def bands(of_diagonal):
-        storage = empty_bands(n, d)
-        add_diagonal(storage, of_diagonal)
-        set_below(storage[:-1], below)
-        return storage
-
-    factor, right = Factor(bands(diagonal)), random.normal(size=(n, d, 3))
+    factor, right = Factor(diagonal, below), random.normal(size=(n, d, 3))
     flat, inverse = right.reshape(n * d, 3), np.linalg.inv(matrix)
-    np.testing.assert_allclose(factor.solve(right).reshape(n * d, 3), inverse @ flat, atol=1e-12)
-    whitened = np.linalg.solve(np.linalg.cholesky(matrix), flat)
-    np.testing.assert_allclose(factor.whiten(right).reshape(n * d, 3), whitened, atol=1e-12)
+    whitened = factor.whiten(right)
+    solved = factor.restore(whitened).reshape(n * d, 3)
+    np.testing.assert_allclose(solved, inverse @ flat, atol=1e-12)
+    squares = whitened.reshape(n * d, 3).T @ whitened.reshape(n * d, 3)
+    np.testing.assert_allclose(squares, flat.T @ inverse @ flat, rtol=1e-12, atol=1e-12)
     assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1])
     blocks = inverse.reshape(n, d, n, d)
     found, found_below = factor.selected_inverse()
+    assert found.shape == (n, d, d)
+    assert found_below.shape == (n - 1, d, d)
     for k in range(n):
         np.testing.assert_allclose(found[k], blocks[k, :, k], atol=1e-12)
     for k in range(n - 1):
         np.testing.assert_allclose(found_below[k], blocks[k + 1, :, k], atol=1e-12)
     with pytest.raises(np.linalg.LinAlgError):
-        Factor(bands(-diagonal))
+        Factor(-diagonal, below)
+
+    in_order, lower = InOrder(diagonal, below), np.linalg.cholesky(matrix)
+    expected = np.linalg.solve(lower, flat)
+    np.testing.assert_allclose(in_order.whiten(right).reshape(n * d, 3), expected, atol=1e-12)
+    if n > 1:
+        np.testing.assert_allclose(in_order.below(0), lower[d : 2 * d, :d], atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        InOrder(-diagonal, below)
