@@ -470,6 +470,11 @@ class CalibratorConfig(OptionSet):
         "", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True
     )
 
+    @property
+    def targets(self) -> tuple[float, float]:
+        """Targets of translation (m) and rotation (rad)."""
+        return self.target_translation, self.target_rotation
+
     def prior(self) -> dict[str, tuple[float, float]]:
         """The prior: axis name to (value, standard deviation), in m and rad; an option of a single
         axis overrides ``prior.transform``.

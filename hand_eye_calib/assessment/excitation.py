@@ -29,6 +29,10 @@ _PERCENTILE = 95
 # Smallest rotation (rad) that reveals anything of a lever arm.
 MIN_ROTATION = float(np.radians(5.0))
 
+# A sensor moves if it does so faster than this over a second (m/s, rad/s).
+_MIN_SPEED, _MIN_RATE = 0.05, float(np.radians(1.0))
+_STEP_NS = 1_000_000_000
+
 _ROTATION_ABOUT = dict(zip(TRANSLATIONS, ROTATIONS, strict=True))
 
 
@@ -47,12 +51,15 @@ class Excitation:
         How far the rotations move lever arms, over the time span with the most of it.
     distance : float
         Length of the path, m.
+    motion_s : float
+        Seconds during which the sensor moved; a robot that stands still shows nothing.
     """
 
     n_poses: int
     rotation: FloatArray
     lever_arms: LeverArms
     distance: float
+    motion_s: float = 0.0
 
     @property
     def gain(self) -> FloatArray:
@@ -105,7 +112,21 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
             lever_arms = at_lag
         lag *= 2
     distance = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    return Excitation(n_poses, rotation, lever_arms, distance)
+    return Excitation(n_poses, rotation, lever_arms, distance, seconds_of_motion(pose_pairs))
+
+
+def seconds_of_motion(pose_pairs: PosePairs) -> float:
+    """Seconds during which the parent sensor moved, by poses that are a second apart or more."""
+    stamps_ns = pose_pairs.stamps_ns
+    rows = np.unique((stamps_ns - stamps_ns[0]) // _STEP_NS, return_index=True)[1]
+    if len(rows) < 2:
+        return 0.0
+    seconds = np.diff(stamps_ns[rows]) * 1e-9
+    poses = pose_pairs.Ts_pw_p[rows]
+    speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / seconds
+    rotations = np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]
+    moves = (speeds > _MIN_SPEED) | (se3.rotation_angle(rotations) / seconds > _MIN_RATE)
+    return float(seconds[moves].sum())
 
 
 def what_is_missing(seen: Excitation, calibration: Calibration | None = None) -> str:

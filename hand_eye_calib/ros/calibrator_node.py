@@ -28,6 +28,7 @@ from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S
 from hand_eye_calib.ros.solve_cycle import ANSWER_PERIOD_S, SolveCycle
 from hand_eye_calib.ros.tf import TfBroadcaster, message_type
 from hand_eye_calib.ros.tf_input import TfInput, tf_source
+from hand_eye_calib.session.goal import Goal
 
 _DISCOVERY_PERIOD_S = 0.2
 _DIAGNOSTICS_PERIOD_S = 1.0
@@ -74,7 +75,12 @@ class CalibratorNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._answered = self.create_guard_condition(self._take_answers)
         self._cycle = SolveCycle(
-            self._session, self._checks, self._log, self._answered.trigger, self._publish_result
+            self._session,
+            self._checks,
+            self._log,
+            self._answered.trigger,
+            self._publish_result,
+            Goal(*self._options.calibrator.targets),
         )
         self._parts = NodeParts(
             self.get_fully_qualified_name(), self._options, self._session, self._inputs,
@@ -244,6 +250,7 @@ class CalibratorNode(Node):
         if options.calibrator != self._session.calibrator.config:
             self._session.reconfigure(options.calibrator)
             self._checks.hasten()
+            self._cycle.aim(*options.calibrator.targets)
         for each in self._inputs:
             each.configure(options)
         self._session.follow_journal(options.node)

@@ -20,6 +20,7 @@ from hand_eye_calib.ros.input_monitor import InputMonitor
 from hand_eye_calib.ros.inputs import PoseInput
 from hand_eye_calib.ros.live_session import LiveSession
 from hand_eye_calib.ros.parameters import Parameters
+from hand_eye_calib.ros.progress import progress_report
 from hand_eye_calib.ros.solve_cycle import SolveCycle
 from hand_eye_calib.ros.solving import FailureKind
 from hand_eye_calib.ros.status import ERROR, OK, WARN, Report, to_status
@@ -60,6 +61,7 @@ def diagnostics(parts: NodeParts, steady_s: float, clock_ns: int) -> DiagnosticA
     """
     reports = {
         "extrinsic": extrinsic_report(parts, steady_s, clock_ns),
+        "progress": progress_report(parts.cycle.goal.progress, parts.cycle.result),
         **_input_reports(parts, steady_s),
         "stream checks": parts.checks.report(steady_s),
         "journal": journal_report(parts.session, parts.options.node),

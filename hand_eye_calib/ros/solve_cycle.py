@@ -6,14 +6,16 @@ from collections.abc import Callable
 
 from rclpy.task import Future
 
-from hand_eye_calib.assessment.excitation import Excitation
+from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.live_session import LiveSession
 from hand_eye_calib.ros.log import NodeLog
+from hand_eye_calib.ros.progress import ProgressLog
 from hand_eye_calib.ros.results import describe
 from hand_eye_calib.ros.solving import Checked, Failure, FailureKind, Job, Solved
 from hand_eye_calib.ros.solving_process import SolvingProcess
+from hand_eye_calib.session.goal import Goal
 
 # Answers to many calls are sent a few at a time: a client keeps ten that it has not taken yet, and
 # loses the others.
@@ -35,6 +37,7 @@ class SolveCycle:
         Called in another thread when :meth:`take_answers` has something to do.
     publish : callable
         Called with each usable Calibration.
+    goal : Goal
 
     Attributes
     ----------
@@ -44,7 +47,8 @@ class SolveCycle:
         Duration of the last one.
     is_solving : bool
     result : Calibration or None
-        Newest usable result of the session, found at ``solved_at_s`` (steady time).
+        The session's result: the newest usable one or, once the goal is reached, the best. The
+        newest was found at ``solved_at_s`` (steady time).
     seen : Excitation or None
         How the sensors have moved, as of the last solve.
     failure : Failure or None
@@ -58,12 +62,15 @@ class SolveCycle:
         log: NodeLog,
         wake: Callable[[], None],
         publish: Callable[[Calibration], None],
+        goal: Goal,
     ) -> None:
         self.solves = 0
         self.seconds = 0.0
         self.is_solving = False
         self._session, self._checks, self._log = session, checks, log
         self._publish = publish
+        self.goal = goal
+        self._progress_log = ProgressLog(log)
         self._rest_until_s = 0.0
         self._asked: list[Future] = []
         self._asked_in_flight: list[Future] = []
@@ -77,6 +84,11 @@ class SolveCycle:
         self.solved_at_s: float | None = None
         self.seen: Excitation | None = None
         self.failure: Failure | None = None
+        self.goal.restart()
+
+    def aim(self, translation: float, rotation: float) -> None:
+        """Start over with a goal of these targets (m, rad): options have changed."""
+        self.goal = Goal(translation, rotation)
 
     @property
     def has_valid_result(self) -> bool:
@@ -174,13 +186,20 @@ class SolveCycle:
         self._session.calibrator.adopt(solved.time_offset)
         if solved.calibration is None:
             assert solved.failure is not None
+            missing = what_is_missing(self.seen) if self.seen and self.seen.n_poses else ""
+            self.goal.wait(missing or solved.failure.what)
             return False, self._report_failure(solved.failure)
         return self._report_result(solved.calibration)
 
     def _report_result(self, calibration: Calibration) -> tuple[bool, str]:
         if not calibration.status.failure:
-            self.result, self.solved_at_s = calibration, time.monotonic()
-            self._publish(calibration)
+            assert self.seen is not None
+            faults = self._checks.faults()
+            progress = self.goal.add(calibration, self.seen, faults)
+            if not faults:  # which are in the log already
+                self._progress_log.tell(progress)
+            self.result, self.solved_at_s = self.goal.best or calibration, time.monotonic()
+            self._publish(self.result)
         text = describe(calibration, self.seen)
         self._log.info(text, "result", 1.0)
         for warning in calibration.warnings:

@@ -15,7 +15,14 @@ from hand_eye_calib.io.results import load_result
 
 NAMES = [
     f"/calibrator: {name}"
-    for name in ("extrinsic", "parent input", "child input", "stream checks", "journal")
+    for name in (
+        "extrinsic",
+        "progress",
+        "parent input",
+        "child input",
+        "stream checks",
+        "journal",
+    )
 ]
 
 

@@ -42,11 +42,12 @@ ENGINE["checks"] = ENGINE["alignment"] | {
     "alignment",
 }
 ENGINE["engine"] = set(ENGINE)
+ENGINE["session"] = set(ENGINE)
 ALLOWED = ENGINE | {
     "io": GROUND | {"geometry", "calibration", "status", "verdict"},
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
-    "root": GROUND | {"geometry", "calibration", "status", "verdict", "engine", "io"},
+    "root": GROUND | {"geometry", "calibration", "status", "verdict", "engine", "session", "io"},
     "ros": {"io", *ENGINE},
     "cli": {"io", "report", "simulation", "ros", *ENGINE},
     "__main__": {"cli"},

@@ -1,0 +1,274 @@
+"""When to stop recording: how far each axis is from its target, how long it still takes, which
+motion helps most, and whether this motion gets there at all.
+
+A standard deviation that once falls below the target is no reason to stop: errors that last have
+not shown yet in a short recording. The rule was measured on recordings with known truth,
+docs/session.md.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.assessment.covariance import AXES, ROTATIONS, TRANSLATIONS
+from hand_eye_calib.assessment.excitation import MIN_ROTATION, Excitation
+from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
+
+# An axis is known if its standard deviation is below this share of its target ...
+_SHARE = 0.7
+# ... at so many results in a row, ...
+_RESULTS = 2
+# ... after so many seconds of motion, and so many correlation times of errors that last.
+_MIN_MOTION_S, _CORRELATION_TIMES = 30.0, 10.0
+
+# The motion will not get there if it would take longer than this (s), ...
+_TOO_LONG_S = 1200.0
+# ... or if, over so many seconds of motion, the information on the worst axis has grown by less
+# than this share of what the motion before would have brought.
+_STALL_S, _STALL_GROWTH = 60.0, 0.25
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a session is from its goal.
+
+    Attributes
+    ----------
+    sigmas : (6,) array
+        Standard deviations along (m) and about (rad) the axes of the parent sensor's frame;
+        infinite if unobservable.
+    targets : (6,) array
+        What they are to fall below, m and rad.
+    seconds_left : (6,) array
+        Seconds of motion like that so far until each axis is known; infinite if unobservable.
+    limiting_axis : str
+        The axis that is farthest from its target; empty if there is none, or no result.
+    is_done : bool
+    will_not_get_there : bool
+        More of this motion is of no use for the limiting axis.
+    sentence : str
+        What to do now, for a person next to the robot.
+    """
+
+    sigmas: FloatArray
+    targets: FloatArray
+    seconds_left: FloatArray
+    limiting_axis: str
+    is_done: bool
+    will_not_get_there: bool
+    sentence: str
+
+
+@dataclass(frozen=True)
+class _Point:
+    """One result: seconds of motion, and the information on the worst axis (1 suffices)."""
+
+    motion_s: float
+    information: float
+    is_known: bool
+
+
+class Goal:
+    """Judges the results of a session, one after the other.
+
+    Once the goal is reached, it stays reached, and the best of the results that reach it is kept.
+
+    Parameters
+    ----------
+    translation, rotation : float
+        Targets, m and rad: standard deviation wanted of each axis, times 1 / 0.7.
+    """
+
+    def __init__(self, translation: float, rotation: float) -> None:
+        self._targets = np.repeat([translation, rotation], 3)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new session."""
+        self._points: deque[_Point] = deque(maxlen=10_000)
+        self._best: Calibration | None = None
+        self._best_information = 0.0
+        self.progress = self._nothing_yet("No result yet: move the sensors, with rotations.")
+
+    @property
+    def best(self) -> Calibration | None:
+        """The best result that reaches the goal; None before that."""
+        return self._best
+
+    def wait(self, sentence: str) -> Progress:
+        """Take note that there is no result yet, and why; returns the progress."""
+        if not self._points:
+            self.progress = self._nothing_yet(sentence)
+        return self.progress
+
+    def add(
+        self, calibration: Calibration, seen: Excitation, faults: Sequence[str] = ()
+    ) -> Progress:
+        """Take the next result of the session.
+
+        Parameters
+        ----------
+        calibration : Calibration
+        seen : Excitation
+            The motion that it comes from.
+        faults : sequence of str
+            What the stream checks found; the goal is not reached while there is something.
+
+        Returns
+        -------
+        Progress
+        """
+        wanted = _SHARE * self._targets
+        exempt = _settled_by_prior(calibration)
+        ratios = np.where(exempt, 0.0, (calibration.sigmas / wanted) ** 2)
+        worst = int(np.argmax(ratios))
+        motion_s = seen.motion_s
+        is_known = calibration.status is SolveStatus.OK and not faults and ratios[worst] <= 1.0
+        is_known = is_known and motion_s >= _least_motion_s(calibration)
+        # Every result of a robot that stands still is the same result.
+        if not self._points or motion_s > self._points[-1].motion_s:
+            self._points.append(_Point(motion_s, 1.0 / max(ratios[worst], 1e-12), is_known))
+        self._keep_best(calibration, is_known)
+        left_s = np.where(ratios > 1.0, motion_s * (ratios - 1.0), 0.0)
+        left_s = np.maximum(left_s, max(_least_motion_s(calibration) - motion_s, 0.0))
+        is_done = self._best is not None
+        stuck = not is_done and self._is_stuck(float(left_s[worst]))
+        self.progress = Progress(
+            sigmas=calibration.sigmas,
+            targets=self._targets,
+            seconds_left=np.zeros(6) if is_done else left_s,
+            limiting_axis="" if is_done else AXES[worst],
+            is_done=is_done,
+            will_not_get_there=stuck,
+            sentence=self._sentence(calibration, seen, faults, AXES[worst], left_s[worst], stuck),
+        )
+        return self.progress
+
+    def _keep_best(self, calibration: Calibration, is_known: bool) -> None:
+        recent = list(self._points)[-_RESULTS:]
+        if not is_known or len(recent) < _RESULTS or not all(each.is_known for each in recent):
+            return
+        if self._best is None or recent[-1].information >= self._best_information:
+            self._best, self._best_information = calibration, recent[-1].information
+
+    def _is_stuck(self, left_s: float) -> bool:
+        newest = self._points[-1]
+        if newest.motion_s < _MIN_MOTION_S:
+            return False
+        if left_s > _TOO_LONG_S:
+            return True
+        earlier = [p for p in self._points if p.motion_s <= newest.motion_s - _STALL_S]
+        if not earlier or earlier[-1].motion_s < _MIN_MOTION_S:
+            return False
+        before = earlier[-1]
+        expected = newest.motion_s / before.motion_s - 1.0
+        return newest.information < before.information * (1.0 + _STALL_GROWTH * expected)
+
+    def _nothing_yet(self, sentence: str) -> Progress:
+        unknown = np.full(6, np.inf)
+        return Progress(unknown, self._targets, unknown, "", False, False, sentence)
+
+    def _sentence(
+        self,
+        calibration: Calibration,
+        seen: Excitation,
+        faults: Sequence[str],
+        axis: str,
+        left_s: float,
+        stuck: bool,
+    ) -> str:
+        if faults:
+            return f"Stop: the streams are faulty: {faults[0]}."
+        if calibration.status.failure:
+            return f"No usable result: {calibration.status.failure}."
+        if self._best is not None:
+            return f"Done: {_precision(self._best)}. Stop and save.{_floor(self._best, self)}"
+        motion = helpful_motion(axis, seen.rotation)
+        if stuck:
+            return f"This motion will not show {_called(axis)} well enough: {motion}."
+        if not np.isfinite(left_s):
+            return f"{_called(axis)} does not show yet: {motion}."
+        return f"Go on for about {_duration(left_s)}: {_called(axis)} is behind, {motion}."
+
+    @property
+    def targets(self) -> FloatArray:
+        """(6,) array: targets of x, y, z (m), roll, pitch, yaw (rad)."""
+        return self._targets
+
+
+def _settled_by_prior(calibration: Calibration) -> BoolArray:
+    """Axes that no motion would tell better: what somebody measured by hand counts."""
+    return np.array([dof.verdict is DofVerdict.PRIOR for dof in calibration.observability])
+
+
+def _least_motion_s(calibration: Calibration) -> float:
+    """Seconds of motion below which a standard deviation is not believed."""
+    lasting = (calibration.noise or {}).get("lasting", ())
+    slowest_s = max((each["tau_s"] for each in lasting if each["kind"] != "scale"), default=0.0)
+    return max(_MIN_MOTION_S, _CORRELATION_TIMES * float(slowest_s))
+
+
+def helpful_motion(axis: str, rotation: FloatArray) -> str:
+    """The motion that would tell most about an axis, in words.
+
+    A rotation about one axis tells about offsets and angles across it, never about those along it.
+
+    Parameters
+    ----------
+    axis : str
+        x, y, z, roll, pitch or yaw.
+    rotation : (3,) array
+        Rotation seen so far about the axes of the parent sensor, rad.
+    """
+    if rotation.max() < MIN_ROTATION:
+        return "move in curves, to both sides"
+    main = int(np.argmax(rotation))
+    is_planar = int((rotation < MIN_ROTATION).sum()) == 2
+    along = (TRANSLATIONS if axis in TRANSLATIONS else ROTATIONS).index(axis)
+    if is_planar and along == main and axis in TRANSLATIONS:
+        return "tilt the sensors over a ramp or a kerb, or measure it by hand"
+    if is_planar and along == main:
+        return "move farther, straight on and in curves"
+    if is_planar:
+        return "tighter curves to both sides help most"
+    across = [other for other in range(3) if other != along]
+    least = min(across, key=lambda other: rotation[other])
+    return f"rotations about {'xyz'[least]} help most"
+
+
+def _called(axis: str) -> str:
+    return f"the offset in {axis}" if axis in TRANSLATIONS else axis
+
+
+def _precision(calibration: Calibration) -> str:
+    metres, radians = calibration.sigmas[:3].max(), calibration.sigmas[3:].max()
+    return (
+        f"translation known to {_length(metres)}, rotation to {np.degrees(radians):.2g} deg "
+        "(one sigma)"
+    )
+
+
+def _floor(calibration: Calibration, goal: Goal) -> str:
+    """A note on errors that more motion does not average out, if they exceed the target."""
+    beyond = calibration.sigmas_of_floor > goal.targets
+    told = [
+        f"{axis} {_length(sigma) if axis in TRANSLATIONS else f'{np.degrees(sigma):.2g} deg'}"
+        for axis, sigma, is_beyond in zip(AXES, calibration.sigmas_of_floor, beyond, strict=True)
+        if is_beyond
+    ]
+    if not told:
+        return ""
+    return f" An error of 1 % in the odometry's scale would add {', '.join(told)}."
+
+
+def _length(metres: float) -> str:
+    return f"{1000 * metres:.2g} mm" if metres < 0.0095 else f"{100 * metres:.2g} cm"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{max(5 * round(seconds / 5), 5)} s"
+    return f"{round(seconds / 60)} min"

@@ -1,0 +1,158 @@
+"""When a session is told to stop, and what it is told until then."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from result_making import calibration as made
+
+from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.assessment.excitation import Excitation, excitation
+from hand_eye_calib.assessment.lever_arm import LeverArms
+from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.session.goal import Goal, helpful_motion
+
+TARGETS = 0.02, 0.005
+
+
+def result(sigmas_m=0.005, sigmas_rad=0.001, verdicts=(), **fields):
+    sigmas = np.r_[np.broadcast_to(sigmas_m, 3), np.broadcast_to(sigmas_rad, 3)]
+    named = dict(verdicts)
+    dofs = tuple(
+        DofObservability(axis, named.get(axis, DofVerdict.OBSERVED), float(sigma))
+        for axis, sigma in zip(AXES, sigmas, strict=True)
+    )
+    fields = {"status": SolveStatus.OK, "noise": None} | fields
+    return dataclasses.replace(made(), observability=dofs, **fields)
+
+
+def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
+    lever_arms = LeverArms.of(np.zeros((1, 3, 3)))
+    return Excitation(100, np.radians(rotation_deg), lever_arms, 10.0, motion_s)
+
+
+def lasting(tau_s):
+    return {"lasting": [{"kind": "body", "part": "rotation", "sigma": 0.01, "tau_s": tau_s}]}
+
+
+def test_two_good_results_in_a_row_end_the_session_and_one_does_not():
+    goal = Goal(*TARGETS)
+    assert not goal.add(result(), seen(40.0)).is_done
+    assert not goal.add(result(sigmas_m=0.015), seen(42.0)).is_done  # below the target, not 0.7
+    assert not goal.add(result(), seen(44.0)).is_done
+    done = goal.add(result(), seen(46.0))
+    assert (done.is_done, done.limiting_axis, done.seconds_left.max()) == (True, "", 0.0)
+    assert done.sentence.startswith("Done: translation known to 5 mm, rotation to 0.057 deg")
+
+
+@pytest.mark.parametrize(
+    ("noise", "motion_s"), [(None, 29.0), (lasting(5.0), 49.0), (lasting(20.0), 199.0)]
+)
+def test_small_sigmas_are_not_believed_in_a_short_recording(noise, motion_s):
+    goal = Goal(*TARGETS)
+    for moved_s in (motion_s - 1.0, motion_s):
+        early = goal.add(result(noise=noise), seen(moved_s))
+        assert not early.is_done
+        assert early.seconds_left.max() == pytest.approx(np.ceil(motion_s / 10) * 10 - moved_s)
+    goal.add(result(noise=noise), seen(motion_s + 1.0))
+    assert goal.add(result(noise=noise), seen(motion_s + 2.0)).is_done
+
+
+def test_time_left_follows_from_the_variance_that_falls_with_time():
+    progress = Goal(*TARGETS).add(result(sigmas_m=(0.004, 0.028, 0.004)), seen(40.0))
+    assert progress.limiting_axis == "y"
+    np.testing.assert_allclose(progress.seconds_left, [0, 120, 0, 0, 0, 0])
+    assert progress.sentence == (
+        "Go on for about 2 min: the offset in y is behind, rotations about x help most."
+    )
+
+
+def test_faults_of_the_streams_and_failed_solves_are_no_success():
+    goal = Goal(*TARGETS)
+    for motion_s in (40.0, 42.0):
+        assert not goal.add(result(), seen(motion_s), ["the clocks differ"]).is_done
+    assert goal.progress.sentence == "Stop: the streams are faulty: the clocks differ."
+    for motion_s in (44.0, 46.0):
+        goal.add(result(status=SolveStatus.CONTRADICTED), seen(motion_s))
+    assert goal.progress.sentence == "No usable result: a prior contradicts the motion."
+    assert goal.best is None
+
+
+def test_what_was_measured_by_hand_need_not_be_shown_by_motion():
+    goal = Goal(*TARGETS)
+    by_hand = result(sigmas_m=(0.004, 0.004, 0.05), verdicts={"z": DofVerdict.PRIOR})
+    goal.add(by_hand, seen(40.0))
+    assert goal.add(by_hand, seen(42.0)).is_done
+
+
+def test_the_best_result_stays_when_the_robot_is_parked_or_later_ones_are_worse():
+    goal = Goal(*TARGETS)
+    goal.add(result(), seen(40.0))
+    goal.add(result(), seen(42.0))
+    best = result(sigmas_m=0.004)
+    goal.add(best, seen(60.0))
+    for _ in range(5):
+        parked = goal.add(result(sigmas_m=0.03), seen(60.0))
+    assert parked.is_done
+    assert goal.best is best
+    goal.restart()
+    assert (goal.best, goal.progress.is_done) == (None, False)
+
+
+class TestNotGettingThere:
+    FLAT = (0.5, 1.0, 90.0)
+
+    def test_an_axis_that_stays_unobservable(self):
+        goal = Goal(*TARGETS)
+        hidden = result(sigmas_m=(0.004, 0.004, np.inf), status=SolveStatus.UNOBSERVABLE)
+        assert not goal.add(hidden, seen(20.0, self.FLAT)).will_not_get_there
+        stuck = goal.add(hidden, seen(40.0, self.FLAT))
+        assert (stuck.will_not_get_there, stuck.limiting_axis) == (True, "z")
+        assert stuck.sentence == (
+            "This motion will not show the offset in z well enough: tilt the sensors over a ramp "
+            "or a kerb, or measure it by hand."
+        )
+
+    def test_information_that_stops_growing(self):
+        goal = Goal(*TARGETS)
+        for motion_s in np.arange(10.0, 100.0, 5.0):
+            sigma = 0.04 * np.sqrt(100.0 / motion_s)
+            assert not goal.add(result(sigmas_m=sigma), seen(motion_s)).will_not_get_there
+        parked = [goal.add(result(sigmas_m=sigma), seen(95.0)) for _ in range(100)]
+        assert not any(each.will_not_get_there for each in parked)
+        for motion_s in np.arange(100.0, 170.0, 5.0):
+            stuck = goal.add(result(sigmas_m=sigma), seen(motion_s)).will_not_get_there
+        assert stuck
+
+    def test_a_faint_hope_is_none(self):
+        assert Goal(*TARGETS).add(result(sigmas_m=0.5), seen(40.0)).will_not_get_there
+
+
+@pytest.mark.parametrize(
+    ("axis", "rotation_deg", "words"),
+    [
+        ("y", (1, 1, 2), "move in curves, to both sides"),
+        ("z", (1, 2, 90), "tilt the sensors over a ramp or a kerb, or measure it by hand"),
+        ("y", (1, 90, 2), "tilt the sensors over a ramp or a kerb, or measure it by hand"),
+        ("x", (1, 2, 90), "tighter curves to both sides help most"),
+        ("roll", (1, 2, 90), "tighter curves to both sides help most"),
+        ("yaw", (1, 2, 90), "move farther, straight on and in curves"),
+        ("z", (20, 10, 90), "rotations about y help most"),
+        ("roll", (20, 40, 30), "rotations about z help most"),
+    ],
+)
+def test_motion_that_helps_is_about_another_axis(axis, rotation_deg, words):
+    assert helpful_motion(axis, np.radians(rotation_deg)) == words
+
+
+def test_only_motion_counts_as_time():
+    s = np.arange(0.0, 60.0, 0.1)
+    moved = np.clip(s - 10.0, 0.0, 20.0)  # parked, 20 s at 1 m/s, parked
+    jitter = np.random.default_rng(0).normal(size=(len(s), 3)) * 0.005
+    places = np.stack([moved, 0 * s, 0 * s], axis=1) + jitter
+    poses = se3.from_rotation_translation(np.tile(np.eye(3), (len(s), 1, 1)), places)
+    pairs = PosePairs((s * 1e9).astype(np.int64), poses, poses)
+    assert excitation(pairs).motion_s == pytest.approx(20.0, abs=1.5)
+    assert excitation(pairs[:50]).motion_s == 0.0
