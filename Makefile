@@ -9,6 +9,7 @@
 #   make coverage-study DATA=x  errors over their lower bound, and what the stated sigmas are worth
 #   make bench         benchmarks against the baseline; two minutes (BENCH_ARGS=--full: four)
 #   make bench-node    load, soak and crashes of the node; about four minutes
+#   make dist          wheel and sdist in dist/, checked (RELEASE=1: only if nothing is a placeholder)
 #   make clean         remove everything that the targets above made
 # PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest.
 PYTHON ?= python3
@@ -19,13 +20,15 @@ FUZZ_ARGS ?=
 STUDY_ARGS ?=
 DATA ?=
 DEMO_ARGS ?= --out demo_output
+RELEASE ?=
 
 VENV := .venv
 OLDEST := .venv-oldest
 PIP_FLAGS := --quiet --disable-pip-version-check
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help demo test test-oldest coverage coverage-study paper bench bench-node lint format clean
+.PHONY: help demo test test-oldest coverage coverage-study fuzz paper bench bench-node lint format \
+	dist clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -72,8 +75,14 @@ format: $(VENV)/.ready-test
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
+dist: $(VENV)/.ready-release
+	rm -rf dist
+	$(if $(RELEASE),! grep -n "\.example" package.xml)
+	$(VENV)/bin/python -m build --outdir dist .
+	$(VENV)/bin/twine check --strict dist/*
+
 clean:
-	rm -rf $(VENV) $(OLDEST) build install log demo_output reproduced *.egg-info .coverage*
+	rm -rf $(VENV) $(OLDEST) build install log dist demo_output reproduced *.egg-info .coverage*
 	rm -rf .pytest_cache .hypothesis .ruff_cache .mypy_cache
 	find hand_eye_calib reproduction test benchmarks launch -name __pycache__ -type d -prune \
 		-exec rm -rf {} +
@@ -81,14 +90,15 @@ clean:
 # The package is installed editable: what runs and what is tested is this work tree. A stamp file is
 # touched last, so that set-up is repeated if it was interrupted or a file it depends on is newer.
 $(VENV)/.ready-demo: EXTRAS := ros
-$(VENV)/.ready-test: EXTRAS := ros,cluster,test,lint
-$(OLDEST)/.ready-test: EXTRAS := ros,cluster,test
+$(VENV)/.ready-test: EXTRAS := ros,cluster,notebook,test,lint
+$(OLDEST)/.ready-test: EXTRAS := ros,cluster,notebook,test
 $(OLDEST)/.ready-test: CONSTRAINTS := --constraint requirements/oldest.txt
 $(OLDEST)/.ready-test: requirements/oldest.txt
 
-# What the benchmarks compare with, and nothing else needs.
-$(VENV)/.ready-bench: $(VENV)/.ready-test requirements/bench.txt
-	@$(VENV)/bin/python -m pip install $(PIP_FLAGS) --requirement requirements/bench.txt
+# What one target needs and nothing else does.
+$(VENV)/.ready-bench $(VENV)/.ready-release: $(VENV)/.ready-%: \
+		$(VENV)/.ready-test requirements/%.txt
+	@$(VENV)/bin/python -m pip install $(PIP_FLAGS) --requirement requirements/$*.txt
 	@touch $@
 
 $(VENV)/.ready-demo $(VENV)/.ready-test $(OLDEST)/.ready-test: $(SETUP_FILES)

@@ -1,7 +1,9 @@
-"""Build script for colcon (ament_python) and pip. Name, version, description, maintainer and
-licence come from package.xml.
+"""Build script for colcon (ament_python) and pip. Name, version, description, maintainer, licence
+and addresses come from package.xml.
 """
 
+import ast
+import re
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -13,11 +15,11 @@ from setuptools import find_packages, setup
 HERE = Path(__file__).resolve().parent
 manifest = ElementTree.parse(HERE / "package.xml").getroot()
 name = manifest.findtext("name")
+addresses = {url.get("type"): url.text for url in manifest.iter("url")}
 
 # For `ros2 run hand_eye_calib COMMAND` every command is an executable in the package's own folder.
 # pip puts executables on PATH, where names such as `info` belong to others: there only these two.
 PIP_COMMANDS = ("calibrator", "replay")
-ROS_COMMANDS = (*PIP_COMMANDS, "calibrate", "check", "demo", "info", "simulate")
 # colcon and bloom call these commands of setup.py, pip others.
 is_for_ros = not {"install", "develop"}.isdisjoint(sys.argv)
 
@@ -27,15 +29,62 @@ def files(pattern):
     return sorted(path.relative_to(HERE).as_posix() for path in HERE.glob(pattern))
 
 
+def all_commands():
+    """Names in the table of commands, which cannot be imported before NumPy is installed."""
+    source = (HERE / name / "cli" / "main.py").read_text(encoding="utf-8")
+    (table,) = (
+        node.value
+        for node in ast.parse(source).body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "COMMANDS"
+    )
+    return tuple(ast.literal_eval(table))
+
+
+def readme():
+    """The README, its links made absolute for pages that have nothing else of the repository."""
+    text = (HERE / "README.md").read_text(encoding="utf-8")
+    return re.sub(r"\]\((?![a-z]+:|#)", f"]({addresses['repository']}/raw/main/", text)
+
+
 setup(
     name=name,
     version=manifest.findtext("version"),
     description=manifest.findtext("description"),
-    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
+    long_description=readme(),
     long_description_content_type="text/markdown",
+    author=manifest.findtext("author"),
     maintainer=manifest.findtext("maintainer"),
     maintainer_email=manifest.find("maintainer").get("email"),
     license=manifest.findtext("license"),
+    url=addresses["website"],
+    project_urls={
+        "Source": addresses["repository"],
+        "Issues": addresses["bugtracker"],
+        "Paper": "https://doi.org/10.3390/s23073740",
+    },
+    keywords=[
+        "extrinsic calibration",
+        "hand-eye calibration",
+        "sensor calibration",
+        "lidar",
+        "camera",
+        "GNSS",
+        "odometry",
+        "ROS 2",
+        "robotics",
+    ],
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Manufacturing",
+        "Intended Audience :: Science/Research",
+        "Operating System :: OS Independent",
+        "Programming Language :: Python :: 3 :: Only",
+        "Programming Language :: Python :: 3.11",
+        "Programming Language :: Python :: 3.12",
+        "Programming Language :: Python :: 3.13",
+        "Topic :: Scientific/Engineering",
+        "Typing :: Typed",
+    ],
     packages=find_packages(include=[name, f"{name}.*"]),
     package_data={name: ["py.typed"], f"{name}.report": ["templates/*.html", "templates/*.css"]},
     data_files=[
@@ -59,9 +108,11 @@ setup(
     extras_require={
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         "cluster": ["distributed>=2024.1"],
+        "notebook": ["ipykernel>=6.29", "pandas>=2.1"],
         "test": [
             "colcon-common-extensions",
             "hypothesis>=6.98",
+            "nbclient>=0.9",
             "packaging",
             "pytest>=7.4",
             "pytest-cov>=5",
@@ -74,7 +125,7 @@ setup(
             f"{name} = hand_eye_calib.cli.main:main",
             *(
                 f"{command} = hand_eye_calib.cli.main:named_command"
-                for command in (ROS_COMMANDS if is_for_ros else PIP_COMMANDS)
+                for command in (all_commands() if is_for_ros else PIP_COMMANDS)
             ),
         ]
     },

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import pytest
 from packaging.requirements import Requirement
 
-from hand_eye_calib.cli.main import COMMANDS
+from hand_eye_calib.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "hand_eye_calib"
@@ -32,6 +32,7 @@ DECLARED_AS = {
     "jinja2": ("jinja2", "python3-jinja2"),
     "matplotlib": ("matplotlib", "python3-matplotlib"),
     "numpy": ("numpy", "python3-numpy"),
+    "pandas": ("pandas", None),  # optional, for tables in Python
     "rich": ("rich", "python3-rich"),
     "rosbags": ("rosbags", "python3-rosbags-pip"),
     "scipy": ("scipy", "python3-scipy"),
@@ -132,6 +133,60 @@ def test_nothing_is_declared_that_is_not_imported():
     # The saved launch file and the printed command run an executable of it.
     wanted = {DECLARED_AS[name][1] for name in imported} | {"tf2_ros"}
     assert {element.text for element in MANIFEST.iter("exec_depend")} - wanted == set()
+
+
+def test_keys_that_only_pip_has_are_asked_for_where_pip_may_install():
+    """bloom refuses them, and pip of Ubuntu 24.04 refuses to install without the variable."""
+    conditions = {e.text: e.get("condition") for e in MANIFEST.iter("exec_depend")}
+    with_condition = {key for key, condition in conditions.items() if condition}
+    assert with_condition == {key for key in conditions if key.endswith("-pip")}
+    assert {conditions[key] for key in with_condition} == {"$PIP_BREAK_SYSTEM_PACKAGES == 1"}
+
+
+@pytest.mark.parametrize(
+    ("library", "command"),
+    [
+        ("casadi", "calibrate PARENT CHILD --method dnlo --backend ipopt"),
+        ("rosbags", "simulate --out again --bag mcap"),
+    ],
+)
+def test_without_a_library_of_pip_one_line_says_what_is_missing(
+    library, command, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "--out", "drives"]) == 0
+    monkeypatch.delitem(sys.modules, "hand_eye_calib.solvers.ipopt", raising=False)
+    monkeypatch.setitem(sys.modules, library, None)
+    files = {"PARENT": "drives/run_01/T_S1_W1.txt", "CHILD": "drives/run_01/T_S2_W2.txt"}
+    capsys.readouterr()
+    assert main([files.get(word, word) for word in command.split()]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert library in line.lower()
+    assert "not installed" in line
+    assert main(["calibrate", *files.values()]) == 0
+
+
+def test_placeholders_are_in_the_manifest_alone(declared):
+    """One domain, reserved for examples, until there is a public repository; docs/release.md."""
+    domain = "hand-eye-calib.example"
+    text = (ROOT / "package.xml").read_text(encoding="utf-8")
+    assert set(re.findall(r"[\w-]+\.example", text)) == {domain}
+    assert all(domain in element.text for element in MANIFEST.iter("url"))
+    assert declared["url"].startswith(f"https://{domain}")
+    elsewhere = [
+        path
+        for pattern in ("*.*", "docs/*.md", ".github/**/*.*", "hand_eye_calib/**/*.py")
+        for path in ROOT.glob(pattern)
+        if path.is_file() and path.name not in ("package.xml", "release.md")
+        if domain.encode() in path.read_bytes()
+    ]
+    assert elsewhere == []
+
+
+def test_links_of_the_readme_are_absolute_on_other_pages(declared):
+    targets = re.findall(r"\]\(([^)\s]+)\)", declared["long_description"])
+    assert len(targets) > 10
+    assert [target for target in targets if not re.match(r"https://|#", target)] == []
 
 
 def test_reports_plots_and_bags_need_no_extra(declared):

@@ -142,7 +142,7 @@ def _zstd() -> Any:
     if sys.version_info >= (3, 14):
         from compression import zstd as module
     else:
-        from backports import zstd as module
+        import backports.zstd as module
     return module
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import POSE_TYPES
@@ -38,6 +38,8 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
         If the path exists or cannot be written.
     ConfigError
         For an unknown storage or message type.
+    MissingDependencyError
+        Without the library rosbags.
     """
     path = Path(path)
     _check(path, streams, storage)
@@ -67,8 +69,12 @@ def _check(path: Path, streams: Streams, storage: str) -> None:
 
 
 def _writer(path: Path, storage: str) -> Any:
-    from rosbags import rosbag1, rosbag2
-
+    try:
+        from rosbags import rosbag1, rosbag2
+    except ImportError as error:
+        raise MissingDependencyError(
+            "writing bags needs rosbags, which is not installed: pip install rosbags"
+        ) from error
     if storage == "rosbag1":
         return rosbag1.Writer(path)
     return rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
