@@ -90,8 +90,8 @@ clean:
 # The package is installed editable: what runs and what is tested is this work tree. A stamp file is
 # touched last, so that set-up is repeated if it was interrupted or a file it depends on is newer.
 $(VENV)/.ready-demo: EXTRAS := ros
-$(VENV)/.ready-test: EXTRAS := ros,cluster,notebook,test,lint
-$(OLDEST)/.ready-test: EXTRAS := ros,cluster,notebook,test
+$(VENV)/.ready-test: EXTRAS := ros,cluster,fleet,gnss,notebook,test,lint
+$(OLDEST)/.ready-test: EXTRAS := ros,cluster,fleet,gnss,notebook,test
 $(OLDEST)/.ready-test: CONSTRAINTS := --constraint requirements/oldest.txt
 $(OLDEST)/.ready-test: requirements/oldest.txt
 

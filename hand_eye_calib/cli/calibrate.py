@@ -1,7 +1,7 @@
 """``calibrate PARENT CHILD``: two trajectory files."""
 
 import argparse
-from collections.abc import Mapping
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +18,14 @@ STREAMS = ("parent", "child")
 EXAMPLES = """\
 examples:
   hand_eye_calib calibrate lidar.txt camera.txt --out result
-  hand_eye_calib calibrate gnss.csv slam.txt --parent-format csv --time-offset estimate
+  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate
   hand_eye_calib calibrate lidar.txt mono.txt --scale estimate --prior z=1.85+/-0.02"""
 
 _FORMATS = (
     "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; csv: columns "
-    "by the names in the header, or with --columns. Default: what the file looks like"
+    "by the names in the header, or with --columns: positions as x y z or lat lon height, "
+    "orientations as quaternion, roll pitch yaw or heading. Default: what the file looks like"
 )
-_USUAL_FORMAT = "tum"
 _FILE_OPTIONS: dict[str, dict[str, Any]] = {
     "format": {"choices": TRAJECTORY_FORMATS, "help": _FORMATS},
     "columns": {
@@ -43,6 +43,11 @@ _FILE_OPTIONS: dict[str, dict[str, Any]] = {
         "help": "unit of the stamps. Default: recognised from their size",
     },
 }
+
+# Options that one of two files of different formats may have no use for.
+_OF_SOME_FILES = ("columns", "times")
+# The options of a file as the messages of its reader name them.
+_FILE_OPTION = re.compile("`(format|columns|times|stamp_unit)`")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,76 +71,71 @@ def add_file_arguments(parser: argparse.ArgumentParser) -> None:
             of_one = settings | {"help": f"the same for {stream.upper()} only"}
             option = f"--{stream}-{name.replace('_', '-')}"
             advanced(group.add_argument(option, dest=f"{stream}_{name}", **of_one))
-    group.add_argument(
-        "--repair-stamps",
-        action="store_true",
-        help="sort poses that are out of order and drop repeated stamps, instead of refusing the "
-        "file",
-    )
 
 
 def read_files(arguments: argparse.Namespace) -> tuple[dict[str, "Trajectory"], list[str]]:
-    """Read both files as the options of :func:`add_file_arguments` say.
+    """Read both files as the options of :func:`add_file_arguments` say, and say what was guessed.
 
     Returns
     -------
     trajectories : dict
         "parent" and "child" to Trajectory.
-    notes : list of str
-        What had to be repaired.
+    repairs : list of str
+        What was wrong with the stamps.
 
     Raises
     ------
     HandEyeCalibError
         If a file cannot be read.
     """
-    from hand_eye_calib.io.trajectory_files import read_trajectory_file
+    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_file
 
     trajectories: dict[str, Trajectory] = {}
-    notes: list[str] = []
-    formats = {stream: _format_of(arguments, stream) for stream in STREAMS}
+    repairs: list[str] = []
     for stream in STREAMS:
-        trajectories[stream], repaired = read_trajectory_file(
-            getattr(arguments, stream),
-            formats[stream],
-            repair=arguments.repair_stamps,
-            **_settings_of(arguments, stream, formats),
-        )
-        notes += repaired
-    return trajectories, notes
+        with waiting_for(f"reading {getattr(arguments, stream)}"):
+            trajectories[stream], repaired, guesses = read_trajectory_file(
+                getattr(arguments, stream),
+                _given(arguments, stream, "format") or AUTO,
+                repair=True,
+                **_settings_of(arguments, stream),
+            )
+        for text in guesses:
+            note(_FILE_OPTION.sub(f"`{stream}_\\1`", text))
+        repairs += repaired
+    return trajectories, repairs
 
 
-def _format_of(arguments: argparse.Namespace, stream: str) -> str:
-    """The format that was given for the file of a stream, or that it looks like."""
-    from hand_eye_calib.io.format_guess import guess_format
-
-    if given := getattr(arguments, f"{stream}_format") or arguments.format:
-        return given
-    path = getattr(arguments, stream)
-    guess = guess_format(path)
-    # Columns are named for csv, and only csv has lines like those of euroc.
-    if guess == "euroc" and (arguments.columns or getattr(arguments, f"{stream}_columns")):
-        guess = "csv"
-    if guess != _USUAL_FORMAT:
-        note(f"{path} looks like format {guess}; to change that, give --{stream}-format")
-    return guess
+def _given(arguments: argparse.Namespace, stream: str, name: str) -> Any:
+    """An option of one file, or the one for both."""
+    return getattr(arguments, f"{stream}_{name}") or getattr(arguments, name)
 
 
-def _settings_of(
-    arguments: argparse.Namespace, stream: str, formats: Mapping[str, str]
-) -> dict[str, Any]:
-    """How to read the file of a stream: its own options before those for both."""
-    given = {
-        name: getattr(arguments, f"{stream}_{name}") or getattr(arguments, name)
-        for name in _FILE_OPTIONS
-        if name != "format"
-    }
-    # An option for both files is meant for those of them that have its format.
-    for name, belongs_to in (("columns", "csv"), ("times", "kitti")):
-        is_own = bool(getattr(arguments, f"{stream}_{name}"))
-        if formats[stream] != belongs_to and not is_own and belongs_to in formats.values():
-            given[name] = None
+def _settings_of(arguments: argparse.Namespace, stream: str) -> dict[str, Any]:
+    """How to read the file of a stream: its own options before those for both.
+
+    Of those for both, columns are meant for the files that do not name their own, and times for
+    those of format kitti.
+    """
+    given = {name: _given(arguments, stream, name) for name in _FILE_OPTIONS if name != "format"}
+    for name in _OF_SOME_FILES:
+        of_both = getattr(arguments, name) and not getattr(arguments, f"{stream}_{name}")
+        if of_both and not _is_meant(arguments, stream, name):
+            others = (other for other in STREAMS if other != stream)
+            if any(_is_meant(arguments, other, name) for other in others):
+                given[name] = None
     return given
+
+
+def _is_meant(arguments: argparse.Namespace, stream: str, name: str) -> bool:
+    """Whether ``--columns`` or ``--times`` for both files fits the file of a stream."""
+    from hand_eye_calib.io.trajectory_files import layout_of_file
+
+    found = layout_of_file(getattr(arguments, stream))
+    format = _given(arguments, stream, "format") or found.format
+    if name == "times":
+        return bool(format == "kitti")
+    return format == "csv" or not (_given(arguments, stream, "format") or found.is_named)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -145,8 +145,8 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
     options = options_from(arguments)
-    trajectories, notes = read_files(arguments)
-    for text in notes:
+    trajectories, repairs = read_files(arguments)
+    for text in repairs:
         note(text)
     config = offline_config(trajectories["parent"], trajectories["child"], options)
     snapshot = whole_snapshot(config, **trajectories)

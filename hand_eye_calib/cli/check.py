@@ -98,9 +98,8 @@ def _read_files(arguments: argparse.Namespace) -> _Read:
     from hand_eye_calib.checks.findings import repaired_file
 
     arguments.parent, arguments.child = arguments.inputs
-    arguments.repair_stamps = True
-    trajectories, notes = read_files(arguments)
-    findings = [repaired_file(text) for text in notes]
+    trajectories, repairs = read_files(arguments)
+    findings = [repaired_file(text) for text in repairs]
     return trajectories, dict(zip(STREAMS, arguments.inputs, strict=True)), findings
 
 

@@ -13,7 +13,11 @@ _FILE_OPTIONS = {
     "columns": "columns",
     "times": "times",
     "stamp_unit": "stamp-unit",
-    "repair": "repair-stamps",
+}
+_FILE_OPTIONS |= {
+    f"{stream}_{name}": f"{stream}-{flag}"
+    for stream in ("parent", "child")
+    for name, flag in _FILE_OPTIONS.items()
 }
 
 # Names that are no words of the language, such as max_gap and prior.z, wherever they stand, but not

@@ -72,6 +72,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "rosbags": "io/bags/writer.py",
     "backports": "io/bags/decompression.py",
     "lz4": "io/bags/decompression.py",
+    "pymap3d": "io/trajectory_files/geodetic.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
     "jinja2": "report/",

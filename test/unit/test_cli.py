@@ -775,12 +775,12 @@ def test_messages_name_options_as_they_are_typed(capsys):
     from hand_eye_calib.cli.console import fail, note
 
     note("raise max_gap, or give prior.z; see 'max_gap' in /data/max_gap.txt and time_offset=3")
-    note("give `scale` or `repair`, not `this`")
+    note("give `scale` or `child_columns`, not `this`")
     fail("keyframe.min_interval: no scale", 1)
     assert capsys.readouterr().err == (
         "hand_eye_calib: note: raise --max-gap, or give --prior-z; see 'max_gap' in "
         "/data/max_gap.txt and time_offset=3\n"
-        "hand_eye_calib: note: give --scale or --repair-stamps, not `this`\n"
+        "hand_eye_calib: note: give --scale or --child-columns, not `this`\n"
         "hand_eye_calib: error: --keyframe-min-interval: no scale\n"
     )
 

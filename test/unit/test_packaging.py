@@ -28,6 +28,7 @@ DECLARED_AS = {
     "compression": (None, None),  # the standard library of Python 3.14
     "lz4": (None, None),
     "dask": ("distributed", None),  # optional, for replay --batch --dask alone
+    "pymap3d": ("pymap3d", None),  # optional, for latitude and longitude alone
     "casadi": ("casadi", "casadi-pip"),
     "jinja2": ("jinja2", "python3-jinja2"),
     "matplotlib": ("matplotlib", "python3-matplotlib"),

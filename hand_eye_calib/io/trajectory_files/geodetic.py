@@ -1,0 +1,61 @@
+"""Latitude, longitude and height as metres east, north and up of the first position."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.errors import MissingDependencyError
+
+
+class LocalPositions(NamedTuple):
+    """Positions in the frame of the first.
+
+    Attributes
+    ----------
+    positions : (N, 3) ndarray
+        Metres east, north and up of the first position, on WGS 84.
+    rotations : (N, 3, 3) ndarray
+        From the east, north and up of each position to those of the first.
+    """
+
+    positions: FloatArray
+    rotations: FloatArray
+
+
+def local_positions(
+    lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray
+) -> LocalPositions:
+    """Local metres from geodetic coordinates.
+
+    Parameters
+    ----------
+    lat_rad, lon_rad, height_m : (N,) ndarray
+
+    Raises
+    ------
+    MissingDependencyError
+        If pymap3d is not installed.
+    """
+    try:
+        from pymap3d import geodetic2enu
+    except ModuleNotFoundError:
+        raise MissingDependencyError(
+            "latitude and longitude need the package pymap3d, which is not installed: "
+            "pip install 'hand_eye_calib[gnss]'"
+        ) from None
+    origin = (lat_rad[0], lon_rad[0], height_m[0])
+    east_north_up = geodetic2enu(lat_rad, lon_rad, height_m, *origin, deg=False)
+    axes = _axes(lat_rad, lon_rad)
+    return LocalPositions(np.stack(east_north_up, axis=1), axes[0].T @ axes)
+
+
+def _axes(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
+    """East, north and up (N, 3, 3), as columns, along the axes of the earth."""
+    sin_lat, cos_lat = np.sin(lat_rad), np.cos(lat_rad)
+    sin_lon, cos_lon = np.sin(lon_rad), np.cos(lon_rad)
+    zero = np.zeros_like(lat_rad)
+    east = np.stack([-sin_lon, cos_lon, zero], axis=1)
+    north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=1)
+    up = np.stack([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat], axis=1)
+    return np.stack([east, north, up], axis=2)

@@ -1,0 +1,205 @@
+"""Reading a trajectory from a text file in any format."""
+
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+from hand_eye_calib.config import STAMP_UNITS
+from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files.formats import (
+    lines_of,
+    read_csv,
+    read_euroc,
+    read_kitti,
+    read_tum,
+)
+from hand_eye_calib.io.trajectory_files.layout import Layout, layout_of
+from hand_eye_calib.io.trajectory_files.poses import poses_of
+from hand_eye_calib.io.trajectory_files.stamps import in_order, stamps_in_ns
+from hand_eye_calib.io.trajectory_files.table import Line, Table
+
+_Path = str | Path
+
+# The format that the lines look like.
+AUTO = "auto"
+_USUAL = "tum"
+# Of eight numbers in files so called, the scalar is the last.
+_SUFFIXES_OF_TUM = ("", ".txt", ".tum")
+_TIMES = "times.txt"
+
+
+class FileReading(NamedTuple):
+    """A trajectory, and what a person should know of the file.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+    repairs : list of str
+        What was wrong with the stamps.
+    guesses : list of str
+        What the file does not say and had to be found or assumed.
+    """
+
+    trajectory: Trajectory
+    repairs: list[str]
+    guesses: list[str]
+
+
+def read_trajectory(
+    path: _Path,
+    format: str = _USUAL,
+    *,
+    topic: str | None = None,
+    tf: str | None = None,
+    columns: str | None = None,
+    times: _Path | None = None,
+    stamp_unit: str | None = None,
+    repair: bool = False,
+) -> Trajectory:
+    """Read a trajectory from a text file, or from a bag if ``topic`` or ``tf`` is given.
+
+    Parameters
+    ----------
+    path : str or path-like
+    format : str
+        "tum", "kitti", "euroc", "csv", or "auto" for what the file looks like.
+    topic : str, optional
+        Of a bag: the topic of the poses. No other option goes with it.
+    tf : str, optional
+        Of a bag: the two frames, ``world:sensor``, whose transform is the trajectory, from ``/tf``
+        and ``/tf_static``.
+    columns : str, optional
+        For csv without a header: the columns' names, such as ``"t,x,y,z,qw,qx,qy,qz"`` or
+        ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other names are columns to skip.
+    times : str or path-like, optional
+        For kitti: the file of the stamps.
+    stamp_unit : str, optional
+        "s", "ms", "us" or "ns"; if left out, recognised from the stamps' size or taken from the
+        header (``timestamp [ns]``).
+    repair : bool
+        Sort poses that are out of order and drop those with a stamp that is there already, with a
+        ``UserWarning`` that says how many; otherwise they are an error.
+
+    Returns
+    -------
+    Trajectory
+        Stamps are exactly the decimal numbers of the file, in nanoseconds; frame names are empty,
+        from a bag those of the messages. Latitude and longitude become metres east and north of
+        the first position. What had to be guessed is a ``UserWarning``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or a line cannot be used; the message names file, line and what
+        was found.
+    ConfigError
+        For a format or unit that is not known, and options that do not go together.
+    MissingDependencyError
+        For latitude and longitude without pymap3d.
+    """
+    if topic or tf:
+        if (format, columns, times, stamp_unit, repair) != (_USUAL, None, None, None, False) or (
+            topic and tf
+        ):
+            raise ConfigError(
+                "topic and tf are for bags: give one of them and none of the options of text files"
+            )
+        from hand_eye_calib.io.bags import read_bag_trajectory
+
+        trajectory, notes = read_bag_trajectory(path, topic, tf)
+    else:
+        trajectory, repairs, guesses = read_trajectory_file(
+            path, format, columns, times, stamp_unit, repair
+        )
+        notes = [*guesses, *repairs]
+    for text in notes:
+        warnings.warn(text, UserWarning, stacklevel=2)
+    return trajectory
+
+
+def read_trajectory_file(
+    path: _Path,
+    format: str = _USUAL,
+    columns: str | None = None,
+    times: _Path | None = None,
+    stamp_unit: str | None = None,
+    repair: bool = False,
+) -> FileReading:
+    """Read a text file as :func:`read_trajectory`, without warnings."""
+    _check_options(format, columns, times, stamp_unit)
+    lines = lines_of(path, "a trajectory")
+    table = _table(path, lines, format, columns, times)
+    if not table.stamps:
+        raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
+    stamps_ns = stamps_in_ns(table, stamp_unit)
+    positions, quats_xyzw = poses_of(table)
+    keep, repairs = in_order(table, stamps_ns, repair)
+    trajectory = Trajectory.from_quat_xyzw(stamps_ns[keep], positions[keep], quats_xyzw[keep])
+    return FileReading(trajectory, repairs, table.guesses)
+
+
+def layout_of_file(path: _Path) -> Layout:
+    """What the lines of a file look like.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    return layout_of(lines_of(path, "a trajectory"))
+
+
+def _check_options(
+    format: str, columns: str | None, times: _Path | None, stamp_unit: str | None
+) -> None:
+    """Refuse what is not known or does not go together."""
+    if stamp_unit is not None and stamp_unit not in STAMP_UNITS:
+        raise ConfigError(
+            f"unknown unit of stamps {stamp_unit!r}; known are {', '.join(STAMP_UNITS)}"
+        )
+    if format not in (*FORMATS, AUTO):
+        known = ", ".join((*FORMATS, AUTO))
+        raise ConfigError(f"unknown trajectory format {format!r}; known are {known}")
+    if columns is not None and format not in ("csv", AUTO):
+        raise ConfigError(f"columns are named for format csv only; the format is {format}")
+    if times is not None and format not in ("kitti", AUTO):
+        raise ConfigError(f"a file of times belongs to format kitti only; the format is {format}")
+
+
+def _table(
+    path: _Path, lines: list[Line], format: str, columns: str | None, times: _Path | None
+) -> Table:
+    if format == AUTO:
+        return _recognised(path, lines, columns, times)
+    if format == "csv":
+        return read_csv(path, lines, columns)
+    if format == "kitti":
+        return read_kitti(path, lines, times)
+    return read_tum(path, lines) if format == _USUAL else read_euroc(path, lines)
+
+
+def _recognised(path: _Path, lines: list[Line], columns: str | None, times: _Path | None) -> Table:
+    """The table of a file in the format that it looks like."""
+    found, is_named = layout_of(lines)
+    if columns is not None:
+        return read_csv(path, lines, columns)
+    if times is not None:
+        return read_kitti(path, lines, times)
+    if found == _USUAL:
+        table = read_tum(path, lines, is_named)
+        table.is_scalar_last_usual = Path(path).suffix.lower() in _SUFFIXES_OF_TUM
+        return table
+    guesses = [f"{path} looks like format {found}; to change that, give `format`"]
+    if found == "kitti":
+        beside = Path(path).with_name(_TIMES)
+        if beside.is_file():
+            guesses.append(f"stamps read from {beside}; to change that, give `times`")
+        table = read_kitti(path, lines, beside if beside.is_file() else None)
+    elif found == "csv":
+        table = read_csv(path, lines, None, may_guess=True)
+    else:
+        table = read_euroc(path, lines)
+    table.guesses[:0] = guesses
+    return table

@@ -1,0 +1,46 @@
+"""Writing a trajectory to a text file."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.files import write_atomically
+from hand_eye_calib.io.trajectory_files.formats import TUM_COLUMNS
+from hand_eye_calib.io.trajectory_files.stamps import seconds
+
+
+def write_trajectory(path: str | Path, trajectory: Trajectory, format: str = "tum") -> None:
+    """Write a trajectory to a file, replacing it if it exists. Reading it back gives the same
+    stamps and poses.
+
+    Parameters
+    ----------
+    path : str or path-like
+    trajectory : Trajectory
+    format : str
+        "tum".
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    ConfigError
+        For any other format.
+    """
+    if format != "tum":
+        raise ConfigError(f"trajectories are written in format tum; got {format!r}")
+    try:
+        write_atomically({Path(path): _tum_text(trajectory)})
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _tum_text(trajectory: Trajectory) -> str:
+    quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
+    values = np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1).tolist()
+    rows = zip(trajectory.stamps_ns.tolist(), values, strict=True)
+    lines = [f"{seconds(stamp)} {' '.join(map(repr, row))}" for stamp, row in rows]
+    return "\n".join([f"# {TUM_COLUMNS}", *lines, ""])

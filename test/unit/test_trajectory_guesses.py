@@ -1,0 +1,401 @@
+"""What a trajectory file does not say is found, and said: format, order of quaternions, angles and
+their units, latitude and longitude, repeated stamps.
+"""
+
+import json
+import os
+import sys
+
+import numpy as np
+import pytest
+from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
+from published_data import data_folder
+
+import hand_eye_calib as hec
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.trajectory_files import (
+    AUTO,
+    layout_of_file,
+    read_trajectory_file,
+    write_trajectory,
+)
+
+NS = "1403637132888318976"
+EUROC_HEADER = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+)
+POSE = ["0.1", "0.2", "0.3", "0.0", "0.0", "0.0", "1.0"]
+SCALAR_FIRST, SCALAR_LAST = [3, 0, 1, 2], [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "format", "is_named"),
+    [
+        (" ".join(["1.5", *POSE]), "tum", False),
+        ("# timestamp tx ty tz qx qy qz qw\n" + " ".join(["1.5", *POSE]), "tum", True),
+        ("# by hand\n# timestamp tx ty tz qw qx qy qz\n" + " ".join(["1.5", *POSE]), "csv", True),
+        ("# made by a program of eight words or so\n" + " ".join(["1.5", *POSE]), "tum", False),
+        ("1 0 0 0 0 1 0 0 0 0 1 0", "kitti", False),
+        (",".join([NS, *POSE]), "euroc", False),
+        ("# by hand\n" + ",".join([NS, *POSE, "1", "2"]), "euroc", False),
+        (EUROC_HEADER + "\n" + ",".join([NS, *POSE]), "csv", True),
+        ("t,x,y,z,qw,qx,qy,qz\n" + ",".join(["1.5", *POSE]), "csv", True),
+        ("t;x;y;z;qw;qx;qy;qz\n" + ";".join(["1.5", *POSE]), "csv", True),
+        ("t x y z qw qx qy qz\n" + " ".join(["1.5", *POSE]), "csv", True),
+        ("t x y yaw\n1 2 3 4", "csv", True),
+        (",".join(["1.5", *POSE]), "csv", False),
+        ("", "tum", False),
+        ("hello", "tum", False),
+    ],
+)
+def test_the_layout_is_recognised(tmp_path, text, format, is_named):
+    path = tmp_path / "poses"
+    path.write_text(text + "\n")
+    assert layout_of_file(path) == (format, is_named)
+
+
+def test_what_is_no_file_is_refused_in_one_line(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "bytes").write_bytes(bytes(range(256)) * 1000)
+    for name in ("absent", "", "fifo", "bytes"):
+        with pytest.raises(InputError, match=r"^[^\n]+$"):
+            read_trajectory_file(tmp_path / name, AUTO)
+
+
+def test_a_binary_file_of_matlab_says_how_to_save_text(tmp_path):
+    (tmp_path / "a.mat").write_bytes(
+        b"MATLAB 5.0 MAT-file, Platform: GLNXA64\x00\x01IM" + bytes(99)
+    )
+    with pytest.raises(InputError, match="binary file of MATLAB; save the poses as text, "):
+        read_trajectory_file(tmp_path / "a.mat", AUTO)
+
+
+# ---- the order of quaternions
+
+
+def write_unnamed(path, trajectory, order, separator=" "):
+    """Eight numbers in each line, and no header."""
+    quats = se3.to_quat_xyzw(trajectory.poses)[:, order]
+    values = np.c_[trajectory.poses[:, :3, 3], quats].tolist()
+    stamps = (trajectory.stamps_ns / 1e9).tolist()
+    rows = zip(stamps, values, strict=True)
+    path.write_text("".join(f"{separator.join(map(repr, [s, *v]))}\n" for s, v in rows))
+    return path
+
+
+def driven(seed=0):
+    """A vehicle on flat ground, its sensor mounted in some direction."""
+    poses = planar_poses(400, seed) @ se3.exp(np.array([0.3, 0.1, 1.0, 0.4, -1.0, 0.8]))
+    # Anywhere but at the identity.
+    return as_trajectory(se3.exp(np.array([10.0, -5.0, 2.0, 0.2, 0.1, 2.0])) @ poses)
+
+
+def read(path, **options):
+    reading = read_trajectory_file(path, AUTO, repair=True, **options)
+    return reading.trajectory, [text.removeprefix(str(path)) for text in reading.guesses]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("suffix", [".txt", ".mat", ".csv"])
+def test_the_motion_of_a_vehicle_tells_the_order(tmp_path, seed, suffix):
+    truth, separator = driven(seed), "," if suffix == ".csv" else " "
+    for order, texts in (
+        (
+            SCALAR_FIRST,
+            [
+                ": quaternions read with the scalar first, t x y z qw qx qy qz: the motion "
+                "keeps a steady direction that way"
+            ],
+        ),
+        (SCALAR_LAST, []),
+    ):
+        path = write_unnamed(tmp_path / f"poses{suffix}", truth, order, separator)
+        trajectory, guesses = read(path)
+        np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
+        assert [text for text in guesses if "looks like" not in text] == texts
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_start_of_an_odometry_tells_the_order(tmp_path, seed):
+    truth = as_trajectory(wandering_poses(200, seed))
+    for order, word in ((SCALAR_FIRST, "the first orientation is the identity"), (SCALAR_LAST, "")):
+        trajectory, guesses = read(write_unnamed(tmp_path / "poses.mat", truth, order))
+        np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
+        assert len(guesses) == bool(word)
+        assert word in "".join(guesses)
+
+
+def test_an_order_that_nothing_tells_is_said(tmp_path):
+    truth = as_trajectory(se3.exp(np.array([1.0, 2.0, 3.0, 1.0, 0.5, -1.0])) @ wandering_poses(200))
+    said = "nothing tells the order of the quaternion; read with the scalar last"
+    for name, separator, is_said in (("a.mat", " ", 1), ("a.csv", ",", 1), ("a.txt", " ", 0)):
+        trajectory, guesses = read(write_unnamed(tmp_path / name, truth, SCALAR_LAST, separator))
+        np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
+        assert sum(said in text for text in guesses) == is_said
+
+
+def test_a_sensor_upside_down_is_not_taken_for_scalar_first(tmp_path):
+    # Read with the scalar last, the first quaternion is 1 0 0 0: half a turn about x.
+    upside_down = se3.exp(np.array([0.0, 0.0, 0.0, np.pi, 0.0, 0.0]))
+    truth = as_trajectory(planar_poses(400) @ upside_down)
+    trajectory, guesses = read(write_unnamed(tmp_path / "poses.txt", truth, SCALAR_LAST))
+    np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
+    assert guesses == []
+
+
+def test_a_comment_names_the_columns_of_a_file_with_spaces(tmp_path):
+    truth = as_trajectory(wandering_poses(50, 3))
+    path = write_unnamed(tmp_path / "a.txt", truth, SCALAR_FIRST)
+    path.write_text("# some rig\n# timestamp tx ty tz qw qx qy qz\n" + path.read_text())
+    trajectory, guesses = read(path)
+    np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
+    assert guesses == [" looks like format csv; to change that, give `format`"]
+
+
+def test_only_auto_guesses(tmp_path):
+    path = write_unnamed(tmp_path / "poses.mat", driven(), SCALAR_FIRST)
+    assert read_trajectory_file(path).guesses == []
+    with pytest.raises(InputError, match="so the order of the quaternion is unknown"):
+        read_trajectory_file(path, "csv")
+
+
+# ---- angles
+
+
+def table(path, header, *columns):
+    """A csv file with these columns, ten rows a second."""
+    stamps = np.arange(len(columns[0])) / 10
+    rows = np.c_[stamps, np.transpose(columns)].tolist()
+    path.write_text("\n".join([f"t,{header}", *(",".join(map(repr, row)) for row in rows), ""]))
+    return path
+
+
+def angles(seed=1):
+    """Positions (N, 3), and roll, pitch and yaw (N, 3), of a vehicle on uneven ground."""
+    poses = planar_poses(300, seed)
+    yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    tilt = 0.1 * np.sin(np.arange(300) / [[7.0], [11.0]])
+    return poses[:, :3, 3].T, np.stack([*tilt, (yaw + np.pi) % (2 * np.pi) - np.pi])
+
+
+@pytest.mark.parametrize(
+    ("header", "unit", "is_said"),
+    [
+        ("roll,pitch,yaw", 1.0, True),
+        ("roll,pitch,yaw", 180 / np.pi, True),
+        ("roll_deg,pitch_deg,yaw_deg", 180 / np.pi, False),
+        ("roll [deg],pitch [deg],yaw [deg]", 180 / np.pi, False),
+        ("Roll (rad),Pitch (rad),Yaw (rad)", 1.0, False),
+        (".roll_degrees,.pitch_degrees,.yaw_degrees", 180 / np.pi, False),
+    ],
+)
+def test_roll_pitch_and_yaw_in_degrees_or_radians(tmp_path, header, unit, is_said):
+    positions, rpy = angles()
+    path = table(tmp_path / "a.csv", f"x,y,z,{header}", *positions, *rpy * unit)
+    trajectory, guesses = read(path)
+    expected = se3.from_rotation_translation(se3.rotation_from_rpy(rpy.T), positions.T)
+    np.testing.assert_allclose(trajectory.poses, expected, atol=1e-12)
+    word = "deg" if unit > 1 else "rad"
+    said = [text for text in guesses if f"angles read in {word}, the largest is" in text]
+    assert (len(said), len(guesses)) == (is_said, 1 + is_said)
+
+
+def test_small_angles_in_degrees_are_read_by_the_name_of_their_unit(tmp_path):
+    path = table(tmp_path / "a.csv", "x [mm],y [mm],yaw_deg", [0.0, 500.0], [0.0, 0.0], [1.0, 2.0])
+    trajectory, guesses = read(path)
+    np.testing.assert_allclose(trajectory.poses[1, :3, 3], [0.5, 0, 0])
+    np.testing.assert_allclose(se3.rotation_to_rpy(trajectory.poses[1, :3, :3])[2], np.radians(2))
+    assert [text for text in guesses if "no column" in text] == [
+        ": no column of z: taken as 0",
+        ": no columns of roll and pitch: taken as 0",
+    ]
+
+
+def test_a_compass_heading_is_clockwise_from_north_and_nose_up_is_positive(tmp_path):
+    positions, rpy = angles()
+    roll, pitch, yaw = rpy
+    compass = np.degrees((np.pi / 2 - yaw) % (2 * np.pi))
+    path = table(
+        tmp_path / "a.csv",
+        "easting,northing,altitude,roll_deg,pitch_deg,heading_deg",
+        *positions,
+        np.degrees(roll),
+        np.degrees(-pitch),
+        compass,
+    )
+    trajectory, guesses = read(path)
+    np.testing.assert_allclose(
+        trajectory.poses[:, :3, :3], se3.rotation_from_rpy(rpy.T), atol=1e-12
+    )
+    assert guesses[1:] == [
+        ": heading read as clockwise from north; axes of the sensor: x forward, y left, z up"
+    ]
+
+
+def test_the_motion_tells_which_way_an_angle_is_counted(tmp_path):
+    positions, (_, _, yaw) = angles()
+    for header, values in (("x,y,z,yaw_rad", np.pi / 2 - yaw), ("x,y,z,heading_rad", yaw)):
+        trajectory, guesses = read(table(tmp_path / "a.csv", header, *positions, values))
+        np.testing.assert_allclose(
+            np.cos(se3.rotation_to_rpy(trajectory.poses[:, :3, :3])[:, 2] - yaw), 1, atol=1e-12
+        )
+        assert "because the motion fits that and not the opposite" in guesses[-1]
+
+
+# ---- latitude and longitude
+
+
+def geodetic(positions):
+    """Latitude and longitude in degrees, and height, of metres east, north and up of a place."""
+    pymap3d = pytest.importorskip(
+        "pymap3d", reason="pymap3d is not installed: pip install '.[gnss]'"
+    )
+    return pymap3d.enu2geodetic(*positions, 60.17, 24.94, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [
+        ("latitude,longitude,height", 1.0),
+        ("Lat [deg],Lon [deg],Alt [m]", 1.0),
+        (".latitude,.longitude,.altitude", 1.0),
+        ("lat_rad,lon_rad,alt", np.pi / 180),
+        ("lat,lng,h_ell", np.pi / 180),
+    ],
+)
+def test_latitude_and_longitude_become_metres_of_the_first_position(tmp_path, header, unit):
+    positions, rpy = angles()
+    positions = positions * [[100], [100], [1]] + [[0], [0], [5.0]]
+    lat, lon, height = geodetic(positions)
+    path = table(
+        tmp_path / "a.csv", f"{header},roll,pitch,yaw", lat * unit, lon * unit, height, *rpy
+    )
+    trajectory, guesses = read(path)
+    expected = positions - positions[:, :1]
+    assert np.ptp(expected[0]) > 500
+    # The axes of the first position are tilted against those of the place by some 1e-5 rad.
+    np.testing.assert_allclose(trajectory.poses[:, :3, 3].T, expected, atol=2e-2)
+    assert "latitude and longitude" in guesses[1]
+    assert "became metres east and north of the first position" in guesses[1]
+    # East, north and up of the places turn against each other as the earth does.
+    turned = se3.rotation_angle(
+        trajectory.poses[:, :3, :3] @ np.swapaxes(se3.rotation_from_rpy(rpy.T), 1, 2)
+    )
+    assert 1e-4 < turned.max() < 1e-3
+
+
+def test_latitudes_that_cannot_be_are_refused(tmp_path):
+    path = table(tmp_path / "a.csv", "lat,lon,height,yaw", [60.0, 91.0], [1, 1], [0, 0], [0, 0])
+    with pytest.raises(InputError, match="line 3: found latitude 91, longitude 1; expected deg"):
+        read(path)
+
+
+def test_without_pymap3d_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymap3d", None)
+    path = table(tmp_path / "a.csv", "lat,lon,height,yaw", [60.0, 60.1], [1, 1], [0, 0], [0, 0])
+    with pytest.raises(MissingDependencyError, match=r"pip install 'hand_eye_calib\[gnss\]'"):
+        read(path)
+
+
+# ---- published files
+
+
+def test_published_files_need_no_options():
+    """Scalar first in the files of one data set; an INS with latitude, longitude and azimuth gives
+    what its authors made of it.
+    """
+    folder = data_folder() / "zxl19"
+    for path in sorted(folder.glob("bag*/[ILV]*_FCPE.mat")):
+        found = read_trajectory_file(path, AUTO, repair=True).trajectory
+        named = read_trajectory_file(path, "csv", "t,x,y,z,qw,qx,qy,qz", repair=True).trajectory
+        np.testing.assert_array_equal(found.poses, named.poses)
+    pytest.importorskip("pymap3d", reason="pymap3d is not installed: pip install '.[gnss]'")
+    ins, _ = read(folder / "raw_bag1" / "bag1-novatel_data-inspvax.csv")
+    theirs = read_trajectory_file(folder / "bag1" / "INS_FCPE.mat", AUTO).trajectory
+    # Their sensor has x to the right and y forward; their roll and pitch are exchanged.
+    headings = [np.arctan2(ins.poses[:, 1, 0], ins.poses[:, 0, 0])]
+    headings.append(np.arctan2(theirs.poses[:, 1, 1], theirs.poses[:, 0, 1]))
+    turned = np.unwrap(headings[0] - headings[1])
+    assert np.degrees(np.abs(turned - turned[0])).max() < 0.06
+    # A UTM grid is some 0.9996 of the ground's scale.
+    lengths = [
+        np.linalg.norm(np.diff(one.poses[:, :2, 3], axis=0), axis=1) for one in (ins, theirs)
+    ]
+    np.testing.assert_allclose(lengths[0].sum(), lengths[1].sum(), rtol=6e-4)
+
+
+# ---- on the command line
+
+
+@pytest.fixture
+def streams():
+    poses = wandering_poses(100)
+    return as_trajectory(poses), as_trajectory(disturbed(child_of(poses), 1, 0.002, 0.001))
+
+
+def write_csv(path, trajectory):
+    rows = np.c_[trajectory.poses[:, :3, 3], np.roll(se3.to_quat_xyzw(trajectory.poses), 1, axis=1)]
+    lines = [
+        ",".join([str(stamp), *map(repr, row)])
+        for stamp, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True)
+    ]
+    path.write_text("t,x,y,z,qw,qx,qy,qz\n" + "\n".join(lines) + "\n")
+
+
+def test_files_of_two_formats_need_no_options(tmp_path, streams, capsys):
+    parent, child = tmp_path / "parent.txt", tmp_path / "child.csv"
+    write_trajectory(parent, streams[0])
+    write_csv(child, streams[1])
+    command = ["calibrate", str(parent), str(child), "--json", "--reference", "B5"]
+    assert main(command) == 0
+    guessed = capsys.readouterr()
+    assert guessed.err == (
+        f"hand_eye_calib: note: {child} looks like format csv; "
+        "to change that, give --child-format\n"
+    )
+    assert main([*command, "--child-format", "csv"]) == 0
+    given = capsys.readouterr()
+    assert given.err == ""
+    assert given.out == guessed.out
+
+
+def test_repeated_stamps_are_dropped_with_a_note(tmp_path, streams, capsys):
+    for name, trajectory in zip(("parent.txt", "child.txt"), streams, strict=True):
+        write_trajectory(tmp_path / name, trajectory)
+    files = [str(tmp_path / name) for name in ("parent.txt", "child.txt")]
+    command = ["calibrate", *files, "--json", "--reference", "B5"]
+    assert main(command) == 0
+    whole = json.loads(capsys.readouterr().out)
+    lines = (tmp_path / "child.txt").read_text().splitlines()
+    stamp = lines[30].split()[0]
+    lines[31:31] = [lines[30], " ".join([stamp, *lines[40].split()[1:]])]
+    (tmp_path / "child.txt").write_text("\n".join(lines))
+    assert main(command) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["T_parent_child"] == whole["T_parent_child"]
+    assert err == (
+        f"hand_eye_calib: note: {files[1]}: dropped 2 whose stamp was there already; "
+        "1 of these with another pose\n"
+    )
+
+
+def test_times_beside_a_kitti_file_are_found(tmp_path, streams, capsys):
+    write_trajectory(tmp_path / "child.txt", streams[1])
+    rows = streams[0].poses[:, :3].reshape(-1, 12).tolist()
+    (tmp_path / "00.txt").write_text("\n".join(" ".join(map(repr, row)) for row in rows))
+    command = ["calibrate", str(tmp_path / "00.txt"), str(tmp_path / "child.txt"), "--json"]
+    assert main(command) == 2
+    assert "name their file with --times" in capsys.readouterr().err
+    stamps = (streams[0].stamps_ns / 1e9).tolist()
+    (tmp_path / "times.txt").write_text("\n".join(map(repr, stamps)))
+    assert main([*command, "--reference", "B5"]) == 0
+    assert "times.txt; to change that, give --parent-times" in capsys.readouterr().err
+
+
+def test_python_reads_what_a_file_looks_like_with_a_warning(tmp_path):
+    path = write_unnamed(tmp_path / "poses.txt", driven(), SCALAR_FIRST)
+    with pytest.warns(UserWarning, match="read with the scalar first"):
+        trajectory = hec.read_trajectory(path, "auto")
+    np.testing.assert_allclose(trajectory.poses, driven().poses, atol=1e-12)
