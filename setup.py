@@ -86,7 +86,11 @@ setup(
         "Typing :: Typed",
     ],
     packages=find_packages(include=[name, f"{name}.*"]),
-    package_data={name: ["py.typed"], f"{name}.report": ["templates/*.html", "templates/*.css"]},
+    package_data={
+        name: ["py.typed"],
+        f"{name}.report": ["templates/*.html", "templates/*.css"],
+        f"{name}.watch": ["page/*"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
         (f"share/{name}", ["package.xml"]),

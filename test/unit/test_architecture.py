@@ -48,8 +48,9 @@ ALLOWED = ENGINE | {
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
     "root": GROUND | {"geometry", "calibration", "status", "verdict", "engine", "session", "io"},
-    "ros": {"io", *ENGINE},
-    "cli": {"io", "report", "simulation", "ros", *ENGINE},
+    "watch": {"errors"},
+    "ros": {"io", "watch", *ENGINE},
+    "cli": {"io", "report", "simulation", "watch", "ros", *ENGINE},
     "__main__": {"cli"},
 }
 

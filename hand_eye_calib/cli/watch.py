@@ -1,0 +1,248 @@
+"""``watch``: the live node as a person sees it, on a terminal and in a browser."""
+
+import argparse
+import contextlib
+import os
+import queue
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from hand_eye_calib.cli.console import note
+from hand_eye_calib.errors import ConfigError
+
+if TYPE_CHECKING:
+    from hand_eye_calib.watch.board import Board, View
+    from hand_eye_calib.watch.web import WebServer
+
+EXAMPLES = """\
+examples:
+  hand_eye_calib watch                     on this terminal
+  hand_eye_calib watch --web               also in a browser, on a phone for example
+  hand_eye_calib watch --node /robot1/calibrator
+  hand_eye_calib watch > seen.txt          in lines, whenever something new is said"""
+
+_PORT = 8765
+_LISTEN_S = 0.1
+_SURE_WITHIN_S = 5.0
+_KEYS = {"s": "solve", "w": "save", "r": "reset"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = EXAMPLES
+    parser.add_argument(
+        "--node",
+        metavar="NAME",
+        default="",
+        help="full name of the node, such as /robot1/calibrator. Default: the first that is heard",
+    )
+    parser.add_argument(
+        "--web",
+        metavar="[HOST:]PORT",
+        nargs="?",
+        const=("", _PORT),
+        type=_address,
+        help=f"also serve a page for browsers, at port {_PORT} of all addresses by default",
+    )
+    parser.add_argument(
+        "--key",
+        metavar="WORD",
+        default="",
+        help="word that is part of the page's address, so that the address stays the same. "
+        "Default: a new one at each start",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Show the node until told to end; returns the exit code."""
+    if arguments.key and arguments.web is None:
+        raise ConfigError("--key is for --web")
+    from hand_eye_calib.ros.watcher import Watcher
+    from hand_eye_calib.watch.board import Board
+
+    board, requests = Board(), queue.SimpleQueue[tuple[str, str]]()
+    stopped = _stop_signals()
+    with (
+        Watcher(board) as watcher,
+        _web(arguments, board, requests) as server,
+        _display(server) as display,
+    ):
+        session = _Session(board, arguments.node, requests, display.keys)
+        while not stopped() and not session.is_over:
+            watcher.spin(_LISTEN_S)
+            while not requests.empty():
+                watcher.ask(*requests.get())
+            display.show(session.view())
+    return 0
+
+
+class _Session:
+    """What the person at the terminal has chosen: the node, and keys that wait for a second press.
+
+    Parameters
+    ----------
+    board : Board
+    wanted : str
+        The node to show; empty for the first.
+    requests : queue
+        Takes (node, request).
+    keys : callable
+        Gives the keys pressed since the last call.
+    """
+
+    def __init__(
+        self,
+        board: "Board",
+        wanted: str,
+        requests: "queue.SimpleQueue[tuple[str, str]]",
+        keys: Callable[[], str],
+    ) -> None:
+        self.is_over = False
+        self._board, self._wanted, self._requests, self._keys = board, wanted, requests, keys
+        self._sure_until_s = 0.0
+
+    def view(self) -> "View":
+        """Do what was typed, and make the view."""
+        now_s = time.monotonic()
+        for key in self._keys():
+            self._press(key, now_s)
+        return self._board.view(self._wanted, now_s)
+
+    def _press(self, key: str, now_s: float) -> None:
+        node = self._board.chosen(self._wanted, now_s)
+        if key in ("q", "\x03", "\x04"):
+            self.is_over = True
+        elif key in "123456789" and int(key) <= len(self._board.nodes):
+            self._wanted = self._board.nodes[int(key) - 1]
+        elif key == "r" and now_s > self._sure_until_s:
+            self._sure_until_s = now_s + _SURE_WITHIN_S
+            self._board.answer(node, "reset", False, "forgets all poses: press r again", now_s)
+        elif key in _KEYS and node:
+            self._requests.put((node, _KEYS[key]))
+
+
+# --------------------------------------------------------------------- display
+
+
+class _Screen:
+    """Draws the view in place, and reads single keys."""
+
+    def __init__(self, footer: str) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        self._console = Console()
+        self._live = Live(console=self._console, screen=True, auto_refresh=False)
+        self._footer = footer
+
+    def __enter__(self) -> "_Screen":
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def show(self, view: "View") -> None:
+        """Draw a view."""
+        from hand_eye_calib.watch.terminal import screen
+
+        self._live.update(screen(view, self._console.width, self._footer), refresh=True)
+
+    def keys(self) -> str:
+        """The keys pressed since the last call."""
+        pressed = ""
+        while sys.stdin.isatty() and select.select([sys.stdin], [], [], 0)[0]:
+            read = os.read(sys.stdin.fileno(), 64).decode(errors="replace")
+            if not read:
+                break
+            pressed += read
+        return pressed
+
+
+class _Lines:
+    """Prints what is new, for a file or a pipe."""
+
+    def __init__(self) -> None:
+        from hand_eye_calib.watch.terminal import LineLog
+
+        self._log, self._started_s = LineLog(), time.monotonic()
+
+    def show(self, view: "View") -> None:
+        """Print what is new."""
+        for line in self._log.lines(view, time.monotonic() - self._started_s):
+            print(line, flush=True)
+
+    def keys(self) -> str:
+        """None: nobody is there to press them."""
+        return ""
+
+
+@contextlib.contextmanager
+def _display(server: "WebServer | None") -> "Iterator[_Screen | _Lines]":
+    """The screen of a terminal, or lines."""
+    if not sys.stdout.isatty():
+        yield _Lines()
+        return
+    footer = f"phone: {server.addresses()[0]}" if server is not None else ""
+    with _single_keys(), _Screen(footer) as screen:
+        yield screen
+
+
+@contextlib.contextmanager
+def _single_keys() -> Iterator[None]:
+    """Give keys at once, without Enter and without showing them."""
+    if not sys.stdin.isatty():
+        yield
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    try:
+        tty.setcbreak(sys.stdin)
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+@contextlib.contextmanager
+def _web(
+    arguments: argparse.Namespace,
+    board: "Board",
+    requests: "queue.SimpleQueue[tuple[str, str]]",
+) -> "Iterator[WebServer | None]":
+    """The server of the page, if it is wanted."""
+    if arguments.web is None:
+        yield None
+        return
+    from hand_eye_calib.watch.web import WebServer
+
+    def request(node: str, what: str) -> None:
+        requests.put((node, what))
+
+    server = WebServer(board, request, arguments.web, wanted=arguments.node, key=arguments.key)
+    try:
+        for address in server.addresses():
+            note(f"open {address} in a browser")
+        yield server
+    finally:
+        server.stop()
+
+
+def _stop_signals() -> Callable[[], bool]:
+    """Function that tells whether SIGINT or SIGTERM has come."""
+    came: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda signum, _: came.append(signum))
+    return lambda: bool(came)
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        raise argparse.ArgumentTypeError(f"expected PORT or HOST:PORT, got {text!r}")
+    return host.strip("[]"), int(port)

@@ -1,0 +1,392 @@
+"""What the nodes on ``/diagnostics`` say, put into the words and bars that a person is shown.
+
+Nothing here knows ROS, a terminal or a browser: statuses go in, a :class:`View` comes out.
+"""
+
+import math
+import threading
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+AXES = {"x": "m", "y": "m", "z": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
+
+# Levels of diagnostic_msgs/DiagnosticStatus.
+OK, WARN, ERROR = 0, 1, 2
+
+# A node that has said nothing for so long is silent; it reports once a second (s).
+SILENT_AFTER_S = 3.5
+
+# The answer to a button is shown for so long (s).
+ANSWER_FOR_S = 20.0
+
+
+class Tone(Enum):
+    """How good something is: never told by a colour alone, always with this sign."""
+
+    GOOD = "✓"
+    BUSY = "▶"
+    ACT = "!"
+    BAD = "✗"
+    UNKNOWN = "?"
+
+
+@dataclass(frozen=True)
+class Status:
+    """A status of ``/diagnostics``: the part of the node it is about, and what it says."""
+
+    part: str
+    level: int
+    text: str
+    values: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """The newest extrinsic: frames, and x, y, z (m), roll, pitch, yaw (rad)."""
+
+    parent_frame: str
+    child_frame: str
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line with its sign, such as the health of an input."""
+
+    tone: Tone
+    name: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One axis against its target.
+
+    Attributes
+    ----------
+    axis : str
+    share : float
+        0 to 1: the share of the information that the target needs. It grows evenly while the motion
+        stays as it is.
+    tone : Tone
+    word : str
+        Such as ``enough`` or ``25 s left``.
+    value, sigma, target, difference : str
+        With units; empty if not known, the value too if the motion does not show it.
+    """
+
+    axis: str
+    share: float
+    tone: Tone
+    word: str
+    value: str
+    sigma: str
+    target: str
+    difference: str
+
+    @property
+    def against(self) -> str:
+        """The standard deviation against the target, such as ``± 0.065 of 0.3 deg``."""
+        if not self.target:
+            return ""
+        if not self.sigma:
+            return f"wanted: {self.target}"
+        number, unit = self.sigma.split()
+        same = self.target.endswith(f" {unit}")
+        return f"± {number if same else self.sigma} of {self.target}"
+
+
+@dataclass(frozen=True)
+class View:
+    """Everything a person is shown of one node."""
+
+    node: str
+    nodes: tuple[str, ...]
+    tone: Tone
+    word: str
+    sentence: str
+    title: str
+    bars: tuple[Bar, ...]
+    health: tuple[Line, ...]
+    verdict: Line
+    reasons: tuple[str, ...]
+    comparison: Line
+    answer: Line | None
+
+
+class _Node:
+    """What is known of one node."""
+
+    def __init__(self) -> None:
+        self.statuses: dict[str, Status] = {}
+        self.heard_s = -math.inf
+        self.pose: Pose | None = None
+        self.answer: Line | None = None
+        self.answered_s = -math.inf
+
+    def values(self, part: str) -> Mapping[str, str]:
+        return self.statuses[part].values if part in self.statuses else {}
+
+
+class Board:
+    """Collects what the nodes say, and makes views of it; may be used from several threads."""
+
+    def __init__(self) -> None:
+        self._nodes: dict[str, _Node] = {}
+        self._lock = threading.Lock()
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the nodes heard so far, fully qualified."""
+        with self._lock:
+            return tuple(sorted(self._nodes))
+
+    def take(self, node: str, statuses: Iterable[Status], now_s: float) -> None:
+        """Take what a node says on ``/diagnostics``, all of it at once."""
+        with self._lock:
+            known = self._nodes.setdefault(node, _Node())
+            known.statuses = {status.part: status for status in statuses}
+            known.heard_s = now_s
+            if known.values("progress").get("verdict") == "no result":
+                known.pose = None
+
+    def take_pose(self, node: str, pose: Pose) -> None:
+        """Take the newest extrinsic of a node."""
+        with self._lock:
+            self._nodes.setdefault(node, _Node()).pose = pose
+
+    def answer(self, node: str, request: str, good: bool | None, text: str, now_s: float) -> None:
+        """Take the answer to a button; ``good`` is None while it is awaited."""
+        tone = Tone.BUSY if good is None else Tone.GOOD if good else Tone.ACT
+        with self._lock:
+            known = self._nodes.setdefault(node, _Node())
+            known.answer, known.answered_s = Line(tone, request, text), now_s
+
+    def chosen(self, wanted: str, now_s: float) -> str:
+        """The node to show: the one that is wanted, or else the first that is not silent; empty if
+        none was heard.
+        """
+        with self._lock:
+            silent = {
+                name: now_s - each.heard_s > SILENT_AFTER_S for name, each in self._nodes.items()
+            }
+        return wanted or min(silent, key=lambda name: (silent[name], name), default="")
+
+    def view(self, wanted: str, now_s: float) -> View:
+        """What to show of a node.
+
+        Parameters
+        ----------
+        wanted : str
+            Its name; empty for the first.
+        now_s : float
+            On the same clock as :meth:`take`.
+        """
+        name, names = self.chosen(wanted, now_s), self.nodes
+        with self._lock:
+            return _view(name, names, self._nodes.get(name, _Node()), now_s)
+
+
+def _view(name: str, names: tuple[str, ...], node: _Node, now_s: float) -> View:
+    silent_s = now_s - node.heard_s
+    tone, word, sentence = _headline(name, node, silent_s)
+    values = node.values("progress")
+    is_answered = node.answer is not None and now_s - node.answered_s < ANSWER_FOR_S
+    return View(
+        node=name,
+        nodes=names,
+        tone=tone,
+        word=word,
+        sentence=sentence,
+        title=_title(node.pose),
+        bars=tuple(_bar(axis, values, node.pose) for axis in AXES),
+        health=tuple(_health(node, silent_s)),
+        verdict=_verdict(values.get("verdict", "")),
+        reasons=tuple(_numbered(values, "reason")),
+        comparison=_comparison(values),
+        answer=node.answer if is_answered else None,
+    )
+
+
+# -------------------------------------------------------------------- headline
+
+
+def _headline(name: str, node: _Node, silent_s: float) -> tuple[Tone, str, str]:
+    """Sign, word and sentence: what a person should know or do first."""
+    if not node.statuses:
+        who = f"of {name}" if name else "of a calibrator"
+        text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and network?"
+        return Tone.UNKNOWN, "NO NODE", text
+    if silent_s > SILENT_AFTER_S:
+        text = f"The node has said nothing for {silent_s:.0f} s. What is below is older than that."
+        return Tone.BAD, "SILENT", text
+    for part in ("extrinsic", "mount", "parent input", "child input", "journal"):
+        status = node.statuses.get(part)
+        if status is not None and status.level >= ERROR:
+            return Tone.BAD, _ERROR_WORDS.get(part, "BROKEN"), _sentence(status.text)
+    progress = node.statuses.get("progress")
+    for part in ("parent input", "child input"):
+        status = node.statuses.get(part)
+        if status is not None and status.level == WARN:
+            return Tone.ACT, "CHECK INPUT", _sentence(status.text)
+    if progress is None:
+        return _of_extrinsic(node.statuses.get("extrinsic"))
+    return _of_progress(progress)
+
+
+_ERROR_WORDS = {"mount": "MOUNT MOVED", "parent input": "BAD INPUT", "child input": "BAD INPUT"}
+
+
+def _of_progress(progress: Status) -> tuple[Tone, str, str]:
+    sentence = _sentence(progress.text)
+    if progress.values.get("done") == "true":
+        return Tone.GOOD, "DONE", sentence
+    if progress.values.get("verdict") == "no result":
+        return Tone.BUSY, "START", sentence
+    if progress.level >= WARN:
+        return Tone.ACT, "CHANGE THE MOTION", sentence
+    return Tone.BUSY, "GO ON", sentence
+
+
+def _of_extrinsic(status: Status | None) -> tuple[Tone, str, str]:
+    """Of a node that sets no goal, such as one that only watches the mount."""
+    if status is None:
+        return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
+    if status.level == OK:
+        return Tone.GOOD, "GOOD", _sentence(status.text)
+    return Tone.ACT, "GO ON", _sentence(status.text)
+
+
+def _sentence(text: str) -> str:
+    """With a capital and a full stop, unless it begins with a name such as ``/lidar``."""
+    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith((".", "!", "?")) else ".")
+
+
+# ------------------------------------------------------------------------ bars
+
+
+def _bar(axis: str, values: Mapping[str, str], pose: Pose | None) -> Bar:
+    sigma, target = (_number(values, f"{what}.{axis}") for what in ("sigma", "target"))
+    left_s = _number(values, f"seconds_left.{axis}")
+    unit = AXES[axis]
+    share = min(1.0, (target / sigma) ** 2) if sigma > 0 and target > 0 else float(sigma == 0)
+    tone, word = _state(sigma, target, left_s, is_behind=values.get("limiting_axis") == axis)
+    value = pose.values[list(AXES).index(axis)] if pose is not None else math.nan
+    return Bar(
+        axis=axis,
+        share=share if math.isfinite(share) else 0.0,
+        tone=tone,
+        word=word,
+        value=_value(value, unit) if math.isfinite(sigma) else "",
+        sigma=small(sigma, unit),
+        target=small(target, unit),
+        difference=_difference(axis, values),
+    )
+
+
+def _state(sigma: float, target: float, left_s: float, is_behind: bool) -> tuple[Tone, str]:
+    if not math.isfinite(sigma):
+        return Tone.UNKNOWN, "not seen yet"
+    if left_s == 0:
+        return Tone.GOOD, "enough"
+    left = f"{duration(left_s)} left" if math.isfinite(left_s) else "not with this motion"
+    if sigma <= target:
+        return Tone.BUSY, f"nearly: {left}"
+    return (Tone.ACT if is_behind else Tone.BUSY), left
+
+
+def _number(values: Mapping[str, str], key: str) -> float:
+    """A value as a number; nan for a word such as ``unobservable``, or if it is missing."""
+    try:
+        return float(values[key])
+    except (KeyError, ValueError):
+        return math.nan
+
+
+def _value(value: float, unit: str) -> str:
+    if not math.isfinite(value):
+        return ""
+    return f"{value:.3f} m" if unit == "m" else f"{math.degrees(value):.2f} deg"
+
+
+def small(value: float, unit: str) -> str:
+    """A standard deviation or a difference, short: in mm, cm, m or deg; empty if not known."""
+    if not math.isfinite(value):
+        return ""
+    if unit == "rad":
+        return f"{_short(math.degrees(value))} deg"
+    size = abs(value)
+    if size < 0.00995:
+        return f"{_short(1000 * value)} mm"
+    if size < 0.995:
+        return f"{_short(100 * value)} cm"
+    return f"{_short(value)} m"
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 9.95 else f"{value:.2g}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds, or minutes."""
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+# ------------------------------------------------- health, verdict, comparison
+
+_PARTS = ("parent input", "child input", "stream checks", "mount", "journal")
+_TONES = {OK: Tone.GOOD, WARN: Tone.ACT}
+
+
+def _health(node: _Node, silent_s: float) -> Iterable[Line]:
+    is_old = silent_s > SILENT_AFTER_S
+    for part in _PARTS:
+        status = node.statuses.get(part)
+        if status is not None:
+            tone = Tone.UNKNOWN if is_old else _TONES.get(status.level, Tone.BAD)
+            topic = status.values.get("topic", "")
+            about = f"{status.text}, {topic}" if topic and topic not in status.text else status.text
+            yield Line(tone, part, about)
+
+
+_VERDICTS = {"USE": Tone.GOOD, "USE WITH CARE": Tone.ACT, "DO NOT USE": Tone.BAD}
+
+
+def _verdict(word: str) -> Line:
+    text = word if word in _VERDICTS else "no result yet"
+    return Line(_VERDICTS.get(word, Tone.UNKNOWN), "verdict", text)
+
+
+def _numbered(values: Mapping[str, str], name: str) -> Iterable[str]:
+    """Values of NAME.1, NAME.2 and so on."""
+    number = 1
+    while f"{name}.{number}" in values:
+        yield values[f"{name}.{number}"]
+        number += 1
+
+
+def _comparison(values: Mapping[str, str]) -> Line:
+    text = values.get("comparison", "")
+    if not text:
+        return Line(Tone.UNKNOWN, "installed", "nothing to compare with (parameter installed)")
+    said = text.lower()
+    tone = Tone.ACT if "moved" in said else Tone.GOOD if "same" in said else Tone.UNKNOWN
+    return Line(tone, "installed", text)
+
+
+def _difference(axis: str, values: Mapping[str, str]) -> str:
+    """Result minus what is installed, with its standard deviation."""
+    difference = _number(values, f"difference.{axis}")
+    sigma = _number(values, f"difference_sigma.{axis}")
+    if not math.isfinite(difference):
+        return ""
+    sign = "+" if difference >= 0 else ""
+    known = f" ± {small(sigma, AXES[axis])}" if math.isfinite(sigma) else ""
+    return f"{sign}{small(difference, AXES[axis])}{known}"
+
+
+def _title(pose: Pose | None) -> str:
+    if pose is None:
+        return "no extrinsic yet"
+    return f"pose of {pose.child_frame} in {pose.parent_frame}"

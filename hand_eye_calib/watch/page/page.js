@@ -1,0 +1,58 @@
+"use strict";
+
+// The key comes with the address that the terminal shows; the node is remembered in it.
+const address = new URLSearchParams(location.search);
+const view = document.getElementById("view");
+const connection = document.getElementById("connection");
+const buttons = document.querySelectorAll("button");
+
+// The server sends something every second. A connection that is silent for longer is opened anew:
+// a phone that was asleep or out of reach does not notice by itself.
+const SILENT_MS = 4000, RETRY_MS = 1000;
+let source = null, heardAt = 0, lostAt = null;
+
+function show(isLive) {
+  if (!isLive && lostAt === null) lostAt = Date.now();
+  if (isLive) lostAt = null;
+  const seconds = lostAt === null ? 0 : Math.round((Date.now() - lostAt) / 1000);
+  connection.classList.toggle("lost", !isLive);
+  connection.textContent = isLive
+    ? "✓ connected" : `✗ NO CONNECTION for ${seconds} s, trying again ...`;
+  for (const button of buttons) button.disabled = !isLive;
+}
+
+function connect() {
+  if (source !== null) source.close();
+  heardAt = Date.now();
+  source = new EventSource("events?" + address);
+  source.onmessage = (event) => {
+    heardAt = Date.now();
+    show(true);
+    if (event.data) view.innerHTML = event.data;
+  };
+  source.onerror = () => { source.close(); show(false); };
+}
+
+setInterval(() => {
+  const isClosed = source.readyState === EventSource.CLOSED;
+  if (isClosed || Date.now() - heardAt > SILENT_MS) { show(false); connect(); }
+}, RETRY_MS);
+
+view.addEventListener("click", (event) => {
+  const link = event.target.closest("a[data-node]");
+  if (link === null) return;
+  event.preventDefault();
+  address.set("node", link.dataset.node);
+  history.replaceState(null, "", "?" + address);
+  connect();
+});
+
+for (const button of buttons) {
+  button.addEventListener("click", () => {
+    if (button.dataset.sure && !confirm(button.dataset.sure)) return;
+    fetch(button.dataset.request + "?" + address, {method: "POST"})
+      .then((answer) => { if (!answer.ok) show(false); }, () => show(false));
+  });
+}
+
+connect();

@@ -1,0 +1,116 @@
+"""A view on a terminal: redrawn in place, or as lines where nothing can be redrawn."""
+
+from rich.console import Group, RenderableType
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from hand_eye_calib.watch.board import Bar, Line, Tone, View
+
+_STYLES = {
+    Tone.GOOD: "bold green",
+    Tone.BUSY: "bold cyan",
+    Tone.ACT: "bold yellow",
+    Tone.BAD: "bold red",
+    Tone.UNKNOWN: "bold magenta",
+}
+_FULL, _EMPTY = "█", "░"
+_BAR_CELLS = 16
+
+# Narrower terminals do without the columns of targets and differences.
+_WIDE = 76
+
+KEYS = "s solve   w save   r reset   q quit"
+
+
+def screen(view: View, width: int, footer: str = "") -> RenderableType:
+    """The whole view.
+
+    Parameters
+    ----------
+    view : View
+    width : int
+        Columns of the terminal.
+    footer : str
+        Such as the address of the page.
+    """
+    head = Text.assemble((f" {view.tone.value} {view.word} ", f"reverse {_STYLES[view.tone]}"))
+    parts: list[RenderableType] = [
+        head,
+        Text(view.sentence, style="bold"),
+        Text(),
+        _bars(view, width),
+        Text(),
+        _lines((*view.health, view.verdict, view.comparison)),
+        *(Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]),
+    ]
+    if view.answer is not None:
+        parts += [Text(), _lines((view.answer,))]
+    if len(view.nodes) > 1:
+        parts += [Text(), _choices(view)]
+    title = f"hand_eye_calib watch {view.node}".rstrip()
+    keys = "   ".join(filter(None, (KEYS, footer)))
+    body = Panel(Group(*parts), title=Text(title), title_align="left")
+    return Group(body, Text(f" {keys}", style="dim"))
+
+
+def _bars(view: View, width: int) -> Table:
+    table = Table.grid(padding=(0, 2 if width >= _WIDE else 1))
+    is_wide = width >= _WIDE
+    has_installed = any(bar.difference for bar in view.bars)
+    for bar in view.bars:
+        sign = Text(f"{bar.tone.value} {bar.word}", style=_STYLES[bar.tone])
+        cells = [Text(bar.axis, style="bold"), _drawn(bar), sign, Text(bar.value, justify="right")]
+        if is_wide:
+            cells.append(Text(bar.against))
+            cells += [Text(bar.difference)] * has_installed
+        table.add_row(*cells)
+    table.title = Text(view.title, style="dim")
+    table.title_justify = "left"
+    return table
+
+
+def _drawn(bar: Bar) -> Text:
+    full = int(bar.share * _BAR_CELLS)
+    text = Text(_FULL * full, style=_STYLES[bar.tone])
+    return text.append(_EMPTY * (_BAR_CELLS - full), style="dim")
+
+
+def _lines(lines: tuple[Line, ...]) -> Table:
+    table = Table.grid(padding=(0, 1))
+    for line in lines:
+        style = _STYLES[line.tone]
+        table.add_row(Text(line.tone.value, style=style), Text(line.name), Text(line.text))
+    return table
+
+
+def _choices(view: View) -> Text:
+    """Which key shows which node."""
+    text = Text("nodes: ")
+    for number, name in enumerate(view.nodes[:9], start=1):
+        style = "reverse" if name == view.node else ""
+        text.append(f" {number} {name} ", style=style)
+    return text
+
+
+class LineLog:
+    """A view in lines: one whenever something new is said."""
+
+    def __init__(self) -> None:
+        self._said: tuple[object, ...] = ()
+
+    def lines(self, view: View, elapsed_s: float) -> list[str]:
+        """What is new since the last call, with the seconds since the start."""
+        verdict, comparison = view.verdict.text, view.comparison.text
+        said = view.node, view.word, view.sentence, verdict, comparison, view.answer
+        if said == self._said:
+            return []
+        self._said = said
+        axes = "  ".join(f"{bar.axis} {100 * bar.share:.0f} %" for bar in view.bars)
+        lines = [
+            f"{elapsed_s:6.1f} s  {view.tone.value} {view.word}: {view.sentence}",
+            f"{'':10}{axes}   verdict: {verdict}   installed: {comparison}",
+        ]
+        if view.answer is not None:
+            lines.append(f"{'':10}{view.answer.name}: {view.answer.text}")
+        return lines

@@ -1,0 +1,93 @@
+"""``watch`` beside the real node, over the real middleware."""
+
+import http.client
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from ros_harness import PATIENCE_S, RELIABLE_INPUTS, drive
+
+QUICK = ("-p solve_period:=0.2", *RELIABLE_INPUTS)
+
+
+class Watch:
+    """``python -m hand_eye_calib watch`` with its lines and notes in files."""
+
+    def __init__(self, domain, directory, *arguments):
+        self.seen, self.notes = directory / "seen.txt", directory / "notes.txt"
+        with self.seen.open("w") as seen, self.notes.open("w") as notes:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "hand_eye_calib", "watch", *arguments],
+                stdout=seen,
+                stderr=notes,
+                env=os.environ | {"ROS_DOMAIN_ID": str(domain)},
+            )
+
+    def wait_for(self, pattern, file=None):
+        """Wait until a file, by default what was seen, has a pattern; returns the match."""
+        end = time.monotonic() + PATIENCE_S
+        while not (match := re.search(pattern, (file or self.seen).read_text())):
+            text = self.seen.read_text() + self.notes.read_text()
+            assert time.monotonic() < end, f"no {pattern!r} in:\n{text}"
+            assert self.process.poll() is None, text
+            time.sleep(0.05)
+        return match
+
+
+@pytest.fixture
+def start_watch(domain, tmp_path):
+    running = []
+
+    def start(*arguments):
+        running.append(Watch(domain, tmp_path, *arguments))
+        return running[-1]
+
+    yield start
+    for watch in running:
+        watch.process.kill()
+        watch.process.wait()
+
+
+def test_a_person_sees_the_session_from_the_first_message_to_done(
+    start_node, start_watch, peer, tmp_path
+):
+    watch = start_watch("--web", "127.0.0.1:0", "--key", "word")
+    watch.wait_for("NO NODE: Nothing heard of a calibrator yet")
+    node = start_node(*QUICK, f"-p output_directory:={tmp_path / 'out'}")
+    watch.wait_for("CHECK INPUT: No message on /parent_odom yet")
+    publishers, poses = peer.publishers(), drive(180, period_ns=300_000_000)
+    peer.feed(publishers, *(part[:120] for part in poses))
+    watch.wait_for("▶ GO ON: ")
+    peer.feed(publishers, *(part[120:] for part in poses))
+    watch.wait_for("✓ DONE: ")
+    watch.wait_for(r"x 100 %  y 100 %  z 100 %  roll 100 %  pitch 100 %  yaw 100 %")
+
+    port = int(watch.wait_for(r"http://127.0.0.1:(\d+)/\?key=word", watch.notes)[1])
+    page = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+    page.request("POST", "/save?key=word")
+    assert page.getresponse().status == 200
+    watch.wait_for("save: result saved to ")
+    assert (tmp_path / "out" / "extrinsic.yaml").exists()
+    events = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+    events.request("GET", "/events?key=word")
+    shown = events.getresponse().readline().decode()
+    assert "pose of camera in lidar" in shown
+    assert "DONE" in shown
+
+    node.stop()
+    watch.wait_for("✗ SILENT: ")
+    watch.process.send_signal(signal.SIGINT)
+    assert watch.process.wait(PATIENCE_S) == 0
+    assert "Traceback" not in watch.notes.read_text()
+
+
+def test_one_of_several_nodes_is_chosen_by_name(start_node, start_watch):
+    for name in ("a", "b"):
+        start_node("-r __ns:=/robot_" + name, *QUICK)
+    watch = start_watch("--node", "/robot_b/calibrator")
+    watch.wait_for("No message on /robot_b/parent_odom yet")
+    assert "robot_a" not in watch.seen.read_text()
