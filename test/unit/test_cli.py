@@ -649,7 +649,7 @@ def test_a_missing_optional_package_breaks_only_its_command(
 ):
     bag = new_bag()
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    assert "needs the Python package 'rosbags', which is not installed" in refused(
+    assert "writing bags needs rosbags, which is not installed" in refused(
         "simulate", "--out", tmp_path / "runs", "--poses", "30", "--bag", "mcap"
     )
     assert run("replay", bag, *TOPICS, "--out", tmp_path / "result")[0] == 0
