@@ -143,7 +143,9 @@ def in_parallel(
 
 @contextmanager
 def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes that are terminated if the block raises."""
+    """Worker processes that are killed if the block raises: one that waits to hand over a result
+    which nobody takes would not see a signal that Python handles.
+    """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     others = set(multiprocessing.active_children())
     os.environ.update(_ONE_THREAD)
@@ -154,7 +156,7 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
         executor.shutdown(wait=False, cancel_futures=True)
         ours = set(multiprocessing.active_children()) - others
         for child in ours:
-            child.terminate()
+            child.kill()
         for child in ours:
             child.join()
         raise
