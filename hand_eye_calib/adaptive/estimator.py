@@ -23,7 +23,6 @@ from hand_eye_calib.adaptive.increments import (
     Streams,
     course_of,
     linearise,
-    motions,
     parameters_of,
 )
 from hand_eye_calib.adaptive.noise_model import CENTRES, SCALE_DRIFT, Extent, NoiseModel
@@ -364,10 +363,17 @@ def _without_outliers(state: _State, quick: bool) -> _State:
         return found
     state = dataclasses.replace(found, heavy=True)
     for _ in range(2):
-        for _ in range(_TAIL_ROUNDS):
-            state = dataclasses.replace(state, weights=student_weights(state.posterior()))
-        state = _fitted(state, walk)
+        state = _fitted(_weighed_tails(state), walk)
     return _outliers_found(state, 2)[0]
+
+
+def _weighed_tails(state: _State) -> _State:
+    """With weights of white errors of Student's t distribution."""
+    space, weights = state.space(), state.weights
+    for _ in range(_TAIL_ROUNDS):
+        weights = student_weights(Posterior(space, state.levels))
+        space = dataclasses.replace(space, weights=np.where(state.outliers.spikes, 0.0, weights))
+    return dataclasses.replace(state, weights=weights)
 
 
 def _outliers_found(state: _State, rounds: int) -> tuple[_State, FloatArray]:
@@ -389,8 +395,8 @@ def _outliers_found(state: _State, rounds: int) -> tuple[_State, FloatArray]:
 
 def _is_noisy(state: _State) -> bool:
     """Whether the rotation between poses is not large beside its noise."""
-    angles = se3.rotation_angle(motions(state.streams.Ts_pw_p)[:, :3, :3])
-    return bool(np.exp(0.5 * state.levels[noise_model.ROTATION]) > _NOISY * np.median(angles))
+    noise = np.exp(0.5 * state.levels[noise_model.ROTATION])
+    return bool(noise > _NOISY * state.streams.typical_turn)
 
 
 def _with_lasting_errors(plain: _State) -> _State:

@@ -17,6 +17,7 @@ steps are lost in noise would seem to shrink.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -76,6 +77,11 @@ class Streams:
 
     def __len__(self) -> int:
         return len(self.stamps_s)
+
+    @cached_property
+    def typical_turn(self) -> float:
+        """Median angle (rad) that the parent turns by from pose to pose."""
+        return float(np.median(se3.rotation_angle(motions(self.Ts_pw_p)[:, :3, :3])))
 
     def __getitem__(self, index: IntArray) -> Streams:
         return Streams(self.stamps_s[index], self.Ts_pw_p[index], self.Ts_cw_c[index])

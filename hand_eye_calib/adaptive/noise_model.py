@@ -137,11 +137,7 @@ class NoiseModel:
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         ahead, behind = self._entries(streams, linearisation, to_child)
         walk = (_TRANSLATIONS, _both_rotations(to_child))
-        white = (
-            _TRANSLATIONS[None],
-            self._white_rotation(streams, to_child),
-            twists[:, :, None] * twists[:, None, :],
-        )
+        white = (_TRANSLATIONS[None], self._white_rotation(streams, to_child))
         jacobian = linearisation.jacobian[:, :, [*range(6), *(6 + column for column in columns)]]
         return StateSpace(
             intervals_s=np.diff(streams.stamps_s),
@@ -152,6 +148,7 @@ class NoiseModel:
             behind=behind,
             white=white,
             walk=walk,
+            twists=twists,
             groups=self._groups(),
             weights=weights,
             cut=cut,

@@ -120,13 +120,13 @@ def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Floa
     """Chi-squares of all increments (n,) and of all poses' white errors (N,)."""
     space = posterior.space
     states, walk = posterior.restricted()
-    walks = posterior.walk * space.relative[:, None, None]
+    walks = space.walk_covariance(posterior.levels) * space.relative[:, None, None]
     known = walk_covariance(posterior) + walk[:, :, 1:] @ walk[:, :, 1:].transpose(0, 2, 1)
     of_walk = _chi_squares(walk[:, :, 0], walks, known, space.cut)
 
     own = states[:, :WHITE]
     weights = np.where(spikes, 1.0, space.weights)
-    whites = posterior.white / weights[:, None, None]
+    whites = space.white_covariance(posterior.levels) / weights[:, None, None]
     known = posterior.selected_inverse[0][:, :WHITE, :WHITE]
     known = known + own[:, :, 1:] @ own[:, :, 1:].transpose(0, 2, 1)
     return of_walk, _chi_squares(own[:, :, 0], whites, known, spikes)
@@ -196,7 +196,7 @@ def student_weights(posterior: Posterior) -> FloatArray:
     ``u = (nu + 6) / (nu + E w' S^-1 w)``; of the expectation, the share that smoothing takes from
     the white errors is spread over the poses in inverse proportion to their weights.
     """
-    states = posterior.restricted()[0][:, :WHITE, 0]
+    states = posterior.states_after(posterior.normal.step)[:, :WHITE]
     pulled = (posterior.white_precision @ states[:, :, None])[:, :, 0]
     squares = (states * pulled).sum(axis=1)
     weights, free = posterior.space.weights, posterior.space.is_free

@@ -141,17 +141,16 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
 
 def _white_gradient(posterior: Posterior, second: FloatArray) -> FloatArray:
     space, precision = posterior.space, posterior.white_precision
-    given = ~space.is_free
     moments = second[:, :WHITE, :WHITE] * space.weights[:, None, None]
-    if len(precision) == 1:
-        excess = given.sum() * precision - precision @ moments.sum(axis=0) @ precision
-    else:
-        excess = (precision - precision @ moments @ precision) * given[:, None, None]
+    excess = precision - precision @ moments @ precision
+    excess[space.is_free] = 0.0
     total = excess.sum(axis=0)
     traces = [
         float((total * basis[0]).sum() if len(basis) == 1 else (excess * basis).sum())
         for basis in space.white
     ]
+    along = (excess @ space.twists[:, :, None])[:, :, 0]
+    traces.append(float((along * space.twists).sum()))
     return 0.5 * np.exp(posterior.levels[: len(traces)]) * traces
 
 
@@ -160,7 +159,7 @@ def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
     moments = walk_covariance(posterior) + walk @ walk.transpose(0, 2, 1)
     total = np.tensordot(posterior.evidence, moments, axes=1)
     excess = (~space.cut).sum() * precision - precision @ total @ precision
-    first = len(space.white)
+    first = space.n_white
     traces = [float((excess * basis).sum()) for basis in space.walk]
     return 0.5 * np.exp(posterior.levels[first : first + len(traces)]) * traces
 
@@ -200,11 +199,12 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     columns = np.empty((len(space), 6, len(variances)))
     pulled = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
     pulled[space.is_free] = 0.0
-    for index, basis in enumerate(space.white):
-        parts = variances[index] * (basis @ pulled[:, :, None])
-        columns[:, :, index] = (parts[1:] - space.behind[:, :, :WHITE] @ parts[:-1])[:, :, 0]
+    along = space.twists * (space.twists * pulled).sum(axis=1, keepdims=True)
+    moved = [*((basis @ pulled[:, :, None])[:, :, 0] for basis in space.white), along]
+    parts = variances[: len(moved)] * np.stack(moved, axis=2)
+    columns[:, :, : len(moved)] = parts[1:] - space.behind[:, :, :WHITE] @ parts[:-1]
     pushed = walk @ posterior.walk_precision
-    for index, basis in enumerate(space.walk, start=len(space.white)):
+    for index, basis in enumerate(space.walk, start=space.n_white):
         columns[:, :, index] = variances[index] * pushed @ basis
     for process in posterior.markov:
         group = process.group

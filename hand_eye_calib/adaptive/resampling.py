@@ -46,8 +46,7 @@ def _up_to(
     ahead = space.ahead[end - 1]
     precision = ahead.T @ (posterior.walk_precision * posterior.evidence[end - 1]) @ ahead
     precision -= before @ before.T
-    white = posterior.white_precision
-    of_pose = space.weights[end] * white[end if len(white) > 1 else 0]
+    of_pose = space.weights[end] * posterior.white_precision[end]
     precision[:WHITE, :WHITE] += FREE * np.eye(WHITE) if space.is_free[end] else of_pose
     for process in posterior.markov:
         states = np.arange(process.group.states.start, process.group.states.stop)

@@ -74,6 +74,8 @@ class StateSpace:
         H1 and H0.
     white, walk : tuples of (1 or N, 6, 6) and (6, 6) arrays
         What log levels scale: the covariances are ``sum exp(level) basis``.
+    twists : (N, 6) array
+        v of one more basis v v' of each pose's white error.
     groups : tuple of Group
     weights : (N,) array
         Factors of the precision of each pose's white error; zero for poses that may be anywhere.
@@ -89,6 +91,7 @@ class StateSpace:
     behind: FloatArray
     white: tuple[FloatArray, ...]
     walk: tuple[FloatArray, ...]
+    twists: FloatArray
     groups: tuple[Group, ...]
     weights: FloatArray
     cut: BoolArray
@@ -106,6 +109,35 @@ class StateSpace:
         """d."""
         return self.ahead.shape[2]
 
+    @property
+    def n_white(self) -> int:
+        """Number of levels of the white errors, the first ones."""
+        return len(self.white) + 1
+
+    def white_covariance(self, levels: FloatArray) -> FloatArray:
+        """Covariances (N, 6, 6) of the white errors at log levels, weights left out."""
+        along = np.exp(levels[len(self.white)]) * self.twists
+        return _combined(levels, self.white) + along[:, :, None] * self.twists[:, None, :]
+
+    def white_precision(self, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Inverses (N, 6, 6) of :meth:`white_covariance`, logarithms (N,) of its determinants.
+
+        With ``S S' = (sum exp(level) basis)^-1``, ``z = S' v`` and the variance j along v the
+        inverse is R'R, ``R = (I - a z z') S'``, ``a = (1 - (1 + j z'z)^-1/2) / z'z``: unlike a
+        difference, never indefinite.
+        """
+        roots, log_determinants = inverse_roots(_combined(levels, self.white))
+        along = roots @ self.twists[:, :, None]
+        squares = (along**2).sum(axis=1, keepdims=True)
+        grown = np.log1p(np.exp(levels[len(self.white)]) * squares)
+        share = -np.expm1(-0.5 * grown) / np.where(squares > 0.0, squares, 1.0)
+        roots = roots - share * along @ (transposed(along) @ roots)
+        return transposed(roots) @ roots, log_determinants + grown[:, 0, 0]
+
+    def walk_covariance(self, levels: FloatArray) -> FloatArray:
+        """Covariance (6, 6) of the walk over a typical increment."""
+        return _combined(levels[self.n_white :], self.walk)
+
     def observed(self, states: FloatArray) -> FloatArray:
         """What states (N, d, k) contribute to the increments, (n, 6, k)."""
         return self.ahead @ states[1:] - self.behind @ states[:-1]
@@ -120,18 +152,17 @@ class StateSpace:
 
 def covariance_times(space: StateSpace, levels: FloatArray, columns: FloatArray) -> FloatArray:
     """V, of all increments, times columns (n, 6, k)."""
-    variances, n_white = np.exp(levels), len(space.white)
     forces = space.gathered(columns)
     states = np.zeros_like(forces)
-    white = _combined(variances[:n_white], space.white) / space.weights[:, None, None]
+    white = space.white_covariance(levels) / space.weights[:, None, None]
     states[:, :WHITE] = white @ forces[:, :WHITE]
     for group in space.groups:
         process = markov(group, levels, space.intervals_s)
         of_group = forces[:, group.states].reshape(len(forces), -1)
         of_group = process.variance * process.covariance_times(of_group)
         states[:, group.states] = of_group.reshape(len(forces), group.size, -1)
-    walk = _combined(variances[n_white : n_white + len(space.walk)], space.walk)
-    return space.observed(states) + space.relative[:, None, None] * (walk @ columns)
+    walk = space.relative[:, None, None] * space.walk_covariance(levels)
+    return space.observed(states) + walk @ columns
 
 
 @dataclass(frozen=True)
@@ -175,7 +206,7 @@ class Posterior:
     ----------
     space : StateSpace
     levels : (m,) array
-        Logarithms: variances of the white and of the walk bases, then variance and time constant
+        Logarithms: variances of the white bases, along v and of the walk bases, then variance and time constant
         (s) of every group.
 
     Raises
@@ -186,12 +217,10 @@ class Posterior:
 
     def __init__(self, space: StateSpace, levels: FloatArray) -> None:
         self.space, self.levels = space, levels
-        variances = np.exp(levels)
-        n_white = len(space.white)
-        self.white = _combined(variances[:n_white], space.white)
-        self.walk = _combined(variances[n_white : n_white + len(space.walk)], space.walk)
-        self.white_precision, self._white_log_determinants = _inverse(self.white)
-        (self.walk_precision,), (self._walk_log_determinant,) = _inverse(self.walk[None])
+        self.white_precision, self._white_log_determinants = space.white_precision(levels)
+        walk = space.walk_covariance(levels)
+        self.walk_precision = np.linalg.inv(walk)
+        self._walk_log_determinant = np.linalg.slogdet(walk)[1]
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
         self._weights = self.evidence[:, None, None] * self.walk_precision
         self.markov = [markov(group, levels, space.intervals_s) for group in space.groups]
@@ -347,14 +376,9 @@ def _mixed(columns: FloatArray, mixing: FloatArray) -> FloatArray:
     return (columns.reshape(n * size, -1) @ mixing).reshape(n, size, -1)
 
 
-def _inverse(covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverses (n, 6, 6), and logarithms (n,) of the determinants, of covariances (n, 6, 6)."""
-    roots, log_determinants = inverse_roots(covariances)
-    return transposed(roots) @ roots, log_determinants
-
-
-def _combined(variances: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
-    total = variances[0] * bases[0]
-    for variance, basis in zip(variances[1:], bases[1:], strict=True):
-        total = total + variance * basis
+def _combined(levels: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
+    """Sum of bases, each times the exponential of its level."""
+    total = np.exp(levels[0]) * bases[0]
+    for level, basis in zip(levels[1:], bases[1:], strict=False):
+        total = total + np.exp(level) * basis
     return total

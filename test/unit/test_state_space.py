@@ -32,7 +32,7 @@ def space_of(seed=1, cut=(4,)):
     ahead[:, :, 6:15], behind[:, :, 6:15] = directions[1:], adjoints @ directions[:-1]
     behind[:, :, 15] = random.standard_normal((n, 6))
     lever = random.standard_normal((3, 6))
-    velocity = random.standard_normal((N_POSES, 6, 1))
+    twists = random.standard_normal((N_POSES, 6))
     bases = np.diag([1.0, 1, 1, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1, 1]) + lever.T @ lever
     ends = [6, 9, 12, 15, 16]
     flags = np.zeros(n, dtype=bool)
@@ -44,8 +44,9 @@ def space_of(seed=1, cut=(4,)):
         jacobian=random.standard_normal((n, 6, N_PARAMETERS)),
         ahead=ahead,
         behind=behind,
-        white=(bases[0][None], bases[1][None], velocity @ velocity.transpose(0, 2, 1)),
+        white=(bases[0][None], bases[1][None]),
         walk=bases,
+        twists=twists,
         groups=tuple(Group(slice(ends[k], ends[k + 1]), 5 + 2 * k, 6 + 2 * k) for k in range(4)),
         weights=random.uniform(0.3, 2.0, N_POSES),
         cut=flags,
@@ -61,6 +62,7 @@ def dense_covariance(space, levels):
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
         bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white]
+        bases.append(np.outer(space.twists[pose], space.twists[pose]))
         white = sum(variance * basis for variance, basis in zip(variances, bases, strict=False))
         prior[pose, :6, pose, :6] = white / space.weights[pose]
     times = np.r_[0.0, np.cumsum(space.intervals_s)]
@@ -72,6 +74,7 @@ def dense_covariance(space, levels):
     for i in range(n):
         entries[i, :, i + 1], entries[i, :, i] = space.ahead[i], -space.behind[i]
     entries = entries.reshape(6 * n, -1)
+    assert len(bases) == space.n_white == 3
     walk = variances[3] * space.walk[0] + variances[4] * space.walk[1]
     return entries @ prior.reshape(N_POSES * d, -1) @ entries.T + np.kron(
         np.diag(space.relative), walk
