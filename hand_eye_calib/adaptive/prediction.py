@@ -29,7 +29,7 @@ from hand_eye_calib.adaptive.increments import (
     turned,
 )
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
-from hand_eye_calib.adaptive.state_space import covariance_times
+from hand_eye_calib.adaptive.state_space import Covariance
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
@@ -68,9 +68,10 @@ class ReferencePredictor:
         plain = linearise(streams, course, X, np.zeros(N_SYSTEMATIC))
         modelled = linearise(streams, course, X, solution.parameters).residuals
         cut = np.zeros(len(streams) - 1, dtype=bool)
-        self._space = solution.model.state_space(
+        space = solution.model.state_space(
             streams, plain, course.twists, X, [], solution.weights, cut
         )
+        self._increments = Covariance(space, solution.levels)
         left_out = solution.left_out[:, None]
         self._systematic = np.where(left_out, 0.0, plain.residuals - modelled)
         self._jumps = np.where(left_out, plain.residuals, 0.0)
@@ -95,9 +96,7 @@ class ReferencePredictor:
         systematic = self._systematic.ravel() @ flat
         jumps = np.add.reduceat((self._jumps[:, None] @ pushes)[:, 0], self._events, axis=0)
         pushed = (
-            flat.T @ covariance_times(self._space, self._solution.levels, pushes).reshape(-1, 6)
-            + np.outer(systematic, systematic)
-            + jumps.T @ jumps
+            self._increments.products(pushes) + np.outer(systematic, systematic) + jumps.T @ jumps
         )
         pull = self._pull(pairs, weights)
         return np.linalg.solve(hessian, np.linalg.solve(hessian, pushed).T) + np.outer(pull, pull)

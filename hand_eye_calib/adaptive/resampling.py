@@ -10,7 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from hand_eye_calib.adaptive.block_tridiagonal import InOrder
-from hand_eye_calib.adaptive.state_space import FREE, WHITE, NormalEquations, Posterior
+from hand_eye_calib.adaptive.state_space import (
+    FREE,
+    WHITE,
+    NormalEquations,
+    Posterior,
+    multiplied,
+)
 from hand_eye_calib.arrays import FloatArray
 
 N_PARTS = 20
@@ -25,11 +31,12 @@ def part_products(posterior: Posterior) -> FloatArray:
     weighed = posterior.of_columns[0]
     whitened = factor.whiten(space.gathered(weighed))
     totals = np.array([_up_to(end, posterior, factor, weighed, whitened) for end in ends])
-    own = np.add.reduceat(np.swapaxes(columns, 1, 2) @ weighed, np.r_[0, ends[:-1]], axis=0)
-    passed = np.add.reduceat(
-        np.swapaxes(whitened[:-1], 1, 2) @ whitened[:-1], np.r_[0, ends[:-1]], axis=0
-    )
-    sums = np.cumsum(own - passed, axis=0) - totals
+    parts = [slice(*part) for part in zip([0, *ends[:-1]], ends, strict=True)]
+    own = [
+        multiplied(columns[part], weighed[part]) - multiplied(whitened[part], whitened[part])
+        for part in parts
+    ]
+    sums = np.cumsum(own, axis=0) - totals
     return np.diff(sums, axis=0, prepend=0.0 * sums[:1])
 
 

@@ -150,19 +150,27 @@ class StateSpace:
         return states
 
 
-def covariance_times(space: StateSpace, levels: FloatArray, columns: FloatArray) -> FloatArray:
-    """V, of all increments, times columns (n, 6, k)."""
-    forces = space.gathered(columns)
-    states = np.zeros_like(forces)
-    white = space.white_covariance(levels) / space.weights[:, None, None]
-    states[:, :WHITE] = white @ forces[:, :WHITE]
-    for group in space.groups:
-        process = markov(group, levels, space.intervals_s)
-        of_group = forces[:, group.states].reshape(len(forces), -1)
-        of_group = process.variance * process.covariance_times(of_group)
-        states[:, group.states] = of_group.reshape(len(forces), group.size, -1)
-    walk = space.relative[:, None, None] * space.walk_covariance(levels)
-    return space.observed(states) + walk @ columns
+class Covariance:
+    """V of all increments of a state space, at log levels."""
+
+    def __init__(self, space: StateSpace, levels: FloatArray) -> None:
+        self._space = space
+        self._white = space.white_covariance(levels) / space.weights[:, None, None]
+        self._walk = space.relative[:, None, None] * space.walk_covariance(levels)
+        self._markov = [markov(group, levels, space.intervals_s) for group in space.groups]
+
+    def products(self, columns: FloatArray) -> FloatArray:
+        """(k, k) array: products of columns (n, 6, k), weighed with V."""
+        forces = self._space.gathered(columns)
+        white = np.ascontiguousarray(forces[:, :WHITE])
+        products = multiplied(columns, self._walk @ columns)
+        products += multiplied(white, self._white @ white)
+        for process in self._markov:
+            of_group = forces[:, process.group.states].reshape(len(forces), -1)
+            moved = process.variance * process.covariance_times(of_group)
+            shape = (len(forces), process.group.size, -1)
+            products += multiplied(of_group.reshape(shape), moved.reshape(shape))
+        return products
 
 
 @dataclass(frozen=True)
@@ -206,8 +214,8 @@ class Posterior:
     ----------
     space : StateSpace
     levels : (m,) array
-        Logarithms: variances of the white bases, along v and of the walk bases, then variance and time constant
-        (s) of every group.
+        Logarithms: variances of the white bases, along v and of the walk bases, then variance and
+        time constant (s) of every group.
 
     Raises
     ------

@@ -140,9 +140,9 @@ def _fine_offset(
         pairs = pairs_over(pose_pairs, lag_s)
         if len(pairs) < _MIN_PAIRS:
             return offset_s, None
-        twists = _twists(shifted, pose_pairs.stamps_ns[np.r_[pairs.i, pairs.j]], span_s)
-        twists_i, twists_j = np.split(twists, 2)
-        fit = fit_similarity(pairs, twists_i, twists_j, start=fit)
+        used, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
+        twists = _twists(shifted, pose_pairs.stamps_ns[used], span_s)[where]
+        fit = fit_similarity(pairs, twists[: len(pairs)], twists[len(pairs) :], start=fit)
         offset_s += fit.offset_s
         if abs(fit.offset_s) < _SETTLED_S:
             break

@@ -17,7 +17,7 @@ from hand_eye_calib.adaptive.increments import (
 )
 from hand_eye_calib.adaptive.noise_model import CENTRES, Extent, NoiseModel
 from hand_eye_calib.adaptive.outliers import chi_square_quantile
-from hand_eye_calib.adaptive.state_space import covariance_times
+from hand_eye_calib.adaptive.state_space import Covariance
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.geometry import se3
@@ -172,7 +172,7 @@ def test_white_errors_have_the_covariance_of_the_model(centre):
     sources = 2 if centre == "sensors" else 1
     variances = [sources * sigma_m**2, sources * sigma_rad**2, 1e-20, 1e-20, 1e-20]
     identity = np.eye(30).reshape(5, 6, 30)
-    expected = covariance_times(space, np.log(variances), identity).reshape(30, 30)
+    expected = Covariance(space, np.log(variances)).products(identity)
     found = np.cov(samples.T)
     scale = np.sqrt(np.diag(expected))
     # A correlation of 4000 samples has a standard error of 0.016; 900 of them stay in 5 sigma.

@@ -8,11 +8,11 @@ from hand_eye_calib.adaptive.block_tridiagonal import Factor, InOrder
 from hand_eye_calib.adaptive.outliers import surprises
 from hand_eye_calib.adaptive.resampling import answers_without, part_products
 from hand_eye_calib.adaptive.state_space import (
+    Covariance,
     Group,
     NormalEquations,
     Posterior,
     StateSpace,
-    covariance_times,
 )
 
 N_POSES, N_STATES, N_PARAMETERS = 15, 16, 7
@@ -134,11 +134,12 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
     np.testing.assert_allclose(information, 0.5 * forced @ P @ forced.T, atol=1e-7)
 
 
-def test_the_covariance_times_columns_is_that_of_the_dense_matrix():
+def test_products_weighed_with_the_covariance_are_those_of_the_dense_matrix():
     space, columns = space_of(), np.random.default_rng(3).standard_normal((N_POSES - 1, 6, 4))
-    expected = dense_covariance(space, LEVELS) @ columns.reshape(-1, 4)
-    product = covariance_times(space, LEVELS, columns)
-    np.testing.assert_allclose(product.reshape(-1, 4), expected, atol=1e-10)
+    flat = columns.reshape(-1, 4)
+    expected = flat.T @ dense_covariance(space, LEVELS) @ flat
+    found = Covariance(space, LEVELS).products(columns)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_surprises_are_what_leaving_one_out_makes_of_it():
