@@ -519,6 +519,11 @@ class NodeConfig(OptionSet):
         choices=("new", "resume", "off"),
         read_only=True,
     )
+    report: bool = option(
+        True,
+        "Also write report.html whenever the result is saved, in a process of its own that goes on "
+        "for some seconds after the end of the node.",
+    )
     publish_tf: bool = option(
         False,
         "Broadcast the result on /tf_static once all of it is observable; leave it off if the "

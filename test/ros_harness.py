@@ -96,6 +96,8 @@ class NodeProcess:
     def __init__(self, domain, log_file, ros_arguments):
         self._log_file = log_file
         command = [sys.executable, "-m", "hand_eye_calib", "calibrator"]
+        if not any("report:=" in str(argument) for argument in ros_arguments):
+            ros_arguments = [*ros_arguments, "-p report:=false"]  # it takes a processor for seconds
         arguments = [word for argument in ros_arguments for word in str(argument).split(" ", 1)]
         source = str(Path(hand_eye_calib.__file__).parents[1])
         environment = {
@@ -105,7 +107,7 @@ class NodeProcess:
         }
         with log_file.open("wb") as log:
             self.process = subprocess.Popen(
-                [*command, *(["--ros-args", *arguments] if arguments else [])],
+                [*command, "--ros-args", *arguments],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=os.environ | environment,
@@ -126,6 +128,13 @@ class NodeProcess:
             )
             time.sleep(0.02)
         return self.log
+
+    def wait_for_text(self, *texts):
+        """Wait until the log has all texts, though the node may have ended."""
+        end = time.monotonic() + PATIENCE_S
+        while not all(text in self.log for text in texts):
+            assert time.monotonic() < end, f"no {texts} in the node's log:\n{self.log}"
+            time.sleep(0.05)
 
     def wait(self):
         """Exit code once the node has ended by itself."""

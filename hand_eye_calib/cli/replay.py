@@ -1,4 +1,4 @@
-"""``replay BAG``: feed the messages of a bag to the engine in the order they were recorded."""
+"""``replay BAG`` and ``replay JOURNAL``: feed what was recorded to the engine in its order."""
 
 import argparse
 import re
@@ -6,11 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import waiting_for
-from hand_eye_calib.cli.options import add_config_arguments, add_output_arguments, config_from
+from hand_eye_calib.cli.options import (
+    add_config_arguments,
+    add_output_arguments,
+    config_from,
+    options_from,
+)
 from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
+    from hand_eye_calib.cli.replaying import Replayed
     from hand_eye_calib.io.transforms import TfSource
 
 EXAMPLES = """\
@@ -18,6 +24,7 @@ examples:
   hand_eye_calib replay my_bag --list
   hand_eye_calib replay my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
   hand_eye_calib replay my_bag --parent-tf odom:lidar --child-topic /vio --out result
+  hand_eye_calib replay live/journal --out result
   hand_eye_calib replay monday_1.mcap monday_2.mcap --time-offset estimate --every 5s"""
 
 _UNITS_S = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0}
@@ -32,7 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         type=Path,
         help="rosbag2 directory, .mcap or .db3 file of one, or rosbag1 .bag file; several are the "
-        "parts of one recording",
+        "parts of one recording. Or the journal of a session of the node: the directory journal, "
+        "or the output directory that holds it",
     )
     _add_stream_arguments(parser)
     parser.add_argument(
@@ -108,15 +116,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hand_eye_calib.cli.findings import with_findings
     from hand_eye_calib.cli.present import deliver
-    from hand_eye_calib.cli.replaying import fingerprints, replay
+    from hand_eye_calib.cli.replaying import fingerprints
 
-    replayed = replay(
-        arguments.bags,
-        arguments.parent_topic or arguments.parent_tf,
-        arguments.child_topic or arguments.child_tf,
-        config_from(arguments),
-        arguments.every,
-    )
+    replayed = _replayed(arguments)
     if arguments.out:
         replayed.inputs["files"] = fingerprints(replayed.files)
     more = {"convergence": replayed.convergence} if arguments.every else {}
@@ -124,6 +126,23 @@ def run(arguments: argparse.Namespace) -> int:
     with waiting_for("checking the streams"):
         calibration, findings = with_findings(replayed.calibration, snapshot)
     return deliver(calibration, arguments, replayed.inputs, snapshot, findings=findings, **more)
+
+
+def _replayed(arguments: argparse.Namespace) -> "Replayed":
+    """What came out of the bags, or of the journal."""
+    from hand_eye_calib.cli.replaying import journal_in, replay, replay_journal
+
+    parent = arguments.parent_topic or arguments.parent_tf
+    child = arguments.child_topic or arguments.child_tf
+    journal = journal_in(arguments.bags)
+    if journal is None:
+        return replay(arguments.bags, parent, child, config_from(arguments), arguments.every)
+    if parent or child or arguments.every:
+        raise ConfigError(
+            f"{journal} is the journal of a session, which has its two streams: no topics, frames "
+            "or --every go with it"
+        )
+    return replay_journal(journal, options_from(arguments))
 
 
 def _check_usage(arguments: argparse.Namespace) -> None:

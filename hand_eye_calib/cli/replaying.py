@@ -1,4 +1,4 @@
-"""Feed the poses of a bag to the engine in the order they were recorded."""
+"""Feed the poses of a bag, or of a session's journal, to the engine in the order they came."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -107,9 +107,53 @@ def replay(
     with output.waiting_for("solving"):
         calibration = calibrator.estimate()
     calibration = dataclasses.replace(calibration, warnings=(*calibration.warnings, *warnings))
-    inputs = {"bag": str(bag), **_inputs(calibrator, sources)}
+    inputs = {"bag": str(bag), **calibrator.inputs(sources)}
     history = convergence.history if convergence else []
     return Replayed(calibration, inputs, files, calibrator, history)
+
+
+def journal_in(paths: Sequence[Path]) -> Path | None:
+    """The directory of the session's journal that is to be replayed; None for bags."""
+    from hand_eye_calib.io.journal import has_session
+
+    if len(paths) != 1:
+        return None
+    found = (path for path in (paths[0], paths[0] / "journal") if has_session(path))
+    return next(found, None)
+
+
+def replay_journal(directory: Path, options: Mapping[str, Any]) -> Replayed:
+    """Calibrate from the journal of a session of the node.
+
+    Parameters
+    ----------
+    directory : pathlib.Path
+    options : mapping
+        Options by their public names; they go before those of the session.
+
+    Returns
+    -------
+    Replayed
+
+    Raises
+    ------
+    HandEyeCalibError
+        If the journal cannot be used, or has too few poses.
+    """
+    from hand_eye_calib.io.journal import read_about
+    from hand_eye_calib.ros.session_journal import resume
+
+    about = read_about(directory)
+    calibrator = Calibrator(CalibratorConfig.from_options({**about.get("options", {}), **options}))
+    with waiting_for(f"reading {directory}"):
+        resume(directory, calibrator)
+    with waiting_for("solving"):
+        calibration = calibrator.estimate()
+    topics = about.get("topics", {})
+    sources = {stream: topics.get(stream, stream) for stream in _STREAMS}
+    inputs = {"journal": str(directory), **calibrator.inputs(sources)}
+    files = sorted(directory.glob("session-*.journal"))
+    return Replayed(calibration, inputs, files, calibrator)
 
 
 def _sources(
@@ -126,15 +170,6 @@ def _sources(
             "--parent-topic and --child-topic"
         )
     return sources
-
-
-def _inputs(calibrator: Calibrator, sources: Mapping[str, Any]) -> dict[str, Any]:
-    """Options and streams in plain values."""
-    streams = {
-        stream: {"topic": str(source), **_counts(calibrator.statistics(stream))}
-        for stream, source in sources.items()
-    }
-    return {"options": calibrator.config.to_options(), **streams}
 
 
 def _read(
@@ -293,13 +328,3 @@ def fingerprints(files: Sequence[Path], quiet: bool = False) -> list[dict[str, A
 def _started(blocks: Iterator[Any]) -> Iterator[Any]:
     """The same blocks, after what a bag has to do before the first of them."""
     return chain(list(islice(blocks, 1)), blocks)
-
-
-def _counts(statistics: Any) -> dict[str, Any]:
-    return {
-        "messages": statistics.received,
-        "refused_duplicate": statistics.refused_duplicate,
-        "refused_late": statistics.refused_late,
-        "first_stamp_ns": statistics.first_stamp_ns,
-        "last_stamp_ns": statistics.last_stamp_ns,
-    }

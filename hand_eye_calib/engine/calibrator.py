@@ -137,6 +137,20 @@ class Calibrator:
         self._buffers, self._kept_parts, self._time_offset = buffers, [kept], time_offset
         self._paired_at = str(state["base"]) or None
 
+    def inputs(self, topics: Mapping[str, object]) -> dict[str, Any]:
+        """Options and streams in plain values: where a result came from.
+
+        Parameters
+        ----------
+        topics : mapping
+            "parent" and "child" to where their poses came from.
+        """
+        streams = {
+            stream: {"topic": str(topic), **self.statistics(stream).to_dict()}
+            for stream, topic in topics.items()
+        }
+        return {"options": self.config.to_options(), **streams}
+
     def statistics(self, stream: str) -> StreamStatistics:
         """StreamStatistics of "parent" or "child"."""
         return self._buffers[stream].statistics

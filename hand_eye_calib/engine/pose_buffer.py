@@ -69,6 +69,16 @@ class StreamStatistics:
     first_stamp_ns: int | None = None
     last_stamp_ns: int | None = None
 
+    def to_dict(self) -> dict[str, int | None]:
+        """What a result says of its inputs."""
+        return {
+            "messages": self.received,
+            "refused_duplicate": self.refused_duplicate,
+            "refused_late": self.refused_late,
+            "first_stamp_ns": self.first_stamp_ns,
+            "last_stamp_ns": self.last_stamp_ns,
+        }
+
 
 @dataclass(frozen=True)
 class RawPoses:

@@ -20,17 +20,22 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.files import read_bytes
+from hand_eye_calib.io.files import read_bytes, write_atomically
 from hand_eye_calib.io.limits import LARGEST_RECORD, LARGEST_SEGMENT, LONGEST_NAME
+from hand_eye_calib.io.yaml_files import read_yaml
 
 _MAGIC = b"hand_eye_calib journal 1\n"
 _HEADER = struct.Struct("<cII")  # kind, payload length, checksum of kind and payload
 _POSE = struct.Struct("<Bq7d")
 _CHECKPOINT, _POSE_KIND, _FRAME = b"C", b"P", b"F"
 _STREAMS = ("parent", "child")
+
+#: Options and topics of the session, beside its segments.
+ABOUT_NAME = "session.yaml"
 
 _SEGMENT_NAME = re.compile(r"session-(\d{1,18})\.journal")
 
@@ -137,6 +142,34 @@ class JournalWriter:
 
     def _add(self, kind: bytes, payload: bytes) -> None:
         self._pending += _record(kind, payload)
+
+
+def write_about(directory: str | Path, about: Mapping[str, Any]) -> None:
+    """Write beside the segments what a person wants to know of the session: plain values.
+
+    Raises
+    ------
+    OSError
+    """
+    text = yaml.safe_dump(dict(about), sort_keys=False, allow_unicode=True)
+    write_atomically({Path(directory) / ABOUT_NAME: text})
+
+
+def read_about(directory: str | Path) -> dict[str, Any]:
+    """What :func:`write_about` wrote; empty if there is nothing.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or is no mapping of names to mappings.
+    """
+    path = Path(directory) / ABOUT_NAME
+    if not path.exists():
+        return {}
+    about = read_yaml(path)
+    if not isinstance(about, dict) or not all(isinstance(each, dict) for each in about.values()):
+        raise InputError(f"{path}: expected a mapping of names to mappings; remove the file")
+    return about
 
 
 def has_session(directory: str | Path) -> bool:

@@ -23,6 +23,7 @@ from hand_eye_calib.ros.inputs import PoseInput, TopicInput, qos_parameter_names
 from hand_eye_calib.ros.live_session import LiveSession, check_below, output_path
 from hand_eye_calib.ros.log import LOG_PERIOD_S, NodeLog
 from hand_eye_calib.ros.parameters import Parameters
+from hand_eye_calib.ros.report_process import ReportProcess, SessionResult
 from hand_eye_calib.ros.results import ResultFiles, ResultTopics
 from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S
 from hand_eye_calib.ros.solve_cycle import ANSWER_PERIOD_S, SolveCycle
@@ -67,7 +68,9 @@ class CalibratorNode(Node):
         self._session.reconfigure(self._options.calibrator)
         self._checks = CheckMonitor()
         self._files = ResultFiles()
+        self._report = ReportProcess()
         self._inputs = self._make_input("parent"), self._make_input("child")
+        self._session.topics = {each.name: each.topic for each in self._inputs}
         self._open_journal()
         self._topics = ResultTopics(self)
         self._tf = TfBroadcaster(self, self._log)
@@ -193,8 +196,16 @@ class CalibratorNode(Node):
             each.restart(because_of)
 
     def _save(self) -> tuple[bool, str]:
-        directory = self._options.node.output_directory
-        return self._files.save(self._cycle.result, directory, self._checks.faults())
+        options, cycle = self._options.node, self._cycle
+        inputs = self._session.inputs()
+        saved, text = self._files.save(
+            cycle.result, options.output_directory, self._checks.faults(), inputs
+        )
+        if saved and options.report and cycle.result is not None and cycle.snapshot is not None:
+            path = output_path(options.output_directory)
+            self._report.write(path, SessionResult(cycle.result, cycle.snapshot, inputs))
+            text += ", report.html follows"
+        return saved, text
 
     def _log_outcome(self, success: bool, text: str) -> None:
         if success:

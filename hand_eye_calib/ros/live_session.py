@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -27,6 +28,8 @@ class LiveSession:
     calibrator : Calibrator
     number : int
         Rises with every new session; a result of another number is out of date.
+    topics : dict of str to str
+        Where the poses of each stream come from, for the journal.
     has_new_poses : bool
         A solve would have something new to go by: poses or options.
     """
@@ -34,6 +37,7 @@ class LiveSession:
     def __init__(self, log: NodeLog) -> None:
         self.calibrator = Calibrator()
         self.number = 0
+        self.topics: dict[str, str] = {}
         self.has_new_poses = False
         self._log = log
         self._journal: SessionJournal | None = None
@@ -68,6 +72,8 @@ class LiveSession:
     def reconfigure(self, config: CalibratorConfig) -> None:
         """Put other options in force; the poses stay, and are to be solved again."""
         self.calibrator.reconfigure(config)
+        if self._journal is not None:
+            self._journal.describe(self._about())
         received = sum(self.calibrator.statistics(stream).received for stream in STREAMS)
         self.has_new_poses = received > 0
 
@@ -117,7 +123,9 @@ class LiveSession:
         if directory is not None:
             self._lock = DirectoryLock(directory.parent)
             resumed = resuming and self._resume(directory)
-            self._journal = SessionJournal(directory, self.calibrator.state(), resumed)
+            self._journal = SessionJournal(
+                directory, self.calibrator.state(), self._about(), resumed
+            )
         return True
 
     def flush_journal(self) -> None:
@@ -152,6 +160,14 @@ class LiveSession:
         self.has_new_poses = poses > 0
         self._log.info(f"session resumed from {directory}: {poses} poses")
         return True
+
+    def inputs(self) -> dict[str, Any]:
+        """Where the poses came from and the options, in plain values."""
+        return self.calibrator.inputs(self.topics)
+
+    def _about(self) -> dict[str, dict[str, Any]]:
+        """Options and topics, for whoever reads the journal."""
+        return {"options": self.calibrator.config.to_options(), "topics": dict(self.topics)}
 
     def _log_notes(self, journal: SessionJournal) -> None:
         for is_warning, text in journal.notes():

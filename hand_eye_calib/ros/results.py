@@ -1,6 +1,8 @@
 """The node's results: on topics, on ``/tf_static``, in files and in one line of the log."""
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
@@ -52,7 +54,11 @@ class ResultFiles:
         self._earlier_kept_in = ""
 
     def save(
-        self, calibration: Calibration | None, directory: str, faults: tuple[str, ...]
+        self,
+        calibration: Calibration | None,
+        directory: str,
+        faults: tuple[str, ...],
+        inputs: Mapping[str, Any],
     ) -> tuple[bool, str]:
         """Write the result files.
 
@@ -63,6 +69,8 @@ class ResultFiles:
             The parameter output_directory.
         faults : tuple of str
             What the stream checks found; they become warnings of the result.
+        inputs : mapping
+            Where the poses came from, in plain values.
 
         Returns
         -------
@@ -80,7 +88,7 @@ class ResultFiles:
                 keep_earlier_results(path)
             self._earlier_kept_in = directory
             warnings = (*calibration.warnings, *faults)
-            save_result(dataclasses.replace(calibration, warnings=warnings), path)
+            save_result(dataclasses.replace(calibration, warnings=warnings), path, inputs)
         except (OSError, HandEyeCalibError) as error:
             return False, f"cannot save to {directory}: {error}"
         return True, f"result saved to {directory}"

@@ -7,7 +7,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from hand_eye_calib.io.journal import (
     has_session,
     keep_aside,
     read_journal,
+    write_about,
 )
 
 # How often what came in is handed to the disk: what a crash can cost.
@@ -106,11 +107,15 @@ class SessionJournal:
     directory : path
     state : dict of str to arrays
         The engine's state to start from.
+    about : mapping
+        Options and topics of the session, in plain values.
     resumed : bool
         The state is that of the session in the directory, which need not be kept aside then.
     """
 
-    def __init__(self, directory: Path, state: State, resumed: bool = False) -> None:
+    def __init__(
+        self, directory: Path, state: State, about: Mapping[str, Any], resumed: bool = False
+    ) -> None:
         self.directory = Path(directory)
         self.error = ""
         self._notes: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
@@ -121,6 +126,7 @@ class SessionJournal:
         self._broken = False  # in the thread: the segment must not be written to any more
         self._is_ours = resumed
         self._writer: JournalWriter | None = None
+        self._about = about
         self._jobs.put((self._open, state))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
@@ -134,6 +140,10 @@ class SessionJournal:
     def set_frame(self, stream: str, sensor_frame: str) -> None:
         """Note the name of a stream's sensor frame."""
         self._events.append((stream, sensor_frame))
+
+    def describe(self, about: Mapping[str, Any]) -> None:
+        """Take other options or topics of the session."""
+        self._jobs.put((self._write_about, about))
 
     def flush(self, make_state: Callable[[], State]) -> None:
         """Hand what was noted to the thread; to be called often.
@@ -210,6 +220,7 @@ class SessionJournal:
         self._is_ours = True
         self._writer = JournalWriter(self.directory, state)
         self._broken = False
+        write_about(self.directory, self._about)
         if self.error:
             self.error = ""
             text = f"the session journal in {self.directory} is being written again"
@@ -245,6 +256,11 @@ class SessionJournal:
             self._writer.add_pose(*event) if len(event) == 4 else self._writer.set_frame(*event)
         self._writer.flush()
         self._is_full = self._writer.is_full
+
+    def _write_about(self, about: Mapping[str, Any]) -> None:
+        self._about = about
+        if not self._broken and self._writer is not None:
+            write_about(self.directory, about)
 
     def _rotate(self, state: State) -> None:
         if not self._broken and self._writer is not None:

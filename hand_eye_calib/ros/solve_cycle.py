@@ -8,6 +8,7 @@ from rclpy.task import Future
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.live_session import LiveSession
 from hand_eye_calib.ros.log import NodeLog
@@ -49,6 +50,8 @@ class SolveCycle:
     result : Calibration or None
         The session's result: the newest usable one or, once the goal is reached, the best. The
         newest was found at ``solved_at_s`` (steady time).
+    snapshot : Snapshot or None
+        The poses and options that gave that result.
     seen : Excitation or None
         How the sensors have moved, as of the last solve.
     failure : Failure or None
@@ -75,12 +78,14 @@ class SolveCycle:
         self._asked: list[Future] = []
         self._asked_in_flight: list[Future] = []
         self._due_answers: deque[tuple[Future, tuple[bool, str]]] = deque()
+        self._submitted: Snapshot | None = None
         self._process = SolvingProcess(wake)
         self.restart()
 
     def restart(self) -> None:
         """Begin a new session: no result yet."""
         self.result: Calibration | None = None
+        self.snapshot: Snapshot | None = None
         self.solved_at_s: float | None = None
         self.seen: Excitation | None = None
         self.failure: Failure | None = None
@@ -148,8 +153,8 @@ class SolveCycle:
         check = self._checks.is_due(now_s)
         if check:
             self._checks.begin(now_s)
-        snapshot = self._session.calibrator.snapshot()
-        self._process.submit(Job(self._session.number, snapshot, check))
+        self._submitted = self._session.calibrator.snapshot()
+        self._process.submit(Job(self._session.number, self._submitted, check))
 
     def _take_check(self, checked: Checked) -> None:
         if checked.session != self._session.number:
@@ -199,6 +204,8 @@ class SolveCycle:
             if not faults:  # which are in the log already
                 self._progress_log.tell(progress)
             self.result, self.solved_at_s = self.goal.best or calibration, time.monotonic()
+            if self.result is calibration:
+                self.snapshot = self._submitted
             self._publish(self.result)
         text = describe(calibration, self.seen)
         self._log.info(text, "result", 1.0)

@@ -84,7 +84,7 @@ def test_nothing_to_resume_and_a_damaged_journal_begin_a_new_session(start_node,
     node = start_node(*QUIET, *into(tmp_path, "resume"))
     node.wait_for_log(f"no session to resume in {tmp_path / 'journal'}: a new one begins")
     assert node.stop()[0] == 0
-    (segment,) = (tmp_path / "journal").iterdir()
+    (segment,) = (tmp_path / "journal").glob("*.journal")
     segment.write_bytes(b"something else")
     node = start_node(*QUIET, *into(tmp_path, "resume"))
     node.wait_for_log(

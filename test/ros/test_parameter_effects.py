@@ -5,9 +5,11 @@ import importlib.util
 
 import numpy as np
 import pytest
+import yaml
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from ros_harness import RELIABLE_INPUTS, NodeProcess, Peer, drive, free_domain, message
 
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import has_session
@@ -131,6 +133,26 @@ def journal_is_used(start_node, peer, tmp_path):
     peer.spin_until(lambda: has_session(tmp_path / "new" / "journal"), "a journal")
 
 
+def report_is_used(start_node, peer, tmp_path):
+    """The report follows after the end of the node; a replay of the journal makes it again."""
+    out = tmp_path / "out"
+    node = start_node(*QUIET, "-p report:=true", f"-p output_directory:={out}", "-p scale:=none")
+    answer, _ = peer.solve(peer.publishers(), *drive())
+    assert answer.success
+    code, _ = node.stop()
+    assert code == 0
+    node.wait_for_text("report.html follows", "wrote", "report.html\n")
+    page = (out / "report.html").read_text()
+    assert "/parent_odom" in page
+    saved = yaml.safe_load((out / "extrinsic.yaml").read_text())
+    assert saved["provenance"]["inputs"]["child"]["topic"] == "/child_odom"
+    assert main(["replay", str(out), "--out", str(tmp_path / "again")]) == 0
+    assert (tmp_path / "again" / "report.html").exists()
+    again = yaml.safe_load((tmp_path / "again" / "extrinsic.yaml").read_text())
+    assert again["T_parent_child"] == saved["T_parent_child"]
+    assert again["provenance"]["inputs"]["child"]["topic"] == "/child_odom"
+
+
 def publish_tf_is_used(start_node, peer, tmp_path):
     start_node(*QUIET)
     if importlib.util.find_spec("tf2_msgs") is None:
@@ -170,6 +192,7 @@ EFFECTS = {
     "solve_period": solve_period_is_used,
     "output_directory": output_directory_is_used,
     "journal": journal_is_used,
+    "report": report_is_used,
     "publish_tf": publish_tf_is_used,
 }
 

@@ -14,7 +14,10 @@ from published_data import data_folder
 
 from hand_eye_calib.cli import batch
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.journal import ABOUT_NAME, JournalWriter, write_about
 from hand_eye_calib.io.results import load_result
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -52,6 +55,46 @@ def matrix(text):
 
 
 # ---- sources
+
+
+def write_session(directory, options):
+    """The journal of a node that has heard both trajectories."""
+    calibrator = Calibrator()
+    writer = JournalWriter(directory, calibrator.state())
+    write_about(directory, {"options": options, "topics": {"parent": "/a", "child": "/b"}})
+    for stream, trajectory in (("parent", PARENT), ("child", CHILD)):
+        writer.set_frame(stream, trajectory.sensor_frame)
+        quats = se3.to_quat_xyzw(trajectory.poses).tolist()
+        positions = trajectory.poses[:, :3, 3].tolist()
+        for message in zip(trajectory.stamps_ns.tolist(), positions, quats, strict=True):
+            writer.add_pose(stream, *message)
+    writer.close()
+
+
+@pytest.mark.parametrize("folder", ["live/journal", "live"])
+def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
+    run, bag, tmp_path, folder
+):
+    write_session(tmp_path / "live" / "journal", {"method": "park", "reference": "B7"})
+    code, out, err = run(tmp_path / folder, "--reference", "B5", "--json")
+    document = json.loads(out)
+    assert (code, err) == (0, "")
+    assert (document["method"], document["reference"]) == ("park", "B5")  # what is typed goes first
+    assert document["inputs"]["child"]["topic"] == "/b"
+    assert document["inputs"]["journal"] == str(tmp_path / "live" / "journal")
+    of_bag = run(bag, *STREAMS, "--method", "park", "--reference", "B5", "--json")[1]
+    assert np.array_equal(matrix(out), matrix(of_bag))
+
+
+def test_what_does_not_go_with_a_journal(run, tmp_path):
+    write_session(tmp_path, {})
+    code, out, err = run(tmp_path, *STREAMS)
+    assert (code, out) == (2, "")
+    assert "is the journal of a session, which has its two streams" in err
+    (tmp_path / ABOUT_NAME).write_text("options: [1]")
+    code, out, err = run(tmp_path)
+    assert (code, out) == (1, "")
+    assert "expected a mapping of names to mappings" in err
 
 
 def test_frames_stand_for_topics(run, bag, tmp_path):

@@ -1,0 +1,59 @@
+"""Starts the process that writes the report of a session, and leaves it to itself."""
+
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.engine.snapshot import Snapshot
+
+_COMMAND = "from hand_eye_calib.cli.session_report import main; main()"
+
+
+@dataclass(frozen=True)
+class SessionResult:
+    """A result of the node, the poses that gave it, and where these came from."""
+
+    calibration: Calibration
+    snapshot: Snapshot
+    inputs: Mapping[str, Any]
+
+
+class ReportProcess:
+    """Writes reports in a process that outlives the node, one at a time: the newest counts."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def write(self, directory: Path, result: SessionResult) -> None:
+        """Start to write ``report.html`` into a directory; takes milliseconds.
+
+        The result is handed over in a file that has no name: nobody else can change it, and no
+        pipe has to be waited for at the end of the node.
+        """
+        self._end_earlier()
+        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+        with tempfile.TemporaryFile() as file:
+            pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
+            file.seek(0)
+            # In a group of its own, which Ctrl-C in the terminal leaves alone.
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _COMMAND, str(directory.resolve())],
+                stdin=file,
+                stdout=subprocess.DEVNULL,
+                env=os.environ | {"PYTHONPATH": path},
+                process_group=0,
+            )
+
+    def _end_earlier(self) -> None:
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.kill()
+            self._process.wait()
