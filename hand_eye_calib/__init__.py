@@ -23,11 +23,13 @@ _HOMES = {
     "Trajectory": "geometry.trajectory",
     "Verdict": "verdict",
     "calibrate": "engine.offline",
+    "compare_methods": "engine.compare_methods",
     "cross_check": "engine.cross_check",
     "load": "io.results",
-    "read_trajectory": "io.trajectory_files",
+    "plot": "report.plot",
+    "read_trajectory": "io.trajectory_files.reading",
     "save": "io.results",
-    "write_trajectory": "io.trajectory_files",
+    "write_trajectory": "io.trajectory_files.writing",
 }
 _ORIGINAL_NAMES = {"load": "load_result", "save": "save_result"}
 
@@ -43,8 +45,10 @@ __all__ = [
     "Trajectory",
     "Verdict",
     "calibrate",
+    "compare_methods",
     "cross_check",
     "load",
+    "plot",
     "read_trajectory",
     "save",
     "write_trajectory",
@@ -55,13 +59,16 @@ if TYPE_CHECKING:
     from hand_eye_calib.calibration import Calibration, Residuals
     from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.engine.calibrator import Calibrator
+    from hand_eye_calib.engine.compare_methods import compare_methods
     from hand_eye_calib.engine.cross_check import cross_check
     from hand_eye_calib.engine.offline import calibrate
     from hand_eye_calib.errors import HandEyeCalibError
     from hand_eye_calib.geometry.trajectory import Trajectory
     from hand_eye_calib.io.results import load_result as load
     from hand_eye_calib.io.results import save_result as save
-    from hand_eye_calib.io.trajectory_files import read_trajectory, write_trajectory
+    from hand_eye_calib.io.trajectory_files.reading import read_trajectory
+    from hand_eye_calib.io.trajectory_files.writing import write_trajectory
+    from hand_eye_calib.report.plot import plot
     from hand_eye_calib.status import SolveStatus
     from hand_eye_calib.verdict import Reason, Verdict
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -18,9 +18,13 @@ from hand_eye_calib.geometry.printed_angles import (
     sigmas_rpy,
     sigmas_translation,
 )
-from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
+from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE, Trajectory
 from hand_eye_calib.status import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.tables import data_frame, html_table
 from hand_eye_calib.verdict import Reason, Verdict, headline, reasons, verdict_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = [
     "Calibration",
@@ -230,6 +234,72 @@ class Calibration:
             f"<Calibration: {self.headline}\n {frames}: {values} (m, rad), "
             f"{self.method} {self.reference}, {self.n_poses} poses>"
         )
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: verdict, a row per axis, frames."""
+        rows = [
+            {
+                "": name,
+                "value": f"{row['value'] * factor:.4f}",
+                "sigma": f"{row['sigma'] * factor:.2g}",
+                "unit": unit,
+                "verdict": row["verdict"],
+            }
+            for name, row in self.rows().items()
+            for factor, unit in [(1.0, "m") if row["unit"] == "m" else (180 / np.pi, "deg")]
+        ]
+        frames = f"pose of {self.child_frame} in {self.parent_frame}"
+        return html_table(f"{self.headline} ({frames})", rows)
+
+    def to_frame(self) -> "pd.DataFrame":
+        """DataFrame with a row for each of x, y, z, roll, pitch, yaw: value, sigma (m, rad) and
+        verdict.
+
+        Raises
+        ------
+        MissingDependencyError
+            Without pandas.
+        """
+        return data_frame([{"axis": name, **row} for name, row in self.rows().items()], "axis")
+
+    def rows(self) -> dict[str, dict[str, Any]]:
+        """By axis the printed number, ``value`` and ``sigma`` in ``unit`` (m, rad), and the
+        ``verdict``.
+        """
+        sigmas = [*self.sigmas[:3].tolist(), *self.sigmas_rpy.tolist()]
+        return {
+            dof.name: {
+                "value": value,
+                "sigma": sigma,
+                "unit": unit,
+                "verdict": dof.verdict.value,
+            }
+            for dof, value, sigma, unit in zip(
+                self.observability, self._printed(), sigmas, 3 * ["m"] + 3 * ["rad"], strict=True
+            )
+        }
+
+    def child_as_parent(self, child: Trajectory) -> Trajectory:
+        """The trajectory that the parent sensor has according to the child's: with the time offset
+        and the scale of this result, each pose moved by ``T_child_parent``.
+
+        It and the parent's own trajectory are of one body, so that tools that compare trajectories
+        (evo: ``evo_ape tum parent.tum moved.tum --align``) see their errors rather than the mount.
+
+        Parameters
+        ----------
+        child : Trajectory
+            Poses of the child sensor in its own world.
+
+        Returns
+        -------
+        Trajectory
+            Poses of the parent sensor in the child's world, at the child's stamps on the parent's
+            clock.
+        """
+        scaled = child.scaled(self.scale).shifted(self.time_offset_s)
+        poses = scaled.poses @ self.T_child_parent
+        return Trajectory(scaled.stamps_ns, poses, self.parent_frame, child.world_frame)
 
     def _printed(self) -> list[float]:
         angles = se3.rotation_to_rpy(self.T_parent_child[:3, :3])

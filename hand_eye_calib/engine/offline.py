@@ -1,7 +1,7 @@
 """Two whole trajectories in, the extrinsic out: the Python function :func:`calibrate`."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig, Prior, prior_fields
@@ -9,6 +9,9 @@ from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
+
+#: Called with the share that is done, 0 to 1, and the step that begins.
+Progress: TypeAlias = Callable[[float, str], None]
 
 
 def calibrate(
@@ -33,6 +36,7 @@ def calibrate(
     target_rotation: float | None = None,
     parent_frame: str | None = None,
     child_frame: str | None = None,
+    progress: Progress | None = None,
 ) -> Calibration:
     """Estimate the pose of the child sensor in the parent sensor's frame from two trajectories.
 
@@ -47,6 +51,8 @@ def calibrate(
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.config.Prior`.
+    progress : callable, optional
+        Called with the share that is done, 0 to 1, and the step that begins.
 
     Raises
     ------
@@ -59,11 +65,22 @@ def calibrate(
     """
     options = dict(locals())
     _require_trajectories(parent, child)
-    for name in ("parent", "child", "prior"):
+    for name in ("parent", "child", "prior", "progress"):
         del options[name]
     options = {name: value for name, value in options.items() if value is not None}
     config = CalibratorConfig(**(_no_limit(parent, child) | options | prior_fields(prior or {})))
-    return whole_snapshot(config, parent, child).estimate()
+    snapshot = whole_snapshot(config, parent, child)
+    if progress is None:
+        return snapshot.estimate()
+    # The snapshot keeps what these steps give.
+    progress(0.0, "time offset")
+    snapshot.resolved()
+    progress(0.2, "pairing")
+    snapshot.pose_pairs()
+    progress(0.3, "solving")
+    result = snapshot.estimate()
+    progress(1.0, "done")
+    return result
 
 
 def _require_trajectories(parent: object, child: object) -> None:

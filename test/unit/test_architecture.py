@@ -27,7 +27,8 @@ ENGINE = {
     "geometry": GROUND,
     "status": set(),
     "verdict": {"status"},
-    "calibration": GROUND | {"geometry", "status", "verdict"},
+    "tables": {"errors"},
+    "calibration": GROUND | {"geometry", "status", "tables", "verdict"},
     "pairing": GROUND | {"geometry"},
 }
 ENGINE["solvers"] = GROUND | {"geometry", "pairing"}
@@ -47,7 +48,8 @@ ALLOWED = ENGINE | {
     "io": GROUND | {"geometry", "calibration", "status", "verdict"},
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
-    "root": GROUND | {"geometry", "calibration", "status", "verdict", "engine", "session", "io"},
+    "root": GROUND
+    | {"geometry", "calibration", "status", "verdict", "engine", "session", "io", "report"},
     "watch": {"errors"},
     "ros": {"io", "watch", *ENGINE},
     "cli": {"io", "report", "simulation", "watch", "ros", *ENGINE},
@@ -76,6 +78,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "pymap3d": "io/trajectory_files/geodetic.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
+    "pandas": ("calibration.py", "engine/compare_methods.py", "tables.py"),
     "jinja2": "report/",
 }
 

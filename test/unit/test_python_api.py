@@ -41,7 +41,7 @@ class TestOptionsOfCalibrate:
         fields = {field.name: field for field in dataclasses.fields(CalibratorConfig)}
         assert set(fields) >= PRIOR_FIELDS
         keywords = self.keywords()
-        assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior"}
+        assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior", "progress"}
         for name, field in fields.items():
             if name not in PRIOR_FIELDS:
                 assert keywords[name].annotation == field.type | None, name
@@ -75,7 +75,7 @@ class TestOptionsOfCalibrate:
             parent_frame="lidar",
             child_frame="camera",
         )
-        assert set(given) | {"prior"} == set(self.keywords())
+        assert set(given) | {"prior", "progress"} == set(self.keywords())
         hec.calibrate(*streams(), **given, prior={"z": (1.85, 0.02)})
         (config,) = seen
         assert {name: getattr(config, name) for name in given} == given
@@ -97,6 +97,17 @@ class TestOptionsOfCalibrate:
     def test_a_typing_error_is_an_error(self):
         with pytest.raises(TypeError, match="unexpected keyword argument 'metod'"):
             hec.calibrate(*streams(), metod="dnlo")
+
+    def test_progress_is_told_and_changes_nothing(self):
+        parent, child = streams()
+        told = []
+        tell = lambda share, step: told.append((share, step))  # noqa: E731
+        result = hec.calibrate(parent, child, reference="B1", progress=tell)
+        assert [step for _, step in told] == ["time offset", "pairing", "solving", "done"]
+        assert sorted(told) == told
+        assert (told[0][0], told[-1][0]) == (0.0, 1.0)
+        again = hec.calibrate(parent, child, reference="B1")
+        np.testing.assert_array_equal(result.T_parent_child, again.T_parent_child)
 
 
 class _Unsolved:

@@ -231,7 +231,7 @@ def test_options_that_do_not_go_with_the_format(file):
         ConfigError, match="unknown unit of stamps 'minutes'; known are s, ms, us, ns"
     ):
         hec.read_trajectory(path, stamp_unit="minutes")
-    with pytest.raises(ConfigError, match="trajectories are written in format tum; got 'kitti'"):
+    with pytest.raises(ConfigError, match="tum, mcap, sqlite3, rosbag1; got .kitti."):
         write_trajectory(path, TRAJECTORY, "kitti")
 
 

@@ -39,6 +39,18 @@ config = hec.CalibratorConfig(method="dnl", max_gap=1.0)
 hec.CalibratorConfig(methd="dnl")  # wrong
 calibrator = hec.Calibrator(config)
 version: str = hec.__version__
+child = hec.read_trajectory(np.zeros((3, 8)), columns="t,x,y,z,qw,qx,qy,qz")
+child = hec.read_trajectory(np.zeros((3, 4, 4)), times=np.arange(3.0))
+child = hec.read_trajectory(np.zeros((3, 4, 4)), time=np.arange(3.0))  # wrong
+child = hec.read_trajectory(5)  # wrong
+hec.calibrate(parent, child, progress=lambda share, step: print(f"{share:.0%} {step}"))
+hec.calibrate(parent, child, progress="done")  # wrong
+hec.compare_methods(parent, child, references=["B5"], progress=None)
+hec.compare_methods(parent, child, reference="B5")  # wrong
+moved: hec.Trajectory = result.child_as_parent(child)
+hec.write_trajectory("moved.tum", moved)
+hec.plot(result).savefig("result.png")
+hec.plot(parent)  # wrong
 part = parent[:10].shifted(0.5).scaled(2.0).at(np.array([5]))
 """
 

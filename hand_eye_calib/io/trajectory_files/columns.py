@@ -86,8 +86,8 @@ class Columns(NamedTuple):
     units: dict[str, str]
 
 
-def choose_columns(path: object, names: Sequence[str]) -> Columns:
-    """Find the columns of stamp, position and orientation.
+def choose_columns(path: object, names: Sequence[str], has_stamps: bool = True) -> Columns:
+    """Find the columns of stamp, unless stamps come from elsewhere, of position and orientation.
 
     Raises
     ------
@@ -96,7 +96,9 @@ def choose_columns(path: object, names: Sequence[str]) -> Columns:
     """
     found = _matches(names)
     # The stamp of the message's header rather than the time of its arrival.
-    stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",)
+    stamp: tuple[str, ...] = ()
+    if has_stamps:
+        stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",)
     orientation = _first_complete((*ORIENTATIONS, *_PLANAR_ORIENTATIONS), found)
     is_planar = orientation in _PLANAR_ORIENTATIONS
     position = _first_complete((*POSITIONS, *(_PLANAR_POSITIONS if is_planar else ())), found)
@@ -117,7 +119,7 @@ def choose_columns(path: object, names: Sequence[str]) -> Columns:
     return Columns(
         stamp=[found[name][0] for name in stamp],
         quantities=quantities,
-        stamp_unit="ns" if len(stamp) > 1 else _stamp_unit(names[found["t"][0]]),
+        stamp_unit=_stamp_unit(names[found["t"][0]]) if stamp == ("t",) else "ns",
         units={name: unit for name, at in quantities.items() if (unit := _unit(names[at]))},
     )
 

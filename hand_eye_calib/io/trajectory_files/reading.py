@@ -4,6 +4,8 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
+from numpy.typing import ArrayLike
+
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
@@ -16,6 +18,7 @@ from hand_eye_calib.io.trajectory_files.formats import (
     read_tum,
 )
 from hand_eye_calib.io.trajectory_files.layout import Layout, layout_of
+from hand_eye_calib.io.trajectory_files.objects import PoseObject, trajectory_from_object
 from hand_eye_calib.io.trajectory_files.poses import poses_of
 from hand_eye_calib.io.trajectory_files.stamps import in_order, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import Line, Table
@@ -48,21 +51,25 @@ class FileReading(NamedTuple):
 
 
 def read_trajectory(
-    path: _Path,
+    source: _Path | PoseObject,
     format: str = _USUAL,
     *,
     topic: str | None = None,
     tf: str | None = None,
     columns: str | None = None,
-    times: _Path | None = None,
+    times: _Path | ArrayLike | None = None,
     stamp_unit: str | None = None,
     repair: bool = False,
 ) -> Trajectory:
-    """Read a trajectory from a text file, or from a bag if ``topic`` or ``tf`` is given.
+    """Read a trajectory from a text file, from a bag if ``topic`` or ``tf`` is given, or from an
+    object of another library.
 
     Parameters
     ----------
-    path : str or path-like
+    source : str, path-like or object
+        A file or a bag; or a PoseTrajectory3D of evo, a pandas DataFrame with the columns of a csv
+        file (or an index of datetimes), a SciPy RigidTransform or an array (N, 4, 4) with
+        ``times``, an array (N, 8) of rows t, x, y, z, qx, qy, qz, qw or (N, 7) without t.
     format : str
         "tum", "kitti", "euroc", "csv", or "auto" for what the file looks like.
     topic : str, optional
@@ -71,10 +78,12 @@ def read_trajectory(
         Of a bag: the two frames, ``world:sensor``, whose transform is the trajectory, from ``/tf``
         and ``/tf_static``.
     columns : str, optional
-        For csv without a header: the columns' names, such as ``"t,x,y,z,qw,qx,qy,qz"`` or
-        ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other names are columns to skip.
-    times : str or path-like, optional
-        For kitti: the file of the stamps.
+        For csv without a header, tables and rows in memory: the columns' names, such as
+        ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other names
+        are columns to skip.
+    times : str, path-like or (N,) array-like, optional
+        For kitti: the file of the stamps. For an object: the stamps, as seconds, whole numbers
+        or datetimes.
     stamp_unit : str, optional
         "s", "ms", "us" or "ns"; if left out, recognised from the stamps' size or taken from the
         header (``timestamp [ns]``).
@@ -100,20 +109,25 @@ def read_trajectory(
         For latitude and longitude without pymap3d.
     """
     if topic or tf:
-        if (format, columns, times, stamp_unit, repair) != (_USUAL, None, None, None, False) or (
-            topic and tf
-        ):
+        of_text = (format != _USUAL, columns, times is not None, stamp_unit, repair)
+        if any(of_text) or (topic and tf) or not isinstance(source, _Path):
             raise ConfigError(
                 "topic and tf are for bags: give one of them and none of the options of text files"
             )
         from hand_eye_calib.io.bags import read_bag_trajectory
 
-        trajectory, notes = read_bag_trajectory(path, topic, tf)
-    else:
+        trajectory, notes = read_bag_trajectory(source, topic, tf)
+    elif isinstance(source, _Path):
+        if not isinstance(times, _Path | None):
+            raise ConfigError("stamps in memory are for poses in memory; of a kitti file name one")
         trajectory, repairs, guesses = read_trajectory_file(
-            path, format, columns, times, stamp_unit, repair
+            source, format, columns, times, stamp_unit, repair
         )
         notes = [*guesses, *repairs]
+    else:
+        if format != _USUAL or isinstance(times, _Path):
+            raise ConfigError("format and a file of times are for text files")
+        trajectory, notes = trajectory_from_object(source, times, columns, stamp_unit, repair)
     for text in notes:
         warnings.warn(text, UserWarning, stacklevel=2)
     return trajectory

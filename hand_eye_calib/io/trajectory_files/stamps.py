@@ -14,7 +14,7 @@ _LARGEST_NS = int(np.iinfo(np.int64).max)
 
 # The largest stamp of a file decides: seconds since 1970 have ten digits, and each smaller unit
 # three more.
-_SMALLEST_OF_UNIT = {
+SMALLEST_OF_UNIT = {
     "ns": Decimal(10) ** 17,
     "us": Decimal(10) ** 14,
     "ms": Decimal(10) ** 11,
@@ -36,7 +36,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     unit = stamp_unit or table.stamp_unit
     largest = max(map(abs, table.stamps))
     recognised = unit or next(
-        unit for unit, smallest in _SMALLEST_OF_UNIT.items() if largest >= smallest
+        unit for unit, smallest in SMALLEST_OF_UNIT.items() if largest >= smallest
     )
     if largest > Decimal(_LARGEST_NS) / STAMP_UNITS[recognised]:
         index = max(range(len(table.stamps)), key=lambda index: abs(table.stamps[index]))

@@ -12,26 +12,35 @@ from hand_eye_calib.io.trajectory_files.formats import TUM_COLUMNS
 from hand_eye_calib.io.trajectory_files.stamps import seconds
 
 
-def write_trajectory(path: str | Path, trajectory: Trajectory, format: str = "tum") -> None:
-    """Write a trajectory to a file, replacing it if it exists. Reading it back gives the same
-    stamps and poses.
+def write_trajectory(
+    path: str | Path, trajectory: Trajectory, format: str = "tum", topic: str = "/odometry"
+) -> None:
+    """Write a trajectory to a text file, replacing it if it exists, or to a new bag. Reading it
+    back gives the same stamps and poses.
 
     Parameters
     ----------
     path : str or path-like
     trajectory : Trajectory
     format : str
-        "tum".
+        "tum", which evo reads, too; or a bag: "mcap", "sqlite3" or "rosbag1".
+    topic : str
+        Of a bag, for messages of type nav_msgs/msg/Odometry.
 
     Raises
     ------
     InputError
-        If the file cannot be written.
+        If the file cannot be written, or a bag exists.
     ConfigError
         For any other format.
     """
     if format != "tum":
-        raise ConfigError(f"trajectories are written in format tum; got {format!r}")
+        from hand_eye_calib.io.bags import STORAGES, write_bag
+
+        if format not in STORAGES:
+            known = ", ".join(("tum", *STORAGES))
+            raise ConfigError(f"trajectories are written in one of {known}; got {format!r}")
+        return write_bag(path, {topic: (trajectory, "nav_msgs/msg/Odometry")}, format)
     try:
         write_atomically({Path(path): _tum_text(trajectory)})
     except OSError as error:

@@ -1,0 +1,40 @@
+"""Tables for notebooks: rows of plain values as a DataFrame or as HTML."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from hand_eye_calib.errors import MissingDependencyError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Row = Mapping[str, Any]
+
+
+def data_frame(rows: Sequence[Row], index: str | None = None) -> "pd.DataFrame":
+    """A DataFrame of rows with equal names, one of which may be the index.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without pandas.
+    """
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise MissingDependencyError(
+            "tables need pandas, which is not installed: pip install 'hand_eye_calib[notebook]'"
+        ) from error
+    frame = pd.DataFrame(list(rows))
+    return frame if index is None else frame.set_index(index)
+
+
+def html_table(title: str, rows: Sequence[Row]) -> str:
+    """Rows of texts with equal names as an HTML table below a title."""
+    heads = "".join(f"<th>{escape(name)}</th>" for name in (rows[0] if rows else {}))
+    lines = "".join(
+        f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row.values())}</tr>"
+        for row in rows
+    )
+    return f"<p><b>{escape(title)}</b></p><table><tr>{heads}</tr>{lines}</table>"

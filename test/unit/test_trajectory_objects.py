@@ -1,0 +1,229 @@
+"""Trajectories from and for other libraries: evo, pandas, NumPy, SciPy, bags."""
+
+from fractions import Fraction
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from scipy.spatial import transform
+
+import hand_eye_calib as hec
+from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.trajectory_files.objects import to_nanoseconds
+
+EPOCH_NS = 1_700_000_000_123_456_789
+POSES = wandering_poses(30)
+TRAJECTORY = hec.Trajectory(EPOCH_NS + 50_000_000 * np.arange(30), POSES)
+QUATS_XYZW = se3.to_quat_xyzw(POSES)
+SECONDS = TRAJECTORY.stamps_ns / 1e9
+# float64 seconds since 1970 have steps of 238 ns.
+STEP_NS = 240
+
+
+def rows(*names):
+    """Columns of the trajectory, by name, in seconds."""
+    columns = dict(zip("xyz", POSES[:, :3, 3].T, strict=True)) | {"t": SECONDS}
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), QUATS_XYZW.T, strict=True))
+    return np.column_stack([columns[name] for name in names])
+
+
+def assert_same(found, tolerance_ns=STEP_NS):
+    assert np.abs(found.stamps_ns - TRAJECTORY.stamps_ns).max() <= tolerance_ns
+    np.testing.assert_allclose(found.poses, TRAJECTORY.poses, atol=1e-12)
+
+
+def of_evo(**more):
+    """What PoseTrajectory3D has."""
+    return SimpleNamespace(
+        positions_xyz=POSES[:, :3, 3], orientations_quat_wxyz=np.roll(QUATS_XYZW, 1, axis=1), **more
+    )
+
+
+class TestReading:
+    def test_a_trajectory_of_evo(self):
+        meta = {"frame_id": "odom", "child_frame_id": "lidar"}
+        found = hec.read_trajectory(of_evo(timestamps=SECONDS, meta=meta))
+        assert_same(found)
+        assert (found.sensor_frame, found.world_frame) == ("lidar", "odom")
+
+    def test_a_path_of_evo_needs_times(self):
+        assert_same(hec.read_trajectory(of_evo(), times=TRAJECTORY.stamps_ns), 0)
+        with pytest.raises(InputError, match="no stamps: give them with `times`"):
+            hec.read_trajectory(of_evo())
+
+    def test_matrices_with_seconds_or_nanoseconds_or_datetimes(self):
+        assert_same(hec.read_trajectory(POSES, times=SECONDS))
+        assert_same(hec.read_trajectory(POSES, times=TRAJECTORY.stamps_ns), 0)
+        dates = TRAJECTORY.stamps_ns.astype("datetime64[ns]")
+        assert_same(hec.read_trajectory(POSES, times=dates), 0)
+        assert_same(hec.read_trajectory(POSES.tolist(), times=SECONDS.tolist()))
+
+    def test_rows_in_the_order_of_tum_or_in_one_that_is_named(self):
+        tum = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+        assert_same(hec.read_trajectory(rows(*tum)))
+        assert_same(hec.read_trajectory(rows(*tum[1:]), times=SECONDS))
+        other = ("qw", "qx", "qy", "qz", "x", "y", "z", "t")
+        assert_same(hec.read_trajectory(rows(*other), columns=",".join(other)))
+        with pytest.raises(InputError, match="quaternion of length"):
+            hec.read_trajectory(rows(*other))
+
+    def test_a_rigid_transform_of_scipy(self):
+        if not hasattr(transform, "RigidTransform"):
+            pytest.skip("SciPy 1.16 has the first RigidTransform")
+        transforms = transform.RigidTransform.from_matrix(POSES)
+        assert_same(hec.read_trajectory(transforms, times=SECONDS))
+
+    def test_a_topic_of_a_bag(self, tmp_path):
+        hec.write_trajectory(tmp_path / "bag", TRAJECTORY, "mcap", topic="/lidar")
+        assert_same(hec.read_trajectory(tmp_path / "bag", topic="/lidar"), 0)
+        with pytest.raises(ConfigError, match="written in one of tum, mcap, sqlite3, rosbag1"):
+            hec.write_trajectory(tmp_path / "file", TRAJECTORY, "csv")
+
+    @pytest.mark.parametrize(
+        ("source", "options", "error", "message"),
+        [
+            (POSES, {}, InputError, "no stamps"),
+            (POSES, {"times": SECONDS[:-1]}, InputError, "one stamp per pose; found 29 stamps"),
+            (5, {"times": SECONDS}, InputError, r"expected a path, .* found an array \(\)"),
+            ({"a": 1}, {}, InputError, "expected a path, .* found dict"),
+            (np.zeros((3, 5)), {}, InputError, r"found an array \(3, 5\)"),
+            (POSES, {"times": SECONDS, "columns": "x"}, ConfigError, "tables and for arrays"),
+            (POSES, {"times": SECONDS, "stamp_unit": "h"}, ConfigError, "unknown unit"),
+            (POSES, {"times": "file.txt"}, ConfigError, "for text files"),
+            (POSES, {"times": SECONDS, "format": "csv"}, ConfigError, "for text files"),
+            (POSES, {"topic": "/a"}, ConfigError, "for bags"),
+            (POSES, {"times": SECONDS * np.nan}, InputError, "finite numbers"),
+            (POSES, {"times": SECONDS * 1e12}, InputError, "too large"),
+            (TRAJECTORY, {"times": SECONDS}, ConfigError, "has stamps and poses already"),
+        ],
+        ids=lambda value: value if isinstance(value, str) else "",
+    )
+    def test_what_cannot_be_read_is_refused_in_words(self, source, options, error, message):
+        with pytest.raises(error, match=message):
+            hec.read_trajectory(source, **options)
+
+    def test_a_trajectory_is_returned_as_it_is(self):
+        assert hec.read_trajectory(TRAJECTORY) is TRAJECTORY
+
+    def test_poses_out_of_order_are_refused_or_repaired(self):
+        order = np.r_[0, 2, 1, 2, 3:30]
+        with pytest.raises(InputError, match="stamps must increase"):
+            hec.read_trajectory(POSES[order], times=SECONDS[order])
+        with pytest.warns(UserWarning, match="sorted by time; 1 repeated"):
+            assert_same(hec.read_trajectory(POSES[order], times=SECONDS[order], repair=True))
+
+
+class TestTables:
+    pd = pytest.importorskip("pandas")
+
+    def frame(self, **more):
+        names = ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
+        values = rows("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+        return self.pd.DataFrame(values, columns=names).assign(**more)
+
+    def test_columns_are_found_by_their_names(self):
+        assert_same(hec.read_trajectory(self.frame(speed=1.0)))
+        nanoseconds = self.frame(timestamp=TRAJECTORY.stamps_ns)
+        assert_same(hec.read_trajectory(nanoseconds), 0)
+
+    def test_columns_of_an_exported_bag(self):
+        seconds, rest = np.divmod(TRAJECTORY.stamps_ns, 1_000_000_000)
+        exported = self.frame().drop(columns="timestamp")
+        exported = exported.assign(**{"header.stamp.sec": seconds, "header.stamp.nanosec": rest})
+        assert_same(hec.read_trajectory(exported), 0)
+
+    def test_an_index_of_times_is_the_stamps(self):
+        for zone in (None, "UTC"):
+            index = self.pd.to_datetime(TRAJECTORY.stamps_ns, utc=zone is not None)
+            frame = self.frame().drop(columns="timestamp").set_index(index)
+            assert_same(hec.read_trajectory(frame), 0)
+
+    def test_times_replace_a_column(self):
+        frame = self.frame(timestamp=np.arange(30.0))
+        assert_same(hec.read_trajectory(frame, times=TRAJECTORY.stamps_ns), 0)
+
+    def test_what_is_missing_is_named(self):
+        with pytest.raises(InputError, match="the table: no column for qw among"):
+            hec.read_trajectory(self.frame().drop(columns="qw"))
+
+    def test_methods_are_compared(self):
+        parent, child = as_trajectory(POSES), as_trajectory(child_of(POSES))
+        told = []
+        table = hec.compare_methods(
+            parent,
+            child,
+            ["dnlo", "park", "adaptive"],
+            ["B1", "B2"],
+            progress=lambda share, step: told.append(step),
+        )
+        assert told == ["dnlo B1", "dnlo B2", "park B1", "park B2", "adaptive", "done"]
+        assert table["solved_by"].tolist() == ["dnlo", "dnlo", "park", "park", "adaptive"]
+        assert table["reference"].tolist() == ["B1", "B2", "B1", "B2", ""]
+        np.testing.assert_allclose(table[["x", "y", "z"]], [T_PARENT_CHILD[:3, 3]] * 5, atol=1e-6)
+        own = hec.calibrate(parent, child, method="park", reference="B2").to_frame()
+        assert table.loc[3, "yaw"] == own.loc["yaw", "value"]
+        assert own.loc["yaw", "unit"] == "rad"
+        with pytest.raises(ConfigError, match="park"):
+            hec.compare_methods(parent, child, ["prak"])
+
+    def test_without_pandas_one_line_says_so(self, monkeypatch):
+        result = hec.calibrate(as_trajectory(POSES), as_trajectory(child_of(POSES)))
+        monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+        with pytest.raises(MissingDependencyError, match=r"pip install 'hand_eye_calib\[notebook"):
+            result.to_frame()
+
+
+class TestStamps:
+    def test_fractions_of_epoch_seconds_keep_all_their_digits(self):
+        exact = Fraction(1_700_000_000.123456) * 10**9
+        assert abs(int(to_nanoseconds([1_700_000_000.123456])[0]) - exact) <= Fraction(1, 2)
+
+    def test_whole_numbers_are_in_the_unit_of_their_size(self):
+        for factor in (1, 10**3, 10**6, 10**9):
+            assert to_nanoseconds([1_700_000_000 * factor]) == [1_700_000_000 * 10**9]
+        assert to_nanoseconds([5], "ms") == [5_000_000]
+
+
+class TestMoving:
+    def test_the_child_becomes_the_parent_up_to_its_world(self, tmp_path):
+        parent = as_trajectory(POSES)
+        late = as_trajectory(child_of(POSES)).scaled(0.5).shifted(-0.25)
+        result = hec.calibrate(parent, late, reference="B1", time_offset=0.25, scale=2.0)
+        moved = result.child_as_parent(late)
+        np.testing.assert_array_equal(moved.stamps_ns, parent.stamps_ns)
+        to_world = parent.poses[0] @ se3.inverse(moved.poses[0])
+        np.testing.assert_allclose(to_world @ moved.poses, parent.poses, atol=1e-6)
+        hec.write_trajectory(tmp_path / "moved.tum", moved)
+        again = hec.read_trajectory(tmp_path / "moved.tum")
+        np.testing.assert_array_equal(again.stamps_ns, moved.stamps_ns)
+        np.testing.assert_allclose(again.poses, moved.poses, atol=1e-12)
+
+
+class TestShowing:
+    def result(self):
+        return hec.calibrate(as_trajectory(POSES), as_trajectory(child_of(POSES)), reference="B1")
+
+    def test_a_figure_shows_every_pair(self):
+        result = self.result()
+        figure = hec.plot(result)
+        (drawn, _) = figure.axes[0].lines
+        assert len(drawn.get_xdata()) == result.n_inliers
+        assert [text.get_text() for text in figure.axes[1].get_yticklabels()] == ["x", "y", "z"]
+        assert figure._repr_png_().startswith(b"\x89PNG")
+
+    def test_a_result_from_a_file_has_no_figure(self):
+        loaded = hec.Calibration.from_dict(self.result().to_dict())
+        with pytest.raises(InputError, match="has no residuals"):
+            hec.plot(loaded)
+
+    def test_a_notebook_shows_a_table(self):
+        shown = self.result()._repr_html_()
+        assert shown.count("<tr>") == 7
+        assert "pose of child_sensor in parent_sensor" in shown
+        assert f"{T_PARENT_CHILD[0, 3]:.4f}" in shown
+
+    def test_representations_are_short(self):
+        assert len(repr(self.result())) < 600
+        assert len(repr(TRAJECTORY)) < 100
