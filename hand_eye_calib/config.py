@@ -337,10 +337,10 @@ class CalibratorConfig(OptionSet):
     """Options of the engine: the same for the node, the replay of bags, files and Python."""
 
     method: str = option(
-        "dnlo",
-        "How the extrinsic is solved; auto: adaptive if its noise model fits, otherwise dnlo; dnlo "
-        "rejects outliers, adaptive estimates the noise and uses no reference, the others use all "
-        "motion pairs.",
+        "auto",
+        "How the extrinsic is solved; auto: adaptive if its noise model fits, otherwise dnlo, and "
+        "dnlo if a reference is given; dnlo rejects outliers, adaptive estimates the noise and "
+        "uses no reference, the others use all motion pairs.",
         choices=tuple(METHODS),
     )
     reference: str = option(

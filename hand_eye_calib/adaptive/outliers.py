@@ -18,8 +18,8 @@ from hand_eye_calib.adaptive.state_space import WHITE, Posterior
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 
-# False alarms expected in a whole recording; and what is given up again as probable enough.
-_FALSE_ALARMS, _PROBABLE = 0.01, 0.01
+# False alarms expected in a whole recording.
+_FALSE_ALARMS = 0.01
 
 # Large steps of a walk are no jumps: these exceed the level of false alarms by this factor.
 _DECISIVE = 2.5
@@ -145,15 +145,13 @@ def judged(
     outliers: Outliers, of_walk: FloatArray, of_white: FloatArray, with_spikes: bool
 ) -> Outliers:
     """Outliers by the chi-squares of increments (n,) and poses (N,): the largest of its
-    neighbourhood is one, and a jump that is probable after all is none.
+    neighbourhood is one, and what a walk makes probable is no jump.
     """
     alarming = chi_square_quantile(_FALSE_ALARMS / len(of_white))
-    probable = chi_square_quantile(_PROBABLE)
+    decisive = of_walk > _DECISIVE * alarming
     beside = np.maximum(of_white[1:], of_white[:-1])
-    found = (
-        (of_walk > _DECISIVE * alarming) & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
-    )
-    jumps = outliers.jumps & (of_walk >= probable)
+    found = decisive & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
+    jumps = outliers.jumps & decisive
     if np.sum(jumps | found) <= _MOST_JUMPS * len(jumps):
         jumps = jumps | found
     spikes = outliers.spikes

@@ -12,11 +12,12 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import Assessment
 from hand_eye_calib.geometry import se3
 
-# Largest share of the increments that may be jumps.
-MAX_JUMPS = 0.1
+# Largest share of the increments that may be jumps: with jumps at a tenth of the poses of both
+# trajectories it is a fifth.
+MAX_JUMPS = 0.25
 
-# Largest weighted squared residual per degree of freedom, and the reciprocal of the smallest: it is
-# 1 if the model holds.
+# Largest weighted squared residual per degree of freedom: it is 1 if the model holds, and less if
+# there is no noise.
 _MAX_MISFIT = 2.0
 
 # Largest distance of both answers, squared, in units of their joint covariance: a chi-squared with
@@ -57,7 +58,7 @@ def why_not(
     jumps = float(np.mean(model.jumps))
     if jumps > MAX_JUMPS:
         return f"{jumps:.0%} of the increments are jumps (at most {MAX_JUMPS:.0%} may be)"
-    if not 1.0 / _MAX_MISFIT < model.misfit < _MAX_MISFIT:
+    if model.misfit > _MAX_MISFIT:
         return f"its residuals have {model.misfit:.2g} times the variance that it predicts"
     joint = of_model.cov_parent_child_in_child + of_dnlo.cov_parent_child_in_child
     apart = squared_distance(difference, joint + floor)

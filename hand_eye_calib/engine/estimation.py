@@ -189,16 +189,20 @@ def fixed_time_offset(config: CalibratorConfig) -> float:
 
 
 def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
-    """The adaptive estimator if its noise model fits, as judged with DNLO's answer, otherwise DNLO.
+    """The adaptive estimator if its noise model fits, as judged with DNLO's answer, otherwise DNLO;
+    and DNLO if a reference is given, which only the paper's methods have.
 
     The adaptive estimator is solved once; DNLO's reference is chosen from the noise that it found.
     """
+    with_dnlo = replace(config, method="dnlo")
+    if config.reference != "auto":
+        dnlo = _solve_pairs(pose_pairs, with_dnlo)
+        return replace(dnlo, method_reason=f"auto: dnlo, for reference {config.reference} is given")
     if len(pose_pairs) < MIN_POSES:
         evaluation = _solve_adaptive(pose_pairs, config)
         reason = f"auto: fewer than {MIN_POSES} poses, too few to compare with dnlo"
         return replace(evaluation, method_reason=reason)
     solution = _adaptive_solution(pose_pairs)
-    with_dnlo = replace(config, method="dnlo")
     dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
     by_model = _evaluated(pose_pairs, solution)
     floor = common_mode_floor(*by_model.spans, solution.T_parent_child)

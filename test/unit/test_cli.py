@@ -244,7 +244,7 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     assert provenance["inputs"]["child"]["topic"] == CHILD_TOPIC
     (file,) = provenance["inputs"]["files"]
     assert file["sha256"] == hashlib.sha256(Path(file["file"]).read_bytes()).hexdigest()
-    assert provenance["parameters"]["method"] == "dnlo"
+    assert provenance["parameters"]["method"] == "auto"
 
 
 def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):

@@ -243,8 +243,8 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
     assert not re.search(r"\binf\b", page.text)
 
 
-def test_outliers_shown_are_those_the_solver_left_out(hilly):
-    snapshot, calibration, _, _ = hilly
+def test_outliers_shown_are_those_the_solver_left_out():
+    snapshot, calibration = simulated(method="dnlo")
     found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs())
     assert found.residuals.is_outlier.sum() == calibration.n_pairs - calibration.n_inliers > 0
     cost = found.residuals.translation_m**2 + 4 * (1 - np.cos(found.residuals.rotation_rad))
@@ -252,8 +252,8 @@ def test_outliers_shown_are_those_the_solver_left_out(hilly):
     assert cost[~found.residuals.is_outlier].max() <= snapshot.config.threshold
 
 
-def test_evidence_ends_at_the_result_and_halves_are_halves(hilly):
-    snapshot, calibration, _, _ = hilly
+def test_evidence_ends_at_the_result_and_halves_are_halves():
+    snapshot, calibration = simulated(method="dnlo")
     pose_pairs = snapshot.pose_pairs()
     found = evidence.gather(calibration, snapshot.config, pose_pairs)
     assert found.convergence[-1].calibration is calibration
