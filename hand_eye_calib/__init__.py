@@ -23,6 +23,7 @@ _HOMES = {
     "Trajectory": "geometry.trajectory",
     "Verdict": "verdict",
     "calibrate": "engine.offline",
+    "compare": "session.compare",
     "compare_methods": "engine.compare_methods",
     "cross_check": "engine.cross_check",
     "load": "io.results",
@@ -45,6 +46,7 @@ __all__ = [
     "Trajectory",
     "Verdict",
     "calibrate",
+    "compare",
     "compare_methods",
     "cross_check",
     "load",
@@ -69,6 +71,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.io.trajectory_files.reading import read_trajectory
     from hand_eye_calib.io.trajectory_files.writing import write_trajectory
     from hand_eye_calib.report.plot import plot
+    from hand_eye_calib.session.compare import compare
     from hand_eye_calib.status import SolveStatus
     from hand_eye_calib.verdict import Reason, Verdict
 

@@ -66,6 +66,7 @@ _PLAIN_LATER = (
     "contradictions",
     "target_translation",
     "target_rotation",
+    "comparison",
 )
 
 # Of other values than numbers.
@@ -73,7 +74,7 @@ _KINDS: dict[str, Any] = (
     dict.fromkeys(("method", "reference", "backend", "parent_frame", "child_frame"), str)
     | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
     | dict.fromkeys(("method_reason", "reference_reason", "proved_global"), str)
-    | dict.fromkeys(("noise", "cross_check"), (dict, type(None)))
+    | dict.fromkeys(("noise", "cross_check", "comparison"), (dict, type(None)))
     | {"contradictions": dict}
 )
 
@@ -183,6 +184,13 @@ class Calibration:
         Axis to the distance, in joint standard deviations, of a prior that contradicts the motion.
     target_translation, target_rotation : float
         Standard deviations (m, rad) that are good enough for the use that is made of the result.
+    comparison : dict or None
+        Comparison with what is installed, in plain values
+        (:meth:`~hand_eye_calib.session.compare.Comparison.to_dict`); None without one.
+    base_frame : str
+        Frame of the robot in which the child's pose is stated as well; empty for none.
+    T_base_parent : (4, 4) array or None
+        Pose of the parent sensor in that frame, as the robot's transforms have it.
     stamp_ns : int
         Stamp of the newest pose used, parent clock.
     parent_frame, child_frame : str
@@ -218,6 +226,9 @@ class Calibration:
     contradictions: dict[str, float] = field(default_factory=dict)
     target_translation: float = CalibratorConfig.target_translation
     target_rotation: float = CalibratorConfig.target_rotation
+    comparison: dict[str, Any] | None = None
+    base_frame: str = ""
+    T_base_parent: FloatArray | None = None
     stamp_ns: int = 0
     parent_frame: str = "parent"
     child_frame: str = "child"
@@ -328,6 +339,20 @@ class Calibration:
         return se3.inverse(self.T_parent_child)
 
     @property
+    def T_base_child(self) -> FloatArray | None:
+        """(4, 4) array: pose of the child sensor in ``base_frame``; None without one."""
+        return None if self.T_base_parent is None else self.T_base_parent @ self.T_parent_child
+
+    @property
+    def mounting(self) -> tuple[str, FloatArray]:
+        """The frame that the child sensor is mounted on in the robot's description, and its pose
+        (4, 4) in it: the base frame if there is one, otherwise the parent sensor's.
+        """
+        if self.T_base_child is not None:
+            return self.base_frame, self.T_base_child
+        return self.parent_frame, self.T_parent_child
+
+    @property
     def sigmas(self) -> FloatArray:
         """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's
         frame; infinite if unobservable.
@@ -416,6 +441,9 @@ class Calibration:
                 for dof in self.observability
             ],
         }
+        if self.T_base_child is not None:
+            document["base_frame"] = self.base_frame
+            document["T_base_child"] = self._base_dict(self.T_base_child)
         if self.T_method is not None:
             document["T_method"] = {
                 "of": "T_parent_child as the method solved it: nothing set, no prior added",
@@ -445,6 +473,13 @@ class Calibration:
             self.sigmas[:3],
             self.covariance,
         )
+
+    def _base_dict(self, T_base_child: FloatArray) -> dict[str, Any]:
+        sigmas_m = sigmas_translation(T_base_child, self.covariance)
+        if self.unobservable():
+            sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
+        frames = self.base_frame, self.child_frame
+        return _transform_dict(T_base_child, *frames, sigmas_m, self.covariance)
 
     def _inverse_dict(self) -> dict[str, Any]:
         covariance = inverse_covariance(self.T_parent_child, self.covariance)
@@ -483,6 +518,8 @@ class Calibration:
             return cls(
                 T_parent_child=_transform(data["T_parent_child"]),
                 T_method=_transform(data["T_method"]) if "T_method" in data else None,
+                base_frame=str(data.get("base_frame", "")),
+                T_base_parent=_base_parent(data) if "T_base_child" in data else None,
                 floor=_matrix(data["floor"], 6) if "floor" in data else None,
                 covariance=_matrix(data["covariance"], 6),
                 status=SolveStatus(data["status"]),
@@ -534,6 +571,8 @@ def _check_values(data: Mapping[str, Any]) -> None:
         if not {*row} >= {"sigma", "of_methods", "of_halves"}:
             raise TypeError("cross_check lacks values")
         _infinite(row.values())
+    if not isinstance((data.get("comparison") or {"sentence": ""}).get("sentence"), str):
+        raise TypeError("comparison has no sentence")
 
 
 def _transform(data: Mapping[str, Any]) -> FloatArray:
@@ -544,6 +583,11 @@ def _transform(data: Mapping[str, Any]) -> FloatArray:
     if not (is_rotation and np.isfinite(matrix).all() and np.linalg.det(rotation) > 0):
         raise ValueError("a matrix is not a transform")
     return matrix
+
+
+def _base_parent(data: Mapping[str, Any]) -> FloatArray:
+    """Pose of the parent sensor in the base frame of a document."""
+    return _transform(data["T_base_child"]) @ se3.inverse(_transform(data["T_parent_child"]))
 
 
 def _matrix(data: Mapping[str, Any], size: int) -> FloatArray:

@@ -312,6 +312,22 @@ def _tf_source(stream: str) -> Any:
     )
 
 
+def parse_pose(name: str, text: str) -> tuple[float, ...]:
+    """The six numbers of ``X Y Z ROLL PITCH YAW``, in m and rad; units may be given, as in
+    ``40cm 0 1.85 0 0 -90deg``.
+
+    Raises
+    ------
+    ConfigError
+        If the text has another form.
+    """
+    words = text.split()
+    if len(words) != len(AXIS_UNITS):
+        raise ConfigError(f"{name} must be X Y Z ROLL PITCH YAW; got {_shown(text)}")
+    values = zip(words, AXIS_UNITS.values(), strict=True)
+    return tuple(_quantity(name, word, unit) for word, unit in values)
+
+
 def _quantity(name: str, text: str, unit: str) -> float:
     match = _QUANTITY.fullmatch(text)
     if not match or (match[2] or unit) not in _IN_SI[unit]:

@@ -1,5 +1,7 @@
 """A calibration with all kinds of values in it."""
 
+import dataclasses
+
 import numpy as np
 
 from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
@@ -35,3 +37,32 @@ def calibration(**changes):
         "warnings": ("z is not observable: 'no'", "second\nline"),
     }
     return Calibration(**(values | changes))
+
+
+SIGMAS = np.r_[np.full(3, 0.002), np.full(3, np.radians(0.02))]
+SHIFTED_FROM = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
+
+
+def shifted(shift=(0,) * 6, hidden="", sigmas=SIGMAS, seed=None, **fields):
+    """A result whose axes along and about the parent's are off by a shift, and by noise."""
+    noise = np.zeros(6) if seed is None else np.random.default_rng(seed).normal(size=6) * sigmas
+    off = np.asarray(shift, dtype=float) + noise
+    T = SHIFTED_FROM.copy()
+    T[:3, :3] = se3.rotation_exp(off[3:]) @ T[:3, :3]
+    T[:3, 3] += off[:3]
+    to_child = np.kron(np.eye(2), T[:3, :3].T)
+    dofs = tuple(
+        DofObservability(
+            axis, DofVerdict.UNOBSERVABLE if axis == hidden else DofVerdict.OBSERVED, float(sigma)
+        )
+        for axis, sigma in zip(NAMES, sigmas, strict=True)
+    )
+    fields = {"status": SolveStatus.OK, "floor": None, "cross_check": None} | fields
+    covariance = to_child @ np.diag(sigmas**2) @ to_child.T
+    return dataclasses.replace(
+        calibration(), T_parent_child=T, covariance=covariance, observability=dofs, **fields
+    )
+
+
+def shift(axis, size):
+    return np.eye(6)[NAMES.index(axis)] * size

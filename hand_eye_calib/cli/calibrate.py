@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.options import add_config_arguments, add_output_arguments, options_from
 from hand_eye_calib.cli.parser import advanced
+from hand_eye_calib.cli.robot import add_robot_arguments
 from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_file_arguments(parser)
     add_config_arguments(parser)
     add_output_arguments(parser)
+    add_robot_arguments(parser)
 
 
 def add_file_arguments(parser: argparse.ArgumentParser) -> None:

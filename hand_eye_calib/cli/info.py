@@ -3,6 +3,8 @@
 import argparse
 
 from hand_eye_calib.cli.options import add_json_argument
+from hand_eye_calib.cli.robot import add_description_arguments, write_description
+from hand_eye_calib.errors import ConfigError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -11,6 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "result", metavar="RESULT", help="extrinsic.yaml, or the directory that holds it"
     )
+    add_description_arguments(parser)
     add_json_argument(parser)
 
 
@@ -20,5 +23,8 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.io.results import load_result
 
     calibration = load_result(arguments.result)
+    if arguments.write and not arguments.urdf:
+        raise ConfigError("--write needs --urdf: the description to change")
     print(as_json(calibration) if arguments.json else as_text(calibration))
+    write_description(calibration, arguments)
     return 0

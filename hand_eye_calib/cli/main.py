@@ -26,6 +26,7 @@ COMMANDS = {
     "check": "check two pose streams before any solve",
     "calibrator": "run the ROS 2 node",
     "watch": "show the live node on the terminal, or in a browser",
+    "compare": "compare results with what is installed, or with each other",
     "info": "show a saved result",
     "simulate": "simulate trajectories or a bag with known truth",
     "demo": "simulate a recording and calibrate from it, offline and live",

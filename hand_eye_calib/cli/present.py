@@ -11,6 +11,7 @@ from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.cli.reporting import with_cross_check, write_report
+from hand_eye_calib.cli.robot import with_robot, write_description
 from hand_eye_calib.cli.spelling import as_typed
 from hand_eye_calib.errors import printable
 from hand_eye_calib.report.words import given_or_estimated, listing, with_sigma
@@ -67,6 +68,7 @@ def deliver(
         What else the JSON document holds.
     """
     evidence = None
+    calibration = with_robot(calibration, arguments)
     if arguments.out:
         from hand_eye_calib.io.results import keep_earlier_results, save_result
 
@@ -76,6 +78,7 @@ def deliver(
         keep_earlier_results(arguments.out)
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
     print(as_json(calibration, inputs=inputs, **more) if arguments.json else as_text(calibration))
+    write_description(calibration, arguments)
     if evidence is not None and snapshot is not None:
         findings = more.get("findings", ())
         write_report(arguments.out, calibration, evidence, snapshot.config, inputs, findings)
@@ -105,6 +108,7 @@ def as_text(calibration: Calibration) -> str:
         f"Along and about the axes of {parent}: {_observability(calibration)}",
         *_floor_lines(calibration),
         *_scatter_lines(calibration.cross_check),
+        *_comparison_lines(calibration),
         *_solution_lines(calibration),
         *_publishing_lines(calibration),
     ]
@@ -194,6 +198,19 @@ _PROOF = {
     "yes": ", proved to be the global minimum over them",
     "no": ", not proved to be the global minimum over them",
 }
+
+
+def _comparison_lines(calibration: Calibration) -> Iterator[str]:
+    """The comparison with what is installed, and the pose in the base frame."""
+    if calibration.comparison:
+        yield (
+            f"Compared with what is installed ({calibration.comparison.get('installed', '')}): "
+            f"{calibration.comparison['sentence']}"
+        )
+    if calibration.T_base_child is not None:
+        base = printable(calibration.base_frame)
+        yield f"Pose of {printable(calibration.child_frame)} (child) in {base}:"
+        yield from _transform_lines(calibration.to_dict()["T_base_child"])
 
 
 def _solution_lines(calibration: Calibration) -> Iterator[str]:

@@ -13,6 +13,7 @@ from hand_eye_calib.cli.options import (
     options_from,
 )
 from hand_eye_calib.cli.parser import advanced
+from hand_eye_calib.cli.robot import add_robot_arguments
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_batch_arguments(parser)
     add_config_arguments(parser)
     add_output_arguments(parser)
+    add_robot_arguments(parser)
 
 
 def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:

@@ -154,14 +154,11 @@ def load_result(path: str | Path) -> Calibration:
 
 def _xacro_text(calibration: Calibration) -> str:
     """A fixed joint from the parent's to the child's link, for a robot description with both."""
-    transform = calibration.to_dict()["T_parent_child"]
-    parent, child = (
-        _xacro_attribute(frame) for frame in (calibration.parent_frame, calibration.child_frame)
-    )
-    joint = _xacro_attribute(f"{calibration.parent_frame}_to_{calibration.child_frame}")
-    xyz, rpy = (
-        " ".join(map(repr, values)) for values in (transform["translation"], _rpy_rad(calibration))
-    )
+    mounted_on, T = calibration.mounting
+    parent, child = (_xacro_attribute(frame) for frame in (mounted_on, calibration.child_frame))
+    joint = _xacro_attribute(f"{mounted_on}_to_{calibration.child_frame}")
+    angles = se3.rotation_to_rpy(T[:3, :3])  # about the fixed axes x, y, z, as in URDF
+    xyz, rpy = (" ".join(map(repr, values.tolist())) for values in (T[:3, 3], angles))
     comment = "\n".join(f"     {line}" for line in _remarks(calibration))
     comment = re.sub("-(?=-)", "- ", comment)  # no comment may hold two hyphens
     return f"""\
@@ -180,15 +177,15 @@ def _xacro_text(calibration: Calibration) -> str:
 
 def _launch_text(calibration: Calibration) -> str:
     """A launch file that publishes the extrinsic as a static transform."""
-    transform = calibration.to_dict()["T_parent_child"]
+    mounted_on, T = calibration.mounting
     values = zip(
         ("x", "y", "z", "qx", "qy", "qz", "qw"),
-        transform["translation"] + transform["quat_xyzw"],
+        [*T[:3, 3].tolist(), *se3.to_quat_xyzw(T).tolist()],
         strict=True,
     )
     arguments = [(f"--{name}", f"{round(value, 12) + 0.0:.12f}") for name, value in values]
     arguments += [
-        ("--frame-id", printable(calibration.parent_frame)),
+        ("--frame-id", printable(mounted_on)),
         ("--child-frame-id", printable(calibration.child_frame)),
     ]
     lines = "\n".join(f"                    {option!r}, {value!r}," for option, value in arguments)
@@ -218,7 +215,7 @@ def generate_launch_description():
 
 def _remarks(calibration: Calibration) -> list[str]:
     """What a person who opens the file must know, in lines."""
-    parent, child = calibration.parent_frame, calibration.child_frame
+    parent, child = calibration.mounting[0], calibration.child_frame
     remarks = [
         f"Pose of {child} in {parent}: maps coordinates of {child} into {parent}.",
         f"Made by hand_eye_calib {package_version()}; {FILE_NAME} beside this file has the "
@@ -229,12 +226,6 @@ def _remarks(calibration: Calibration) -> list[str]:
         what = calibration.status.failure or f"the motion does not reveal {names}"
         remarks.append(f"DO NOT USE AS IT IS: {what}.")
     return [printable(" ".join(remark.split())) for remark in remarks]
-
-
-def _rpy_rad(calibration: Calibration) -> list[float]:
-    """Rotation about the parent's fixed axes x, y, z, as in URDF."""
-    angles: list[float] = se3.rotation_to_rpy(calibration.T_parent_child[:3, :3]).tolist()
-    return angles
 
 
 def _xacro_attribute(text: str) -> str:

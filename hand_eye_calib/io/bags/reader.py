@@ -12,6 +12,7 @@ from hand_eye_calib.arrays import BoolArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.frames import Frames
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.blocks import (
     Message,
@@ -382,6 +383,30 @@ class PoseBag:
         for transform, is_static, _ in self._transforms():
             tree.note(transform, is_static)
         return tree
+
+    def static_frames(self) -> Frames:
+        """The frames of the bag and their static transforms; of repeated ones the last.
+
+        Raises
+        ------
+        InputError
+            If the transforms form no tree or are damaged.
+        """
+        tree = TransformTree()
+        poses = {}
+        for transform, is_static, _ in self._transforms():
+            tree.note(transform, is_static)
+            if is_static:
+                poses[transform.sensor_frame or ""] = se3.from_quat_xyzw(
+                    transform.position, transform.quat_xyzw
+                )
+        fixed = {
+            frame: (edge.parent, poses[frame])
+            for frame, edge in tree.edges.items()
+            if edge.is_static
+        }
+        moving = {frame: edge.parent for frame, edge in tree.edges.items() if not edge.is_static}
+        return Frames(fixed, moving)
 
     def _transforms(
         self, frames: Container[str] | None = None

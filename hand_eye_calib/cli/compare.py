@@ -1,0 +1,98 @@
+"""``compare RESULT...``: has the mount moved, or which recording shows that it has?"""
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hand_eye_calib.cli.options import add_json_argument
+from hand_eye_calib.errors import InputError, printable
+
+if TYPE_CHECKING:
+    from hand_eye_calib.calibration import Calibration
+    from hand_eye_calib.session.compare import Comparison, Difference
+
+EXIT_SAME, EXIT_CANNOT_TELL, EXIT_MOVED = 0, 3, 4
+
+_EPILOG = """\
+examples:
+  hand_eye_calib compare result --with robot.urdf
+  hand_eye_calib compare result --with "0.40 0 1.85 0 0 -90deg"
+  hand_eye_calib compare monday/ tuesday/ wednesday/     which one has moved?
+
+exit codes: 0 same, 3 cannot tell, 4 moved; 1 bad input, 2 wrong usage"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = _EPILOG
+    parser.add_argument(
+        "results",
+        metavar="RESULT",
+        nargs="+",
+        help="extrinsic.yaml, or the directory that holds it; without --with two or more",
+    )
+    parser.add_argument(
+        "--with",
+        dest="installed",
+        metavar="SOURCE",
+        help="what is installed: a URDF, an earlier extrinsic.yaml, a bag with /tf_static, or "
+        '"X Y Z ROLL PITCH YAW" in m and rad',
+    )
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare; returns the exit code."""
+    from hand_eye_calib.io.results import load_result
+    from hand_eye_calib.session.compare import Change, compare
+
+    results = [load_result(path) for path in arguments.results]
+    for path, result in zip(arguments.results, results, strict=True):
+        if result.status.failure:
+            raise InputError(f"{path}: {result.status.failure}; there is nothing to compare")
+    installed = None
+    if arguments.installed:
+        from hand_eye_calib.io.installed import read_installed
+
+        frames = results[0].parent_frame, results[0].child_frame
+        installed = read_installed(arguments.installed, *frames)
+    found = compare(results, installed, _names(arguments.results))
+    if arguments.json:
+        print(json.dumps(found.to_dict(), indent=2, allow_nan=False))
+    else:
+        print("\n".join(printable(line) for line in _lines(found, results[0])))
+    codes = {Change.SAME: EXIT_SAME, Change.MOVED: EXIT_MOVED}
+    return codes.get(found.verdict, EXIT_CANNOT_TELL)
+
+
+def _names(paths: list[str]) -> list[str]:
+    """The shortest ends of the paths that tell them apart."""
+    parts = [Path(path).parts for path in paths]
+    for length in range(1, max(map(len, parts)) + 1):
+        names = [str(Path(*part[-length:])) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    raise InputError(f"expected different results; got {', '.join(paths)}")
+
+
+def _lines(found: "Comparison", result: "Calibration") -> Iterator[str]:
+    yield f"Mount of {result.child_frame} on {result.parent_frame}: {found.sentence}"
+    for each in found.differences:
+        sentence = "" if len(found.differences) == 1 else each.sentence
+        yield f"{each.second} minus {each.first}: {sentence}".rstrip(": ")
+        yield from _table(each)
+
+
+def _table(difference: "Difference") -> Iterator[str]:
+    """A row per axis."""
+    yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
+    for axis, row in difference.to_dict()["axes"].items():
+        is_angle = axis in ("roll", "pitch", "yaw")
+        factor, unit = (float(np.degrees(1.0)), "deg") if is_angle else (100.0, "cm")
+        numbers = (row["difference"], row["sigma"], row["visible"])
+        cells = ["unknown" if value is None else f"{factor * value:.2f}" for value in numbers]
+        yield f"  {axis:<6}{cells[0]:>12}{cells[1]:>10}{cells[2]:>12} {unit:<4}{row['verdict']}"

@@ -1,0 +1,121 @@
+"""What a robot has installed: compared with a result, and changed in its description."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.cli.console import note
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.status import listing
+
+if TYPE_CHECKING:
+    from hand_eye_calib.geometry.extrinsic import Extrinsic
+    from hand_eye_calib.geometry.frames import Frames
+
+
+def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options about what is installed on the robot."""
+    group = parser.add_argument_group("what is installed")
+    group.add_argument(
+        "--installed",
+        metavar="SOURCE",
+        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a bag with "
+        '/tf_static, or "X Y Z ROLL PITCH YAW" in m and rad. Default: --urdf, if it is given',
+    )
+    group.add_argument(
+        "--base-frame",
+        metavar="FRAME",
+        help="state the child's pose in this frame too, as --urdf or the bag's /tf_static has it",
+    )
+    add_description_arguments(group)
+
+
+def add_description_arguments(parser: argparse._ActionsContainer) -> None:
+    """Add ``--urdf`` and ``--write``."""
+    parser.add_argument(
+        "--urdf", metavar="FILE", type=Path, help="robot description with both sensors' frames"
+    )
+    parser.add_argument(
+        "--write",
+        metavar="FILE",
+        type=Path,
+        help="write the description of --urdf with the result in it: one joint's origin changes, "
+        "nothing else",
+    )
+
+
+def with_robot(calibration: Calibration, arguments: argparse.Namespace) -> Calibration:
+    """The result with its comparison and its pose in the base frame, if they were asked for.
+
+    Raises
+    ------
+    HandEyeCalibError
+        If what is installed cannot be read.
+    """
+    if arguments.write and not arguments.urdf:
+        raise ConfigError("--write needs --urdf: the description to change")
+    if calibration.status.failure:
+        return calibration
+    if (installed := _installed(calibration, arguments)) is not None:
+        from hand_eye_calib.session.compare import with_comparison
+
+        calibration = with_comparison(calibration, installed)
+    if not arguments.base_frame:
+        return calibration
+    T_base_parent = _frames(arguments).pose(arguments.base_frame, calibration.parent_frame)
+    return dataclasses.replace(
+        calibration, base_frame=arguments.base_frame, T_base_parent=T_base_parent
+    )
+
+
+def write_description(calibration: Calibration, arguments: argparse.Namespace) -> None:
+    """Write the changed robot description, if it was asked for.
+
+    Raises
+    ------
+    InputError
+        If an axis is not known, or the description is not understood.
+    """
+    if not arguments.write:
+        return
+    from hand_eye_calib.io.files import write_atomically
+    from hand_eye_calib.io.urdf import RobotDescription
+
+    if calibration.status is not SolveStatus.OK:
+        unknown = listing(calibration.unobservable()) or "the whole result"
+        raise InputError(
+            f"{arguments.write} is not written: {unknown} not known; measure by hand and give "
+            "--prior"
+        )
+    description = RobotDescription(arguments.urdf)
+    frames = calibration.parent_frame, calibration.child_frame
+    patched = description.patched(*frames, calibration.T_parent_child)
+    try:
+        write_atomically({arguments.write: patched})
+    except OSError as error:
+        raise InputError(f"cannot write {arguments.write}: {error.strerror}") from None
+    note(f"wrote {arguments.write}: joint {description.joint_name(*frames)} changed")
+
+
+def _installed(calibration: Calibration, arguments: argparse.Namespace) -> "Extrinsic | None":
+    from hand_eye_calib.io.installed import of_frames, read_installed
+
+    frames = calibration.parent_frame, calibration.child_frame
+    if arguments.installed:
+        return read_installed(arguments.installed, *frames)
+    if arguments.urdf:
+        return of_frames(_frames(arguments), *frames, str(arguments.urdf))
+    return None
+
+
+def _frames(arguments: argparse.Namespace) -> "Frames":
+    from hand_eye_calib.io.installed import frames_of_bag
+    from hand_eye_calib.io.urdf import RobotDescription
+
+    if arguments.urdf:
+        return RobotDescription(arguments.urdf).frames
+    if bags := getattr(arguments, "bags", None):
+        return frames_of_bag(bags[0])
+    raise ConfigError("--base-frame needs --urdf: the description that has the frame")

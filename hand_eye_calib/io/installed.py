@@ -1,0 +1,93 @@
+"""What is installed now: from a robot description, an earlier result, a bag, or numbers."""
+
+from pathlib import Path
+
+from hand_eye_calib.config import parse_pose
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.geometry.frames import Frames
+from hand_eye_calib.io.results import FILE_NAME, load_result
+from hand_eye_calib.io.urdf import RobotDescription
+
+_RESULTS, _DESCRIPTIONS = (".yaml", ".yml"), (".urdf", ".xml", ".xacro")
+
+
+def read_installed(text: str, parent_frame: str, child_frame: str) -> Extrinsic:
+    """The installed pose of the child sensor in the parent sensor's frame.
+
+    Parameters
+    ----------
+    text : str
+        A robot description (``.urdf``), a result (``extrinsic.yaml``, or its directory), a bag
+        with ``/tf_static``, or ``X Y Z ROLL PITCH YAW`` in m and rad.
+    parent_frame, child_frame : str
+        The sensors' frames.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or does not have these frames.
+    ConfigError
+        If it is neither a file nor six numbers.
+    """
+    path = Path(text)
+    try:
+        exists = path.exists()
+    except (OSError, ValueError):
+        exists = False
+    if not exists:
+        return _numbers(text)
+    if path.suffix in _RESULTS or (path / FILE_NAME).exists():
+        return _result(path, parent_frame, child_frame)
+    is_description = path.suffix in _DESCRIPTIONS
+    frames = RobotDescription(path).frames if is_description else frames_of_bag(path)
+    return of_frames(frames, parent_frame, child_frame, str(path))
+
+
+def of_frames(frames: Frames, parent_frame: str, child_frame: str, origin: str) -> Extrinsic:
+    """The installed pose that a tree of frames has.
+
+    Raises
+    ------
+    InputError
+        If the frames are not there, or move against each other.
+    """
+    try:
+        return Extrinsic(frames.pose(parent_frame, child_frame), origin)
+    except InputError as error:
+        raise InputError(f"{origin}: {error}") from None
+
+
+def frames_of_bag(path: str | Path) -> Frames:
+    """The frames of a bag's ``/tf_static``."""
+    from hand_eye_calib.io.bags import PoseBag
+
+    with PoseBag(path) as bag:
+        return bag.static_frames()
+
+
+def _numbers(text: str) -> Extrinsic:
+    try:
+        values = parse_pose("installed", text)
+    except ConfigError:
+        raise ConfigError(
+            "what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or "
+            f"X Y Z ROLL PITCH YAW in m and rad; got {text!r}"
+        ) from None
+    rotation = se3.rotation_from_rpy(values[3:])
+    return Extrinsic(se3.from_rotation_translation(rotation, values[:3]), text)
+
+
+def _result(path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
+    result = load_result(path)
+    found, wanted = (result.parent_frame, result.child_frame), (parent_frame, child_frame)
+    T, covariance = result.T_parent_child, result.covariance
+    if found == wanted[::-1]:
+        adjoint = se3.adjoint(T)
+        T, covariance = result.T_child_parent, adjoint @ covariance @ adjoint.T
+    elif found != wanted:
+        raise InputError(
+            f"{path}: is about {found[1]} in {found[0]}; expected {child_frame} in {parent_frame}"
+        )
+    return Extrinsic(T, str(path), covariance, is_calibration=True)

@@ -1,0 +1,380 @@
+"""Has the mount moved? A result against what is installed, or the results of several recordings.
+
+Stated standard deviations of whole recordings are honest, those of short ones somewhat small; the
+comparison takes them 1.4 times as large (docs/session.md has the measurements). A change is called
+one if an axis differs by more than chance makes of six axes once in 200 comparisons, or all axes
+together by what chance makes of them once in 1,000. An axis is called the same only if a change
+that matters would have been seen.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.assessment.metrics import deviation
+from hand_eye_calib.calibration import Calibration, DofVerdict
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.status import amount, listing
+
+# Factor on stated variances.
+_CAUTION = 2.0
+
+# Probabilities with which chance makes a change of an axis, and of all axes together.
+_CHANCE_OF_AXES, _CHANCE_OF_ALL = 0.005, 0.001
+_SIGMAS = float(norm.isf(_CHANCE_OF_AXES / 2 / len(AXES)))
+_CHI2 = float(chi2.isf(_CHANCE_OF_ALL, len(AXES)))
+
+# With this probability a change of the stated size is seen.
+_POWER = 0.9
+_SEEN_SIGMAS = _SIGMAS + float(norm.isf(1.0 - _POWER))
+
+# An axis is the same if changes of so many targets would have been seen.
+_TARGETS = 5.0
+
+# Variances that stand for "nothing known" (m^2, rad^2).
+_UNKNOWN = np.diag(np.r_[np.full(3, 100.0), np.full(3, 10.0)])
+
+
+class Change(str, Enum):
+    """What a comparison says."""
+
+    SAME = "same"
+    MOVED = "moved"
+    CANNOT_TELL = "cannot tell"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """How an extrinsic differs from another.
+
+    Attributes
+    ----------
+    first, second : str
+        What is compared; the difference is second minus first.
+    values : (6,) array
+        Differences along (m) and about (rad) the axes of the parent sensor's frame.
+    sigmas : (6,) array
+        Their standard deviations; infinite if one of both does not know the axis.
+    visible : (6,) array
+        Changes of this size would have been seen nine times out of ten.
+    verdicts : tuple of Change
+        Per axis.
+    verdict : Change
+    chi2 : float
+        Squared distance in units of the covariance; 6 on average if nothing has moved.
+    """
+
+    first: str
+    second: str
+    values: FloatArray
+    sigmas: FloatArray
+    visible: FloatArray
+    verdicts: tuple[Change, ...]
+    verdict: Change
+    chi2: float
+
+    def axes(self, change: Change) -> list[str]:
+        """Names of the axes with this verdict."""
+        return [axis for axis, found in zip(AXES, self.verdicts, strict=True) if found is change]
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one line, with what it rests on."""
+        if self.verdict is Change.MOVED:
+            return f"moved: {self._moved()}"
+        same, unknown = self.axes(Change.SAME), self.axes(Change.CANNOT_TELL)
+        if not unknown:
+            return f"same: {self._power(same)}"
+        told = f"cannot tell about {listing(unknown)}"
+        return f"{told}; {listing(same)} the same: {self._power(same)}" if same else told
+
+    def _moved(self) -> str:
+        moved = self.axes(Change.MOVED)
+        if not moved:
+            ratios = np.abs(self.values) / self.sigmas
+            moved = [AXES[axis] for axis in np.argsort(-ratios)[:2]]
+        told = []
+        for axis in moved:
+            index = AXES.index(axis)
+            sigma = amount(axis, float(self.sigmas[index]))
+            told.append(f"{axis} by {amount(axis, float(self.values[index]))} +/- {sigma}")
+        return listing(told)
+
+    def _power(self, axes: Sequence[str]) -> str:
+        told = []
+        for names in (AXES[:3], AXES[3:]):
+            known = [axis for axis in names if axis in axes]
+            if known:
+                worst = max(known, key=lambda axis: float(self.visible[AXES.index(axis)]))
+                told.append(amount(worst, float(self.visible[AXES.index(worst)])))
+        return f"a change of {' or '.join(told)} would have been seen"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values."""
+        columns = zip(AXES, self.values, self.sigmas, self.visible, self.verdicts, strict=True)
+        return {
+            "first": self.first,
+            "second": self.second,
+            "verdict": self.verdict.value,
+            "sentence": self.sentence,
+            "chi2": self.chi2,
+            "axes": {
+                axis: {
+                    "difference": float(value),
+                    "sigma": _finite(sigma),
+                    "visible": _finite(visible),
+                    "verdict": verdict.value,
+                }
+                for axis, value, sigma, visible, verdict in columns
+            },
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """The differences of results from what is installed, or of each from each.
+
+    Attributes
+    ----------
+    differences : tuple of Difference
+    moved : tuple of str
+        Results after whose removal the others agree; those that differ from what is installed.
+    verdict : Change
+    sentence : str
+    """
+
+    differences: tuple[Difference, ...]
+    moved: tuple[str, ...]
+    verdict: Change
+    sentence: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values."""
+        return {
+            "verdict": self.verdict.value,
+            "sentence": self.sentence,
+            "moved": list(self.moved),
+            "differences": [each.to_dict() for each in self.differences],
+        }
+
+
+def compare(
+    results: Sequence[Calibration | Extrinsic],
+    installed: Calibration | Extrinsic | None = None,
+    names: Sequence[str] | None = None,
+    targets: tuple[float, float] | None = None,
+) -> Comparison:
+    """Compare results with what is installed, or with each other.
+
+    Parameters
+    ----------
+    results : sequence of Calibration
+    installed : Calibration or Extrinsic, optional
+        What the robot uses now. Without it the results of several recordings of one rig are
+        compared: which one has moved?
+    names : sequence of str, optional
+        What to call the results; numbered by default.
+    targets : (float, float), optional
+        Accuracy that matters along (m) and about (rad) each axis; by default that of the results.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        If there is nothing to compare, or the results are of different frames.
+    """
+    called = list(names) if names else [f"result {i}" for i in range(1, len(results) + 1)]
+    if len(called) != len(results) or len(set(called)) != len(called):
+        raise InputError(f"expected {len(results)} different names, found {len(called)}")
+    _require_same_frames([*results, *([installed] if installed is not None else [])])
+    limits = _limits(results, targets)
+    stated = [_stated(result, name) for result, name in zip(results, called, strict=True)]
+    if installed is not None:
+        if not stated:
+            raise InputError("expected at least one result, found none")
+        return _with_installed(stated, _stated(installed, "installed"), limits)
+    if len(stated) < 2:
+        raise InputError("expected two results or more, or one and what is installed")
+    return _among_each_other(stated, limits)
+
+
+def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
+    """The result with its comparison with what is installed."""
+    document = compare([result], installed, ["result"]).to_dict()
+    origin = installed.origin if isinstance(installed, Extrinsic) else "a result"
+    stated = installed if isinstance(installed, Extrinsic) else _stated(installed, "").extrinsic
+    values = dict(zip(AXES, stated.values.tolist(), strict=True))
+    return replace(result, comparison={"installed": origin, "values": values} | document)
+
+
+@dataclass(frozen=True)
+class _Stated:
+    """An extrinsic, its covariance along and about the parent's axes, and its floor there."""
+
+    name: str
+    extrinsic: Extrinsic
+    covariance: FloatArray
+    floor: FloatArray
+
+
+def _stated(given: Calibration | Extrinsic, name: str) -> _Stated:
+    if isinstance(given, Extrinsic):
+        is_known = bool(np.isfinite(given.covariance).all())
+        covariance = given.covariance_in_parent if is_known else _UNKNOWN
+        return _Stated(name, given, covariance, np.zeros((6, 6)))
+    X = given.T_parent_child
+    found = Extrinsic(X, name, given.covariance, is_calibration=True)
+    to_parent = np.kron(np.eye(2), X[:3, :3])
+    floor = np.zeros((6, 6)) if given.floor is None else to_parent @ given.floor @ to_parent.T
+    hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability]
+    unknown = np.diag(np.where(hidden, np.diag(_UNKNOWN), 0.0))
+    is_known = bool(np.isfinite(given.covariance).all())
+    covariance = found.covariance_in_parent if is_known else _UNKNOWN
+    return _Stated(name, found, covariance + unknown, floor)
+
+
+def _require_same_frames(results: Sequence[Calibration | Extrinsic]) -> None:
+    frames = {
+        (result.parent_frame, result.child_frame)
+        for result in results
+        if isinstance(result, Calibration)
+    }
+    if len(frames) > 1:
+        told = listing([f"{child} in {parent}" for parent, child in sorted(frames)])
+        raise InputError(f"expected results of one pair of frames; found {told}")
+
+
+def _limits(
+    results: Sequence[Calibration | Extrinsic], targets: tuple[float, float] | None
+) -> FloatArray:
+    """Changes (6,) that have to be seen before an axis is called the same."""
+    if targets is None:
+        stated = [
+            (result.target_translation, result.target_rotation)
+            for result in results
+            if isinstance(result, Calibration)
+        ]
+        targets = stated[0] if stated else CalibratorConfig().targets
+    return _TARGETS * np.repeat(targets, 3)
+
+
+def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Difference:
+    values = deviation(second.extrinsic.T_parent_child, first.extrinsic.T_parent_child)
+    covariance = _CAUTION * (first.covariance + second.covariance)
+    if not (first.extrinsic.is_calibration and second.extrinsic.is_calibration):
+        # What is the same in all recordings is in one of both only.
+        covariance = covariance + first.floor + second.floor
+    covariance = covariance + 1e-18 * np.eye(6)
+    sigmas = np.sqrt(np.diag(covariance))
+    visible = _SEEN_SIGMAS * sigmas
+    distance = float(values @ np.linalg.solve(covariance, values))
+    verdicts = tuple(
+        _axis_verdict(abs(value) / sigma, seen <= limit)
+        for value, sigma, seen, limit in zip(values, sigmas, visible, limits, strict=True)
+    )
+    if Change.MOVED in verdicts or distance > _CHI2:
+        verdict = Change.MOVED
+    else:
+        verdict = Change.CANNOT_TELL if Change.CANNOT_TELL in verdicts else Change.SAME
+    unknown = sigmas > 0.1 * np.sqrt(np.diag(_UNKNOWN))
+    return Difference(
+        first=first.name,
+        second=second.name,
+        values=values,
+        sigmas=np.where(unknown, np.inf, sigmas),
+        visible=np.where(unknown, np.inf, visible),
+        verdicts=verdicts,
+        verdict=verdict,
+        chi2=distance,
+    )
+
+
+def _axis_verdict(ratio: float, would_be_seen: bool) -> Change:
+    if ratio > _SIGMAS:
+        return Change.MOVED
+    return Change.SAME if would_be_seen else Change.CANNOT_TELL
+
+
+def _with_installed(
+    stated: Sequence[_Stated], installed: _Stated, limits: FloatArray
+) -> Comparison:
+    differences = tuple(_difference(installed, each, limits) for each in stated)
+    moved = tuple(each.second for each in differences if each.verdict is Change.MOVED)
+    if len(differences) == 1:
+        sentence = differences[0].sentence
+    elif moved:
+        sentence = f"moved: {listing(moved)} of {len(stated)}"
+    else:
+        sentence = f"{_overall(differences).value}: none of {len(stated)} differs"
+    return Comparison(
+        differences=differences, moved=moved, verdict=_overall(differences), sentence=sentence
+    )
+
+
+def _overall(differences: Sequence[Difference]) -> Change:
+    verdicts = [each.verdict for each in differences]
+    for graver in (Change.MOVED, Change.CANNOT_TELL):
+        if graver in verdicts:
+            return graver
+    return Change.SAME
+
+
+def _among_each_other(stated: Sequence[_Stated], limits: FloatArray) -> Comparison:
+    """Each with each; and whose removal lets the others agree."""
+    differences = tuple(
+        _difference(first, second, limits) for first, second in itertools.combinations(stated, 2)
+    )
+    verdict = _overall(differences)
+    moved = _who_moved(stated, differences) if verdict is Change.MOVED else ()
+    if verdict is not Change.MOVED:
+        sentence = f"{verdict.value}: none of {len(stated)} differs from another"
+    elif not moved:
+        pairs = [f"{d.first} and {d.second}" for d in differences if d.verdict is Change.MOVED]
+        sentence = f"moved: {listing(pairs)} differ; which of them has moved, they do not tell"
+    elif len(moved) == 1:
+        sentence = f"moved: {moved[0]} differs, the others agree"
+    else:
+        sentence = f"moved between {_before(stated, moved)} and {moved[0]}: {listing(moved)}"
+    return Comparison(differences=differences, moved=moved, verdict=verdict, sentence=sentence)
+
+
+def _before(stated: Sequence[_Stated], moved: Sequence[str]) -> str:
+    names = [each.name for each in stated]
+    return names[names.index(moved[0]) - 1]
+
+
+def _who_moved(stated: Sequence[_Stated], differences: Sequence[Difference]) -> tuple[str, ...]:
+    """The one without which the others agree; or those from some recording on, if those before
+    agree and those from there on agree. Empty if neither, or more than one, is possible.
+    """
+    apart = {(d.first, d.second) for d in differences if d.verdict is Change.MOVED}
+
+    def agree(names: Sequence[str]) -> bool:
+        return not any(first in names and second in names for first, second in apart)
+
+    names = [each.name for each in stated]
+    if len(names) < 3:
+        return ()
+    singles = [name for name in names if agree([other for other in names if other != name])]
+    if len(singles) == 1:
+        return tuple(singles)
+    splits = [k for k in range(2, len(names) - 1) if agree(names[:k]) and agree(names[k:])]
+    return tuple(names[splits[0] :]) if not singles and len(splits) == 1 else ()
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

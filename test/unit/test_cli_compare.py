@@ -1,0 +1,128 @@
+"""``compare`` and the options about what is installed, as a person types them."""
+
+import json
+
+import numpy as np
+import pytest
+from result_making import SHIFTED_FROM as X
+from result_making import shift
+from result_making import shifted as result
+
+import hand_eye_calib as hec
+from hand_eye_calib.calibration import SolveStatus
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.geometry import se3
+
+NUMBERS = " ".join(f"{value:.6f}" for value in (*X[:3, 3], *se3.rotation_to_rpy(X[:3, :3])))
+
+
+def urdf_of(T):
+    xyz, rpy = (
+        " ".join(map(repr, values.tolist()))
+        for values in (T[:3, 3], se3.rotation_to_rpy(T[:3, :3]))
+    )
+    return f"""<robot name="r"><link name="base"/>
+<joint name="a" type="fixed"><parent link="base"/><child link="lidar"/><origin xyz="1 0 2"/></joint>
+<joint name="b" type="fixed"><parent link="lidar"/><child link="camera"/><origin
+xyz="{xyz}" rpy="{rpy}"/></joint></robot>"""
+
+
+@pytest.fixture
+def saved(tmp_path, monkeypatch, capsys):
+    """Folders with results: two that agree, one that has moved; and a description."""
+    monkeypatch.chdir(tmp_path)
+    frames = {"parent_frame": "lidar", "child_frame": "camera"}
+    hec.save(result(seed=1, **frames), "first")
+    hec.save(result(seed=2, **frames), "second")
+    hec.save(result(shift("y", 0.05), seed=3, **frames), "third")
+    flat = {"hidden": "z", "status": SolveStatus.UNOBSERVABLE}
+    hec.save(result(seed=4, **flat, **frames), "flat")
+    (tmp_path / "robot.urdf").write_text(urdf_of(X))
+    return tmp_path
+
+
+def run(capsys, *words):
+    code = main([str(word) for word in words])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["first", "--with", NUMBERS], 0, "Mount of camera on lidar: same: a change of "),
+        (["third", "--with", "robot.urdf"], 4, "moved: y by "),
+        (["flat", "--with", "first"], 3, "cannot tell about z; x, y, roll, pitch and yaw the same"),
+        (["first", "second"], 0, "same: none of 2 differs"),
+        (["first", "second", "third"], 4, "moved: third differs, the others agree"),
+        (["first", "third", "--with", "second"], 4, "moved: third of 2"),
+    ],
+)
+def test_the_exit_code_is_the_verdict(saved, capsys, words, code, text):
+    found, out, err = run(capsys, "compare", *words)
+    assert (found, err) == (code, "")
+    assert text in out
+
+
+def test_json_has_it_all(saved, capsys):
+    code, out, _ = run(capsys, "compare", "third", "--with", "robot.urdf", "--json")
+    document = json.loads(out)
+    assert (code, document["verdict"], document["moved"]) == (4, "moved", ["third"])
+    (difference,) = document["differences"]
+    assert difference["axes"]["y"]["difference"] == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["first"], 1, "two results or more"),
+        (["first", "first"], 1, "expected different results"),
+        (["first", "--with", "absent.urdf"], 2, "file that exists"),
+        (["absent", "first"], 1, "cannot read absent"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_line(saved, capsys, words, code, text):
+    found, out, err = run(capsys, "compare", *words)
+    assert (found, out, err.count("\n")) == (code, "", 1)
+    assert text in err
+
+
+def test_info_writes_the_result_into_the_description(saved, capsys):
+    words = ("info", "third", "--urdf", "robot.urdf", "--write", "patched.urdf")
+    code, _, err = run(capsys, *words)
+    assert (code, err) == (0, "hand_eye_calib: note: wrote patched.urdf: joint b changed\n")
+    assert run(capsys, "compare", "third", "--with", "patched.urdf")[0] == 0
+    before, after = (saved / name for name in ("robot.urdf", "patched.urdf"))
+    changed = zip(before.read_text().splitlines(), after.read_text().splitlines(), strict=True)
+    assert [old.startswith("xyz=") for old, new in changed if old != new] == [True]
+
+
+def test_an_axis_that_is_not_known_is_not_written(saved, capsys):
+    words = ("info", "flat", "--urdf", "robot.urdf", "--write", "patched.urdf")
+    code, _, err = run(capsys, *words)
+    assert (code, (saved / "patched.urdf").exists()) == (1, False)
+    assert "z not known" in err
+    assert run(capsys, "info", "first", "--write", "p.urdf")[0] == 2
+
+
+def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, capsys):
+    assert main(["simulate", "--out", "drive"]) == 0
+    drive = saved / "drive" / "run_01"
+    truth = np.loadtxt(drive / "T_S2_S1.txt")
+    T = se3.from_quat_xyzw(truth[1:4], truth[4:])
+    (saved / "true.urdf").write_text(urdf_of(T))
+    capsys.readouterr()
+    code, out, _ = run(
+        capsys, "calibrate", drive / "T_S1_W1.txt", drive / "T_S2_W2.txt", "--urdf", "true.urdf",
+        "--parent-frame", "lidar", "--child-frame", "camera", "--base-frame", "base", "--json",
+    )  # fmt: skip
+    document = json.loads(out)
+    assert code == 0
+    assert document["comparison"]["verdict"] == "same"
+    in_base = se3.from_rotation_translation(np.eye(3), [1.0, 0.0, 2.0]) @ T
+    np.testing.assert_allclose(document["T_base_child"]["matrix"], in_base, atol=1e-6)
+    saved_result = hec.Calibration.from_dict(document)
+    hec.save(saved_result, "in_base")
+    np.testing.assert_allclose(hec.load("in_base").T_base_child, in_base, atol=1e-6)
+    assert '<parent link="base"/>' in (saved / "in_base" / "extrinsic.urdf.xacro").read_text()
+    assert "--frame-id base --child-frame-id camera" in run(capsys, "info", "in_base")[1]

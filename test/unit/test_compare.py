@@ -1,0 +1,117 @@
+"""Results against what is installed, and recordings against each other."""
+
+import json
+
+import numpy as np
+import pytest
+from result_making import SHIFTED_FROM as X
+from result_making import shift
+from result_making import shifted as result
+
+import hand_eye_calib as hec
+from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.assessment.metrics import deviation
+from hand_eye_calib.calibration import SolveStatus
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.session.compare import Change, compare, with_comparison
+
+
+def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told():
+    found = compare([result(seed=1), result(seed=2), result(seed=3)])
+    assert (found.verdict, found.moved) == (Change.SAME, ())
+    one = found.differences[0]
+    assert one.sentence == "same: a change of 1.8 cm or 0.18 deg would have been seen"
+    np.testing.assert_allclose(
+        one.values, deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child)
+    )
+
+
+def test_chance_makes_a_change_less_than_once_in_a_hundred():
+    moved = [
+        compare([result(seed=2 * i), result(seed=2 * i + 1)]).verdict is Change.MOVED
+        for i in range(150)
+    ]
+    assert sum(moved) <= 2
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_a_change_of_the_size_that_is_said_to_be_seen_is_seen(axis):
+    seen = compare([result(), result()]).differences[0].visible[AXES.index(axis)]
+    found = [
+        compare([result(seed=i), result(shift(axis, seen), seed=100 + i)]).differences[0]
+        for i in range(20)
+    ]
+    named = [axis in each.axes(Change.MOVED) for each in found]
+    assert np.mean(named) >= 0.9  # sigmas are taken larger than stated
+
+
+def test_an_unknown_axis_is_neither_the_same_nor_moved():
+    flat = result(shift("z", 0.5), hidden="z", status=SolveStatus.UNOBSERVABLE)
+    found = compare([flat], Extrinsic(X, "drawing")).differences[0]
+    assert found.verdict is Change.CANNOT_TELL
+    assert found.axes(Change.CANNOT_TELL) == ["z"]
+    assert np.isinf(found.sigmas[2])
+    assert found.sentence.startswith("cannot tell about z; x, y, roll, pitch and yaw the same: ")
+
+
+def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recording():
+    floor = np.diag(np.r_[np.zeros(3), np.full(3, np.radians(0.15) ** 2)])
+    first, second = result(floor=floor), result(shift("yaw", np.radians(0.3)), floor=floor)
+    assert compare([second], Extrinsic(X, "drawing")).verdict is Change.SAME
+    assert compare([first, second]).verdict is Change.MOVED
+    known = Extrinsic(X, "earlier result", first.covariance, is_calibration=True)
+    assert compare([second], known).differences[0].axes(Change.MOVED) == ["yaw"]
+
+
+class TestWhichOneMoved:
+    def names(self, *shifts):
+        found = compare(
+            [result(each, seed=i) for i, each in enumerate(shifts)],
+            names=[f"drive {i}" for i in range(1, len(shifts) + 1)],
+        )
+        return found.moved, found.sentence
+
+    NOT, MOVED = np.zeros(6), shift("pitch", np.radians(0.6))
+
+    def test_the_one_without_which_the_others_agree(self):
+        moved, sentence = self.names(self.NOT, self.MOVED, self.NOT)
+        assert moved == ("drive 2",)
+        assert sentence == "moved: drive 2 differs, the others agree"
+
+    def test_all_from_one_on(self):
+        moved, sentence = self.names(self.NOT, self.NOT, self.MOVED, self.MOVED)
+        assert moved == ("drive 3", "drive 4")
+        assert sentence == "moved between drive 2 and drive 3: drive 3 and drive 4"
+
+    def test_of_two_nobody_can_tell(self):
+        moved, sentence = self.names(self.NOT, self.MOVED)
+        assert moved == ()
+        assert sentence.endswith(
+            "drive 1 and drive 2 differ; which of them has moved, they do not tell"
+        )
+
+
+def test_files_and_python_speak_of_the_same(tmp_path):
+    changed = with_comparison(result(shift("x", 0.1), seed=1), Extrinsic(X, "drawing"))
+    hec.save(changed, tmp_path)
+    again = hec.load(tmp_path)
+    assert again.comparison == changed.comparison
+    assert again.comparison["verdict"] == "moved"
+    assert again.comparison["installed"] == "drawing"
+    assert hec.compare([again], Extrinsic(X, "drawing")).to_dict()["moved"] == ["result 1"]
+    json.dumps(again.comparison, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("results", "fields", "text"),
+    [
+        ([], {}, "two results or more"),
+        ([result()], {}, "two results or more"),
+        ([result(), result()], {"names": ["a", "a"]}, "2 different names"),
+        ([result(), result(parent_frame="imu")], {}, "results of one pair of frames; found "),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(results, fields, text):
+    with pytest.raises(InputError, match=text):
+        compare(results, **fields)

@@ -1,0 +1,111 @@
+"""Robot descriptions: what is fixed to what, and one joint's origin changed."""
+
+import numpy as np
+import pytest
+
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.frames import Frames
+from hand_eye_calib.io.installed import read_installed
+from hand_eye_calib.io.urdf import RobotDescription
+
+URDF = """<?xml version="1.0" encoding="utf-8"?>
+<!-- origin xyz="9 9 9": a decoy; the mast's <joint> is bent -->
+<robot name='r'>
+\t<link name="base_link"><visual><origin xyz="7 7 7" rpy="0 0 0"/></visual></link>
+  <link name="lidar"/><link name="camera"/><link name="optical"/><link name="arm"/>
+  <joint name="to_lidar" type="fixed">
+    <parent link="base_link"/> <child link="lidar"/>
+    <origin rpy="0 0 0"
+            xyz='1.0   0 2.0' />   <!-- 1 m ahead -->
+  </joint>
+  <joint name="to_camera" type="fixed">
+    <origin xyz="0.5 0 1" rpy="0 0.1 0"/><parent link="base_link"/><child link="camera"/></joint>
+  <joint name="shoulder" type="revolute"><parent link="base_link"/><child link="arm"/></joint>
+  <joint name="plain" type="fixed"><parent link="camera"/><child link="optical"/></joint>
+</robot>\r
+"""
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_bytes(URDF.encode())
+    return path
+
+
+def test_frames_through_the_base(urdf):
+    found = RobotDescription(urdf).frames.pose("lidar", "camera")
+    np.testing.assert_allclose(found[:3, 3], [-0.5, 0, -1])
+    np.testing.assert_allclose(se3.rotation_to_rpy(found[:3, :3]), [0, 0.1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("child", "old", "new"),
+    [
+        (
+            "camera",
+            '<origin xyz="0.5 0 1" rpy="0 0.1 0"/>',
+            '<origin xyz="1.25 -0.5 2.0" rpy="0.0 0.0 1.570796327"/>',
+        ),
+        (
+            "lidar",
+            "<origin rpy=\"0 0 0\"\n            xyz='1.0   0 2.0' />",
+            "<origin rpy=\"0.0 0.0 1.570796327\"\n            xyz='1.25 -0.5 2.0' />",
+        ),
+    ],
+)
+def test_one_origin_changes_and_every_other_byte_stays(urdf, child, old, new):
+    T = se3.from_rotation_translation(se3.rotation_from_rpy([0, 0, np.pi / 2]), [1.25, -0.5, 2.0])
+    patched = RobotDescription(urdf).patched("base_link", child, T)
+    assert patched == URDF.replace(old, new).encode()
+    urdf.write_bytes(patched)
+    np.testing.assert_allclose(RobotDescription(urdf).frames.pose("base_link", child), T, atol=1e-8)
+
+
+def test_a_joint_without_an_origin_gets_one(urdf):
+    T = se3.from_rotation_translation(np.eye(3), [0, 0, 0.01])
+    patched = RobotDescription(urdf).patched("camera", "optical", T)
+    added = b'\n    <origin xyz="0.0 0.0 0.01" rpy="0.0 0.0 0.0"/>'
+    assert added in patched
+    assert patched.replace(added, b"") == URDF.encode()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "frames", "text"),
+    [
+        ("", "", ("lidar", "optical"), r"2 joints lead to optical \(to_camera, plain\)"),
+        ("", "", ("lidar", "arm"), "not fixed to each other: arm moves"),
+        ("", "", ("lidar", "radar"), "no frame 'radar'; found arm, base_link"),
+        ("", "", ("camera", "base_link"), "camera is mounted on base_link"),
+        ('<link name="lidar"/>', "<xacro:lidar/>", ("lidar", "camera"), "has xacro macros"),
+        ('xyz="0.5 0 1"', 'xyz="${x} 0 1"', ("lidar", "camera"), "not six numbers"),
+        ('xyz="0.5 0 1"', 'xyz="0.5 0 1" quat_xyzw="0 0 0 1"', ("lidar", "camera"), "one pair"),
+        ('link="optical"', 'link="lidar"', ("lidar", "camera"), "'lidar' has two parents"),
+        ("<robot", "<!DOCTYPE robot><robot", ("lidar", "camera"), "document type"),
+        ("</robot>", "", ("lidar", "camera"), "not XML"),
+        ('encoding="utf-8"', 'encoding="latin-1"', ("lidar", "camera"), "is in latin-1"),
+        ("<robot name='r'>", "<sdf>", ("lidar", "camera"), "found <sdf>"),
+    ],
+)
+def test_what_is_not_understood_is_refused(urdf, old, new, frames, text):
+    urdf.write_text(URDF.replace(old, new))
+    with pytest.raises(InputError, match=text):
+        RobotDescription(urdf).patched(*frames, np.eye(4))
+
+
+def test_a_loop_of_frames_is_refused():
+    loop = Frames({"a": ("b", np.eye(4)), "b": ("a", np.eye(4))})
+    with pytest.raises(InputError, match="form a loop"):
+        loop.pose("a", "b")
+
+
+def test_installed_from_numbers_and_descriptions(urdf):
+    numbers = read_installed("-50cm 0 -1 0 0.1 0deg", "lidar", "camera")
+    drawn = read_installed(str(urdf), "lidar", "camera")
+    np.testing.assert_allclose(numbers.T_parent_child, drawn.T_parent_child, atol=1e-12)
+    assert not numbers.covariance.any()
+    with pytest.raises(ConfigError, match="file that exists"):
+        read_installed("robot.urdf", "lidar", "camera")
+    with pytest.raises(InputError, match="no frame 'radar'"):
+        read_installed(str(urdf), "lidar", "radar")
