@@ -25,6 +25,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.aligned import Aligned, check_aligned
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
 from hand_eye_calib.checks.hypotheses import (
     LAGS_S,
@@ -34,11 +35,12 @@ from hand_eye_calib.checks.hypotheses import (
     StreamPair,
     explain,
 )
-from hand_eye_calib.checks.streams import check_frozen, check_stamps, check_stream
+from hand_eye_calib.checks.streams import check_flat, check_frozen, check_stamps, check_stream
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
@@ -114,6 +116,8 @@ def check_streams(
         aligned = replace(streams, child=streams.child.shifted(correlation.offset_s))
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
+    if flat := check_flat(aligned.parent, aligned.child):
+        return CheckResult(gravest_first([*findings, *flat]), correlation)
     try:
         explanation = explain(aligned, thorough=correlation.is_clear)
     except NotEnoughDataError as error:
@@ -157,14 +161,20 @@ def _check_agreeing(
     pose_pairs = synchronise(
         corrected.parent, corrected.child.shifted(correlation.offset_s), corrected.max_gap_s
     )
-    scale = estimate_scale(pose_pairs, start=explanation.fit)
-    rotations = _rotations(pose_pairs)
+    try:
+        scale = estimate_scale(pose_pairs, start=explanation.fit)
+    except NotEnoughDataError:
+        scale = None  # too few poses to tell
+    rotations = _motions(pose_pairs).Ts_parenti_parentj[:, :3, :3]
     findings = [
         *findings,
         *_check_offset(offset, known_offset_s),
-        *_check_scale(scale, known_scale),
+        *(_check_scale(scale, known_scale) if scale else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
     ]
+    if not explanation.findings:
+        fit = scale.fit if scale else explanation.fit
+        findings += _check_aligned(streams, offset.seconds, fit)
     rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
     return CheckResult(
         gravest_first(findings),
@@ -172,6 +182,19 @@ def _check_agreeing(
         explanation.fit,
         dict(zip("xyz", rms.tolist(), strict=True)),
     )
+
+
+def _check_aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit) -> list[Finding]:
+    """What is wrong with streams that agree without any mistake undone."""
+    child = streams.child.shifted(offset_s).scaled(fit.scale)
+    pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
+    aligned = Aligned(
+        pose_pairs=pose_pairs,
+        motions=_motions(pose_pairs),
+        T_parent_child=fit.T_parent_child,
+        covariance=fit.covariance[:6, :6],
+    )
+    return check_aligned(aligned)
 
 
 def can_check(parent: Trajectory, child: Trajectory) -> bool:
@@ -208,12 +231,11 @@ def _check_scale(scale: Scale, known: float) -> list[Finding]:
     return [wording.scale_differs(scale, round(known * scale.value, 4))]
 
 
-def _rotations(pose_pairs: PosePairs) -> FloatArray:
-    """Rotations (K, 3, 3) of the parent over 3 s, or less if there are too few of those."""
+def _motions(pose_pairs: PosePairs) -> MotionPairs:
+    """Motions over 3 s, or less if there are too few of those."""
     motions = (pairs_over(pose_pairs, lag_s, MAX_PAIRS) for lag_s in LAGS_S)
     # There are enough over one of the lags: the fit is over it.
-    pairs = next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
-    return pairs.Ts_parenti_parentj[:, :3, :3]
+    return next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
 
 
 def _check_axes(rotations: FloatArray, sigma_rotation: float) -> list[Finding]:

@@ -7,11 +7,15 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     from hand_eye_calib.alignment.angular_rates import Correlation
     from hand_eye_calib.alignment.scale import Scale
     from hand_eye_calib.alignment.time_offset import TimeOffset
     from hand_eye_calib.arrays import FloatArray
+    from hand_eye_calib.assessment.mount_change import MountChange
+    from hand_eye_calib.checks.response import Quantity
     from hand_eye_calib.pairing.leaps import Leap
 
 
@@ -91,6 +95,10 @@ class Finding:
     def __str__(self) -> str:
         cause = f" ({self.cause})" if self.cause else ""
         return f"{self.what}{cause}; {self.advice}"
+
+
+# Jumps up to this share hardly matter to the methods that leave them out.
+_FEW_JUMPS = 0.02
 
 
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -182,11 +190,13 @@ def jumps(stream: str, share: float) -> Finding:
     return Finding(
         code="jumps",
         stream=stream,
-        severity=Severity.WARNING,
+        severity=Severity.NOTE if share < _FEW_JUMPS else Severity.WARNING,
         confidence=Confidence.LIKELY,
         what=f"{share:.1%} of the {stream} stream's steps are jumps: far from the motion before "
         "and after",
-        advice="keep method dnlo or adaptive, which leave them out; better, repair the source",
+        cause="relocalisations, loop closures or wrong detections",
+        advice="keep a method that leaves them out; better, repair the source",
+        evidence=(("share", share),),
         options=(("method", "dnlo"),),
     )
 
@@ -272,13 +282,29 @@ def noisy(unexplained: float) -> Finding:
     )
 
 
+def _whose(stream: str) -> str:
+    return "both streams'" if stream == "both" else f"the {stream} stream's"
+
+
 def quaternion_order(stream: str) -> Finding:
     """Quaternions are scalar first."""
     return _error(
         "quaternion_order",
         stream,
-        f"the {stream} stream's quaternions seem to be written w x y z and read as x y z w",
+        f"{_whose(stream)} quaternions seem to be written w x y z and read as x y z w",
         "write them as x y z w",
+        Confidence.LIKELY,
+    )
+
+
+def inverse_orientation(stream: str) -> Finding:
+    """Orientations are inverted, positions are not."""
+    return _error(
+        "inverse_orientation",
+        stream,
+        f"{_whose(stream)} orientations seem to be inverted (of the world in the sensor), while "
+        "the positions are those of the sensor in its world",
+        "invert the orientations alone: negate x, y and z of every quaternion",
         Confidence.LIKELY,
     )
 
@@ -387,4 +413,167 @@ def one_axis(direction: FloatArray, hidden: Sequence[str], main: str) -> Finding
         f"translation along it, {' and '.join(hidden)}, will be unobservable",
         advice=f"drive over slopes or kerbs, or measure {main} and give it",
         options=((f"prior.{main}", "VALUE+/-SIGMA"),),
+    )
+
+
+def same_frame(distance_m: float, angle_rad: float) -> Finding:
+    """The extrinsic is the identity."""
+    return Finding(
+        code="same_frame",
+        stream="both",
+        severity=Severity.ERROR,
+        confidence=Confidence.LIKELY,
+        what="both streams are of one and the same frame: the extrinsic is the identity, to "
+        f"{1e3 * distance_m:.1f} mm and {np.degrees(angle_rad):.2f} deg",
+        cause="such as two topics of one odometry, or odometry of the robot's base that was "
+        "derived from the other sensor",
+        advice="give the stream of the child sensor itself",
+        evidence=(("translation_m", distance_m), ("rotation_rad", angle_rad)),
+    )
+
+
+def same_position(distance_m: float, sigma_m: float) -> Finding:
+    """The translation is zero."""
+    return Finding(
+        code="same_position",
+        stream="both",
+        severity=Severity.ERROR,
+        confidence=Confidence.LIKELY,
+        what="both streams have the same positions and other orientations: the translation "
+        f"between the sensors is zero ({1e3 * distance_m:.1f} +/- {1e3 * sigma_m:.1f} mm)",
+        cause="such as positions that were fused from the other sensor, or given for another "
+        "point of the robot than the sensor",
+        advice="give positions of the child sensor itself",
+        evidence=(("translation_m", distance_m), ("sigma_m", sigma_m)),
+    )
+
+
+def interleaved(stream: str, ratio: float, distance_m: float) -> Finding:
+    """Poses of two sensors take turns."""
+    return Finding(
+        code="interleaved",
+        stream=stream,
+        severity=Severity.ERROR,
+        confidence=Confidence.LIKELY,
+        what=f"the {stream} stream's poses alternate between two levels {distance_m:.2g} m apart",
+        cause="two sensors, or two programs, publish on one topic",
+        advice="give each its own topic, and calibrate one",
+        evidence=(("roughness_ratio", ratio), ("distance_m", distance_m)),
+    )
+
+
+def coarse_positions(stream: str, step_m: float, is_float32: bool, severity: Severity) -> Finding:
+    """Positions lie on a grid."""
+    cause = (
+        "numbers of 32 bits far from the origin, such as map coordinates"
+        if is_float32
+        else "they were rounded"
+    )
+    return Finding(
+        code="coarse_positions",
+        stream=stream,
+        severity=severity,
+        confidence=Confidence.CERTAIN,
+        what=f"the {stream} stream's positions are multiples of {step_m:.3g} m",
+        cause=cause,
+        advice="write positions with 64 bits and all digits, or relative to a near origin",
+        evidence=(("step_m", step_m),),
+    )
+
+
+def flat(stream: str, other: str, tilt_rad: float) -> Finding:
+    """A stream has x, y and yaw only while the other one tilts."""
+    return Finding(
+        code="flat",
+        stream=stream,
+        severity=Severity.ERROR,
+        confidence=Confidence.CERTAIN,
+        what=f"the {stream} stream has only x, y and yaw, while the {other} tilts by "
+        f"{np.degrees(tilt_rad):.1f} deg (root mean square)",
+        cause="odometry in 2D, such as that of wheels",
+        advice="give poses with all six degrees of freedom, or record on level ground and measure "
+        "height, roll and pitch by hand",
+        evidence=(("tilt_rad", tilt_rad),),
+    )
+
+
+def rotation_gain(gain: Quantity, axis: FloatArray, severity: Severity) -> Finding:
+    """Rotation angles differ by a factor."""
+    direction = ", ".join(f"{component:.2f}" for component in axis)
+    return Finding(
+        code="rotation_gain",
+        stream="child",
+        severity=severity,
+        confidence=Confidence.LIKELY,
+        what=f"the child rotates {gain.value:.4f} +/- {gain.sigma:.4f} times as far as the parent "
+        f"about ({direction}) in the parent sensor's frame",
+        cause="a gyroscope or wheel base with a wrong scale, in either stream",
+        advice="calibrate that scale first",
+        evidence=(("gain", gain.value), ("sigma", gain.sigma)),
+    )
+
+
+def position_clock(delay: Quantity, shift_m: float, severity: Severity) -> Finding:
+    """Positions and orientations have different delays."""
+    later, earlier = ("child", "parent") if delay.value > 0 else ("parent", "child")
+    return Finding(
+        code="position_clock",
+        stream="both",
+        severity=severity,
+        confidence=Confidence.LIKELY,
+        what=f"with orientations aligned, the {later}'s positions are {abs(delay.value):.3f} +/- "
+        f"{delay.sigma:.3f} s late, or the {earlier}'s early: at this speed a shift of "
+        f"{shift_m:.2g} m",
+        cause="positions and orientations of one stream come from different sources or filters",
+        advice="use the poses before that filter, or correct the delay of the positions",
+        evidence=(
+            ("delay_s", delay.value),
+            ("sigma_s", delay.sigma),
+            ("shift_m", shift_m),
+        ),
+    )
+
+
+def smoothed(
+    part: str, stream: str, smoothing: Quantity, severity: Severity, shift_m: float
+) -> Finding:
+    """Positions or orientations of one stream are smoother than those of the other."""
+    seconds = float(np.sqrt(max(smoothing.value, 0.0)))
+    return Finding(
+        code=f"smoothed_{part}",
+        stream=stream,
+        severity=severity,
+        confidence=Confidence.LIKELY,
+        what=f"the {stream} stream's {part} are smoothed over about {seconds:.2f} s, which the "
+        f"other's are not: the translation may be off by {shift_m:.2g} m",
+        cause="a low-pass or smoothing filter",
+        advice="use the poses before that filter",
+        evidence=(
+            ("smoothing_s", seconds),
+            ("sigmas", smoothing.value / max(smoothing.sigma, 1e-12)),
+            ("shift_m", shift_m),
+        ),
+    )
+
+
+def mount_moved(change: MountChange, at_s: float, span_s: float, severity: Severity) -> Finding:
+    """The mount has moved within the recording; ``at_s`` seconds after its start."""
+    distance_m = float(np.linalg.norm(change.xi[:3]))
+    angle_rad = float(np.linalg.norm(change.xi[3:]))
+    return Finding(
+        code="mount_moved",
+        stream="both",
+        severity=severity,
+        confidence=Confidence.LIKELY,
+        what=f"the extrinsic changes {at_s:.0f} s after the start (within {span_s:.0f} s) by "
+        f"{100 * distance_m:.2g} cm and {np.degrees(angle_rad):.2g} deg",
+        cause="a mount that came loose or was knocked, or an estimator that started anew",
+        advice="tighten it and record again, or calibrate the parts before and after on their own",
+        evidence=(
+            ("at_s", at_s),
+            ("at_ns", float(change.at_ns)),
+            ("translation_m", distance_m),
+            ("rotation_rad", angle_rad),
+            ("log_likelihood_ratio", change.log_ratio),
+        ),
     )

@@ -148,6 +148,12 @@ def _inverted(trajectory: Trajectory) -> Trajectory:
     return Trajectory(trajectory.stamps_ns, se3.inverse(trajectory.poses))
 
 
+def _orientations_inverted(trajectory: Trajectory) -> Trajectory:
+    poses = trajectory.poses.copy()
+    poses[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    return Trajectory(trajectory.stamps_ns, poses)
+
+
 def _with_axes(matrix: FloatArray, trajectory: Trajectory) -> Trajectory:
     poses = trajectory.poses.copy()
     poses[:, :3, 3] = poses[:, :3, 3] @ matrix.T
@@ -158,13 +164,19 @@ _MIRROR = -np.eye(3)
 _PLAIN = Hypothesis("", "child", lambda trajectory: trajectory, 0)
 _BOTH_INVERTED = Hypothesis("inverse_both", "both", _inverted)
 _USUAL = [
-    Hypothesis(code, stream, correct)
-    for stream in ("child", "parent")
-    for code, correct in (
-        ("quaternion_order", _reordered),
-        ("inverse", _inverted),
-        ("left_handed", functools.partial(_with_axes, _MIRROR)),
-    )
+    *(
+        Hypothesis(code, stream, correct)
+        for stream in ("child", "parent")
+        for code, correct in (
+            ("quaternion_order", _reordered),
+            ("inverse", _inverted),
+            ("inverse_orientation", _orientations_inverted),
+            ("left_handed", functools.partial(_with_axes, _MIRROR)),
+        )
+    ),
+    # One exporter often writes both streams.
+    Hypothesis("quaternion_order", "both", _reordered),
+    Hypothesis("inverse_orientation", "both", _orientations_inverted),
 ]
 
 
@@ -214,7 +226,7 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
     failed: list[tuple[float, Explanation]] = []
     for lag_s in LAGS_S:
         try:
-            chosen = _plain_or_usual(streams, lag_s)
+            chosen = _plain_or_usual(streams, lag_s, _NOISY if thorough else HOLDS)
         except NotEnoughDataError as error:
             too_few = error
             continue
@@ -233,16 +245,18 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
             return _attribute(best, streams, lag_s)
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
-        return replace(best, findings=(wording.noisy(unexplained),), limit=_NOISY)
+        attributed = _attribute(best, streams, lag_s)
+        findings = (*attributed.findings, wording.noisy(unexplained))
+        return replace(attributed, findings=findings, limit=_NOISY)
     return replace(best, findings=(wording.not_one_body(unexplained, HOLDS),))
 
 
-def _plain_or_usual(streams: StreamPair, lag_s: float) -> Explanation:
+def _plain_or_usual(streams: StreamPair, lag_s: float, limit: float) -> Explanation:
     plain = _fitted(_PLAIN, streams, lag_s)
     if plain.fit.unexplained < EXPLAINED:
         return plain
     usual = _simplest_of_the_best([_fitted(hypothesis, streams, lag_s) for hypothesis in _USUAL])
-    return usual if _is_decisive(plain, usual) else plain
+    return usual if _is_decisive(plain, usual, limit) else plain
 
 
 def _or_other_axes(plain: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
@@ -257,7 +271,7 @@ def _or_other_axes(plain: Explanation, streams: StreamPair, lag_s: float) -> Exp
             for hypothesis in _axis_hypotheses()
         ]
     )
-    return axes if _is_decisive(plain, axes) else plain
+    return axes if _is_decisive(plain, axes, HOLDS) else plain
 
 
 def _fitted(
@@ -290,15 +304,17 @@ def _simplest_of_the_best(explanations: Sequence[Explanation]) -> Explanation:
     return min(best, key=_complexity)
 
 
-def _complexity(explanation: Explanation) -> tuple[int, bool]:
+def _complexity(explanation: Explanation) -> tuple[int, int]:
     """Number of things that would have to be wrong; for equal numbers, the child's come first."""
     odd_scale = abs(np.log(explanation.fit.scale)) > _ODD_SCALE
     hypothesis = explanation.hypothesis
-    return hypothesis.complexity + int(odd_scale), hypothesis.stream == "parent"
+    by_stream = ("child", "parent", "both").index(hypothesis.stream)
+    return hypothesis.complexity + int(odd_scale), by_stream
 
 
-def _is_decisive(plain: Explanation, rival: Explanation) -> bool:
-    return rival.holds and _DECISIVE * rival.fit.unexplained < plain.fit.unexplained
+def _is_decisive(plain: Explanation, rival: Explanation, limit: float) -> bool:
+    unexplained = rival.fit.unexplained
+    return unexplained < limit and _DECISIVE * unexplained < plain.fit.unexplained
 
 
 def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
@@ -325,7 +341,11 @@ def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
 def _finding(hypothesis: Hypothesis) -> Finding:
     if hypothesis.code == "axes":
         return wording.axes(hypothesis.stream, hypothesis.detail)
-    make = {"quaternion_order": wording.quaternion_order, "left_handed": wording.left_handed}
+    make = {
+        "quaternion_order": wording.quaternion_order,
+        "inverse_orientation": wording.inverse_orientation,
+        "left_handed": wording.left_handed,
+    }
     return make[hypothesis.code](hypothesis.stream)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.findings import Finding
+from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -30,6 +30,20 @@ _SAME_POSE = 1e-12
 
 # Largest share of the time in which a stream may be frozen.
 _MAX_FROZEN = 0.02
+
+# Two sensors take turns if a stream is this many times rougher from pose to pose than over some
+# longer lag (in poses), by at least so many metres. Repeated poses are another matter.
+_ALTERNATES, _MAX_PERIOD, _LEAST_LEVELS_M = 2.0, 6, 0.01
+_MIN_POSES_OF_TURNS, _MAX_REPEATS = 60, 0.1
+
+# Positions are on a grid if this share of so many differences, those of a few steps, are multiples
+# of the smallest, to this share of a step. Steps (m) from which on that matters.
+_MIN_GRID, _ON_GRID, _GRID_TOLERANCE, _MAX_MULTIPLE = 30, 0.98, 0.06, 200.0
+_COARSE_NOTE_M, _COARSE_WARNING_M, _COARSE_ERROR_M = 0.002, 0.005, 0.02
+
+# A stream is flat if its vertical and its height (m) stay the same to rounding; that matters if the
+# other tilts by more than this (rad).
+_UPRIGHT, _LEVEL_M, _TILTS_RAD = 1e-6, 1e-6, 0.02
 
 # Motion (rad, m) from which on a stream moves.
 _MOVES_RAD, _MOVES_M = 0.02, 0.02
@@ -152,10 +166,100 @@ def check_stream(
         share = float(intervals_s[gaps].sum() / intervals_s.sum())
         longest_s = float(intervals_s.max())
         findings.append(wording.gaps(stream, int(gaps.sum()), longest_s, share))
+    if levels := _interleaved(trajectory):
+        return [*findings, wording.interleaved(stream, *levels)]
+    if coarse := _check_grid(trajectory.poses[:, :3, 3], stream):
+        return [*findings, coarse]
     share = float(_jumps(trajectory).mean())
     if share > _MIN_JUMPS:
         findings.append(wording.jumps(stream, share))
     return findings
+
+
+def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
+    """How much rougher the positions are from one pose to the next than over several, and the
+    distance of the two levels (m), if two sensors take turns in a stream; otherwise None.
+    """
+    positions, stamps_ns = trajectory.poses[:, :3, 3], trajectory.stamps_ns
+    if len(positions) < _MIN_POSES_OF_TURNS:
+        return None
+    repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME_POSE
+    if repeats.mean() > _MAX_REPEATS:
+        return None
+    rough = [_roughness(positions, stamps_ns, lag) for lag in range(1, _MAX_PERIOD + 1)]
+    smoothest = max(min(rough[1:]), 1e-9)
+    if rough[0] < max(_ALTERNATES * smoothest, _LEAST_LEVELS_M):
+        return None
+    return rough[0] / smoothest, rough[0]
+
+
+def _roughness(positions: FloatArray, stamps_ns: IntArray, lag: int) -> float:
+    """Median distance (m) of a pose from the line between those ``lag`` poses before and after."""
+    before, middle, after = positions[: -2 * lag], positions[lag:-lag], positions[2 * lag :]
+    elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
+    share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
+    off = middle - before - share[:, None] * (after - before)
+    return float(np.median(np.linalg.norm(off, axis=1)))
+
+
+def _check_grid(positions: FloatArray, stream: str) -> Finding | None:
+    """Finding about positions that are multiples of a step, or None."""
+    steps = [_grid_step(column) for column in positions.T]
+    coarsest = int(np.argmax(steps))
+    step_m = steps[coarsest]
+    if step_m < _COARSE_NOTE_M:
+        return None
+    severity = Severity.NOTE
+    if step_m > _COARSE_ERROR_M:
+        severity = Severity.ERROR
+    elif step_m > _COARSE_WARNING_M:
+        severity = Severity.WARNING
+    column = positions[:, coarsest]
+    is_float32 = bool((column == column.astype(np.float32)).all()) and step_m >= 0.5 * float(
+        np.spacing(np.float32(np.abs(column).max()))
+    )
+    return wording.coarse_positions(stream, step_m, is_float32, severity)
+
+
+def _grid_step(values: FloatArray) -> float:
+    """Step (m) of which all differences (N - 1,) are multiples, 0 if there is none."""
+    differences = np.abs(np.diff(values))
+    differences = differences[differences > _SAME_POSE]
+    if len(differences) < _MIN_GRID:
+        return 0.0
+    step = float(differences.min())
+    multiples = differences / step
+    off = np.abs(multiples - np.round(multiples))
+    few = multiples < _MAX_MULTIPLE
+    is_grid = few.mean() > 0.5 and (off[few] < _GRID_TOLERANCE).mean() > _ON_GRID
+    return step if is_grid else 0.0
+
+
+def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
+    """Finding about a stream that has only x, y and yaw while the other tilts, or none."""
+    streams = {"parent": parent, "child": child}
+    for name, other in (("parent", "child"), ("child", "parent")):
+        rotations = streams[name].poses[:, :3, :3]
+        upright = np.abs(rotations[:, 2, 2] - rotations[0, 2, 2]).max() < _UPRIGHT
+        if not upright or np.ptp(streams[name].poses[:, 2, 3]) > _LEVEL_M:
+            continue
+        tilt_rad = _tilt(streams[other].poses[:, :3, :3])
+        if tilt_rad > _TILTS_RAD:
+            return [wording.flat(name, other, tilt_rad)]
+    return []
+
+
+def _tilt(rotations: FloatArray) -> float:
+    """Root mean square angle (rad) by which a sensor's axis of rotation tilts: of the axis that
+    stays most nearly the same in the world.
+    """
+    vectors = np.concatenate([rotations[::10, :, axis] for axis in range(3)], axis=1)
+    blocks = vectors.reshape(len(vectors), 3, 3)
+    # The direction in the sensor whose image in the world scatters least.
+    moments = np.einsum("kai,kbi->ab", blocks, blocks) / len(blocks)
+    mean = blocks.mean(axis=0)
+    scatter = moments - mean @ mean.T
+    return float(np.sqrt(max(np.linalg.eigvalsh(scatter)[0], 0.0)))
 
 
 def _jumps(trajectory: Trajectory) -> BoolArray:

@@ -1,0 +1,154 @@
+"""Checks of two streams that agree, on one clock and in one unit of length: faults that leave
+little of the motion unexplained and yet spoil the extrinsic.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.mount_change import find_change, information
+from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.checks.response import Quantity, Response, response, rotation_gains
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+# Significance that every one of these findings needs, in standard deviations.
+_SIGMAS = 6.0
+
+# Two frames are one if they are this close (m, rad), within their standard deviations, which must
+# not be larger than these.
+_SAME_M, _SAME_RAD = 0.005, float(np.radians(0.3))
+_MAX_SIGMA_M, _MAX_SIGMA_RAD = 0.01, float(np.radians(0.5))
+_WITHIN = 3.0
+
+# Gains of rotations, less 1, from which on there is a warning, an error.
+# They must exceed what noise makes of them.
+_GAIN_WARNING, _GAIN_ERROR, _BIASES = 0.003, 0.015, 3.0
+
+# Delays of positions against orientations (s, intervals of the poses), and smoothing (s^2, squared
+# intervals), from which on they count.
+_DELAY_S, _DELAY_INTERVALS = 0.035, 0.35
+_SMOOTHING_S2, _SMOOTHING_INTERVALS2 = 0.002, 0.1
+
+# Shifts (m) by a delay or by smoothing from which on a result is unusable.
+_SHIFT_ERROR_M = 0.03
+
+# Shifts of the mount (m, rad) from which on they count, and from which on a result is unusable.
+_MOVED_M, _MOVED_RAD = 0.005, float(np.radians(0.2))
+_MOVED_ERROR_M, _MOVED_ERROR_RAD = 0.02, float(np.radians(1.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aligned:
+    """Two streams that agree.
+
+    Attributes
+    ----------
+    pose_pairs : PosePairs
+        On one clock, in one unit of length.
+    motions : MotionPairs
+        Over some seconds.
+    T_parent_child : (4, 4) array
+        X.
+    covariance : (6, 6) array
+        Of (rho, phi) in ``X exp(rho, phi)``.
+    """
+
+    pose_pairs: PosePairs
+    motions: MotionPairs
+    T_parent_child: FloatArray
+    covariance: FloatArray
+
+
+def check_aligned(aligned: Aligned) -> list[Finding]:
+    """Findings about two streams that agree."""
+    if same := _check_same(aligned):
+        return same
+    gains, gain_findings = _check_gains(aligned)
+    found = response(aligned.pose_pairs, aligned.T_parent_child, gains)
+    return [
+        *gain_findings,
+        *(_check_response(found) if found else []),
+        *_check_mount(aligned),
+    ]
+
+
+def _check_same(aligned: Aligned) -> list[Finding]:
+    """Finding about an extrinsic, or a translation, of zero."""
+    T, covariance = aligned.T_parent_child, aligned.covariance
+    sigmas = np.sqrt(np.diag(covariance))
+    if sigmas[:3].max() > _MAX_SIGMA_M or sigmas[3:].max() > _MAX_SIGMA_RAD:
+        return []
+    distance_m = float(np.linalg.norm(T[:3, 3]))
+    angle_rad = float(se3.rotation_angle(T[:3, :3]))
+    if distance_m > max(_SAME_M, _WITHIN * sigmas[:3].max()):
+        return []
+    if angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max()):
+        return [wording.same_frame(distance_m, angle_rad)]
+    return [wording.same_position(distance_m, float(sigmas[:3].max()))]
+
+
+def _check_gains(aligned: Aligned) -> tuple[FloatArray, list[Finding]]:
+    """Gain of the child's rotations, as a matrix, and findings about it."""
+    gains, axes = rotation_gains(aligned.motions, aligned.T_parent_child[:3, :3])
+    findings: list[Finding] = []
+    matrix = np.eye(3)
+    for gain, axis in zip(gains, axes.T, strict=True):
+        off = abs(gain.value - 1.0)
+        if off < max(_GAIN_WARNING, _SIGMAS * gain.sigma, _BIASES * gain.bias):
+            continue
+        matrix += (gain.value - 1.0) * np.outer(axis, axis)
+        if not findings:
+            severity = Severity.ERROR if off > _GAIN_ERROR else Severity.WARNING
+            findings.append(wording.rotation_gain(gain, axis, severity))
+    return matrix, findings
+
+
+def _check_response(found: Response) -> list[Finding]:
+    """Findings about delays and smoothing of one part of the poses."""
+    late = found.position_delay
+    shift_m = abs(late.value) * found.rms_speed
+    if _counts(late, max(_DELAY_S, _DELAY_INTERVALS * found.interval_s)):
+        return [wording.position_clock(late, shift_m, _severity(shift_m))]
+    least = _SMOOTHING_S2 + _SMOOTHING_INTERVALS2 * found.interval_s**2
+    for part in ("position", "rotation"):
+        smoothing = getattr(found, f"{part}_smoothing")
+        for stream in ("child", "parent"):
+            quantity = getattr(smoothing, stream)
+            if not quantity.exceeds(least, _SIGMAS):
+                continue
+            shift_m = float(np.sqrt(quantity.value)) * found.rms_speed
+            name = {"position": "positions", "rotation": "orientations"}[part]
+            return [wording.smoothed(name, stream, quantity, _severity(shift_m), shift_m)]
+    return []
+
+
+def _counts(quantity: Quantity, least: float) -> bool:
+    return abs(quantity.value) > max(least, _SIGMAS * quantity.sigma)
+
+
+def _severity(shift_m: float) -> Severity:
+    return Severity.ERROR if shift_m > _SHIFT_ERROR_M else Severity.WARNING
+
+
+def _check_mount(aligned: Aligned) -> list[Finding]:
+    """Finding about a mount that has moved."""
+    pose_pairs = aligned.pose_pairs
+    change = find_change(information(pose_pairs, aligned.T_parent_child))
+    if change is None or not change.is_significant:
+        return []
+    sigmas = np.sqrt(np.diag(change.covariance))
+    moved_m, moved_rad = (
+        float(np.linalg.norm(change.xi[part] * (np.abs(change.xi) > 2.0 * sigmas)[part]))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    if moved_m < _MOVED_M and moved_rad < _MOVED_RAD:
+        return []
+    is_large = moved_m > _MOVED_ERROR_M or moved_rad > _MOVED_ERROR_RAD
+    at_s = (change.at_ns - pose_pairs.stamps_ns[0]) * 1e-9
+    span_s = (change.latest_ns - change.earliest_ns) * 1e-9
+    severity = Severity.ERROR if is_large else Severity.WARNING
+    return [wording.mount_moved(change, at_s, max(span_s, 1.0), severity)]

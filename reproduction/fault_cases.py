@@ -1,0 +1,368 @@
+"""Faults that give a wrong extrinsic in confidence, made on purpose in two streams, each in three
+severities.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+
+Streams = tuple[Trajectory, Trajectory]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault.
+
+    Attributes
+    ----------
+    code : str
+        As in the list of faults.
+    what : str
+        What is wrong, in words.
+    severities : tuple
+        Three values, the weakest first.
+    damage : callable
+        Damages (parent, child, severity, generator).
+    unit : str
+        Of the severities.
+    named : frozenset of str
+        Codes of findings that name it.
+    options : dict
+        Options of the calibration, besides its method.
+    """
+
+    code: str
+    what: str
+    severities: tuple[float, ...]
+    damage: Callable[[Trajectory, Trajectory, float, np.random.Generator], Streams]
+    unit: str
+    named: frozenset[str]
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def with_poses(
+    stream: Trajectory, rotations: FloatArray | None = None, positions: FloatArray | None = None
+) -> Trajectory:
+    """The stream with other orientations (N, 3, 3) or positions (N, 3)."""
+    poses = stream.poses.copy()
+    if rotations is not None:
+        poses[:, :3, :3] = rotations
+    if positions is not None:
+        poses[:, :3, 3] = positions
+    return dataclasses.replace(stream, poses=poses)
+
+
+def _noisy(poses: FloatArray, metres: float, random: np.random.Generator) -> FloatArray:
+    """Poses with white noise, as many metres as half radians."""
+    xi = metres * random.standard_normal((len(poses), 6))
+    xi[:, 3:] *= 2.0
+    return poses @ se3.exp(xi)
+
+
+def copied(parent: Trajectory, child: Trajectory, noise: float, random: Any) -> Streams:
+    """The child stream is the parent's own frame in another world."""
+    world = se3.exp(random.standard_normal(6))
+    poses = _noisy(world @ parent.poses, noise, random)
+    return parent, Trajectory(parent.stamps_ns, poses)
+
+
+def fused(parent: Trajectory, child: Trajectory, noise: float, random: Any) -> Streams:
+    """The child's positions are the parent's, in the child's world."""
+    inside = (child.stamps_ns >= parent.stamps_ns[0]) & (child.stamps_ns <= parent.stamps_ns[-1])
+    child = child[inside]
+    at_child = parent.at(child.stamps_ns)
+    # The child's world in the parent's, from the orientations at the start and a common origin.
+    turned = child.poses[0, :3, :3] @ _fitted_rotation(parent, child).T @ at_child[0, :3, :3].T
+    positions = (at_child[:, :3, 3] - at_child[0, :3, 3]) @ turned.T
+    positions += noise * random.standard_normal(positions.shape)
+    return parent, with_poses(child, positions=positions)
+
+
+def _fitted_rotation(parent: Trajectory, child: Trajectory) -> FloatArray:
+    """Rotation X from the rotations of both streams alone."""
+    at_child = parent.at(child.stamps_ns)[::10, :3, :3]
+    own = child.poses[::10, :3, :3]
+    of_parent, of_child = (
+        se3.rotation_log(np.swapaxes(poses[:-1], 1, 2) @ poses[1:]) for poses in (at_child, own)
+    )
+    return Rotation.align_vectors(of_parent, of_child)[0].as_matrix()
+
+
+def interleaved(worlds: bool) -> Callable[..., Streams]:
+    """Two sensors take turns on the child's topic, in one world or each in its own."""
+
+    def damage(parent: Trajectory, child: Trajectory, metres: float, random: Any) -> Streams:
+        offset = se3.from_rotation_translation(np.eye(3), [metres, 0.0, 0.0])
+        poses = child.poses.copy()
+        world = se3.exp(np.r_[metres, 0, 0, 0, 0, 0.2]) if worlds else np.eye(4)
+        poses[1::2] = world @ poses[1::2] @ offset
+        return parent, dataclasses.replace(child, poses=poses)
+
+    return damage
+
+
+def _low_passed(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
+    """First-order low-pass filter."""
+    out = values.copy()
+    shares = 1.0 - np.exp(-np.diff(stamps_ns) * 1e-9 / tau_s)
+    for k, share in enumerate(shares):
+        out[k + 1] = out[k] + share * (values[k + 1] - out[k])
+    return out
+
+
+def _smoothed(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
+    """The same filter forwards and backwards: no delay."""
+    ahead = _low_passed(values, stamps_ns, tau_s)
+    return _low_passed(ahead[::-1], -stamps_ns[::-1], tau_s)[::-1]
+
+
+def low_passed(parent: Trajectory, child: Trajectory, tau_s: float, random: Any) -> Streams:
+    """Positions low-passed, orientations not."""
+    return parent, with_poses(
+        child, positions=_low_passed(child.poses[:, :3, 3], child.stamps_ns, tau_s)
+    )
+
+
+def smoothed(parent: Trajectory, child: Trajectory, tau_s: float, random: Any) -> Streams:
+    """Positions smoothed without a delay."""
+    return parent, with_poses(
+        child, positions=_smoothed(child.poses[:, :3, 3], child.stamps_ns, tau_s)
+    )
+
+
+def all_low_passed(parent: Trajectory, child: Trajectory, tau_s: float, random: Any) -> Streams:
+    """Positions and orientations low-passed."""
+    return parent, with_poses(
+        child,
+        _low_passed_rotations(child, tau_s),
+        _low_passed(child.poses[:, :3, 3], child.stamps_ns, tau_s),
+    )
+
+
+def _low_passed_rotations(child: Trajectory, tau_s: float) -> FloatArray:
+    rotations = child.poses[:, :3, :3].copy()
+    shares = 1.0 - np.exp(-np.diff(child.stamps_ns) * 1e-9 / tau_s)
+    for k, share in enumerate(shares):
+        step = se3.rotation_log(rotations[k].T @ child.poses[k + 1, :3, :3])
+        rotations[k + 1] = rotations[k] @ se3.rotation_exp(share * step)
+    return rotations
+
+
+def late_positions(parent: Trajectory, child: Trajectory, delay_s: float, random: Any) -> Streams:
+    """Positions later than the orientations of the same message."""
+    late = child.shifted(delay_s).at(child.stamps_ns, extrapolate=True)
+    return parent, with_poses(child, positions=late[:, :3, 3])
+
+
+def yaw_gain(parent: Trajectory, child: Trajectory, gain: float, random: Any) -> Streams:
+    """Dead reckoning whose yaw rate has a gain, as of wheels."""
+    steps = se3.inverse(child.poses[:-1]) @ child.poses[1:]
+    # The vehicle's vertical in the child's frame: the main axis of rotation.
+    vectors = se3.rotation_log(steps[:, :3, :3])
+    axis = np.linalg.eigh(vectors.T @ vectors)[1][:, -1]
+    vectors = vectors + gain * np.outer(vectors @ axis, axis)
+    steps[:, :3, :3] = se3.rotation_exp(vectors)
+    poses = [child.poses[0]]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return parent, dataclasses.replace(child, poses=np.array(poses))
+
+
+def loosened(parent: Trajectory, child: Trajectory, degrees: float, random: Any) -> Streams:
+    """The mount moves half-way, by so many degrees and 2.5 cm for each."""
+    axes = random.standard_normal((2, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    shift = se3.exp(np.r_[0.025 * degrees * axes[0], np.radians(degrees) * axes[1]])
+    poses = child.poses.copy()
+    half = len(poses) // 2
+    poses[half:] = poses[half:] @ shift
+    return parent, dataclasses.replace(child, poses=poses)
+
+
+def scaled(parent: Trajectory, child: Trajectory, excess: float, random: Any) -> Streams:
+    """Lengths off by a factor."""
+    return parent, child.scaled(1.0 + excess)
+
+
+def mirrored(parent: Trajectory, child: Trajectory, axis: float, random: Any) -> Streams:
+    """One axis of the positions mirrored."""
+    positions = child.poses[:, :3, 3].copy()
+    positions[:, int(axis)] *= -1.0
+    return parent, with_poses(child, positions=positions)
+
+
+def flattened(parent: Trajectory, child: Trajectory, share: float, random: Any) -> Streams:
+    """Height, roll and pitch of the child are zero, or a share less than they were."""
+    tilt = Rotation.from_matrix(child.poses[:, :3, :3]).as_euler("ZYX")
+    tilt[:, 1:] *= 1.0 - share
+    positions = child.poses[:, :3, 3] * [1.0, 1.0, 1.0 - share]
+    return parent, with_poses(child, Rotation.from_euler("ZYX", tilt).as_matrix(), positions)
+
+
+def as_float32(parent: Trajectory, child: Trajectory, metres: float, random: Any) -> Streams:
+    """Positions far from the origin in 32 bits, both streams on one map."""
+    origin = np.array([metres, 9.0 * metres, 0.0])
+
+    def rounded(stream: Trajectory) -> Trajectory:
+        positions = stream.poses[:, :3, 3] + origin
+        return with_poses(stream, positions=positions.astype(np.float32).astype(float))
+
+    return rounded(parent), rounded(child)
+
+
+def _scalar_first(stream: Trajectory) -> Trajectory:
+    quats = np.roll(se3.to_quat_xyzw(stream.poses), 1, axis=1)
+    return Trajectory(stream.stamps_ns, se3.from_quat_xyzw(stream.poses[:, :3, 3], quats))
+
+
+def scalar_first(parent: Trajectory, child: Trajectory, which: float, random: Any) -> Streams:
+    """Quaternions w x y z in both files."""
+    return _scalar_first(parent), _scalar_first(child)
+
+
+def inverted(parent: Trajectory, child: Trajectory, noise: float, random: Any) -> Streams:
+    """Inverse poses, under noise."""
+    poses = se3.inverse(_noisy(child.poses, noise, random))
+    return parent, dataclasses.replace(child, poses=poses)
+
+
+def inverted_orientations(
+    parent: Trajectory, child: Trajectory, noise: float, random: Any
+) -> Streams:
+    """Orientations inverted, positions upright."""
+    poses = _noisy(child.poses, noise, random)
+    return parent, with_poses(child, np.swapaxes(poses[:, :3, :3], 1, 2))
+
+
+def late(parent: Trajectory, child: Trajectory, delay_s: float, random: Any) -> Streams:
+    """The child's clock is off."""
+    return parent, child.shifted(delay_s)
+
+
+def jumping(parent: Trajectory, child: Trajectory, share: float, random: Any) -> Streams:
+    """Lasting jumps of some 30 cm at a share of the poses."""
+    shifts = np.zeros((len(child), 3))
+    at = random.integers(len(child), size=round(share * len(child)))
+    shifts[at] = 0.3 * random.standard_normal((len(at), 3))
+    return parent, with_poses(child, positions=child.poses[:, :3, 3] + np.cumsum(shifts, axis=0))
+
+
+_POSITIONS = frozenset({"smoothed_positions", "position_clock"})
+_ESTIMATE = {"time_offset": "estimate"}
+
+FAULTS = (
+    Fault(
+        "S1",
+        "child is the parent's own frame",
+        (0.01, 0.003, 0.0),
+        copied,
+        "m noise",
+        frozenset({"same_frame"}),
+    ),
+    Fault(
+        "S2",
+        "child positions from the parent",
+        (0.01, 0.003, 0.0),
+        fused,
+        "m noise",
+        frozenset({"same_position", "same_frame"}),
+    ),
+    Fault(
+        "S3",
+        "two sensors, one world",
+        (0.03, 0.1, 0.3),
+        interleaved(False),
+        "m",
+        frozenset({"interleaved"}),
+    ),
+    Fault(
+        "S3b",
+        "two sensors, two worlds",
+        (0.1, 0.3, 3.0),
+        interleaved(True),
+        "m",
+        frozenset({"interleaved"}),
+    ),
+    Fault("S4", "positions low-passed", (0.05, 0.1, 0.2), low_passed, "s", _POSITIONS),
+    Fault("S4b", "positions late", (0.05, 0.1, 0.2), late_positions, "s", _POSITIONS),
+    Fault("S5", "positions smoothed, no delay", (0.05, 0.1, 0.2), smoothed, "s", _POSITIONS),
+    Fault(
+        "S6",
+        "all low-passed",
+        (0.05, 0.1, 0.2),
+        all_low_passed,
+        "s",
+        frozenset({"smoothed_orientations", *_POSITIONS}),
+        _ESTIMATE,
+    ),
+    Fault("S7", "yaw gain", (0.005, 0.01, 0.02), yaw_gain, "", frozenset({"rotation_gain"})),
+    Fault(
+        "S8",
+        "mount loosened half-way",
+        (0.5, 1.0, 2.0),
+        loosened,
+        "deg",
+        frozenset({"mount_moved"}),
+    ),
+    Fault("S9", "scale", (0.005, 0.01, 0.02), scaled, "", frozenset({"scale"})),
+    Fault(
+        "S10",
+        "mirrored axis",
+        (0.0, 1.0, 2.0),
+        mirrored,
+        "(axis)",
+        frozenset({"axes", "left_handed"}),
+    ),
+    Fault(
+        "S10b",
+        "child in 2D",
+        (0.5, 0.8, 1.0),
+        flattened,
+        "share",
+        frozenset({"flat", "unrelated", "noisy"}),
+    ),
+    Fault(
+        "S11",
+        "float32 positions",
+        (2e3, 5e4, 5e5),
+        as_float32,
+        "m east",
+        frozenset({"coarse_positions"}),
+    ),
+    Fault(
+        "S12",
+        "both scalar first",
+        (0.0, 0.0, 0.0),
+        scalar_first,
+        "",
+        frozenset({"quaternion_order"}),
+    ),
+    Fault(
+        "S13",
+        "inverse poses under noise",
+        (0.003, 0.02, 0.05),
+        inverted,
+        "m noise",
+        frozenset({"inverse"}),
+    ),
+    Fault(
+        "S14",
+        "orientations inverted",
+        (0.0, 0.01, 0.03),
+        inverted_orientations,
+        "m noise",
+        frozenset({"inverse_orientation"}),
+    ),
+    Fault("clock", "child's clock", (0.02, 0.05, 0.2), late, "s", frozenset({"time_offset"})),
+    Fault("S15", "jumps", (0.003, 0.01, 0.03), jumping, "share", frozenset({"jumps"})),
+)
