@@ -32,6 +32,7 @@ _GPS_EPOCH_S, _LEAP_SECONDS = 315_964_800, 18
 _TANGO_SCALES = (0.971, 1.024, 1.010)
 _ZXL19_OFFSETS_S = {"LO": (-0.052, -0.044, -0.075), "VO": (0.031, 0.034, 0.025)}
 _KITTI_LONG_SCALE = 0.9774
+_ARM_OFFSETS_S = {"complete": -0.0195, "sim": 0.0}
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,9 @@ def robot_arm(which):
         "sim": ("sim_hand", "sim_camera"),
     }[which]
     return Recording(
-        f"arm {which}", *(_asl_csv("asl_robot_arm", f"robot_arm_{name}") for name in names)
+        f"arm {which}",
+        *(_asl_csv("asl_robot_arm", f"robot_arm_{name}") for name in names),
+        _ARM_OFFSETS_S[which],
     )
 
 

@@ -44,9 +44,10 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
-# Time offsets (s) from which on a warning, a note is given; a note also needs this many standard
-# deviations.
-_OFFSET_WARNING_S, _OFFSET_NOTE_S, _OFFSET_SIGMAS = 0.03, 0.005, 5.0
+# Time offsets (s) from which on an error, a warning, a note is given; each also needs this many
+# standard deviations. Differences of lengths from which on an error is given.
+_OFFSET_ERROR_S, _OFFSET_WARNING_S, _OFFSET_NOTE_S, _OFFSET_SIGMAS = 0.1, 0.01, 0.005, 5.0
+_SCALE_ERROR = 0.03
 
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
 _UNIT_TOLERANCE = 0.1
@@ -154,6 +155,7 @@ def _check_agreeing(
     known_scale: float,
 ) -> CheckResult:
     """What else there is to say of streams that agree under a hypothesis."""
+    is_sound = not any(finding.makes_unusable for finding in findings)
     corrected = explanation.hypothesis.undo(streams)
     offset = refine_time_offset(
         corrected.parent, corrected.child, correlation, corrected.max_gap_s, explanation.fit
@@ -172,7 +174,7 @@ def _check_agreeing(
         *(_check_scale(scale, known_scale) if scale else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
     ]
-    if not explanation.findings:
+    if is_sound:
         fit = scale.fit if scale else explanation.fit
         findings += _check_aligned(streams, offset.seconds, fit)
     rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
@@ -217,8 +219,9 @@ def _rates_disagree(correlation: Correlation) -> Finding:
 def _check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
     if abs(found.seconds) < max(_OFFSET_NOTE_S, _OFFSET_SIGMAS * found.sigma_s):
         return []
-    is_large = abs(found.seconds) > _OFFSET_WARNING_S
-    severity = Severity.WARNING if is_large else Severity.NOTE
+    severity = Severity.NOTE
+    if abs(found.seconds) > _OFFSET_WARNING_S:
+        severity = Severity.ERROR if abs(found.seconds) > _OFFSET_ERROR_S else Severity.WARNING
     return [wording.time_offset(found, round(known_s + found.seconds, 4), severity)]
 
 
@@ -228,7 +231,8 @@ def _check_scale(scale: Scale, known: float) -> list[Finding]:
     for factor, unit in _UNITS.items():
         if abs(scale.value / factor - 1.0) < _UNIT_TOLERANCE:
             return [wording.units(scale, unit, round(known * factor, 9))]
-    return [wording.scale_differs(scale, round(known * scale.value, 4))]
+    severity = Severity.ERROR if abs(scale.value - 1.0) > _SCALE_ERROR else Severity.WARNING
+    return [wording.scale_differs(scale, round(known * scale.value, 4), severity)]
 
 
 def _motions(pose_pairs: PosePairs) -> MotionPairs:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from hand_eye_calib.methods import METHODS
 
 if TYPE_CHECKING:
     from hand_eye_calib.alignment.angular_rates import Correlation
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.arrays import FloatArray
     from hand_eye_calib.assessment.mount_change import MountChange
     from hand_eye_calib.checks.response import Quantity
+    from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.pairing.leaps import Leap
 
 
@@ -99,6 +102,26 @@ class Finding:
 
 # Jumps up to this share hardly matter to the methods that leave them out.
 _FEW_JUMPS = 0.02
+
+
+def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
+    """The same findings; those that the options answer already are notes, and so are a few jumps if
+    the method leaves outliers out.
+    """
+    given = config.to_options()
+    rejects_outliers = METHODS[config.method].rejects_outliers
+
+    def is_answered(finding: Finding) -> bool:
+        few = finding.code == "jumps" and dict(finding.evidence)["share"] < _FEW_JUMPS
+        if few and rejects_outliers:
+            return True
+        set_so = [given.get(name) == value for name, value in finding.options]
+        return bool(set_so) and all(set_so)
+
+    return [
+        replace(finding, severity=Severity.NOTE) if is_answered(finding) else finding
+        for finding in findings
+    ]
 
 
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -190,7 +213,7 @@ def jumps(stream: str, share: float) -> Finding:
     return Finding(
         code="jumps",
         stream=stream,
-        severity=Severity.NOTE if share < _FEW_JUMPS else Severity.WARNING,
+        severity=Severity.WARNING,
         confidence=Confidence.LIKELY,
         what=f"{share:.1%} of the {stream} stream's steps are jumps: far from the motion before "
         "and after",
@@ -369,6 +392,7 @@ def time_offset(found: TimeOffset, total_s: float, severity: Severity) -> Findin
         what=f"the child's clock is {abs(found.seconds):.4f} +/- {found.sigma_s:.4f} s {direction} "
         "the parent's",
         advice=f"add {total_s} s to the child's stamps, or have it estimated",
+        evidence=(("offset_s", found.seconds), ("sigma_s", found.sigma_s)),
         options=(("time_offset", total_s),),
     )
 
@@ -383,20 +407,22 @@ def units(scale: Scale, unit: str, factor: float) -> Finding:
         what=f"the child's lengths are {unit} while the parent's are metres (factor "
         f"{scale.value:.5g} +/- {scale.sigma:.2g})",
         advice="convert them to metres",
+        evidence=(("scale", scale.value), ("sigma", scale.sigma)),
         options=(("scale", factor),),
     )
 
 
-def scale_differs(scale: Scale, factor: float) -> Finding:
+def scale_differs(scale: Scale, factor: float, severity: Severity) -> Finding:
     """The child's lengths are off by a factor."""
     return Finding(
         code="scale",
         stream="child",
-        severity=Severity.WARNING,
+        severity=severity,
         confidence=Confidence.CERTAIN,
         what=f"the child's lengths must be multiplied by {scale.value:.4f} +/- {scale.sigma:.4f} "
         "to agree with the parent's",
         advice="have the scale estimated, or find out which of the two measures wrongly",
+        evidence=(("scale", scale.value), ("sigma", scale.sigma)),
         options=(("scale", factor),),
     )
 

@@ -170,13 +170,17 @@ _USUAL = [
         for code, correct in (
             ("quaternion_order", _reordered),
             ("inverse", _inverted),
-            ("inverse_orientation", _orientations_inverted),
             ("left_handed", functools.partial(_with_axes, _MIRROR)),
         )
     ),
     # One exporter often writes both streams.
     Hypothesis("quaternion_order", "both", _reordered),
-    Hypothesis("inverse_orientation", "both", _orientations_inverted),
+]
+
+# Less usual, and on flat ground the same as two axes swapped.
+_ORIENTATIONS = [
+    Hypothesis("inverse_orientation", stream, _orientations_inverted, 2)
+    for stream in ("child", "parent", "both")
 ]
 
 
@@ -260,18 +264,21 @@ def _plain_or_usual(streams: StreamPair, lag_s: float, limit: float) -> Explanat
 
 
 def _or_other_axes(plain: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
-    """The explanation by wrong axes if it is decisive, otherwise the given one."""
+    """The explanation by wrong axes, or by inverted orientations, if it is decisive, otherwise the
+    given one.
+    """
+    tried = []
     rotation = _agreed_rotation(streams, lag_s)
-    if rotation is None:
-        return plain
-    start = replace(plain.fit, T_parent_child=se3.from_rotation_translation(rotation, np.zeros(3)))
-    axes = _simplest_of_the_best(
-        [
+    if rotation is not None:
+        T = se3.from_rotation_translation(rotation, np.zeros(3))
+        start = replace(plain.fit, T_parent_child=T)
+        tried = [
             _fitted(hypothesis, streams, lag_s, _MAX_PAIRS_FOR_AXES, start)
             for hypothesis in _axis_hypotheses()
         ]
-    )
-    return axes if _is_decisive(plain, axes, HOLDS) else plain
+    tried += [_fitted(hypothesis, streams, lag_s) for hypothesis in _ORIENTATIONS]
+    best = _simplest_of_the_best(tried)
+    return best if _is_decisive(plain, best, HOLDS) else plain
 
 
 def _fitted(

@@ -39,6 +39,7 @@ _MIN_POSES_OF_TURNS, _MAX_REPEATS = 60, 0.1
 # Positions are on a grid if this share of so many differences, those of a few steps, are multiples
 # of the smallest, to this share of a step. Steps (m) from which on that matters.
 _MIN_GRID, _ON_GRID, _GRID_TOLERANCE, _MAX_MULTIPLE = 30, 0.98, 0.06, 200.0
+_MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
 _COARSE_NOTE_M, _COARSE_WARNING_M, _COARSE_ERROR_M = 0.002, 0.005, 0.02
 
 # A stream is flat if its vertical and its height (m) stay the same to rounding; that matters if the
@@ -223,12 +224,16 @@ def _check_grid(positions: FloatArray, stream: str) -> Finding | None:
 
 def _grid_step(values: FloatArray) -> float:
     """Step (m) of which all differences (N - 1,) are multiples, 0 if there is none."""
-    differences = np.abs(np.diff(values))
-    differences = differences[differences > _SAME_POSE]
+    steps = np.abs(np.diff(values))
+    differences = steps[steps > _SAME_POSE]
     if len(differences) < _MIN_GRID:
         return 0.0
     step = float(differences.min())
     multiples = differences / step
+    # Steady motion has equal steps, too, but not many different ones.
+    different = len(np.unique(np.round(multiples)))
+    if different < _MIN_DIFFERENT and len(differences) > _MAX_MOVING * len(steps):
+        return 0.0
     off = np.abs(multiples - np.round(multiples))
     few = multiples < _MAX_MULTIPLE
     is_grid = few.mean() > 0.5 and (off[few] < _GRID_TOLERANCE).mean() > _ON_GRID

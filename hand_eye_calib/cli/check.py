@@ -49,11 +49,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what was found; returns 1 if something is wrong with the streams, otherwise 0."""
+    """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
     from hand_eye_calib.checks.check import check_streams
-    from hand_eye_calib.checks.findings import Severity
+    from hand_eye_calib.checks.findings import answered, gravest_first
     from hand_eye_calib.checks.streams import summarise
-    from hand_eye_calib.cli.findings import verdict, with_options_set
+    from hand_eye_calib.cli.findings import verdict
 
     if len(arguments.inputs) > 2:
         raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.inputs)}")
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     scale = config.scale if isinstance(config.scale, float) else 1.0
     with waiting_for("checking the streams"):
         checked = check_streams(parent, child, offset_s, scale, config.max_gap)
-    findings = with_options_set([*checked.findings, *of_files], config)
+    findings = gravest_first(answered([*checked.findings, *of_files], config))
     streams = {name: summarise(one) for name, one in trajectories.items() if len(one) > 1}
     if arguments.json:
         document = _document(sources, streams, findings, checked)
@@ -80,8 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
         corrected = child.shifted(offset_s).scaled(scale)
         said = (findings, named, verdict(findings))
         write_check(arguments.out, parent, corrected, checked, *said, config.max_gap)
-    serious = [finding for finding in findings if finding.severity is not Severity.NOTE]
-    return fail(f"{serious[0].what}; {serious[0].advice}", 1) if serious else 0
+    return fail(str(findings[0]), 1) if findings and findings[0].makes_unusable else 0
 
 
 def _named(sources: Mapping[str, str], is_bag: bool) -> list[str]:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.cli.spelling import as_typed, flag
-from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import printable
 
 if TYPE_CHECKING:
@@ -37,17 +36,6 @@ def with_findings(
     return dataclasses.replace(calibration, warnings=warnings, findings=tuple(plain)), plain
 
 
-def with_options_set(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
-    """The same findings; those that the options answer already are notes."""
-    given = config.to_options()
-    return [
-        dataclasses.replace(finding, severity=Severity.NOTE)
-        if finding.options and all(given[name] == value for name, value in finding.options)
-        else finding
-        for finding in findings
-    ]
-
-
 def verdict(findings: Sequence[Finding]) -> str:
     """What the findings mean for a calibration with these streams, in one sentence."""
     serious = [finding for finding in findings if finding.severity is not Severity.NOTE]
@@ -56,8 +44,11 @@ def verdict(findings: Sequence[Finding]) -> str:
     if all(finding.options for finding in serious):
         options = "".join(_typed_options(finding) for finding in serious).replace(":", "")
         return f"calibrate with{options}, not without it."
-    codes = ", ".join(finding.code for finding in serious if not finding.options)
-    return f"do not calibrate with these streams as they are ({codes})."
+    errors = [finding for finding in serious if finding.makes_unusable]
+    codes = ", ".join(finding.code for finding in errors or serious if not finding.options)
+    if not errors:
+        return f"calibrate with care ({codes})."
+    return f"do not calibrate with these streams as they are ({codes or errors[0].code})."
 
 
 def table(findings: Sequence[Finding]) -> str:

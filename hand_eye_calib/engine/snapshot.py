@@ -9,6 +9,7 @@ import numpy as np
 from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.checks.check import CheckResult, check_streams
+from hand_eye_calib.checks.findings import answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import RawPoses
@@ -174,8 +175,8 @@ class Snapshot:
             obsolete.add("gaps")  # pairs may have gaps where the streams have none
         if calibration and not _hides_a_translation(calibration):
             obsolete.add("one_axis")  # the result has shown otherwise
-        findings = tuple(found for found in result.findings if found.code not in obsolete)
-        return replace(result, findings=findings)
+        findings = [found for found in result.findings if found.code not in obsolete]
+        return replace(result, findings=gravest_first(answered(findings, self.config)))
 
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
