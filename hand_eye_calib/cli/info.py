@@ -1,6 +1,7 @@
-"""``info RESULT``: show a saved calibration."""
+"""``info RESULT``: show a saved calibration, or pack it for a report."""
 
 import argparse
+from pathlib import Path
 
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.cli.robot import add_description_arguments, write_description
@@ -9,11 +10,21 @@ from hand_eye_calib.errors import ConfigError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.epilog = "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json"
+    parser.epilog = (
+        "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json\n"
+        "  hand_eye_calib info result --bundle wrong_answer.zip"
+    )
     parser.add_argument(
         "result", metavar="RESULT", help="extrinsic.yaml, or the directory that holds it"
     )
     add_description_arguments(parser)
+    parser.add_argument(
+        "--bundle",
+        metavar="FILE",
+        type=Path,
+        help="write what a report of a wrong answer needs to a zip file: versions, options, "
+        "findings, the result and 200 kB of downsampled poses without their place; nothing else",
+    )
     add_json_argument(parser)
 
 
@@ -25,6 +36,13 @@ def run(arguments: argparse.Namespace) -> int:
     calibration = load_result(arguments.result)
     if arguments.write and not arguments.urdf:
         raise ConfigError("--write needs --urdf: the description to change")
+    if arguments.bundle:
+        from hand_eye_calib.cli.bundle import write_bundle
+        from hand_eye_calib.cli.console import note
+
+        for text in write_bundle(arguments.result, arguments.bundle):
+            note(text)
+        note(f"wrote {arguments.bundle}")
     print(as_json(calibration) if arguments.json else as_text(calibration))
     write_description(calibration, arguments)
     return 0

@@ -79,8 +79,8 @@ def read_trajectory(
         and ``/tf_static``.
     columns : str, optional
         For csv without a header, tables and rows in memory: the columns' names, such as
-        ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other names
-        are columns to skip.
+        ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other
+        names are columns to skip.
     times : str, path-like or (N,) array-like, optional
         For kitti: the file of the stamps. For an object: the stamps, as seconds, whole numbers
         or datetimes.
