@@ -175,7 +175,7 @@ class Calibration:
         Noise of the trajectories as the adaptive estimator found it; None with other methods.
     cross_check : dict or None
         Per axis, the scatter of the answers of other methods and references and of both halves of
-        the recording about this one (:class:`~hand_eye_calib.engine.cross_check.CrossCheck`); None
+        the recording about this one (:class:`~hand_eye_calib.engine.scatter.CrossCheck`); None
         without that cross-check.
     findings : tuple of dict
         What the stream checks found, in plain values
@@ -198,6 +198,9 @@ class Calibration:
         What a person should know before using the result.
     motion_residuals : Residuals or None
         Not part of files; see :meth:`residuals`.
+    other_answer : ((4, 4) array, (6, 6) array) or None
+        T_parent_child and covariance under other assumptions on the noise: of the adaptive
+        estimator beside DNLO, or the reverse. Not part of files.
     """
 
     T_parent_child: FloatArray
@@ -234,6 +237,9 @@ class Calibration:
     child_frame: str = "child"
     warnings: tuple[str, ...] = ()
     motion_residuals: Residuals | None = field(default=None, repr=False, compare=False)
+    other_answer: tuple[FloatArray, FloatArray] | None = field(
+        default=None, repr=False, compare=False
+    )
 
     def __repr__(self) -> str:
         frames = f"{self.child_frame} in {self.parent_frame}"
@@ -379,7 +385,8 @@ class Calibration:
         if self.floor is None:
             return np.zeros(6)
         to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
-        return np.asarray(np.sqrt(np.diag(to_parent @ self.floor @ to_parent.T)))
+        variances = np.diag(to_parent @ self.floor @ to_parent.T)
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
     @property
     def sigmas_with_floor(self) -> FloatArray:

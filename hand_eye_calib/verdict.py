@@ -116,17 +116,23 @@ class Rule:
 _Found: TypeAlias = tuple[str, str, tuple[str, ...], tuple[tuple[str, Any], ...]]
 
 # Other answers contradict a result if they lie farther away than so many joint standard deviations
-# and than this share of the target. From so many targets on nothing of it may be used.
-CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, HOPELESS_TARGETS = 3.0, 0.25, 10.0
+# and than this share of the target; other references also if they scatter by so many of its own
+# standard deviations and so many targets: that they are uncertain themselves does not excuse a
+# large scatter. From even more targets on nothing of it may be used.
+CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
+HOPELESS_TARGETS = 10.0
 
 # Smallest share of the motion pairs that are inliers in a recording whose noise is understood.
 FEWEST_INLIERS = 0.6
 
 _OTHERS = {
+    "model": "dnlo and adaptive, which assume different noise,",
     "halves": "the two halves of the recording",
     "methods": "other methods and references",
 }
 _WHAT_TO_DO = {
+    "model": "take the difference as the standard deviation, or record again with more varied "
+    "motion; look for an odometry that drifts to one side",
     "halves": "check that both mounts are tight and record again; what the halves agree on holds",
     "methods": "take the scatter as the standard deviation, or record longer with more varied "
     "motion",
@@ -228,8 +234,9 @@ def _contradiction(kind: str, is_hopeless: bool) -> Callable[[Judged], Iterator[
             sigmas = [
                 amount(dof.name, dof.sigma) for dof in result.observability if dof.name in far
             ]
+            what = "differ" if kind == "model" else "scatter"
             text = (
-                f"{_OTHERS[kind]} scatter in {listing(told)} about this result, which states "
+                f"{_OTHERS[kind]} {what} in {listing(told)}, and this result states "
                 f"{listing(sigmas)}"
             )
             yield text, _WHAT_TO_DO[kind], tuple(far), ()
@@ -245,10 +252,14 @@ def _far(result: Judged, kind: str) -> dict[str, float]:
         scatter = row.get(f"of_{kind}")
         if scatter is None or not math.isfinite(sigmas[axis]):
             continue
+        own = scatter / max(sigmas[axis], 1e-12)
         # Older files have no distances.
-        excess = row.get(f"excess_of_{kind}") or scatter / max(sigmas[axis], 1e-12)
-        is_large = scatter > CONTRADICTED_SHARE * target_of(axis, result)
-        if excess > CONTRADICTED_SIGMAS and is_large:
+        excess = row.get(f"excess_of_{kind}") or own
+        of_target = scatter / target_of(axis, result)
+        is_beyond_all = kind == "methods" and own > CONTRADICTED_SIGMAS
+        if (excess > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE) or (
+            is_beyond_all and of_target > CONTRADICTED_TARGETS
+        ):
             far[axis] = scatter
     return far
 
@@ -316,6 +327,17 @@ def _known(result: Judged) -> str:
     return f"all six axes are known to {texts[0]} and {texts[1]} or better, one standard deviation"
 
 
+def _condition(kind: str) -> str:
+    text = (
+        f"{_OTHERS[kind].partition(',')[0]} differ by more than {CONTRADICTED_SIGMAS:g} joint "
+        f"standard deviations and {CONTRADICTED_SHARE:g} of the target"
+    )
+    if kind == "methods":
+        text += f", or {CONTRADICTED_SIGMAS:g} of the result's own and {CONTRADICTED_TARGETS:g} "
+        text += "targets"
+    return text
+
+
 _NEVER, _CARE = Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE
 
 RULES = (
@@ -333,11 +355,10 @@ RULES = (
         Rule(
             f"{kind}_far",
             _NEVER,
-            f"{others} contradict the result, and scatter by more than {HOPELESS_TARGETS:g} "
-            "targets about it",
+            f"{_condition(kind)}, and by more than {HOPELESS_TARGETS:g} targets",
             _contradiction(kind, is_hopeless=True),
         )
-        for kind, others in _OTHERS.items()
+        for kind in _OTHERS
     ),
     Rule("unobservable", _CARE, "the motion does not show an axis", _hidden),
     Rule("warning_finding", _CARE, "a stream check gave a warning", _findings_of("warning")),
@@ -345,11 +366,10 @@ RULES = (
         Rule(
             kind,
             _CARE,
-            f"{others} contradict the result: they scatter by more than {CONTRADICTED_SIGMAS:g} "
-            f"joint standard deviations and {CONTRADICTED_SHARE:g} of the target about it",
+            _condition(kind),
             _contradiction(kind, is_hopeless=False),
         )
-        for kind, others in _OTHERS.items()
+        for kind in _OTHERS
     ),
     Rule(
         "outliers",

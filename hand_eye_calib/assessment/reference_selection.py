@@ -41,12 +41,15 @@ class ReferenceChoice:
         Candidate to its predicted root mean square translation (m) and rotation error (rad).
     alike : tuple of str
         The candidates with nearly the smallest joint error, among which their answers decided.
+    answer : ((4, 4) array, (6, 6) array) or None
+        The adaptive estimator's answer and its covariance, if it was computed for the choice.
     """
 
     reference: str
     predicted_m: dict[str, float]
     predicted_rad: dict[str, float]
     alike: tuple[str, ...] = ()
+    answer: tuple[FloatArray, FloatArray] | None = None
 
     def joint_errors(self) -> dict[str, float]:
         """Candidate to its predicted error in translation and rotation together: the root mean
@@ -144,7 +147,8 @@ def select_reference(
     limit = _NEARLY_AS_GOOD * min(joint.values())
     alike = tuple(reference for reference, expected in joint.items() if expected <= limit)
     nearest = _nearest(pose_pairs, method, dataclasses.replace(choice, alike=alike), solution)
-    return dataclasses.replace(choice, reference=nearest, alike=alike)
+    answer = (solution.T_parent_child, solution.cov_parent_child_in_child)
+    return dataclasses.replace(choice, reference=nearest, alike=alike, answer=answer)
 
 
 def _rms(covariances: Mapping[str, FloatArray], part: slice) -> dict[str, float]:

@@ -20,8 +20,7 @@ _WIDTH = 100
 def with_findings(
     calibration: Calibration, snapshot: "Snapshot"
 ) -> tuple[Calibration, list[dict[str, Any]]]:
-    """A calibration whose warnings include those of the stream checks, and all findings as plain
-    values.
+    """A calibration with what the stream checks found, which is also returned as plain values.
 
     Parameters
     ----------
@@ -29,11 +28,8 @@ def with_findings(
     snapshot : Snapshot
         The poses it comes from.
     """
-    findings = snapshot.check(calibration).findings
-    serious = [str(finding) for finding in findings if finding.severity is not Severity.NOTE]
-    plain = [finding.to_dict() for finding in findings]
-    warnings = (*calibration.warnings, *serious)
-    return dataclasses.replace(calibration, warnings=warnings, findings=tuple(plain)), plain
+    findings = [finding.to_dict() for finding in snapshot.check(calibration).findings]
+    return dataclasses.replace(calibration, findings=tuple(findings)), findings
 
 
 def verdict(findings: Sequence[Finding]) -> str:

@@ -36,7 +36,7 @@ def with_cross_check(
     Returns
     -------
     calibration : Calibration
-        With the cross-checks' scatter and warnings.
+        With the cross-checks' scatter.
     evidence : Evidence
         For a report.
     """
@@ -47,9 +47,7 @@ def with_cross_check(
     pose_pairs = dataclasses.replace(snapshot, config=config).pose_pairs()
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True))
     evidence = gather(calibration, snapshot.config, pose_pairs, streams)
-    found = evidence.cross_check
-    warnings = (*calibration.warnings, *found.warnings())
-    checked = dataclasses.replace(calibration, cross_check=found.to_dict(), warnings=warnings)
+    checked = dataclasses.replace(calibration, cross_check=evidence.cross_check.to_dict())
     return checked, evidence
 
 

@@ -5,7 +5,7 @@ Long recordings are downsampled before they are solved again, so that all answer
 seconds.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,9 @@ _COMPARED_METHODS = ("dnlo", "dnl", "park")
 _COMPARED_BASELINES = (1, 5, 10, 20)
 _MAX_POSES_OF_OTHERS = 3_000
 _COMPARED_ESTIMATOR = "adaptive"
+
+# The same for a check within every solve: the method that takes least time, at these baselines.
+_QUICK_METHOD, _QUICK_BASELINES = "dnlo", (1, 3, 8, 20)
 
 _MIN_POSES = 20
 
@@ -96,15 +99,41 @@ class OtherAnswers:
 
     def halves(self) -> tuple[Answer, ...]:
         """From each half alone, without priors."""
+        return self._same_method(
+            self._halves_with(self._without_prior), METHODS[self._config.method].most_poses_of_few
+        )
+
+    def _halves_with(self, config: CalibratorConfig) -> list[_Question]:
         half = len(self._poses) // 2
-        questions = [
-            _Question("first half", slice(0, half), self._without_prior),
-            _Question("second half", slice(half, None), self._without_prior),
+        return [
+            _Question("first half", slice(0, half), config),
+            _Question("second half", slice(half, None), config),
         ]
-        return self._same_method(questions, METHODS[self._config.method].most_poses_of_few)
 
     def other_methods(self) -> tuple[Answer, ...]:
         """From other methods and references, without priors."""
+        questions = [
+            question
+            for method in _COMPARED_METHODS
+            for question in self._at_baselines(method, _COMPARED_BASELINES)
+        ]
+        if self._calibration.method != _COMPARED_ESTIMATOR:
+            questions.append(self._estimator_question())
+        return self._answers(questions)
+
+    def quick(self) -> tuple[tuple[Answer, ...], tuple[Answer, ...]]:
+        """From other references, and from each half, with the quickest method: without priors."""
+        others = self._at_baselines(_QUICK_METHOD, _QUICK_BASELINES)
+        own = self._calibration.reference
+        if not METHODS[self._calibration.method].uses_reference or own[0] not in "BC":
+            own = f"B{_QUICK_BASELINES[2]}"
+        config = replace(self._without_prior, method=_QUICK_METHOD, reference=own)
+        return self._answers(others), self._answers(
+            self._downsampled(half, _MAX_POSES_OF_OTHERS, own) for half in self._halves_with(config)
+        )
+
+    def _at_baselines(self, method: str, baselines: Sequence[int]) -> list[_Question]:
+        """A method at these baselines, with at most so many poses; without the result itself."""
         stride = _stride(len(self._poses), _MAX_POSES_OF_OTHERS)
         own_label = f"{self._calibration.method} {self._calibration.reference}"
         questions = [
@@ -113,14 +142,10 @@ class OtherAnswers:
                 slice(None, None, stride),
                 replace(self._without_prior, method=method, reference=f"B{n}"),
             )
-            for method in _COMPARED_METHODS
-            for n in _COMPARED_BASELINES
+            for n in baselines
             if n * stride * 4 < len(self._poses)
         ]
-        questions = [question for question in questions if question.label != own_label]
-        if self._calibration.method != _COMPARED_ESTIMATOR:
-            questions.append(self._estimator_question())
-        return self._answers(questions)
+        return [question for question in questions if question.label != own_label]
 
     def _estimator_question(self) -> _Question:
         label = _COMPARED_ESTIMATOR
@@ -132,14 +157,17 @@ class OtherAnswers:
 
     def _same_method(self, questions: Iterable[_Question], max_poses: int) -> tuple[Answer, ...]:
         """Answers of the result's own method, with its reference, from at most so many poses."""
-        return self._answers(self._downsampled(question, max_poses) for question in questions)
+        return self._answers(
+            self._downsampled(question, max_poses, self._calibration.reference)
+            for question in questions
+        )
 
-    def _downsampled(self, question: _Question, max_poses: int) -> _Question:
+    def _downsampled(self, question: _Question, max_poses: int, own_reference: str) -> _Question:
         start, end, _ = question.part.indices(len(self._poses))
         stride = _stride(end - start, max_poses)
         reference = "auto"
         if METHODS[question.config.method].uses_reference:
-            reference = _coarser(self._calibration.reference, stride)
+            reference = _coarser(own_reference, stride)
         config = replace(question.config, reference=reference)
         return replace(question, part=slice(start, end, stride), config=config)
 

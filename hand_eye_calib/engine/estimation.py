@@ -13,12 +13,7 @@ from hand_eye_calib.alignment.scale import Scale, child_scaled, estimate_scale
 from hand_eye_calib.alignment.similarity import MAX_UNEXPLAINED_TRANSLATION
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.assessment.covariance import (
-    TRANSLATIONS,
-    Assessment,
-    assess,
-    assess_adaptive,
-)
+from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive
 from hand_eye_calib.assessment.floor import common_mode_floor
 from hand_eye_calib.assessment.model_fit import MAX_JUMPS, why_not
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
@@ -69,6 +64,7 @@ class _Evaluation:
     time_correction_s: float = 0.0
     time_sigma_s: float = 0.0
     warnings: tuple[str, ...] = ()
+    other_answer: tuple[FloatArray, FloatArray] | None = None
 
 
 @dataclass(frozen=True)
@@ -156,8 +152,9 @@ def _calibration(
         target_translation=config.target_translation,
         target_rotation=config.target_rotation,
         stamp_ns=int(stamps_ns[-1]),
-        warnings=(*_warnings_of(fused, solution.converged), *evaluation.warnings),
+        warnings=(*_warnings_of(fused), *evaluation.warnings),
         motion_residuals=residuals,
+        other_answer=evaluation.other_answer,
     )
 
 
@@ -215,9 +212,17 @@ def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
     compared = f"dnlo on reference {dnlo.reference}"
     if misfit:
         reason = f"auto: {compared} stands, because the noise model does not fit: {misfit}"
-        return replace(dnlo, method_reason=reason)
+        return replace(dnlo, method_reason=reason, other_answer=_beside(by_model))
     reason = f"auto: the noise model fits, and its answer agrees with that of {compared}"
-    return replace(by_model, method_reason=reason)
+    return replace(by_model, method_reason=reason, other_answer=_beside(dnlo))
+
+
+def _beside(evaluation: _Evaluation) -> tuple[FloatArray, FloatArray]:
+    """An answer that was not chosen, and its covariance."""
+    return (
+        evaluation.solution.T_parent_child,
+        evaluation.assessment.cov_parent_child_in_child,
+    )
 
 
 def _answer(evaluation: _Evaluation) -> tuple[FloatArray, Assessment]:
@@ -248,7 +253,7 @@ def _solve_pairs(
         longer = _solve_reference(pose_pairs, method, reference, reason)
         if _n_unobservable(longer.assessment) < n_unobservable:
             chosen = longer
-    return chosen
+    return replace(chosen, other_answer=choice.answer)
 
 
 def _solve_reference(
@@ -278,17 +283,6 @@ def _n_unobservable(assessment: Assessment) -> int:
 
 def _named(assessment: Assessment, verdict: DofVerdict) -> list[str]:
     return [dof.name for dof in assessment.observability if dof.verdict is verdict]
-
-
-def _weak(assessment: Assessment) -> list[str]:
-    """Weak axes with their standard deviations in words."""
-    return [
-        f"{dof.name} (+/- {dof.sigma:.2g} m)"
-        if dof.name in TRANSLATIONS
-        else f"{dof.name} (+/- {np.degrees(dof.sigma):.2g} deg)"
-        for dof in assessment.observability
-        if dof.verdict is DofVerdict.WEAK
-    ]
 
 
 def _solve_adaptive(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
@@ -399,30 +393,9 @@ def _status(converged: bool, fused: Fused) -> SolveStatus:
     return SolveStatus.UNOBSERVABLE if unobservable else SolveStatus.OK
 
 
-def _warnings_of(fused: Fused, converged: bool) -> list[str]:
-    warnings = []
-    if unobservable := _named(fused.assessment, DofVerdict.UNOBSERVABLE):
-        priors = " and ".join(f"prior {name}=VALUE+/-SIGMA" for name in unobservable)
-        warnings.append(
-            f"the motion does not reveal {', '.join(unobservable)} of the child sensor in the "
-            "parent sensor's frame: do not use these values; drive curves over slopes, or measure "
-            f"them by hand and give them as {priors}"
-        )
-    if weak := _weak(fused.assessment):
-        warnings.append(
-            f"little is known of {', '.join(weak)} (one standard deviation): record longer, with "
-            "more rotation about other axes, or give what was measured by hand as a prior"
-        )
-    if mostly_prior := _named(fused.assessment, DofVerdict.PRIOR):
-        warnings.append(
-            f"{', '.join(mostly_prior)} of the child sensor: mostly from the prior, "
-            "not from the motion"
-        )
-    for axis, distance in fused.contradictions.items():
-        warnings.append(
-            f"the prior on {axis} is {distance:.1f} standard deviations from the estimate from "
-            "motion and was left out: check its value, unit and sign"
-        )
-    if not converged:
-        warnings.append("the solver did not converge: do not use this result")
-    return warnings
+def _warnings_of(fused: Fused) -> list[str]:
+    """What the reasons of the verdict do not say."""
+    mostly_prior = _named(fused.assessment, DofVerdict.PRIOR)
+    if not mostly_prior:
+        return []
+    return [f"{', '.join(mostly_prior)} of the child sensor: mostly from the prior, not the motion"]

@@ -14,7 +14,7 @@ from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import Answer, OtherAnswers
-from hand_eye_calib.engine.cross_check import CrossCheck, compare_answers
+from hand_eye_calib.engine.scatter import CrossCheck, compare_answers
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS

@@ -13,6 +13,7 @@ from hand_eye_calib.checks.findings import answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import RawPoses
+from hand_eye_calib.engine.scatter import quick_cross_check
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
@@ -126,8 +127,10 @@ class Snapshot:
         if len(self._pose_pairs) < self.config.min_pairs:
             raise NotEnoughDataError(self._what_is_missing(len(self._pose_pairs)))
         result = estimate_extrinsic(self._pose_pairs, self.config, self.time_offset)
+        checked = quick_cross_check(result, self.config, self._pose_pairs)
         return replace(
             result,
+            cross_check=checked.to_dict(),
             parent_frame=self.parent_frame,
             child_frame=self.child_frame,
             warnings=self.warnings + result.warnings,

@@ -6,7 +6,7 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 from hand_eye_calib.assessment.covariance import AXES, UNKNOWN_TRANSLATION, Assessment
 from hand_eye_calib.assessment.prior import fuse
-from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig, parse_prior
 from hand_eye_calib.engine.offline import calibrate
@@ -81,7 +81,7 @@ class TestFlatGround:
         assert result.unobservable() == ["z"]
         assert abs(result.T_parent_child[2, 3]) < 0.05  # level with the parent, whatever noise says
         np.testing.assert_allclose(result.T_parent_child[:2, 3], MOUNT[:2, 3], atol=0.05)
-        assert any("prior z=VALUE+/-SIGMA" in warning for warning in result.warnings)
+        assert result.reasons[0].what_to_do == "measure it by hand and give prior.z=VALUE+/-SIGMA"
 
     def test_prior_fills_in_what_is_unknown(self):
         result = calibrate(*flat_drive(), reference="B10", prior={"z": (1.85, 0.02)})
@@ -157,8 +157,9 @@ class TestFullMotion:
         result = calibrate(*self.drive(), reference="B10", prior={axis: prior})
         assert result.status is SolveStatus.CONTRADICTED
         assert result.status.failure == "a prior contradicts the motion"
-        (warning,) = (w for w in result.warnings if f"prior on {axis} is" in w)
-        assert "check its value, unit and sign" in warning
+        assert result.verdict is Verdict.DO_NOT_USE
+        assert result.reasons[0].sentence.startswith(f"the prior on {axis} is ")
+        assert result.reasons[0].what_to_do == f"check value, unit and sign of prior.{axis}"
         np.testing.assert_array_equal(result.T_parent_child, plain.T_parent_child)
         np.testing.assert_array_equal(result.covariance, plain.covariance)
 
@@ -172,7 +173,7 @@ class TestFullMotion:
     def test_a_prior_that_agrees_is_no_contradiction(self):
         result = calibrate(*self.drive(), reference="B10", prior={"x": (0.6, 0.05)})
         assert result.status is SolveStatus.OK
-        assert not any("standard deviations" in warning for warning in result.warnings)
+        assert result.contradictions == {}
 
     @pytest.mark.parametrize("sigma", [1e-9, 1e-15])
     def test_tiny_standard_deviations_are_no_trouble(self, sigma):

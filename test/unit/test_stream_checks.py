@@ -331,7 +331,8 @@ class TestCommand:
         main(["calibrate", *paths, "--reference", "B5", "--json"])
         document = json.loads(capsys.readouterr().out)
         assert document["findings"][0]["code"] == "inverse"
-        assert any("inverse poses" in warning for warning in document["warnings"])
+        assert document["verdict"] == "DO NOT USE"
+        assert "inverse poses" in document["reasons"][0]["sentence"]
 
 
 def test_findings_are_plain_values():

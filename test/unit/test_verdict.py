@@ -21,6 +21,7 @@ from hand_eye_calib.calibration import (
 )
 from hand_eye_calib.verdict import RULES
 
+OTHERS = ("model", "methods", "halves")
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "verdict.md"
 TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)")
 
@@ -55,7 +56,7 @@ def good(**changes):
 
 
 def checked(axis, scatter, excess, kind):
-    nothing = dict.fromkeys(("of_methods", "of_halves", "excess_of_methods", "excess_of_halves"))
+    nothing = dict.fromkeys(f"{what}of_{who}" for what in ("", "excess_") for who in OTHERS)
     rows = {name: {"sigma": 0.003} | nothing for name in NAMES}
     rows[axis] |= {f"of_{kind}": scatter, f"excess_of_{kind}": excess}
     return rows
@@ -76,10 +77,12 @@ CASES = {
     "prior": dict(status=SolveStatus.CONTRADICTED, contradictions={"x": 5.5}),
     "error_finding": dict(findings=(FINDING,)),
     "nothing_known": dict(observability=observed(np.inf, np.inf)),
+    "model_far": dict(cross_check=checked("yaw", 0.2, 9.0, "model")),
     "halves_far": dict(cross_check=checked("yaw", 0.2, 9.0, "halves")),
     "methods_far": dict(cross_check=checked("x", 0.5, 9.0, "methods")),
     "unobservable": dict(observability=observed(z=np.inf)),
     "warning_finding": dict(findings=(FINDING | {"severity": "warning"},)),
+    "model": dict(cross_check=checked("x", 0.02, 3.5, "model")),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
     "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),
     "outliers": dict(n_pairs=100, n_inliers=55),
@@ -103,6 +106,11 @@ def test_each_rule_alone_decides(rule):
     assert result.headline.startswith(f"{rule.verdict.value}: ")
 
 
+def test_a_large_scatter_of_references_is_not_excused_by_their_own_uncertainty():
+    result = good(cross_check=checked("x", 0.05, 2.9, "methods"))
+    assert [reason.rule for reason in result.reasons] == ["methods"]
+
+
 def test_nothing_against_it_is_use():
     result = good()
     assert (result.verdict, result.reasons) == (Verdict.USE, ())
@@ -116,7 +124,8 @@ def test_nothing_against_it_is_use():
     [
         dict(findings=(FINDING | {"severity": "note"},)),
         dict(cross_check=checked("x", 0.002, 9.0, "halves")),
-        dict(cross_check=checked("x", 0.05, 2.9, "methods")),
+        dict(cross_check=checked("x", 0.035, 2.9, "methods")),
+        dict(cross_check=checked("x", 0.05, 2.9, "halves")),
         dict(observability=observed(x=0.0199, yaw=0.0052)),
         dict(
             observability=observed(x=0.04, yaw=0.02), target_translation=0.05, target_rotation=0.1
@@ -152,7 +161,8 @@ def test_a_result_of_version_0_1_has_a_verdict():
     for name in ("verdict", "headline", "reasons", "findings", "contradictions"):
         del document[name]
     for row in document["cross_check"].values():
-        del row["excess_of_methods"], row["excess_of_halves"]
+        for name in ("excess_of_methods", "excess_of_halves", "excess_of_model", "of_model"):
+            del row[name]
     read = Calibration.from_dict(document)
     assert [reason.rule for reason in read.reasons] == ["halves"]
 

@@ -1,0 +1,195 @@
+"""The scatter of other answers about a result, compared with what their covariances allow.
+
+Two kinds of answers are compared with the result: those of other methods and references from the
+same poses, and those of each half of the recording alone. The first show what the noise model
+misses, such as errors that last longer than it assumes. The second show what changes during the
+recording. Neither shows an error that is constant.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.metrics import deviation
+from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.answers import OtherAnswers
+from hand_eye_calib.methods import METHODS
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+# Fewest other answers that have a scatter.
+_MIN_OTHERS = 3
+
+# Smallest joint standard deviation (m, rad) to divide by: noise-free data has none.
+_ROUNDING = 1e-9
+
+# Median absolute value of a normal variable, in standard deviations.
+_MEDIAN_OF_NORMAL = 0.6745
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrossCheck:
+    """Scatter of other answers about a result, along and about the axes of the parent sensor's
+    frame (m and rad).
+
+    Attributes
+    ----------
+    axes : tuple of str
+        x, y, z, roll, pitch, yaw.
+    sigma : (6,) array
+        The result's standard deviations; infinite if an axis is unobservable.
+    of_methods : (6,) array
+        Robust standard deviation of the answers of other methods and references about the result;
+        NaN if too few of them know the axis.
+    of_halves : (6,) array
+        Standard deviation of the result that follows from the difference between the answers of
+        both halves; NaN if they do not know the axis.
+    of_model : (6,) array
+        Distance from the answer under other assumptions on the noise; NaN if there is none.
+    excess_of_methods, excess_of_halves, excess_of_model : (6,) arrays
+        Distance of the answers in their joint standard deviations (of the methods: the median over
+        that of a normal variable). Those of methods and model contain the common-mode floor.
+    """
+
+    axes: tuple[str, ...]
+    sigma: FloatArray
+    of_methods: FloatArray
+    of_halves: FloatArray
+    of_model: FloatArray
+    excess_of_methods: FloatArray
+    excess_of_halves: FloatArray
+    excess_of_model: FloatArray
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON or YAML; None for what is not known."""
+        columns = {name: values for name, values in vars(self).items() if name != "axes"}
+        return {
+            axis: {
+                name: float(values[k]) if np.isfinite(values[k]) else None
+                for name, values in columns.items()
+            }
+            for k, axis in enumerate(self.axes)
+        }
+
+
+def quick_cross_check(
+    calibration: Calibration, config: CalibratorConfig, pose_pairs: PosePairs
+) -> CrossCheck:
+    """Compare a result with what DNLO gives at a few references and from each half: part of every
+    solve.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    config : CalibratorConfig
+        The options that gave it.
+    pose_pairs : PosePairs
+        The poses that gave it.
+
+    Returns
+    -------
+    CrossCheck
+    """
+    others, halves = OtherAnswers(calibration, config, pose_pairs).quick()
+    return compare_answers(
+        calibration,
+        [other.calibration for other in others],
+        [half.calibration for half in halves],
+    )
+
+
+def compare_answers(
+    calibration: Calibration,
+    others: Sequence[Calibration] = (),
+    halves: Sequence[Calibration] = (),
+) -> CrossCheck:
+    """Compare a result with other answers to the same question.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The result.
+    others : sequence of Calibration
+        From other methods and references. Only methods that reject outliers count: with jumps, the
+        others disagree for a reason that says nothing about the result.
+    halves : sequence of Calibration
+        From the first and the second half of the recording, or fewer.
+
+    Returns
+    -------
+    CrossCheck
+    """
+    robust = [other for other in others if METHODS[other.method].rejects_outliers]
+    of_methods, excess_of_methods = _scatter(calibration, robust)
+    of_halves = excess_of_halves = np.full(6, np.nan)
+    if len(halves) == 2:
+        apart, allowed = _apart(halves[0], halves[1])
+        # The whole is the mean of both halves: its standard deviation is half of that of their
+        # difference.
+        of_halves, excess_of_halves = apart / 2, apart / allowed
+    of_model, excess_of_model = _from_other_model(calibration)
+    known = np.isfinite(calibration.sigmas)
+    return CrossCheck(
+        axes=tuple(dof.name for dof in calibration.observability),
+        sigma=calibration.sigmas,
+        of_methods=np.where(known, of_methods, np.nan),
+        of_halves=np.where(known, of_halves, np.nan),
+        of_model=np.where(known, of_model, np.nan),
+        excess_of_methods=np.where(known, excess_of_methods, np.nan),
+        excess_of_halves=np.where(known, excess_of_halves, np.nan),
+        excess_of_model=np.where(known, excess_of_model, np.nan),
+    )
+
+
+def _scatter(
+    calibration: Calibration, others: Sequence[Calibration]
+) -> tuple[FloatArray, FloatArray]:
+    """Robust standard deviation (6,) of other answers about a result, and the same in joint
+    standard deviations.
+    """
+    if not others:
+        return np.full(6, np.nan), np.full(6, np.nan)
+    floor = calibration.sigmas_of_floor
+    distances = [_apart(calibration, other, floor) for other in others]
+    apart = np.array([distance for distance, _ in distances])
+    allowed = np.array([joint for _, joint in distances])
+    apart[:, np.isfinite(apart).sum(axis=0) < _MIN_OTHERS] = np.nan
+    return _median(apart) / _MEDIAN_OF_NORMAL, _median(apart / allowed) / _MEDIAN_OF_NORMAL
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """Median (6,) of the finite values in each column; NaN if there is none."""
+    return np.array(
+        [
+            np.median(column[np.isfinite(column)]) if np.isfinite(column).any() else np.nan
+            for column in values.T
+        ]
+    )
+
+
+def _apart(
+    first: Calibration, second: Calibration, floor: FloatArray | float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Distance (6,) of two answers and their joint standard deviation; NaN if either does not know
+    the axis.
+    """
+    distance = np.abs(deviation(first.T_parent_child, second.T_parent_child))
+    joint = np.hypot(np.hypot(first.sigmas, second.sigmas), floor)
+    known = np.isfinite(joint)
+    return np.where(known, distance, np.nan), np.where(known, np.maximum(joint, _ROUNDING), np.nan)
+
+
+def _from_other_model(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
+    """Distance (6,) from the answer under other assumptions, and the same in joint standard
+    deviations.
+    """
+    if calibration.other_answer is None:
+        return np.full(6, np.nan), np.full(6, np.nan)
+    T_other, covariance = calibration.other_answer
+    distance = np.abs(deviation(T_other, calibration.T_parent_child))
+    to_parent = np.kron(np.eye(2), T_other[:3, :3])
+    variances = np.diag(to_parent @ covariance @ to_parent.T) + calibration.sigmas_with_floor**2
+    return distance, distance / np.sqrt(np.maximum(variances, _ROUNDING**2))
