@@ -19,7 +19,14 @@ from hand_eye_calib.geometry.printed_angles import (
     sigmas_translation,
 )
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE, Trajectory
-from hand_eye_calib.status import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.status import (
+    ROTATIONS,
+    TRANSLATIONS,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+    by_hand,
+)
 from hand_eye_calib.tables import data_frame, html_table
 from hand_eye_calib.verdict import Reason, Verdict, headline, reasons, verdict_of
 
@@ -80,6 +87,9 @@ _KINDS: dict[str, Any] = (
 
 # Motion pairs with more weight than this count as inliers.
 INLIER_WEIGHT = 0.5
+
+# An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
+_SHARED = 0.02
 
 # With a direction unobservable, a larger standard deviation (m) of the inverse comes from that.
 _UNKNOWN_M = 0.9
@@ -415,6 +425,52 @@ class Calibration:
     def unobservable(self) -> list[str]:
         """Names of the degrees of freedom that the motion does not reveal."""
         return [dof.name for dof in self.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
+
+    def usable_numbers(self) -> dict[str, float | str]:
+        """The numbers of :attr:`mounting` for commands and files that others read.
+
+        Returns
+        -------
+        dict
+            x, y, z in m and qx, qy, qz, qw; if an angle is unknown, roll, pitch and yaw in rad
+            instead of the quaternion. An axis that the motion does not show is a text that no
+            parser takes, such as MEASURE_Z_BY_HAND. Empty under DO NOT USE.
+        """
+        if self.verdict is Verdict.DO_NOT_USE:
+            return {}
+        T = self.mounting[1]
+        numbers: dict[str, float | str] = {
+            axis: by_hand(axis) if is_unknown else float(value)
+            for axis, value, is_unknown in zip(
+                TRANSLATIONS, T[:3, 3], self._unknown_translations(), strict=True
+            )
+        }
+        if set(self.unobservable()).intersection(ROTATIONS):
+            return numbers | self.usable_angles()
+        return numbers | dict(zip(("qx", "qy", "qz", "qw"), se3.to_quat_xyzw(T), strict=True))
+
+    def usable_angles(self) -> dict[str, float | str]:
+        """Roll, pitch and yaw of :attr:`mounting`, rad, about fixed axes, as in URDF; a text for an
+        angle that the motion does not show.
+        """
+        T = self.mounting[1]
+        known = np.full(3, True)  # near gimbal lock roll and yaw have no sigma and are known
+        if set(self.unobservable()).intersection(ROTATIONS):
+            known = np.isfinite(sigmas_rpy(T, self.covariance))
+        angles = se3.rotation_to_rpy(T[:3, :3]).tolist()
+        return {
+            name: angle if is_known else by_hand(name)
+            for name, angle, is_known in zip(ROTATIONS, angles, known, strict=True)
+        }
+
+    def _unknown_translations(self) -> BoolArray:
+        """Which axes (3,) of the mounting's frame share a direction that the motion hides."""
+        hidden = np.array(
+            [dof.verdict is DofVerdict.UNOBSERVABLE for dof in self.observability[:3]]
+        )
+        if self.T_base_parent is None:
+            return hidden
+        return np.abs(self.T_base_parent[:3, :3][:, hidden]).max(axis=1, initial=0.0) > _SHARED
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the residuals as plain numbers, strings, lists and mappings, ready for

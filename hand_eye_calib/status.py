@@ -62,6 +62,11 @@ class DofObservability:
     sigma: float
 
 
+def by_hand(axis: str) -> str:
+    """What stands in files and commands for an axis that is not known; no parser takes it."""
+    return f"MEASURE_{axis.upper()}_BY_HAND"
+
+
 def amount(axis: str, value: float) -> str:
     """A length (m) or an angle (rad) in words with two digits; which of them, the axis says."""
     if axis in ROTATIONS:

@@ -55,6 +55,11 @@ class Reason:
     axes: tuple[str, ...] = ()
     options: tuple[tuple[str, Any], ...] = ()
 
+    @property
+    def is_finding(self) -> bool:
+        """Whether a stream check found it."""
+        return self.rule in ("error_finding", "warning_finding")
+
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values."""
         return {
@@ -123,7 +128,7 @@ CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
 HOPELESS_TARGETS = 10.0
 
 # Smallest share of the motion pairs that are inliers in a recording whose noise is understood.
-FEWEST_INLIERS = 0.6
+FEWEST_INLIERS = 0.7
 
 _OTHERS = {
     "model": "dnlo and adaptive, which assume different noise,",
@@ -267,7 +272,7 @@ def _far(result: Judged, kind: str) -> dict[str, float]:
 def _hidden(result: Judged) -> Iterator[_Found]:
     axes = _unobservable(result)
     if axes and len(axes) < len(result.observability):
-        priors = listing([f"prior.{axis}=VALUE+/-SIGMA" for axis in axes])
+        priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
         it = "it" if len(axes) == 1 else "them"
         text = f"the motion does not show {listing(axes)}"
         yield text, f"measure {it} by hand and give {priors}", axes, ()
@@ -287,8 +292,9 @@ def _worse_than_target(result: Judged) -> Iterator[_Found]:
         if math.isfinite(dof.sigma) and dof.sigma > target_of(dof.name, result)
     ]
     if rough:
-        told = listing([f"{dof.name} to {amount(dof.name, dof.sigma)}" for dof in rough])
-        text = f"known is {told} (one standard deviation), which is worse than the target"
+        told = listing([f"{dof.name} {amount(dof.name, dof.sigma)}" for dof in rough])
+        targets = {amount(dof.name, target_of(dof.name, result)): None for dof in rough}
+        text = f"standard deviations above the target of {listing(list(targets))}: {told}"
         axes = tuple(dof.name for dof in rough)
         yield text, f"record longer, with {_motion_for(axes)}", axes, ()
 
@@ -297,13 +303,13 @@ def _floor(result: Judged) -> Iterator[_Found]:
     rough = {}
     for dof, floor in zip(result.observability, result.sigmas_of_floor, strict=True):
         target = target_of(dof.name, result)
-        if dof.sigma <= target < math.hypot(dof.sigma, float(floor)):
+        if dof.sigma <= min(target, float(floor)) and target < math.hypot(dof.sigma, float(floor)):
             rough[dof.name] = float(floor)
     if rough:
         told = listing([f"{axis} by {amount(axis, floor)}" for axis, floor in rough.items()])
         text = (
-            "an odometry that is off by 1% in scale, which no recording shows, moves "
-            f"{told}: more than the target"
+            "an odometry that is off by 1% in scale and 0.15 deg all the time, which no recording "
+            f"shows, moves {told}: more than the target"
         )
         yield text, "check the scale of both odometries on a known distance", tuple(rough), ()
 
@@ -386,7 +392,8 @@ RULES = (
     Rule(
         "floor",
         _CARE,
-        "an axis is worse than its target only together with the common-mode floor",
+        "an axis is worse than its target only together with the common-mode floor, which is the "
+        "larger part",
         _floor,
     ),
 )

@@ -66,3 +66,15 @@ def shifted(shift=(0,) * 6, hidden="", sigmas=SIGMAS, seed=None, **fields):
 
 def shift(axis, size):
     return np.eye(6)[NAMES.index(axis)] * size
+
+
+def good_calibration(**changes):
+    """One with nothing against it."""
+    verdicts = [DofVerdict.OBSERVED] * 6
+    sigmas = [0.003] * 3 + [0.001] * 3
+    values = {
+        "status": SolveStatus.OK,
+        "observability": tuple(map(DofObservability, NAMES, verdicts, sigmas)),
+        "covariance": np.diag(np.square(sigmas)),
+    }
+    return calibration(**(values | changes))

@@ -33,6 +33,11 @@ MIN_ROTATION = float(np.radians(5.0))
 _MIN_SPEED, _MIN_RATE = 0.05, float(np.radians(1.0))
 _STEP_NS = 1_000_000_000
 
+# Wheels and tracks move a sensor along one axis of its own: at least this share of its squared
+# directions. Directions of the shorter steps, below this share of the median, are noise. (Road
+# vehicles: 0.95 to 1; handheld devices, drones and robot arms: 0.4 to 0.85.)
+_ALONG_ONE_AXIS, _LONG_STEP = 0.9, 0.3
+
 _ROTATION_ABOUT = dict(zip(TRANSLATIONS, ROTATIONS, strict=True))
 
 
@@ -53,6 +58,8 @@ class Excitation:
         Length of the path, m.
     motion_s : float
         Seconds during which the sensor moved; a robot that stands still shows nothing.
+    drives : bool
+        The sensor moves as on a vehicle, along one axis of its own; also if it has not moved yet.
     """
 
     n_poses: int
@@ -60,6 +67,7 @@ class Excitation:
     lever_arms: LeverArms
     distance: float
     motion_s: float = 0.0
+    drives: bool = True
 
     @property
     def gain(self) -> FloatArray:
@@ -112,7 +120,25 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
             lever_arms = at_lag
         lag *= 2
     distance = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    return Excitation(n_poses, rotation, lever_arms, distance, seconds_of_motion(pose_pairs))
+    return Excitation(
+        n_poses, rotation, lever_arms, distance, seconds_of_motion(pose_pairs), _drives(poses)
+    )
+
+
+def _drives(poses: FloatArray) -> bool:
+    """Whether poses (N, 4, 4) move along one axis of their own."""
+    shares = [_share_of_main_direction(poses, lag) for lag in (1, 2, 4) if lag < len(poses)]
+    return max(shares, default=1.0) >= _ALONG_ONE_AXIS
+
+
+def _share_of_main_direction(poses: FloatArray, lag: int) -> float:
+    steps = poses[lag:, :3, 3] - poses[:-lag, :3, 3]
+    lengths = np.linalg.norm(steps, axis=1)
+    long = (lengths > _LONG_STEP * np.median(lengths)) & (lengths > 0)
+    if not long.any():
+        return 1.0
+    own = np.einsum("nji,nj->ni", poses[:-lag, :3, :3], steps)[long] / lengths[long, None]
+    return float(np.linalg.eigvalsh(own.T @ own / len(own))[-1])
 
 
 def seconds_of_motion(pose_pairs: PosePairs) -> float:
@@ -146,13 +172,14 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     """
     hidden = calibration.unobservable() if calibration else seen.hidden_axes()
     if not hidden:
-        return _weak(calibration) if calibration else ""
+        return _weak(calibration, seen) if calibration else ""
     angles = dict(zip("xyz", seen.rotation.tolist(), strict=True))
     most = max(angles.values())
     if most < MIN_ROTATION:
+        turn = "drive curves in both directions" if seen.drives else "rotate about all axes"
         return (
             f"hardly any rotation so far (at most {_degrees(most)}): {_list(hidden)} not "
-            "observable, drive curves in both directions"
+            f"observable, {turn}"
         )
     fine = [axis for axis, angle in angles.items() if angle >= MIN_ROTATION]
     small = [axis for axis in angles if axis not in fine]
@@ -160,32 +187,38 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     if small:
         below = _degrees(max(angles[axis] for axis in small), round_up=True)
         text += f"; {_list([_ROTATION_ABOUT[axis] for axis in small])} under {below}"
-    names = _list([_described(name) for name in hidden])
-    return f"{text}: {names} not observable, {_advice(hidden, small)}"
+    vertical = TRANSLATIONS[int(np.argmax(seen.rotation))] if seen.drives else ""
+    names = _list([_described(name, vertical) for name in hidden])
+    return f"{text}: {names} not observable, {_advice(hidden, small, seen.drives)}"
 
 
-def _described(name: str) -> str:
-    if name == "z":
-        return "vertical offset (z)"
+def _described(name: str, vertical: str) -> str:
+    if name == vertical:
+        return f"vertical offset ({name})"
     return f"offset {name}" if name in TRANSLATIONS else name
 
 
-def _advice(hidden: Sequence[str], small: Sequence[str]) -> str:
+_ROTATE_ABOUT_OTHERS = "rotate by 20 deg and more about the other two axes"
+
+
+def _advice(hidden: Sequence[str], small: Sequence[str], drives: bool) -> str:
     if not any(name in TRANSLATIONS for name in hidden):
         return "rotate about other axes as well"
     if len(small) >= 2:
-        return "drive over a ramp or a kerb, or measure it by hand"
+        them = "it" if len(hidden) == 1 else "them"
+        tilt = "drive over a ramp or a kerb" if drives else _ROTATE_ABOUT_OTHERS
+        return f"{tilt}, or measure {them} by hand"
     return "rotate further about the other axes"
 
 
-def _weak(calibration: Calibration) -> str:
+def _weak(calibration: Calibration, seen: Excitation) -> str:
     weak = [dof for dof in calibration.observability if dof.verdict is DofVerdict.WEAK]
     if not weak:
         return ""
     limits = f"{WEAK_TRANSLATION * 100:g} cm or {np.degrees(WEAK_ROTATION):g} deg"
     return (
         f"{_list([_with_sigma(dof) for dof in weak])} still more uncertain than {limits}: "
-        "continue, with more curves"
+        f"continue, with {'more curves' if seen.drives else 'larger rotations about all axes'}"
     )
 
 

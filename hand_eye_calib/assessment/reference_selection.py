@@ -42,7 +42,7 @@ class ReferenceChoice:
     alike : tuple of str
         The candidates with nearly the smallest joint error, among which their answers decided.
     answer : ((4, 4) array, (6, 6) array) or None
-        The adaptive estimator's answer and its covariance, if it was computed for the choice.
+        The adaptive estimator's answer and its covariance, if it knows all axes.
     """
 
     reference: str
@@ -147,7 +147,9 @@ def select_reference(
     limit = _NEARLY_AS_GOOD * min(joint.values())
     alike = tuple(reference for reference, expected in joint.items() if expected <= limit)
     nearest = _nearest(pose_pairs, method, dataclasses.replace(choice, alike=alike), solution)
-    answer = (solution.T_parent_child, solution.cov_parent_child_in_child)
+    answer = None
+    if solution.converged and not solution.unseen.size:
+        answer = solution.T_parent_child, solution.cov_parent_child_in_child
     return dataclasses.replace(choice, reference=nearest, alike=alike, answer=answer)
 
 

@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo; returns the exit code."""
-    from hand_eye_calib.cli.present import EXIT_CODES
+    from hand_eye_calib.cli.present import exit_code
     from hand_eye_calib.simulation.drive import simulate_drive
 
     player = _import_player()
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             "the same messages must give the same",
             1,
         )
-    return EXIT_CODES[offline.status]
+    return exit_code(offline)
 
 
 def _write_report(

@@ -38,7 +38,8 @@ examples:
   hand_eye_calib check my_bag                 check both pose streams first
   hand_eye_calib COMMAND --help               options and examples of a command
 
-exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is unobservable"""
+exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
+unobservable or the verdict is DO NOT USE"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,8 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is unobservable; 130
-        interrupted.
+        0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is unobservable or the
+        verdict is DO NOT USE; 130 interrupted.
 
     Raises
     ------
@@ -115,6 +116,7 @@ def _run(argv: Sequence[str]) -> int:
     if rest and not hasattr(arguments, "passed_on"):
         of_commands[arguments.command].refuse(rest[0])
     arguments.passed_on = rest
+    arguments.typed = list(argv)
     return module.run(arguments)
 
 

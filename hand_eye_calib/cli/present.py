@@ -2,33 +2,30 @@
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping
+import shlex
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.calibration import Calibration, DofVerdict, Reason, Verdict
 from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.cli.reporting import with_cross_check, write_report
 from hand_eye_calib.cli.robot import with_robot, write_description
-from hand_eye_calib.cli.spelling import as_typed
+from hand_eye_calib.cli.spelling import as_typed, flag
 from hand_eye_calib.errors import printable
+from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.words import given_or_estimated, listing, with_sigma
+from hand_eye_calib.status import amount
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
 
-EXIT_CODES = {
-    SolveStatus.OK: 0,
-    SolveStatus.NOT_CONVERGED: 1,
-    SolveStatus.CONTRADICTED: 1,
-    SolveStatus.UNOBSERVABLE: 3,
-}
-_REMEDIES = {
-    SolveStatus.NOT_CONVERGED: "record more varied motion",
-    SolveStatus.CONTRADICTED: "check value, unit and sign of the prior",
-}
+_EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
+
+_WIDTH = 100
 
 _ROTATIONS = ("roll", "pitch", "yaw")
 _ROTATION_VECTOR = ("rx", "ry", "rz")
@@ -38,9 +35,14 @@ _VERDICTS = {
     DofVerdict.PRIOR: "mostly from the prior",
     DofVerdict.UNOBSERVABLE: "unobservable",
 }
+_PROOF = {
+    "yes": ", proved to be the global minimum over them",
+    "no": ", not proved to be the global minimum over them",
+}
 _SCATTER = {
-    "of_methods": "other methods and references",
-    "of_halves": "the two halves of the recording",
+    "of_methods": "scatter of other methods and references about it",
+    "of_halves": "scatter of the two halves of the recording about it",
+    "of_model": "difference between dnlo and adaptive",
 }
 
 
@@ -77,14 +79,28 @@ def deliver(
                 calibration, evidence = with_cross_check(calibration, snapshot)
         keep_earlier_results(arguments.out)
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
-    print(as_json(calibration, inputs=inputs, **more) if arguments.json else as_text(calibration))
+    print(
+        as_json(calibration, inputs=inputs, **more)
+        if arguments.json
+        else as_text(calibration, next_steps(calibration, arguments, snapshot))
+    )
     write_description(calibration, arguments)
     if evidence is not None and snapshot is not None:
         findings = more.get("findings", ())
         write_report(arguments.out, calibration, evidence, snapshot.config, inputs, findings)
-    if failure := calibration.status.failure:
-        fail(f"{failure}; do not use this result, {_REMEDIES[calibration.status]}", 1)
-    return EXIT_CODES[calibration.status]
+    code = exit_code(calibration)
+    if code == _EXIT_FAILED:
+        reason = calibration.reasons[0]
+        fail(f"{reason.sentence}; do not use this result, {reason.what_to_do}", code)
+    return code
+
+
+def exit_code(calibration: Calibration) -> int:
+    """0 good; 1 failed; 3 solved, but an axis is unobservable or the verdict is DO NOT USE."""
+    if calibration.status.failure:
+        return _EXIT_FAILED
+    is_all = calibration.verdict is not Verdict.DO_NOT_USE and not calibration.unobservable()
+    return 0 if is_all else _EXIT_NOT_ALL
 
 
 def as_json(calibration: Calibration, **more: Any) -> str:
@@ -92,27 +108,106 @@ def as_json(calibration: Calibration, **more: Any) -> str:
     return json.dumps(calibration.to_dict() | more, indent=2, allow_nan=False)
 
 
-def as_text(calibration: Calibration) -> str:
-    """Everything a person needs to see, in several lines."""
-    parent, child = (
-        printable(frame) for frame in (calibration.parent_frame, calibration.child_frame)
-    )
+def as_text(calibration: Calibration, steps: Iterable[str] = ()) -> str:
+    """Everything a person needs to see: verdict and reasons, the extrinsic in both directions, what
+    to do next, details.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    steps : iterable of str
+        What to do next: sentences, and commands that are indented.
+    """
+    parent, child = calibration.parent_frame, calibration.child_frame
     document = calibration.to_dict()
     lines = [
-        f"Status: {_status(calibration)}",
-        *(f"Warning: {as_typed(warning)}" for warning in calibration.warnings),
-        f"Pose of {child} (child) in {parent} (parent): maps coordinates of {child} into {parent}",
+        calibration.headline,
+        *_reason_lines(calibration),
+        "",
+        f"{child} in {parent}: maps coordinates of {child} into {parent}",
         *_transform_lines(document["T_parent_child"]),
-        f"Pose of {parent} (parent) in {child} (child): maps coordinates of {parent} into {child}",
+        "",
+        f"{parent} in {child}: maps coordinates of {parent} into {child}",
         *_transform_lines(document["T_child_parent"]),
-        f"Along and about the axes of {parent}: {_observability(calibration)}",
-        *_floor_lines(calibration),
-        *_scatter_lines(calibration.cross_check),
-        *_comparison_lines(calibration),
-        *_solution_lines(calibration),
+        "",
+        *_base_lines(calibration),
+        *(["Next", *(f"  {step}" for step in steps), ""] if steps else []),
         *_publishing_lines(calibration),
+        "Details",
+        *(line for detail in _details(calibration) for line in _wrapped(detail, "  ", "    ")),
     ]
     return "\n".join(printable(line) for line in lines)
+
+
+def _base_lines(calibration: Calibration) -> Iterator[str]:
+    """The child's pose in the base frame, if there is one."""
+    if calibration.T_base_child is not None:
+        yield f"{calibration.child_frame} in {calibration.base_frame}"
+        yield from _transform_lines(calibration.to_dict()["T_base_child"])
+        yield ""
+
+
+def _details(calibration: Calibration) -> Iterator[str]:
+    yield f"along and about the axes of {calibration.parent_frame}: {_observability(calibration)}"
+    yield from _floor_lines(calibration)
+    yield from _scatter_lines(calibration.cross_check)
+    yield from _comparison_lines(calibration)
+    yield from _solution_lines(calibration)
+    yield from (f"warning: {warning}" for warning in calibration.warnings)
+
+
+def _reason_lines(calibration: Calibration) -> Iterator[str]:
+    for reason in calibration.reasons:
+        yield from _wrapped(reason.sentence, "- ", "  ")
+        yield from _wrapped(_what_to_do(reason), "  -> ", "     ")
+
+
+def _what_to_do(reason: Reason) -> str:
+    options = " ".join(f"--{flag(name)} {value}" for name, value in reason.options)
+    return f"{reason.what_to_do}: {options}" if options else reason.what_to_do
+
+
+def _wrapped(text: str, first: str, others: str) -> list[str]:
+    return textwrap.wrap(
+        printable(as_typed(text)),
+        _WIDTH,
+        initial_indent=first,
+        subsequent_indent=others,
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
+
+
+def next_steps(
+    calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot | None"
+) -> list[str]:
+    """What to do next, in sentences and commands; empty if the result may be used."""
+    if calibration.verdict is Verdict.USE:
+        return []
+    steps = []
+    if snapshot is not None and (motion := _motion_advice(calibration, snapshot)):
+        steps.append(motion)
+    extra = [
+        f"--{flag(name)} {value}"
+        for reason in calibration.reasons
+        for name, value in reason.options
+    ]
+    extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.unobservable()[:3]]
+    if not extra and not arguments.out:
+        extra = ["--out result"]  # figures that show where the disagreement comes from
+    typed = getattr(arguments, "typed", [])
+    if typed and extra:
+        steps.append(f"hand_eye_calib {shlex.join(typed)} {' '.join(dict.fromkeys(extra))}")
+    return steps
+
+
+def _motion_advice(calibration: Calibration, snapshot: "Snapshot") -> str:
+    """What the recording does not show, and the motion that would."""
+    from hand_eye_calib.assessment.excitation import excitation, what_is_missing
+
+    if calibration.status.failure or calibration.verdict is Verdict.DO_NOT_USE:
+        return ""
+    return what_is_missing(excitation(snapshot.pose_pairs()), calibration)
 
 
 def convergence_line(entry: Mapping[str, Any]) -> str:
@@ -123,8 +218,8 @@ def convergence_line(entry: Mapping[str, Any]) -> str:
     transform = calibration["T_parent_child"]
     position = _values("xyz", transform["translation"], 3)
     angles = _values(_ROTATIONS, transform["rpy_deg"], 2)
-    poses, status = calibration["n_poses"], calibration["status"]
-    return f"{at} {position} m, {angles} deg, {poses} poses, {status}"
+    poses, verdict = calibration["n_poses"], calibration["verdict"]
+    return f"{at} {position} m, {angles} deg, {poses} poses, {verdict}"
 
 
 def _values(names: tuple[str, ...] | str, values: list[float], decimals: int) -> str:
@@ -165,16 +260,14 @@ def _floor_lines(calibration: Calibration) -> Iterator[str]:
         from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
 
         told = [
-            f"{dof.name} {np.degrees(sigma):.2g} deg"
-            if dof.name in _ROTATIONS
-            else f"{dof.name} {sigma:.2g} m"
+            f"{dof.name} {amount(dof.name, sigma)}"
             for dof, sigma in zip(
                 calibration.observability, calibration.sigmas_of_floor, strict=True
             )
             if np.isfinite(dof.sigma)
         ]
         yield (
-            "Not in these standard deviations, because it is the same all the time: odometry that "
+            "not in these standard deviations, because it is the same all the time: odometry that "
             f"is off by {FLOOR_SCALE:.0%} in scale and {np.degrees(FLOOR_ROTATION):.2g} deg: "
             f"{', '.join(told)}"
         )
@@ -184,72 +277,54 @@ def _scatter_lines(cross_check: Mapping[str, Mapping[str, Any]] | None) -> Itera
     """How far other answers to the same question scatter about the result."""
     for kind, title in _SCATTER.items() if cross_check else ():
         told = [
-            f"{axis} {np.degrees(row[kind]):.2g} deg"
-            if axis in _ROTATIONS
-            else f"{axis} {row[kind]:.2g} m"
+            f"{axis} {amount(axis, row[kind])}"
             for axis, row in (cross_check or {}).items()
-            if row[kind] is not None
+            if row.get(kind) is not None
         ]
         if told:
-            yield f"Scatter of {title} (one standard deviation): {', '.join(told)}"
-
-
-_PROOF = {
-    "yes": ", proved to be the global minimum over them",
-    "no": ", not proved to be the global minimum over them",
-}
+            yield f"{title}: {', '.join(told)}"
 
 
 def _comparison_lines(calibration: Calibration) -> Iterator[str]:
-    """The comparison with what is installed, and the pose in the base frame."""
+    """The comparison with what is installed."""
     if calibration.comparison:
         yield (
-            f"Compared with what is installed ({calibration.comparison.get('installed', '')}): "
+            f"compared with what is installed ({calibration.comparison.get('installed', '')}): "
             f"{calibration.comparison['sentence']}"
         )
-    if calibration.T_base_child is not None:
-        base = printable(calibration.base_frame)
-        yield f"Pose of {printable(calibration.child_frame)} (child) in {base}:"
-        yield from _transform_lines(calibration.to_dict()["T_base_child"])
 
 
 def _solution_lines(calibration: Calibration) -> Iterator[str]:
+    on = f"on reference {calibration.reference}"
+    if not METHODS[calibration.method].uses_reference:
+        on = "on all poses"
     yield (
-        f"Solved with {calibration.method} ({calibration.backend}) on reference "
-        f"{calibration.reference}: {calibration.n_inliers} of {calibration.n_pairs} motion pairs "
-        f"are inliers, from {calibration.n_poses} poses; objective {calibration.objective:.6g}"
-        f"{_PROOF.get(calibration.proved_global, '')}"
+        f"solved with {calibration.method} ({calibration.backend}) {on}: {calibration.n_inliers} "
+        f"of {calibration.n_pairs} motion pairs are inliers, from {calibration.n_poses} poses; "
+        f"objective {calibration.objective:.6g}{_PROOF.get(calibration.proved_global, '')}"
     )
     if calibration.method_reason:
-        yield f"  method {calibration.method_reason}"
+        yield f"method {calibration.method_reason}"
     if calibration.reference_reason:
-        yield f"  reference {calibration.reference_reason}"
-    for line in (calibration.noise or {}).get("in_words", ()):
-        yield f"  {line}"
+        yield f"reference {calibration.reference_reason}"
+    yield from (calibration.noise or {}).get("in_words", ())
     offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
     scale = (calibration.scale, calibration.scale_sigma)
     yield (
-        f"  time offset {given_or_estimated(*offset, 's')}; scale {given_or_estimated(*scale, '')}"
+        f"time offset {given_or_estimated(*offset, 's')}; scale {given_or_estimated(*scale, '')}"
     )
 
 
 def _publishing_lines(calibration: Calibration) -> Iterator[str]:
-    """The command that publishes the result, if it is one to use."""
-    if calibration.status is SolveStatus.OK:
-        yield "To publish it:"
-        yield f"  {static_transform_command(calibration)}"
-    elif unknown := calibration.unobservable():
-        yield (
-            f"No command to publish it, because {listing(unknown)} "
-            f"{'is' if len(unknown) == 1 else 'are'} unknown. Record motion with rotations about "
-            f"other axes, or measure by hand and give --prior {unknown[0]}=VALUE+/-SIGMA"
-        )
+    """The command that publishes the result, under its verdict, if it is one to use."""
+    if command := static_transform_command(calibration):
+        yield f"To publish it ({_condition(calibration)})"
+        yield f"  {command}"
+        yield ""
 
 
-def _status(calibration: Calibration) -> str:
-    if calibration.status is SolveStatus.UNOBSERVABLE:
-        names = calibration.unobservable()
-        values = "its value" if len(names) == 1 else "their values"
-        return f"unobservable: this motion does not determine {listing(names)}; do not use {values}"
-    words = calibration.status.value.replace("_", " ")
-    return f"{words}: do not use this result" if calibration.status.failure else words
+def _condition(calibration: Calibration) -> str:
+    numbers = calibration.usable_numbers().values()
+    by_hand = [value for value in numbers if isinstance(value, str)]
+    first = f", once you have put in {listing(by_hand)}" if by_hand else ""
+    return f"{calibration.verdict.value}{first}"

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.publishing import static_transform_command
 from hand_eye_calib.config import CalibratorConfig
@@ -141,8 +141,7 @@ def rendered(
     """
     from hand_eye_calib.report.report import render
 
-    is_usable = calibration.status is SolveStatus.OK
-    command = static_transform_command(calibration) if is_usable else ""
+    command = static_transform_command(calibration)
     return render(calibration, config, evidence, inputs=inputs, findings=findings, command=command)
 
 

@@ -5,7 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.status import listing
@@ -89,6 +89,8 @@ def write_description(calibration: Calibration, arguments: argparse.Namespace) -
             f"{arguments.write} is not written: {unknown} not known; measure by hand and give "
             "--prior"
         )
+    if calibration.verdict is Verdict.DO_NOT_USE:
+        raise InputError(f"{arguments.write} is not written: {calibration.headline}")
     description = RobotDescription(arguments.urdf)
     frames = calibration.parent_frame, calibration.child_frame
     patched = description.patched(*frames, calibration.T_parent_child)

@@ -217,8 +217,10 @@ def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
     return replace(by_model, method_reason=reason, other_answer=_beside(dnlo))
 
 
-def _beside(evaluation: _Evaluation) -> tuple[FloatArray, FloatArray]:
-    """An answer that was not chosen, and its covariance."""
+def _beside(evaluation: _Evaluation) -> tuple[FloatArray, FloatArray] | None:
+    """An answer that was not chosen, and its covariance, if it knows all axes."""
+    if not evaluation.solution.converged or _n_unobservable(evaluation.assessment):
+        return None
     return (
         evaluation.solution.T_parent_child,
         evaluation.assessment.cov_parent_child_in_child,

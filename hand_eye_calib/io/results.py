@@ -14,12 +14,12 @@ from xml.sax.saxutils import quoteattr
 
 import yaml
 
-from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.errors import InputError, printable
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
 from hand_eye_calib.io.limits import LARGEST_TEXT
 from hand_eye_calib.io.yaml_files import read_yaml
+from hand_eye_calib.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.version import package_version
 
 FILE_NAME = "extrinsic.yaml"
@@ -32,8 +32,9 @@ def save_result(
 ) -> Path:
     """Write ``extrinsic.yaml``, ``extrinsic.urdf.xacro`` and ``static_transform.launch.py``.
 
-    Each is written in one step: a reader sees the old file or the new one, never half of it. If one
-    cannot be written, none changes.
+    If the verdict is DO NOT USE, only the first, and files of an earlier result with the other two
+    names are removed. Each is written in one step: a reader sees the old file or the new one, never
+    half of it. If one cannot be written, none changes.
 
     Parameters
     ----------
@@ -56,16 +57,19 @@ def save_result(
     """
     document = calibration.to_dict() | {"provenance": _provenance(inputs or {})}
     texts = {
-        XACRO_NAME: _xacro_text(calibration),
-        LAUNCH_NAME: _launch_text(calibration),
         FILE_NAME: yaml.safe_dump(
             document, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
         ),
     }
+    if calibration.verdict is not Verdict.DO_NOT_USE:
+        ready = {XACRO_NAME: _xacro_text(calibration), LAUNCH_NAME: _launch_text(calibration)}
+        texts = ready | texts
     directory = Path(directory)
     try:
         directory.mkdir(parents=True, exist_ok=True)
         write_atomically({directory / name: text for name, text in texts.items()})
+        for name in {XACRO_NAME, LAUNCH_NAME} - set(texts):
+            (directory / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or directory}: {error.strerror}; choose another "
@@ -154,11 +158,13 @@ def load_result(path: str | Path) -> Calibration:
 
 def _xacro_text(calibration: Calibration) -> str:
     """A fixed joint from the parent's to the child's link, for a robot description with both."""
-    mounted_on, T = calibration.mounting
+    mounted_on = calibration.mounting[0]
     parent, child = (_xacro_attribute(frame) for frame in (mounted_on, calibration.child_frame))
     joint = _xacro_attribute(f"{mounted_on}_to_{calibration.child_frame}")
-    angles = se3.rotation_to_rpy(T[:3, :3])  # about the fixed axes x, y, z, as in URDF
-    xyz, rpy = (" ".join(map(repr, values.tolist())) for values in (T[:3, 3], angles))
+    numbers = calibration.usable_numbers() | calibration.usable_angles()
+    xyz, rpy = (
+        " ".join(str(numbers[name]) for name in names) for names in (TRANSLATIONS, ROTATIONS)
+    )
     comment = "\n".join(f"     {line}" for line in _remarks(calibration))
     comment = re.sub("-(?=-)", "- ", comment)  # no comment may hold two hyphens
     return f"""\
@@ -177,30 +183,31 @@ def _xacro_text(calibration: Calibration) -> str:
 
 def _launch_text(calibration: Calibration) -> str:
     """A launch file that publishes the extrinsic as a static transform."""
-    mounted_on, T = calibration.mounting
-    values = zip(
-        ("x", "y", "z", "qx", "qy", "qz", "qw"),
-        [*T[:3, 3].tolist(), *se3.to_quat_xyzw(T).tolist()],
-        strict=True,
-    )
-    arguments = [(f"--{name}", f"{round(value, 12) + 0.0:.12f}") for name, value in values]
+    mounted_on = calibration.mounting[0]
+    arguments = [
+        (f"--{name}", value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}")
+        for name, value in calibration.usable_numbers().items()
+    ]
     arguments += [
         ("--frame-id", printable(mounted_on)),
         ("--child-frame-id", printable(calibration.child_frame)),
     ]
     lines = "\n".join(f"                    {option!r}, {value!r}," for option, value in arguments)
-    comment = "\n".join(f"# {line}" for line in _remarks(calibration))
+    remarks = _remarks(calibration)
+    comment = "\n".join(f"# {line}" for line in remarks)
     return f"""\
 # Publishes the extrinsic on /tf_static. Only if no robot description has this edge: a frame has one
 # parent and one publisher.
 {comment}
 from launch import LaunchDescription
+from launch.actions import LogInfo
 from launch_ros.actions import Node
 
 
 def generate_launch_description():
     return LaunchDescription(
         [
+            LogInfo(msg={remarks[0]!r}),
             Node(
                 package='tf2_ros',
                 executable='static_transform_publisher',
@@ -217,14 +224,12 @@ def _remarks(calibration: Calibration) -> list[str]:
     """What a person who opens the file must know, in lines."""
     parent, child = calibration.mounting[0], calibration.child_frame
     remarks = [
+        calibration.headline,
+        *(f"{reason.sentence}: {reason.what_to_do}" for reason in calibration.reasons),
         f"Pose of {child} in {parent}: maps coordinates of {child} into {parent}.",
         f"Made by hand_eye_calib {package_version()}; {FILE_NAME} beside this file has the "
         "covariance and where it came from.",
     ]
-    if calibration.status is not SolveStatus.OK:
-        names = ", ".join(calibration.unobservable())
-        what = calibration.status.failure or f"the motion does not reveal {names}"
-        remarks.append(f"DO NOT USE AS IT IS: {what}.")
     return [printable(" ".join(remark.split())) for remark in remarks]
 
 

@@ -49,8 +49,8 @@ def plain(value: object) -> str:
 
 def given_or_estimated(value: float, sigma: float, unit: str) -> str:
     """A number with its standard deviation if it was estimated, as it is if it was given."""
-    text = f"{value:.4f} +/- {sigma:.4f} {unit}, estimated" if sigma else f"{value:g} {unit}"
-    return " ".join(text.split())
+    text = f"{value:.4f} +/- {sigma:.4f} {unit}" if sigma else f"{value:g} {unit}"
+    return text.strip() + (", estimated" if sigma else "")
 
 
 def size(value: float, axis: str) -> str:

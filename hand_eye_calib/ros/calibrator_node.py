@@ -198,9 +198,7 @@ class CalibratorNode(Node):
     def _save(self) -> tuple[bool, str]:
         options, cycle = self._options.node, self._cycle
         inputs = self._session.inputs()
-        saved, text = self._files.save(
-            cycle.result, options.output_directory, self._checks.faults(), inputs
-        )
+        saved, text = self._files.save(cycle.result, options.output_directory, inputs)
         if saved and options.report and cycle.result is not None and cycle.snapshot is not None:
             path = output_path(options.output_directory)
             self._report.write(path, SessionResult(cycle.result, cycle.snapshot, inputs))

@@ -1,5 +1,7 @@
 """When the node checks the streams, and what the last check found."""
 
+from typing import Any
+
 import numpy as np
 
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
@@ -80,6 +82,10 @@ class CheckMonitor:
     def faults(self) -> tuple[str, ...]:
         """What speaks against calibrating with these streams, the gravest first, a line each."""
         return tuple(in_parameters(finding) for finding in self._faults.values())
+
+    def findings(self) -> tuple[dict[str, Any], ...]:
+        """The same findings as plain values: for a result and its verdict."""
+        return tuple(finding.to_dict() for finding in self._faults.values())
 
     def report(self, steady_s: float) -> Report:
         """Findings of the last check."""

@@ -9,10 +9,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
-from hand_eye_calib.calibration import (
-    Calibration,
-    SolveStatus,
-)
+from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.conversions import to_time
@@ -118,6 +115,9 @@ def _result_values(calibration: Calibration, age_s: float, clock_ns: int) -> dic
     scale = f"{calibration.scale:.6f} +/- {calibration.scale_sigma:.6f}"
     inliers = 100 * calibration.n_inliers / max(calibration.n_pairs, 1)
     return {
+        "verdict": calibration.headline,
+        "reasons": "; ".join(f"{each.sentence}: {each.what_to_do}" for each in calibration.reasons)
+        or "none",
         "status": calibration.status.value,
         "extrinsic": f"{frames}: ({x:.4f}, {y:.4f}, {z:.4f}) m",
         "method": f"{calibration.method} {calibration.reference} {calibration.backend}",
@@ -146,21 +146,18 @@ def _judge(parts: NodeParts, age_s: float | None, missing: str) -> tuple[bytes, 
         return ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
     if not parts.inputs[0].is_enabled:
         return WARN, "not accepting poses: call ~/set_enabled to go on"
-    if faults := parts.checks.faults():
-        return WARN, f"do not use the result: {faults[0]}"
     said = failure.what if failure else ""
     if result is None or age_s is None:
-        return WARN, "; ".join(filter(None, (said, missing))) or "no result yet"
-    if result.status is not SolveStatus.OK:
-        return WARN, missing or "; ".join(result.warnings) or result.status.value
+        faults = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in parts.checks.faults()[:1]]
+        return WARN, "; ".join(filter(None, (*faults, said, missing))) or "no result yet"
+    if result.verdict is Verdict.DO_NOT_USE:
+        return WARN, result.headline
     if parts.tf.refused:
         return WARN, f"publish_tf is refused: {parts.tf.refused}"
     if _is_stale(parts, age_s):
         return WARN, ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
-    if missing:
-        return WARN, missing
-    weakest = max((dof.sigma for dof in result.observability if dof.name in "xyz"), default=0.0)
-    return OK, f"all axes are observable; translation known to {weakest * 1000:.1f} mm (one sigma)"
+    level = OK if result.verdict is Verdict.USE else WARN
+    return level, "; ".join(filter(None, (result.headline, missing)))
 
 
 def _is_stale(parts: NodeParts, age_s: float) -> bool:

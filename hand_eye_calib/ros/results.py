@@ -1,6 +1,5 @@
 """The node's results: on topics, on ``/tf_static``, in files and in one line of the log."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -57,7 +56,6 @@ class ResultFiles:
         self,
         calibration: Calibration | None,
         directory: str,
-        faults: tuple[str, ...],
         inputs: Mapping[str, Any],
     ) -> tuple[bool, str]:
         """Write the result files.
@@ -67,8 +65,6 @@ class ResultFiles:
         calibration : Calibration or None
         directory : str
             The parameter output_directory.
-        faults : tuple of str
-            What the stream checks found; they become warnings of the result.
         inputs : mapping
             Where the poses came from, in plain values.
 
@@ -87,11 +83,10 @@ class ResultFiles:
             if self._earlier_kept_in != directory:
                 keep_earlier_results(path)
             self._earlier_kept_in = directory
-            warnings = (*calibration.warnings, *faults)
-            save_result(dataclasses.replace(calibration, warnings=warnings), path, inputs)
+            save_result(calibration, path, inputs)
         except (OSError, HandEyeCalibError) as error:
             return False, f"cannot save to {directory}: {error}"
-        return True, f"result saved to {directory}"
+        return True, f"result saved to {directory}: {calibration.headline}"
 
 
 def describe(calibration: Calibration, seen: Excitation | None = None) -> str:

@@ -4,7 +4,7 @@ from collections import deque
 
 import numpy as np
 
-from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.geometry import se3
 
 # So many results in a row must agree, over so much of the recording (s).
@@ -51,6 +51,8 @@ class SettledRule:
             return f"the streams are faulty: {faults[0]}"
         if newest.status is not SolveStatus.OK:
             return f"the result is {newest.status.value}"
+        if newest.verdict is Verdict.DO_NOT_USE:
+            return newest.headline
         weak = [dof.name for dof in newest.observability if dof.verdict not in _KNOWN]
         if weak:
             return f"{', '.join(weak)} only weakly observable"

@@ -3,6 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 
 from rclpy.task import Future
 
@@ -166,6 +167,8 @@ class SolveCycle:
             self._log.warning(text, "unchecked")
             return
         new, gone = self._checks.take(checked.result, now_s)
+        if self.result is not None:
+            self.result = self._with_findings(self.result)
         for line in new:
             self._log.warning(line)
         for line in gone:
@@ -203,16 +206,26 @@ class SolveCycle:
             progress = self.goal.add(calibration, self.seen, faults)
             if not faults:  # which are in the log already
                 self._progress_log.tell(progress)
-            self.result, self.solved_at_s = self.goal.best or calibration, time.monotonic()
-            if self.result is calibration:
+            best = self.goal.best or calibration
+            if best is calibration:
                 self.snapshot = self._submitted
+            self.result, self.solved_at_s = self._with_findings(best), time.monotonic()
             self._publish(self.result)
+        calibration = self._with_findings(calibration)
         text = describe(calibration, self.seen)
         self._log.info(text, "result", 1.0)
+        for reason in calibration.reasons:
+            if not reason.is_finding:  # which are in the log already
+                told = f"{reason.verdict.value}: {reason.sentence}; {reason.what_to_do}"
+                self._log.warning(told, (reason.rule, reason.axes))
         for warning in calibration.warnings:
             self._log.warning(warning, warning)
         good = calibration.status is SolveStatus.OK
-        return good, "; ".join((text, *calibration.warnings))
+        said = [f"{reason.sentence}; {reason.what_to_do}" for reason in calibration.reasons]
+        return good, "; ".join((text, *said, *calibration.warnings))
+
+    def _with_findings(self, calibration: Calibration) -> Calibration:
+        return replace(calibration, findings=self._checks.findings())
 
     def _report_failure(self, failure: Failure) -> str:
         if failure.kind is FailureKind.NOT_ENOUGH_DATA:

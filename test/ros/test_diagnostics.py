@@ -111,7 +111,7 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, heard, tmp_pa
             status.level == DiagnosticStatus.OK and "120" in values(status)["synchronised poses"]
         ),
     )
-    assert good.message.startswith("all axes are observable; translation known to ")
+    assert good.message.startswith("USE: all six axes are known to ")
     found = values(good)
     assert found["missing"] == "nothing"
     assert found["status"] == "ok"
@@ -143,6 +143,7 @@ def test_flat_ground_is_said_in_one_sentence(start_node, peer, heard):
         ),
     )
     assert status.level == DiagnosticStatus.WARN
+    assert status.message.startswith("USE WITH CARE: all but z; measure z by hand; ")
     assert (
         "roll and pitch under 1 deg: vertical offset (z) not observable, drive over a ramp"
         in status.message
@@ -256,7 +257,7 @@ class TestStreamChecks:
         assert status.level == DiagnosticStatus.WARN
         verdict = wait(peer, heard, "extrinsic", lambda status: said in status.message)
         assert verdict.level == DiagnosticStatus.WARN
-        assert verdict.message.startswith("do not use the result: ")
+        assert verdict.message.startswith("DO NOT USE: ")
         node.wait_for_log(said)
 
     def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(
@@ -275,7 +276,7 @@ class TestStreamChecks:
             lambda status: status.message.endswith(": set scale to 0.001"),
         )
         assert peer.trigger("save").success
-        assert any("millimetres" in warning for warning in load_result(tmp_path).warnings)
+        assert load_result(tmp_path).headline.startswith("DO NOT USE: the child's lengths are mill")
         assert peer.set_parameter("scale", 0.001).successful
         status = wait(
             peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK

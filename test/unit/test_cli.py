@@ -121,19 +121,16 @@ def with_pose(trajectory, index, **fields):
 def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag, storage):
     code, out, err = run("replay", new_bag(storage=storage), *TOPICS)
     assert (code, err) == (0, "")
-    assert out.startswith("Status: ok\n")
-    assert (
-        "Pose of camera (child) in lidar (parent): maps coordinates of camera into lidar\n" in out
-    )
-    assert (
-        "Pose of lidar (parent) in camera (child): maps coordinates of lidar into camera\n" in out
-    )
+    assert out.startswith("USE: all six axes are known to ")
+    assert "\ncamera in lidar: maps coordinates of camera into lidar\n" in out
+    assert "\nlidar in camera: maps coordinates of lidar into camera\n" in out
     rows = re.findall(r"^  [xyz] +(\S+) \+/- \d\S* m$", out, flags=re.MULTILINE)
     truth = np.concatenate([TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]])
     np.testing.assert_allclose(np.array(rows, dtype=float), truth, atol=2e-6)
     assert re.search(r"^  yaw +\S+ \+/- \d\S* deg$", out, flags=re.MULTILINE)
     assert "axes of lidar: x, y, z, roll, pitch and yaw observed\n" in out
-    assert "To publish it:\n  ros2 run tf2_ros static_transform_publisher" in out
+    assert "\nNext\n" not in out
+    assert "\nTo publish it (USE)\n  ros2 run tf2_ros static_transform_publisher" in out
 
 
 def test_json_is_one_document_on_stdout(run, new_bag):
@@ -252,10 +249,17 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
     code, out, err = run("replay", new_bag(parent, child), *TOPICS)
     assert (code, err) == (3, "")
     assert re.search(r"^  z +unknown m$", out, flags=re.MULTILINE)
-    assert out.startswith("Status: unobservable: this motion does not determine z; do not use its")
+    assert out.startswith("USE WITH CARE: all but z; measure z by hand\n")
     assert "x, y, roll, pitch and yaw observed; z unobservable\n" in out
-    assert "static_transform_publisher" not in out
-    assert "give --prior z=VALUE+/-SIGMA" in out
+    command = next(line for line in out.splitlines() if "static_transform_publisher" in line)
+    assert " --z MEASURE_Z_BY_HAND --qx " in command
+    assert "\nTo publish it (USE WITH CARE, once you have put in MEASURE_Z_BY_HAND)\n" in out
+    (step,) = re.findall(r"^  hand_eye_calib (replay .*)$", out, flags=re.MULTILINE)
+    again = step.replace("VALUE+/-SIGMA", "0.1+/-0.01")
+    code, out, err = run(*shlex.split(again))
+    assert (code, err) == (0, "")
+    assert "MEASURE_Z_BY_HAND" not in out
+    assert "z mostly from the prior" in out
 
 
 # ---- what is printed
@@ -284,7 +288,11 @@ def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_ba
         run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED, warnings=("look here",)
     )
     text = as_text(calibration)
-    assert text.startswith("Status: not converged: do not use this result\nWarning: look here\n")
+    assert text.startswith(
+        "DO NOT USE: the solver did not converge\n- the solver did not converge\n"
+    )
+    assert "warning: look here" in text
+    assert "static_transform_publisher" not in text
     assert all(dof.verdict is DofVerdict.OBSERVED for dof in calibration.observability)
     assert "unobservable" not in text
 
@@ -791,7 +799,7 @@ def test_control_characters_in_names_do_not_reach_the_terminal(run, new_bag, tmp
     hostile = "cam\x1b[2Jera\nStatus: ok"
     text = as_text(some_calibration(run, new_bag, tmp_path, child_frame=hostile))
     assert "\x1b" not in text
-    assert "cam\\x1b[2Jera\\nStatus: ok (child)" in text
+    assert "\ncam\\x1b[2Jera\\nStatus: ok in lidar" in text
     fail(hostile, 1)
     assert capsys.readouterr().err == "hand_eye_calib: error: cam\\x1b[2Jera\\nStatus: ok\n"
 

@@ -261,7 +261,7 @@ def test_every_estimates_on_the_way_and_over_everything_in_the_end(run, bag):
     )
     lines = [line for line in err.splitlines() if "note: after " in line]
     assert [
-        re.search(r"after (\d) s: x .* m, roll .* deg, (\d+) poses, ok", line).groups()
+        re.search(r"after (\d) s: x .* m, roll .* deg, (\d+) poses, USE", line).groups()
         for line in lines
     ] == [("2", "20"), ("4", "40"), ("6", "60"), ("8", "80")]
 

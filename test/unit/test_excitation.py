@@ -97,3 +97,22 @@ def test_the_verdicts_of_a_result_win():
         dataclasses.replace(result, observability=(*result.observability[:5], hidden)),
     )
     assert text.endswith("yaw not observable, rotate about other axes as well")
+
+
+def test_an_arm_is_not_told_to_drive():
+    s = np.linspace(0, 4 * np.pi, 400)
+    turns = np.stack([0 * s, 0 * s, np.sin(s)], axis=1)
+    path = np.stack([np.sin(2 * s), np.cos(3 * s), np.sin(5 * s + 1)], axis=1)
+    seen = seen_in(se3.from_rotation_translation(se3.rotation_exp(turns), path))
+    assert not seen.drives
+    said = what_is_missing(seen)
+    assert "offset z not observable, rotate by 20 deg and more about the other two axes" in said
+    assert "drive" not in said
+    still = seen_in(se3.from_rotation_translation(np.tile(np.eye(3), (400, 1, 1)), path))
+    assert what_is_missing(still).endswith("rotate about all axes")
+
+
+def test_a_vehicle_is_told_to_drive_over_a_ramp():
+    seen = seen_in(planar_poses(300))
+    assert seen.drives
+    assert "vertical offset (z) not observable, drive over a ramp" in what_is_missing(seen)

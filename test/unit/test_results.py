@@ -5,15 +5,21 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import stat
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import yaml
-from result_making import calibration
+from result_making import calibration, good_calibration
 
-from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import fingerprint, load_result, save_result
@@ -89,7 +95,7 @@ AWKWARD = {"parent_frame": 'li"dar & <${x}>', "child_frame": "caméra -- 'left' 
 
 @pytest.mark.parametrize("frames", [{}, AWKWARD])
 def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path, frames):
-    written = calibration(**frames)
+    written = good_calibration(**frames)
     save_result(written, tmp_path)
     root = ElementTree.parse(tmp_path / "extrinsic.urdf.xacro").getroot()
     (joint,) = root
@@ -110,12 +116,14 @@ def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path, frames):
 
 @pytest.mark.parametrize("frames", [{}, AWKWARD])
 def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path, frames):
-    written = calibration(**frames)
+    written = good_calibration(**frames)
     save_result(written, tmp_path)
     text = (tmp_path / "static_transform.launch.py").read_text(encoding="utf-8")
     compile(text, "static_transform.launch.py", "exec")
     calls = {node.func.id: node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)}
-    assert set(calls) == {"LaunchDescription", "Node"}
+    assert set(calls) == {"LaunchDescription", "LogInfo", "Node"}
+    (said,) = calls["LogInfo"].keywords
+    assert ast.literal_eval(said.value) == written.headline
     node = {keyword.arg: ast.literal_eval(keyword.value) for keyword in calls["Node"].keywords}
     assert (node["package"], node["executable"]) == ("tf2_ros", "static_transform_publisher")
     options = dict(zip(node["arguments"][::2], node["arguments"][1::2], strict=True))
@@ -130,13 +138,50 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path, frames):
     )
 
 
-@pytest.mark.parametrize(
-    ("status", "said"), [("ok", False), ("unobservable", True), ("not_converged", True)]
-)
-def test_files_for_robots_warn_of_a_result_that_is_not_good(tmp_path, status, said):
-    save_result(calibration(status=SolveStatus(status)), tmp_path)
-    for name in ("extrinsic.urdf.xacro", "static_transform.launch.py"):
-        assert ("DO NOT USE AS IT IS" in (tmp_path / name).read_text(encoding="utf-8")) is said
+ROBOT_FILES = ("extrinsic.urdf.xacro", "static_transform.launch.py")
+
+
+def test_files_for_robots_begin_with_the_verdict(tmp_path):
+    save_result(calibration(), tmp_path)
+    for name in ROBOT_FILES:
+        text = (tmp_path / name).read_text(encoding="utf-8")
+        assert "USE WITH CARE: all but z; measure z by hand" in text
+
+
+def test_an_unknown_axis_is_nothing_that_a_robot_takes(tmp_path):
+    save_result(calibration(), tmp_path)
+    xacro, launch = ((tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES)
+    xyz = re.search(r'xyz="(.*?)"', xacro)[1].split()
+    assert xyz[2] == "MEASURE_Z_BY_HAND"
+    assert list(map(float, xyz[:2])) == calibration().T_parent_child[:2, 3].tolist()
+    assert "'--z', 'MEASURE_Z_BY_HAND'" in launch
+
+
+def test_an_unknown_rotation_is_nothing_that_a_robot_takes(tmp_path):
+    known = good_calibration()
+    unknown = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
+    save_result(
+        dataclasses.replace(
+            known,
+            T_parent_child=np.eye(4),
+            observability=(*known.observability[:5], unknown),
+            covariance=np.diag([1e-6] * 5 + [np.inf]),
+        ),
+        tmp_path,
+    )
+    xacro, launch = ((tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES)
+    assert re.search(r'rpy="(.*?)"', xacro)[1].split()[2] == "MEASURE_YAW_BY_HAND"
+    assert "'--yaw', 'MEASURE_YAW_BY_HAND'" in launch
+    assert "--qx" not in launch
+
+
+def test_under_do_not_use_there_is_nothing_for_a_robot(tmp_path):
+    save_result(good_calibration(), tmp_path)
+    assert sorted(os.listdir(tmp_path)) == FILES
+    save_result(good_calibration(status=SolveStatus.NOT_CONVERGED), tmp_path)
+    assert os.listdir(tmp_path) == ["extrinsic.yaml"]
+    text = (tmp_path / "extrinsic.yaml").read_text(encoding="utf-8")
+    assert text.startswith("verdict: DO NOT USE\nheadline: ")
 
 
 def test_saving_again_replaces_the_file_and_leaves_nothing_else(tmp_path):
