@@ -94,7 +94,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
         (f"share/{name}", ["package.xml"]),
-        (f"share/{name}/config", files("config/*.yaml")),
+        (f"share/{name}/config", files("config/*.*")),
         (f"share/{name}/launch", files("launch/*.launch.py")),
     ],
     zip_safe=False,

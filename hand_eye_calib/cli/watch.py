@@ -150,7 +150,8 @@ class _Screen:
         """Draw a view."""
         from hand_eye_calib.watch.terminal import screen
 
-        self._live.update(screen(view, self._console.width, self._footer), refresh=True)
+        drawn = screen(view, self._console.width, self._console.height, self._footer)
+        self._live.update(drawn, refresh=True)
 
     def keys(self) -> str:
         """The keys pressed since the last call."""

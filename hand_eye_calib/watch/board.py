@@ -5,11 +5,13 @@ Nothing here knows ROS, a terminal or a browser: statuses go in, a :class:`View`
 
 import math
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
 AXES = {"x": "m", "y": "m", "z": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
+
+_AXES_OF_ROTATIONS = {"roll": "x", "pitch": "y", "yaw": "z"}
 
 # Levels of diagnostic_msgs/DiagnosticStatus.
 OK, WARN, ERROR = 0, 1, 2
@@ -61,29 +63,35 @@ class Line:
 
 @dataclass(frozen=True)
 class Bar:
-    """One axis against its target.
+    """One axis of the parent sensor's frame against its target.
 
     Attributes
     ----------
     axis : str
+        x, y, z: the offset along it; roll, pitch, yaw: the rotation about x, y, z.
     share : float
         0 to 1: the share of the information that the target needs. It grows evenly while the motion
         stays as it is.
     tone : Tone
     word : str
         Such as ``enough`` or ``25 s left``.
-    value, sigma, target, difference : str
-        With units; empty if not known, the value too if the motion does not show it.
+    sigma, target, difference : str
+        With units; empty if not known.
     """
 
     axis: str
     share: float
     tone: Tone
     word: str
-    value: str
     sigma: str
     target: str
     difference: str
+
+    @property
+    def meaning(self) -> str:
+        """Such as ``along x`` or ``about z``."""
+        along = _AXES_OF_ROTATIONS.get(self.axis)
+        return f"about {along}" if along else f"along {self.axis}"
 
     @property
     def against(self) -> str:
@@ -99,7 +107,11 @@ class Bar:
 
 @dataclass(frozen=True)
 class View:
-    """Everything a person is shown of one node."""
+    """Everything a person is shown of one node.
+
+    The pose (``values``: each axis with its value) has the angles as they are printed, with their
+    own standard deviations. The bars are about the axes of the parent sensor's frame.
+    """
 
     node: str
     nodes: tuple[str, ...]
@@ -107,6 +119,7 @@ class View:
     word: str
     sentence: str
     title: str
+    values: tuple[tuple[str, str], ...]
     bars: tuple[Bar, ...]
     health: tuple[Line, ...]
     verdict: Line
@@ -200,7 +213,8 @@ def _view(name: str, names: tuple[str, ...], node: _Node, now_s: float) -> View:
         word=word,
         sentence=sentence,
         title=_title(node.pose),
-        bars=tuple(_bar(axis, values, node.pose) for axis in AXES),
+        values=tuple(_values(node)),
+        bars=tuple(_bar(axis, values) for axis in AXES),
         health=tuple(_health(node, silent_s)),
         verdict=_verdict(values.get("verdict", "")),
         reasons=tuple(_numbered(values, "reason")),
@@ -266,19 +280,17 @@ def _sentence(text: str) -> str:
 # ------------------------------------------------------------------------ bars
 
 
-def _bar(axis: str, values: Mapping[str, str], pose: Pose | None) -> Bar:
+def _bar(axis: str, values: Mapping[str, str]) -> Bar:
     sigma, target = (_number(values, f"{what}.{axis}") for what in ("sigma", "target"))
     left_s = _number(values, f"seconds_left.{axis}")
     unit = AXES[axis]
     share = min(1.0, (target / sigma) ** 2) if sigma > 0 and target > 0 else float(sigma == 0)
     tone, word = _state(sigma, target, left_s, is_behind=values.get("limiting_axis") == axis)
-    value = pose.values[list(AXES).index(axis)] if pose is not None else math.nan
     return Bar(
         axis=axis,
         share=share if math.isfinite(share) else 0.0,
         tone=tone,
         word=word,
-        value=_value(value, unit) if math.isfinite(sigma) else "",
         sigma=small(sigma, unit),
         target=small(target, unit),
         difference=_difference(axis, values),
@@ -304,12 +316,6 @@ def _number(values: Mapping[str, str], key: str) -> float:
         return math.nan
 
 
-def _value(value: float, unit: str) -> str:
-    if not math.isfinite(value):
-        return ""
-    return f"{value:.3f} m" if unit == "m" else f"{math.degrees(value):.2f} deg"
-
-
 def small(value: float, unit: str) -> str:
     """A standard deviation or a difference, short: in mm, cm, m or deg; empty if not known."""
     if not math.isfinite(value):
@@ -333,13 +339,31 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
+# ------------------------------------------------------------------------ pose
+
+
+def _values(node: _Node) -> Iterator[tuple[str, str]]:
+    """Each axis with its value and standard deviation; a question mark if it is not observed."""
+    if node.pose is None:
+        return
+    said = node.values("extrinsic")
+    for (axis, unit), value in zip(AXES.items(), node.pose.values, strict=True):
+        if unit == "m":
+            sigma = _number(said, f"sigma {axis} (mm)") / 1000.0
+            text = f"{value:.3f} m"
+        else:
+            sigma = math.radians(_number(said, f"sigma {axis} (deg)"))
+            text = f"{math.degrees(value):.2f} deg"
+        yield axis, f"{text} ± {small(sigma, unit)}" if math.isfinite(sigma) else "? not observed"
+
+
 # ------------------------------------------------- health, verdict, comparison
 
 _PARTS = ("parent input", "child input", "stream checks", "mount", "journal")
 _TONES = {OK: Tone.GOOD, WARN: Tone.ACT}
 
 
-def _health(node: _Node, silent_s: float) -> Iterable[Line]:
+def _health(node: _Node, silent_s: float) -> Iterator[Line]:
     is_old = silent_s > SILENT_AFTER_S
     for part in _PARTS:
         status = node.statuses.get(part)
@@ -358,7 +382,7 @@ def _verdict(word: str) -> Line:
     return Line(_VERDICTS.get(word, Tone.UNKNOWN), "verdict", text)
 
 
-def _numbered(values: Mapping[str, str], name: str) -> Iterable[str]:
+def _numbered(values: Mapping[str, str], name: str) -> Iterator[str]:
     """Values of NAME.1, NAME.2 and so on."""
     number = 1
     while f"{name}.{number}" in values:

@@ -16,9 +16,11 @@ def fragment(view: View) -> str:
             f'<section class="headline {_CLASSES[view.tone]}"><h1>{_sign(view.tone)} '
             f"{escape(view.word)}</h1><p>{escape(view.sentence)}</p></section>",
             _answer(view.answer),
-            f'<section class="axes"><h2>{escape(view.title)}</h2>',
+            '<section class="axes"><h2>precision against the target</h2>',
             *map(_bar, view.bars),
-            '</section><section class="health"><h2>result and inputs</h2>',
+            "</section>",
+            _pose(view),
+            '<section class="health"><h2>result and inputs</h2>',
             _line(view.verdict),
             _reasons(view.reasons),
             *map(_line, (view.comparison, *view.health)),
@@ -44,10 +46,15 @@ def _bar(bar: Bar) -> str:
         f'<div class="axis {_CLASSES[bar.tone]}"><b>{escape(bar.axis)}</b>'
         f'<progress max="1" value="{bar.share:.3f}" aria-label="{escape(bar.axis)}"></progress>'
         f'<span class="state">{_sign(bar.tone)} {escape(bar.word)}</span>'
-        f'<span class="value">{escape(bar.value)}</span>'
+        f'<span class="meaning">{escape(bar.meaning)}</span>'
         f'<span class="against">{escape(bar.against)}</span>'
         f'<span class="difference">{escape(difference)}</span></div>'
     )
+
+
+def _pose(view: View) -> str:
+    rows = (f"<dt>{escape(axis)}</dt><dd>{escape(text)}</dd>" for axis, text in view.values)
+    return f'<section class="pose"><h2>{escape(view.title)}</h2><dl>{"".join(rows)}</dl></section>'
 
 
 def _line(line: Line) -> str:

@@ -17,57 +17,63 @@ _STYLES = {
 _FULL, _EMPTY = "█", "░"
 _BAR_CELLS = 16
 
-# Narrower terminals do without the columns of targets and differences.
+# Narrower terminals do without the column of differences.
 _WIDE = 76
+
+# Lower ones do without empty lines.
+_HIGH = 30
 
 KEYS = "s solve   w save   r reset   q quit"
 
 
-def screen(view: View, width: int, footer: str = "") -> RenderableType:
-    """The whole view.
+def screen(view: View, width: int, height: int, footer: str = "") -> RenderableType:
+    """The whole view; what is most important comes first, if the terminal is too low for it.
 
     Parameters
     ----------
     view : View
-    width : int
-        Columns of the terminal.
+    width, height : int
+        Columns and rows of the terminal.
     footer : str
         Such as the address of the page.
     """
     head = Text.assemble((f" {view.tone.value} {view.word} ", f"reverse {_STYLES[view.tone]}"))
-    parts: list[RenderableType] = [
-        head,
-        Text(view.sentence, style="bold"),
-        Text(),
-        _bars(view, width),
-        Text(),
-        _lines((*view.health, view.verdict, view.comparison)),
-        *(Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]),
-    ]
+    space = [Text()] * (height >= _HIGH)
+    parts: list[RenderableType] = [head, Text(view.sentence, style="bold"), *space]
     if view.answer is not None:
-        parts += [Text(), _lines((view.answer,))]
-    if len(view.nodes) > 1:
-        parts += [Text(), _choices(view)]
+        parts += [_lines((view.answer,)), *space]
+    parts += [_bars(view, width), *space, *_pose(view), *space]
+    parts.append(_lines((view.verdict, view.comparison, *view.health)))
+    parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
     title = f"hand_eye_calib watch {view.node}".rstrip()
-    keys = "   ".join(filter(None, (KEYS, footer)))
+    keys = Text(" " + "   ".join(filter(None, (KEYS, footer))), style="dim")
     body = Panel(Group(*parts), title=Text(title), title_align="left")
-    return Group(body, Text(f" {keys}", style="dim"))
+    return Group(keys, *([_choices(view)] if len(view.nodes) > 1 else []), body)
 
 
 def _bars(view: View, width: int) -> Table:
-    table = Table.grid(padding=(0, 2 if width >= _WIDE else 1))
     is_wide = width >= _WIDE
+    table = Table.grid(padding=(0, 2 if is_wide else 1))
     has_installed = any(bar.difference for bar in view.bars)
     for bar in view.bars:
         sign = Text(f"{bar.tone.value} {bar.word}", style=_STYLES[bar.tone])
-        cells = [Text(bar.axis, style="bold"), _drawn(bar), sign, Text(bar.value, justify="right")]
-        if is_wide:
-            cells.append(Text(bar.against))
-            cells += [Text(bar.difference)] * has_installed
+        cells = [Text(bar.axis, style="bold"), _drawn(bar), sign, Text(bar.against)]
+        if is_wide and has_installed:
+            cells.append(Text(bar.difference))
         table.add_row(*cells)
-    table.title = Text(view.title, style="dim")
-    table.title_justify = "left"
     return table
+
+
+def _pose(view: View) -> list[RenderableType]:
+    """Title, and three columns: x, y, z above roll, pitch, yaw."""
+    title = Text(view.title, style="dim")
+    if not view.values:
+        return [title]
+    table = Table.grid(padding=(0, 3))
+    texts = [Text.assemble((axis, "bold"), f" {text}") for axis, text in view.values]
+    for row in (texts[:3], texts[3:]):
+        table.add_row(*row)
+    return [title, table]
 
 
 def _drawn(bar: Bar) -> Text:
@@ -86,7 +92,7 @@ def _lines(lines: tuple[Line, ...]) -> Table:
 
 def _choices(view: View) -> Text:
     """Which key shows which node."""
-    text = Text("nodes: ")
+    text = Text(" nodes: ")
     for number, name in enumerate(view.nodes[:9], start=1):
         style = "reverse" if name == view.node else ""
         text.append(f" {number} {name} ", style=style)
