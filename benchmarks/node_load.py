@@ -1,7 +1,7 @@
 """Load, soak and crashes of the node, measured.
 
-    OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [ipopt] [slow] [share] [busy] [solver]
-    [soak] [kill] [--seconds 60] [--hours 10] [--kills 20]
+    OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [ipopt] [slow] [share] [busy] [watch]
+    [solver] [soak] [kill] [--seconds 60] [--hours 10] [--kills 20]
 
 load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages
        lost, latency of the callbacks, CPU
@@ -9,6 +9,7 @@ ipopt  the same while CasADi + Ipopt solves
 slow   the same while every solve takes two seconds of pure Python
 share  the same with a share of a core for the node and for its solving process (cgroups v1)
 busy   the same while other programs load all cores: messages lost against messages reported lost
+watch  the same while somebody watches, on a terminal and in a browser
 solver the same while the solving process is killed again and again
 soak   10 hours of 2 x 100 Hz, simulated, through the engine: memory and solve time hour by hour
 kill   kill -9 of the node at random moments, and resuming: what is lost
@@ -33,6 +34,7 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 from rich.console import Console
@@ -48,7 +50,7 @@ from hand_eye_calib.geometry import se3  # noqa: E402
 from hand_eye_calib.io.journal import read_journal  # noqa: E402
 from hand_eye_calib.io.results import load_result, save_result  # noqa: E402
 
-PARTS = ("load", "ipopt", "slow", "share", "busy", "solver", "soak", "kill")
+PARTS = ("load", "ipopt", "slow", "share", "busy", "watch", "solver", "soak", "kill")
 STREAMS = ("parent", "child")
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 START_NS = 1_700_000_000_000_000_000
@@ -110,7 +112,7 @@ def measured_node(report, arguments):
     """
     from hand_eye_calib.ros import solve_cycle
     from hand_eye_calib.ros.calibrator_node import CalibratorNode
-    from hand_eye_calib.ros.inputs import PoseInput
+    from hand_eye_calib.ros.inputs import TopicInput
     from hand_eye_calib.ros.node import main
     from hand_eye_calib.ros.solving_process import SolvingProcess
 
@@ -118,7 +120,7 @@ def measured_node(report, arguments):
         solve_cycle.SolvingProcess = functools.partial(SolvingProcess, command=SLOW_SOLVER)
 
     latencies, durations, used = [], [], []
-    receive = PoseInput.receive
+    receive = TopicInput.receive
 
     def stopwatch(self, pose_type, message, info):
         begun = time.time()
@@ -130,7 +132,7 @@ def measured_node(report, arguments):
         if len(latencies) % 100 == 0:
             used[1:] = [(time.monotonic(), cpu_seconds())]
 
-    PoseInput.receive = stopwatch
+    TopicInput.receive = stopwatch
     stop = CalibratorNode.stop
 
     def stop_and_report(self, timeout_s):
@@ -242,7 +244,7 @@ def publish(domain, rate_hz, n_poses):
     return 0
 
 
-def start(domain, *words, **more):
+def start(domain, *words, stdout=None, **more):
     """Another process of this file, or of the package."""
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain),
@@ -254,6 +256,7 @@ def start(domain, *words, **more):
         [sys.executable, *map(str, words)],
         env=environment | more,
         cwd=PROJECT,
+        stdout=stdout,
         stderr=subprocess.STDOUT,
     )
 
@@ -300,7 +303,7 @@ def others(count):
     return lambda: [(each.kill(), each.wait()) for each in busy]
 
 
-def solver_killer(node, report):
+def solver_killer(node, report, domain):
     """Kill the node's solving process twenty times, every two seconds; ends that."""
     done, stop = [], threading.Event()
 
@@ -322,13 +325,52 @@ def solver_killer(node, report):
     return end
 
 
+def watcher(node, report, domain):
+    """Somebody who watches on a terminal and in a browser; ends that and notes what it has cost."""
+    page, key = 8700 + domain, "load"
+    words = ("-m", "hand_eye_calib", "watch", "--web", f"127.0.0.1:{page}", "--key", key)
+    process = start(domain, *words, stdout=subprocess.DEVNULL)
+    begun, events = time.monotonic(), []
+
+    def browse():
+        while process.poll() is None:
+            try:
+                events_page = urlopen(f"http://127.0.0.1:{page}/events?key={key}", timeout=5)
+                events.extend(len(line) for line in events_page if len(line) > 10)
+            except OSError:
+                time.sleep(0.2)
+
+    browser = threading.Thread(target=browse)
+    browser.start()
+
+    def end():
+        stat = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2]
+        ticks = sum(map(int, stat.split()[11:13]))
+        cost = ticks / os.sysconf("SC_CLK_TCK") / (time.monotonic() - begun)
+        process.send_signal(signal.SIGINT)
+        process.wait()
+        browser.join()
+        report.with_suffix(".watched").write_text(json.dumps([cost, len(events)]))
+
+    return end
+
+
+def watched(folder, seconds):
+    """Rows of the node while somebody watches."""
+    seen = loaded_node(folder, "watch", seconds, disturb=watcher)
+    cost, views = json.loads((folder / "watch.watched").read_text())
+    rows = load(seen)
+    return [*rows, ("watch: CPU (cores), views", f"{cost:.3f}, {views}", "views > 5", views > 5)]
+
+
 def loaded_node(folder, name, seconds, backend="fast", disturb=None, **environment):
     """What the node saw of two streams at 400 Hz.
 
     Parameters
     ----------
     disturb : callable, optional
-        Given the node's process, makes life hard for it; returns what undoes that.
+        Given the node's process, its report and the domain, makes life hard for the node; returns
+        what undoes that.
     """
     rate_hz, domain = 400, random.randint(1, 100)
     report = folder / f"{name}.json"
@@ -339,13 +381,14 @@ def loaded_node(folder, name, seconds, backend="fast", disturb=None, **environme
         "solve_period": 1.0,
         "max_pairs": 5005,
         "output_directory": folder / name,
+        "report": "false",  # it would load the machine in the next part
     }
     parameters = [
         word for option, value in options.items() for word in ("-p", f"{option}:={value}")
     ]
     words = ("--node", report, "--ros-args", "--log-level", "warn", *parameters)
     node = start(domain, __file__, *words, **environment)
-    undo = disturb(node, report) if disturb else lambda: None
+    undo = disturb(node, report, domain) if disturb else lambda: None
     n_poses = round(seconds * rate_hz)
     try:
         if start(domain, __file__, "--publish", rate_hz, n_poses).wait():
@@ -631,7 +674,7 @@ def main(arguments):
                     folder,
                     "share",
                     options.seconds,
-                    disturb=lambda node, _: slow_processor(node, options.share),
+                    disturb=lambda node, *_: slow_processor(node, options.share),
                     **{SLOW: "1"},
                 ),
                 MOST_LATENCY_OF_A_SHARE_S,
@@ -646,6 +689,7 @@ def main(arguments):
                 ),
                 may_lose=True,
             ),
+            "watch": lambda: watched(folder, options.seconds),
             "solver": lambda: solver(folder, options.seconds),
             "soak": lambda: soak(options.hours),
             "kill": lambda: kill(folder, options.kills),

@@ -185,7 +185,9 @@ def _input_reports(parts: NodeParts, steady_s: float) -> dict[str, Report]:
     all_silent = all(each.monitor.is_silent(steady_s) for each in parts.inputs)
     may_rest = all_silent and parts.cycle.has_valid_result
     reports = {
-        each.name: each.monitor.report(each.topic, steady_s, each.statistics, may_rest)
+        each.name: each.monitor.report(
+            each.topic, steady_s, each.statistics, may_rest, each.what_is_missing()
+        )
         for each in parts.inputs
     }
     seen_s = _clock_offset(*(each.monitor for each in parts.inputs))

@@ -80,7 +80,12 @@ class InputMonitor:
         return self._arrived_at_s is not None and steady_s - self._arrived_at_s > STALE_AFTER_S
 
     def report(
-        self, topic: str, steady_s: float, statistics: StreamStatistics, may_rest: bool = False
+        self,
+        topic: str,
+        steady_s: float,
+        statistics: StreamStatistics,
+        may_rest: bool = False,
+        missing: str = "",
     ) -> Report:
         """State of this input; begins a new interval.
 
@@ -91,6 +96,8 @@ class InputMonitor:
         statistics : StreamStatistics
         may_rest : bool
             Silence is nothing to look at: there is a result, and the other input is silent too.
+        missing : str
+            Why no message has come yet, if that is known.
         """
         self._counts.append((steady_s, self.arrived))
         (start_s, start), (end_s, end) = self._counts[0], self._counts[-1]
@@ -101,6 +108,8 @@ class InputMonitor:
         if delays_s.size:
             self.delay_s = float(np.median(delays_s))
         level, text = self._judge(topic, steady_s, rate_hz, delivery, may_rest)
+        if self._arrived_at_s is None and missing:
+            text = f"{text}: {missing}"
         values = {
             "topic": topic,
             "rate (Hz)": f"{rate_hz:.1f}",

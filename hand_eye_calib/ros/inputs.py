@@ -111,6 +111,10 @@ class PoseInput:
         """Why nothing has come yet, as far as the graph tells."""
         raise NotImplementedError
 
+    def what_is_missing(self) -> str:
+        """Why nothing has come yet, if more is known than that; otherwise empty."""
+        return ""
+
     # -------------------------------------------------------------- messages
 
     def accept(self, pose_type: PoseType, stamp_ns: int, message: Any) -> None:

@@ -62,7 +62,10 @@ class TfInput(PoseInput):
         self._log.info(f"{self._source} is taken from /tf for the {self.name} sensor")
 
     def describe_silence(self) -> str:
-        return f"no pose yet of {self._source}: {self._stream.describe_missing()}"
+        return f"no pose yet of {self._source}: {self.what_is_missing()}"
+
+    def what_is_missing(self) -> str:
+        return self._stream.describe_missing()
 
     def _hear(self, topic: str, message: Any, info: dict[str, Any]) -> None:
         self._receive(topic, message, info)

@@ -19,6 +19,8 @@ OK, WARN, ERROR = 0, 1, 2
 # A node that has said nothing for so long is silent; it reports once a second (s).
 SILENT_AFTER_S = 3.5
 
+SILENT = "SILENT"
+
 # The answer to a button is shown for so long (s).
 ANSWER_FOR_S = 20.0
 
@@ -234,7 +236,7 @@ def _headline(name: str, node: _Node, silent_s: float) -> tuple[Tone, str, str]:
         return Tone.UNKNOWN, "NO NODE", text
     if silent_s > SILENT_AFTER_S:
         text = f"The node has said nothing for {silent_s:.0f} s. What is below is older than that."
-        return Tone.BAD, "SILENT", text
+        return Tone.BAD, SILENT, text
     for part in ("extrinsic", "mount", "parent input", "child input", "journal"):
         status = node.statuses.get(part)
         if status is not None and status.level >= ERROR:
@@ -244,6 +246,9 @@ def _headline(name: str, node: _Node, silent_s: float) -> tuple[Tone, str, str]:
         status = node.statuses.get(part)
         if status is not None and status.level == WARN:
             return Tone.ACT, "CHECK INPUT", _sentence(status.text)
+    checks = node.statuses.get("stream checks")
+    if checks is not None and _tone(checks) is Tone.ACT:
+        return Tone.ACT, "CHECK THE STREAMS", _sentence(checks.text)
     if progress is None:
         return _of_extrinsic(node.statuses.get("extrinsic"))
     return _of_progress(progress)
@@ -353,7 +358,7 @@ def _values(node: _Node) -> Iterator[tuple[str, str]]:
             text = f"{value:.3f} m"
         else:
             sigma = math.radians(_number(said, f"sigma {axis} (deg)"))
-            text = f"{math.degrees(value):.2f} deg"
+            text = f"{math.degrees(value):.2f}"
         yield axis, f"{text} ± {small(sigma, unit)}" if math.isfinite(sigma) else "? not observed"
 
 
@@ -363,12 +368,19 @@ _PARTS = ("parent input", "child input", "stream checks", "mount", "journal")
 _TONES = {OK: Tone.GOOD, WARN: Tone.ACT}
 
 
+def _tone(status: Status) -> Tone:
+    """Of a part of the node; a check that has not been made yet asks for nothing."""
+    if status.values.get("checked") == "not yet":
+        return Tone.BUSY
+    return _TONES.get(status.level, Tone.BAD)
+
+
 def _health(node: _Node, silent_s: float) -> Iterator[Line]:
     is_old = silent_s > SILENT_AFTER_S
     for part in _PARTS:
         status = node.statuses.get(part)
         if status is not None:
-            tone = Tone.UNKNOWN if is_old else _TONES.get(status.level, Tone.BAD)
+            tone = Tone.UNKNOWN if is_old else _tone(status)
             topic = status.values.get("topic", "")
             about = f"{status.text}, {topic}" if topic and topic not in status.text else status.text
             yield Line(tone, part, about)

@@ -5,7 +5,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from hand_eye_calib.watch.board import Bar, Line, Tone, View
+from hand_eye_calib.watch.board import SILENT, Bar, Line, Tone, View
 
 _STYLES = {
     Tone.GOOD: "bold green",
@@ -100,23 +100,24 @@ def _choices(view: View) -> Text:
 
 
 class LineLog:
-    """A view in lines: one whenever something new is said."""
+    """A view in lines: some whenever something new is said."""
 
     def __init__(self) -> None:
         self._said: tuple[object, ...] = ()
+        self._answer: Line | None = None
 
     def lines(self, view: View, elapsed_s: float) -> list[str]:
         """What is new since the last call, with the seconds since the start."""
         verdict, comparison = view.verdict.text, view.comparison.text
-        said = view.node, view.word, view.sentence, verdict, comparison, view.answer
-        if said == self._said:
-            return []
-        self._said = said
-        axes = "  ".join(f"{bar.axis} {100 * bar.share:.0f} %" for bar in view.bars)
-        lines = [
-            f"{elapsed_s:6.1f} s  {view.tone.value} {view.word}: {view.sentence}",
-            f"{'':10}{axes}   verdict: {verdict}   installed: {comparison}",
-        ]
-        if view.answer is not None:
-            lines.append(f"{'':10}{view.answer.name}: {view.answer.text}")
+        sentence = "" if view.word == SILENT else view.sentence  # that one counts the seconds
+        said = view.node, view.word, sentence, verdict, comparison
+        lines = []
+        if said != self._said:
+            axes = "  ".join(f"{bar.axis} {100 * bar.share:.0f} %" for bar in view.bars)
+            lines.append(f"{elapsed_s:6.1f} s  {view.tone.value} {view.word}: {view.sentence}")
+            lines.append(f"{'':10}{axes}   verdict: {verdict}   installed: {comparison}")
+        if view.answer is not None and view.answer != self._answer:
+            answer = view.answer
+            lines.append(f"{elapsed_s:6.1f} s  {answer.tone.value} {answer.name}: {answer.text}")
+        self._said, self._answer = said, view.answer
         return lines

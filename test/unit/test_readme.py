@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 NODE_PAGE, LIMITS_PAGE = ROOT / "docs" / "node.md", ROOT / "docs" / "limits.md"
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
-    for page in (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md")))
+    for page in (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")))
 }
 HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
 FEWEST_WORDS, MOST_WORDS = 700, 900
@@ -134,7 +134,7 @@ def shell_lines(text):
 def commands(text):
     """Every command of ours on a page, as (subcommand, arguments)."""
     for line in shell_lines(text):
-        words = shlex.split(line, comments=True)
+        words = shlex.split(line.partition(" > ")[0], comments=True)
         while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
             words = words[1:]
         if words[:3] == ["ros2", "run", "hand_eye_calib"]:

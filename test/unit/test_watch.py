@@ -59,6 +59,14 @@ def view_of(*statuses, now_s=0.5, pose=POSE, node=""):
         ([progress(done="true"), *inputs()], 0.5, Tone.GOOD, "DONE", "Go on"),
         ([progress(), *inputs(child=1)], 0.5, Tone.ACT, "CHECK INPUT", "/odom has been silent"),
         ([progress(), *inputs(1, 2)], 0.5, Tone.BAD, "BAD INPUT", "/odom: bad quaternion."),
+        (
+            [progress(), Status("stream checks", 1, "the child's lengths are feet")],
+            *(0.5, Tone.ACT, "CHECK THE STREAMS", "The child's lengths are feet."),
+        ),
+        (
+            [progress(), Status("stream checks", 1, "not checked yet", {"checked": "not yet"})],
+            *(0.5, Tone.BUSY, "GO ON", "Go on for"),
+        ),
         ([Status("mount", 2, "it moved"), progress()], 0.5, Tone.BAD, "MOUNT MOVED", "It moved."),
         ([Status("extrinsic", 0, "known")], 0.5, Tone.GOOD, "GOOD", "Known."),
         ([Status("extrinsic", 2, "defect")], 0.5, Tone.BAD, "BROKEN", "Defect."),
@@ -103,7 +111,7 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
     values = dict(view.values)
     assert view.title == "pose of camera in lidar"
     assert values["x"] == "0.420 m ± 4 mm"
-    assert values["roll"] == "0.57 deg ± 0.57 deg"
+    assert values["roll"] == "0.57 ± 0.57 deg"
     assert values["z"] == values["yaw"] == "? not observed"
 
 
@@ -211,6 +219,16 @@ def test_lines_are_printed_when_something_new_is_said():
     assert "z 25 %" in first[1]
     assert log.lines(view_of(progress(**{"sigma.x": "0.003"})), 2.0) == []
     assert log.lines(view_of(progress(done="true")), 3.0)
+    assert log.lines(view_of(progress(), now_s=9.0), 9.0)
+    assert log.lines(view_of(progress(), now_s=10.0), 10.0) == []  # still silent
+
+
+def test_an_answer_has_a_line_of_its_own():
+    log, board = terminal.LineLog(), Board()
+    board.take(NODE, [progress()], 0.0)
+    log.lines(board.view("", 0.0), 0.0)
+    board.answer(NODE, "save", True, "result saved", 0.0)
+    assert log.lines(board.view("", 1.0), 1.0) == ["   1.0 s  ✓ save: result saved"]
 
 
 # ------------------------------------------------------------------------ page
