@@ -204,6 +204,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, b"too many browsers", "text/plain")
             return
         self.close_connection = True
+        self._notice_silence()
         try:
             self._begin(HTTPStatus.OK, "text/event-stream; charset=utf-8")
             self.end_headers()
@@ -213,6 +214,12 @@ class _Handler(BaseHTTPRequestHandler):
             return  # the browser has gone
         finally:
             owner.clients.release()
+
+    def _notice_silence(self) -> None:
+        """Let the connection to a phone out of reach end after a while, not after an hour."""
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
+            patience_ms = round(1000 * _PATIENCE_S)
+            self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
 
     def _events(self, node: str) -> Iterator[bytes]:
         """The view whenever it has changed; an empty event every second in between."""

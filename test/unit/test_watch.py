@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.watch import terminal
+from hand_eye_calib.watch import terminal, web
 from hand_eye_calib.watch.board import AXES, Board, Pose, Status, Tone, duration, small
 from hand_eye_calib.watch.html import fragment
 from hand_eye_calib.watch.web import WebServer
@@ -306,6 +306,23 @@ def test_buttons_are_passed_on_with_the_key_only(server):
     assert fetch(server, "POST", "/shutdown?key=word").status == 404
     assert fetch(server, "GET", "/save?key=word").status == 404
     assert server.requests.empty()
+
+
+def test_a_browser_that_leaves_makes_room_for_another(monkeypatch):
+    monkeypatch.setattr(web, "_MOST_CLIENTS", 1)
+    board = Board()
+    server = WebServer(board, print, ("127.0.0.1", 0), key="word")
+    try:
+        events = fetch(server, "GET", "/events?key=word")
+        assert events.readline().startswith(b"data: <p")
+        assert fetch(server, "GET", "/events?key=word").status == 503
+        events.close()
+        end = time.monotonic() + 30
+        while fetch(server, "GET", "/events?key=word").status == 503:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+    finally:
+        server.stop()
 
 
 def test_a_port_in_use_is_said_in_one_line(server):
