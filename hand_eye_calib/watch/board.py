@@ -21,6 +21,9 @@ SILENT_AFTER_S = 3.5
 
 SILENT = "SILENT"
 
+# A shift is told from this many standard deviations on.
+_CLEARLY = 3.0
+
 # The answer to a button is shown for so long (s).
 ANSWER_FOR_S = 20.0
 
@@ -113,6 +116,9 @@ class View:
 
     The pose (``values``: each axis with its value) has the angles as they are printed, with their
     own standard deviations. The bars are about the axes of the parent sensor's frame.
+
+    A node that only watches the mount has no bars, verdict and comparison, but a line for each axis
+    (``watched``): whether it has moved, or which change would be seen.
     """
 
     node: str
@@ -123,10 +129,10 @@ class View:
     title: str
     values: tuple[tuple[str, str], ...]
     bars: tuple[Bar, ...]
-    health: tuple[Line, ...]
-    verdict: Line
+    watched: tuple[Line, ...]
+    result: tuple[Line, ...]
     reasons: tuple[str, ...]
-    comparison: Line
+    health: tuple[Line, ...]
     answer: Line | None
 
 
@@ -206,7 +212,8 @@ class Board:
 def _view(name: str, names: tuple[str, ...], node: _Node, now_s: float) -> View:
     silent_s = now_s - node.heard_s
     tone, word, sentence = _headline(name, node, silent_s)
-    values = node.values("progress")
+    values, mount = node.values("progress"), node.values("mount")
+    is_watching = "mount" in node.statuses and "progress" not in node.statuses
     is_answered = node.answer is not None and now_s - node.answered_s < ANSWER_FOR_S
     return View(
         node=name,
@@ -214,13 +221,13 @@ def _view(name: str, names: tuple[str, ...], node: _Node, now_s: float) -> View:
         tone=tone,
         word=word,
         sentence=sentence,
-        title=_title(node.pose),
+        title="" if is_watching else _title(node.pose),
         values=tuple(_values(node)),
-        bars=tuple(_bar(axis, values) for axis in AXES),
-        health=tuple(_health(node, silent_s)),
-        verdict=_verdict(values.get("verdict", "")),
+        bars=() if is_watching else tuple(_bar(axis, values) for axis in AXES),
+        watched=tuple(_watched(axis, mount) for axis in AXES) if is_watching else (),
+        result=() if is_watching else (_verdict(values.get("verdict", "")), _comparison(values)),
         reasons=tuple(_numbered(values, "reason")),
-        comparison=_comparison(values),
+        health=tuple(_health(node, silent_s)),
         answer=node.answer if is_answered else None,
     )
 
@@ -249,9 +256,11 @@ def _headline(name: str, node: _Node, silent_s: float) -> tuple[Tone, str, str]:
     checks = node.statuses.get("stream checks")
     if checks is not None and _tone(checks) is Tone.ACT:
         return Tone.ACT, "CHECK THE STREAMS", _sentence(checks.text)
-    if progress is None:
-        return _of_extrinsic(node.statuses.get("extrinsic"))
-    return _of_progress(progress)
+    if progress is not None:
+        return _of_progress(progress)
+    if "mount" in node.statuses:
+        return _of_mount(node.statuses["mount"])
+    return _of_extrinsic(node.statuses.get("extrinsic"))
 
 
 _ERROR_WORDS = {"mount": "MOUNT MOVED", "parent input": "BAD INPUT", "child input": "BAD INPUT"}
@@ -268,8 +277,17 @@ def _of_progress(progress: Status) -> tuple[Tone, str, str]:
     return Tone.BUSY, "GO ON", sentence
 
 
+def _of_mount(status: Status) -> tuple[Tone, str, str]:
+    """Of a node that watches the mount, which has not moved."""
+    if status.level != OK:
+        return Tone.ACT, "NOT WATCHING", _sentence(status.text)
+    if status.text.startswith("learning"):
+        return Tone.BUSY, "LEARNING", _sentence(status.text)
+    return Tone.GOOD, "WATCHING", _sentence(status.text)
+
+
 def _of_extrinsic(status: Status | None) -> tuple[Tone, str, str]:
-    """Of a node that sets no goal, such as one that only watches the mount."""
+    """Of a node that sets no goal."""
     if status is None:
         return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
     if status.level == OK:
@@ -402,13 +420,28 @@ def _numbered(values: Mapping[str, str], name: str) -> Iterator[str]:
         number += 1
 
 
+_COMPARED = {"same": Tone.GOOD, "moved": Tone.ACT}
+
+
 def _comparison(values: Mapping[str, str]) -> Line:
-    text = values.get("comparison", "")
-    if not text:
+    verdict = values.get("comparison", "")
+    if not verdict:
         return Line(Tone.UNKNOWN, "installed", "nothing to compare with (parameter installed)")
-    said = text.lower()
-    tone = Tone.ACT if "moved" in said else Tone.GOOD if "same" in said else Tone.UNKNOWN
-    return Line(tone, "installed", text)
+    text = values.get("comparison_sentence") or verdict
+    return Line(_COMPARED.get(verdict, Tone.UNKNOWN), "installed", text)
+
+
+def _watched(axis: str, values: Mapping[str, str]) -> Line:
+    """Whether an axis of a watched mount has moved, or which change of it would be seen."""
+    unit = AXES[axis]
+    shift, sigma = _number(values, f"shift.{axis}"), _number(values, f"shift_sigma.{axis}")
+    if abs(shift) > _CLEARLY * sigma:
+        return Line(Tone.BAD, axis, f"moved by {small(shift, unit)} ± {small(sigma, unit)}")
+    visible = _number(values, f"visible_10min.{axis}")
+    if math.isfinite(visible):
+        shown = f"ten minutes of motion would show a change of {small(visible, unit)}"
+        return Line(Tone.GOOD, axis, shown)
+    return Line(Tone.UNKNOWN, axis, "cannot be watched with the motion so far")
 
 
 def _difference(axis: str, values: Mapping[str, str]) -> str:

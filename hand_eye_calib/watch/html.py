@@ -1,5 +1,6 @@
 """A view as a piece of HTML, which the page in the browser puts in place."""
 
+from collections.abc import Iterable, Iterator
 from html import escape
 
 from hand_eye_calib.watch.board import Bar, Line, Tone, View
@@ -16,17 +17,29 @@ def fragment(view: View) -> str:
             f'<section class="headline {_CLASSES[view.tone]}"><h1>{_sign(view.tone)} '
             f"{escape(view.word)}</h1><p>{escape(view.sentence)}</p></section>",
             _answer(view.answer),
-            '<section class="axes"><h2>precision against the target</h2>',
-            *map(_bar, view.bars),
-            "</section>",
-            _pose(view),
-            '<section class="health"><h2>result and inputs</h2>',
-            _line(view.verdict),
-            _reasons(view.reasons),
-            *map(_line, (view.comparison, *view.health)),
-            "</section>",
+            _section("axes", "precision against the target", map(_bar, view.bars)),
+            _section("axes", "the mount, axis by axis", map(_line, view.watched)),
+            _section("pose", view.title, _pose(view)),
+            _section("health", "result and inputs", _health(view)),
         )
     )
+
+
+def _section(name: str, title: str, parts: Iterable[str]) -> str:
+    """A section with a title; nothing if it is empty."""
+    content = "".join(parts)
+    if not content:
+        return ""
+    return f'<section class="{name}"><h2>{escape(title)}</h2>{content}</section>'
+
+
+def _health(view: View) -> Iterator[str]:
+    verdict_and_comparison = [_line(line) for line in view.result]
+    yield from verdict_and_comparison[:1]
+    if view.reasons:
+        yield f"<ul>{''.join(f'<li>{escape(reason)}</li>' for reason in view.reasons)}</ul>"
+    yield from verdict_and_comparison[1:]
+    yield from map(_line, view.health)
 
 
 def _nodes(view: View) -> str:
@@ -52,9 +65,10 @@ def _bar(bar: Bar) -> str:
     )
 
 
-def _pose(view: View) -> str:
-    rows = (f"<dt>{escape(axis)}</dt><dd>{escape(text)}</dd>" for axis, text in view.values)
-    return f'<section class="pose"><h2>{escape(view.title)}</h2><dl>{"".join(rows)}</dl></section>'
+def _pose(view: View) -> Iterator[str]:
+    if view.title:
+        rows = (f"<dt>{escape(axis)}</dt><dd>{escape(text)}</dd>" for axis, text in view.values)
+        yield f"<dl>{''.join(rows)}</dl>"
 
 
 def _line(line: Line) -> str:
@@ -66,12 +80,6 @@ def _line(line: Line) -> str:
 
 def _answer(line: Line | None) -> str:
     return f'<section class="answer">{_line(line)}</section>' if line is not None else ""
-
-
-def _reasons(reasons: tuple[str, ...]) -> str:
-    if not reasons:
-        return ""
-    return f"<ul>{''.join(f'<li>{escape(reason)}</li>' for reason in reasons)}</ul>"
 
 
 def _sign(tone: Tone) -> str:

@@ -42,8 +42,9 @@ def screen(view: View, width: int, height: int, footer: str = "") -> RenderableT
     parts: list[RenderableType] = [head, Text(view.sentence, style="bold"), *space]
     if view.answer is not None:
         parts += [_lines((view.answer,)), *space]
-    parts += [_bars(view, width), *space, *_pose(view), *space]
-    parts.append(_lines((view.verdict, view.comparison, *view.health)))
+    parts += [_bars(view, width), *space, *_pose(view), *space] if view.bars else []
+    parts += [_lines(view.watched), *space] if view.watched else []
+    parts.append(_lines((*view.result, *view.health)))
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
     title = f"hand_eye_calib watch {view.node}".rstrip()
     keys = Text(" " + "   ".join(filter(None, (KEYS, footer))), style="dim")
@@ -108,14 +109,14 @@ class LineLog:
 
     def lines(self, view: View, elapsed_s: float) -> list[str]:
         """What is new since the last call, with the seconds since the start."""
-        verdict, comparison = view.verdict.text, view.comparison.text
         sentence = "" if view.word == SILENT else view.sentence  # that one counts the seconds
-        said = view.node, view.word, sentence, verdict, comparison
+        said = view.node, view.word, sentence, view.result
         lines = []
         if said != self._said:
-            axes = "  ".join(f"{bar.axis} {100 * bar.share:.0f} %" for bar in view.bars)
             lines.append(f"{elapsed_s:6.1f} s  {view.tone.value} {view.word}: {view.sentence}")
-            lines.append(f"{'':10}{axes}   verdict: {verdict}   installed: {comparison}")
+            axes = "  ".join(f"{bar.axis} {100 * bar.share:.0f} %" for bar in view.bars)
+            more = [axes, *(f"{line.name}: {line.text}" for line in view.result)]
+            lines += [f"{'':10}{'   '.join(more)}"] if view.bars else []
         if view.answer is not None and view.answer != self._answer:
             answer = view.answer
             lines.append(f"{elapsed_s:6.1f} s  {answer.tone.value} {answer.name}: {answer.text}")

@@ -68,6 +68,9 @@ def view_of(*statuses, now_s=0.5, pose=POSE, node=""):
             *(0.5, Tone.BUSY, "GO ON", "Go on for"),
         ),
         ([Status("mount", 2, "it moved"), progress()], 0.5, Tone.BAD, "MOUNT MOVED", "It moved."),
+        ([Status("mount", 0, "it has not")], 0.5, Tone.GOOD, "WATCHING", "It has not."),
+        ([Status("mount", 0, "learning")], 0.5, Tone.BUSY, "LEARNING", "Learning."),
+        ([Status("mount", 1, "no URDF")], 0.5, Tone.ACT, "NOT WATCHING", "No URDF."),
         ([Status("extrinsic", 0, "known")], 0.5, Tone.GOOD, "GOOD", "Known."),
         ([Status("extrinsic", 2, "defect")], 0.5, Tone.BAD, "BROKEN", "Defect."),
     ],
@@ -117,23 +120,41 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
 
 def test_the_comparison_has_its_figures_and_a_sign():
     values = {
-        "comparison": "moved: z by 3 cm",
+        "comparison": "moved",
+        "comparison_sentence": "z has moved by 3 cm",
         "difference.z": "0.031",
         "difference_sigma.z": "0.004",
         "difference.yaw": "-0.02",
     }
     view = view_of(progress(**values))
-    assert (view.comparison.tone, view.comparison.text) == (Tone.ACT, "moved: z by 3 cm")
+    assert (view.result[1].tone, view.result[1].text) == (Tone.ACT, "z has moved by 3 cm")
     assert view.bars[2].difference == "+3.1 cm ± 4 mm"
     assert view.bars[5].difference == "-1.1 deg"
-    assert view_of(progress(comparison="same")).comparison.tone is Tone.GOOD
-    assert view_of(progress()).comparison.tone is Tone.UNKNOWN
+    assert view_of(progress(comparison="same")).result[1].tone is Tone.GOOD
+    assert view_of(progress(comparison="cannot tell")).result[1].tone is Tone.UNKNOWN
+    assert "nothing to compare with" in view_of(progress()).result[1].text
 
 
 def test_verdict_and_reasons():
     view = view_of(progress(verdict="DO NOT USE", **{"reason.1": "a: b", "reason.2": "c"}))
-    assert (view.verdict.tone, view.verdict.text) == (Tone.BAD, "DO NOT USE")
+    assert (view.result[0].tone, view.result[0].text) == (Tone.BAD, "DO NOT USE")
     assert view.reasons == ("a: b", "c")
+
+
+def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
+    values = {f"visible_10min.{axis}": "0.004" for axis in AXES} | {"visible_10min.z": "unknown"}
+    values |= {"shift.yaw": "0.0175", "shift_sigma.yaw": "0.001", "shift.x": "0.001"}
+    values |= {"shift_sigma.x": "0.001"}
+    view = view_of(Status("mount", 2, "the mount has moved: yaw by 1 deg", values), *inputs())
+    lines = {line.name: (line.tone, line.text) for line in view.watched}
+    assert lines["yaw"] == (Tone.BAD, "moved by 1 deg ± 0.057 deg")
+    assert lines["x"] == (Tone.GOOD, "ten minutes of motion would show a change of 4 mm")
+    assert lines["z"] == (Tone.UNKNOWN, "cannot be watched with the motion so far")
+    assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
+    assert "the mount, axis by axis" in fragment(view)
+    assert "precision" not in fragment(view)
+    assert "moved by 1 deg" in drawn(view, 80)
+    assert len(terminal.LineLog().lines(view, 0.0)) == 1
 
 
 def test_a_reset_takes_the_values_away():
