@@ -25,7 +25,13 @@ from hand_eye_calib.adaptive.increments import (
     linearise,
     parameters_of,
 )
-from hand_eye_calib.adaptive.noise_model import CENTRES, SCALE_DRIFT, Extent, NoiseModel
+from hand_eye_calib.adaptive.noise_model import (
+    CENTRES,
+    LONGEST_IN_THE_MEAN,
+    SCALE_DRIFT,
+    Extent,
+    NoiseModel,
+)
 from hand_eye_calib.adaptive.outliers import (
     Outliers,
     bridged,
@@ -79,6 +85,9 @@ _NOISY, _FREED_ROUNDS = 0.2, 2
 # Errors that last are looked for if a first step promises to lower the loss by so much, and part of
 # the model if it is so much lower in the end.
 _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
+
+# Sizes of errors that last longer than those found, as shares of their variance.
+_LONGER_SIZES = np.array([0.0, 0.0625, 0.25, 1.0])
 
 # Systematic errors larger than this (of the length, m/m, s) are none: a wrong unit, a clock that
 # was not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground a
@@ -184,6 +193,8 @@ class _State:
         Their values.
     other_sigmas : (8,) array
         Standard deviations of parameters that are not in the model.
+    mean_variances : (6,) array
+        Of X, by errors that last too long to be found.
     weights : (N,) array
         Of white errors; other than 1 where tails are heavy.
     """
@@ -202,6 +213,7 @@ class _State:
     columns: list[int] = dataclasses.field(default_factory=list)
     parameters: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
     other_sigmas: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
+    mean_variances: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(6))
     n_evaluations: int = 0
 
     def linearised(self, kept: IntArray | None = None) -> tuple[Streams, Course, Linearisation]:
@@ -416,7 +428,28 @@ def _with_lasting_errors(plain: _State) -> _State:
     if before.loss - fit.loss < _LEAST_GAIN:
         return dataclasses.replace(plain, n_evaluations=n_evaluations)
     model, levels = model.reduced(fit)
-    return dataclasses.replace(plain, model=model, levels=levels, n_evaluations=n_evaluations)
+    found = dataclasses.replace(plain, model=model, levels=levels, n_evaluations=n_evaluations)
+    return dataclasses.replace(found, mean_variances=_mean_variances(found, kept))
+
+
+def _mean_variances(found: _State, kept: IntArray | None) -> FloatArray:
+    """Variances (6,) of the mean of errors fixed to the body that last too long to be found.
+
+    Errors that last often do so on all scales (flicker). A recording hardly shows those about as
+    long as itself, and X takes their mean. So beside each process that was found, the longest that
+    is modelled gets the mean of sizes from none to that of the one found, weighted by likelihood.
+    """
+    variances = np.zeros(6)
+    none = Posterior(found.space(kept), found.levels).loss
+    for process, size in found.model.fixed_to_body(found.levels):
+        losses = [none]
+        for share in _LONGER_SIZES[1:]:
+            model, levels = found.model.with_longer(process, found.levels, share * size)
+            losses.append(Posterior(found.space(kept, model), levels).loss)
+        likelihoods = np.exp(min(losses) - np.array(losses))
+        expected = size * float(likelihoods @ _LONGER_SIZES) / float(likelihoods.sum())
+        variances[noise_model.states_of(process.part)] = LONGEST_IN_THE_MEAN * expected
+    return variances
 
 
 def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
@@ -502,9 +535,11 @@ def _freed(state: _State, states: FloatArray) -> _State:
 def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveSolution:
     normal, streams = posterior.normal, state.streams
     n_columns = len(state.columns)
-    freedom = 6 * int((~state.outliers.jumps).sum()) - 6 - n_columns
-    misfit = normal.cost / max(freedom, 1)
-    covariance = misfit * normal.covariance
+    n_evidence = int((~state.outliers.jumps).sum()) - int(state.outliers.spikes.sum())
+    misfit = normal.cost / max(6 * n_evidence - 6 - n_columns, 1)
+    # Steps smaller than predicted do not make what was learned over long baselines more certain.
+    covariance = max(misfit, 1.0) * normal.covariance
+    covariance[:6, :6] += np.diag(state.mean_variances)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     parts = part_products(posterior)
     return AdaptiveSolution(

@@ -80,6 +80,12 @@ class Slow:
         return 1 if self.kind == "scale" else 3
 
 
+# Variance of the mean over a recording of a process with the longest time constant, as a share of
+# its own: 2 r (1 - r (1 - exp(-1 / r))) with r the share of the recording.
+LONGEST_IN_THE_MEAN = (
+    2.0 * _LONGEST_SHARE * (1.0 - _LONGEST_SHARE * -float(np.expm1(-1.0 / _LONGEST_SHARE)))
+)
+
 SCALE_DRIFT = Slow("scale", "scale")
 LASTING = tuple(Slow(kind, part) for kind in ("body", "world") for part in _PARTS)
 
@@ -264,6 +270,22 @@ class NoiseModel:
         model = self.richer((*LASTING, *self.slow))
         return model, np.concatenate([levels[:N_FAST], slow_levels, levels[N_FAST:]])
 
+    def fixed_to_body(self, levels: FloatArray) -> list[tuple[Slow, float]]:
+        """The slow processes that are fixed to the body, with their variances."""
+        return [
+            (process, float(np.exp(levels[group.variance])))
+            for process, group in zip(self.slow, self._groups(), strict=True)
+            if process.kind == "body"
+        ]
+
+    def with_longer(
+        self, process: Slow, levels: FloatArray, variance: float
+    ) -> tuple[NoiseModel, FloatArray]:
+        """The model and log levels with one more process, as long as a recording can show."""
+        longer = [np.log(variance), np.log(_LONGEST_SHARE * self.extent.duration_s)]
+        model = self.richer((process, *self.slow))
+        return model, np.concatenate([levels[:N_FAST], longer, levels[N_FAST:]])
+
     def taus_s(self) -> list[float]:
         """Time constants to look for lasting errors at."""
         shortest = _FIRST_TAU * self.extent.interval_s
@@ -327,6 +349,11 @@ class NoiseModel:
                 directions = slow_directions(process, streams, to_child)
                 error += (directions @ states[:, group.states, None])[:, :, 0]
         return error
+
+
+def states_of(part: str) -> slice:
+    """Where translation or rotation is in an error (6,)."""
+    return _PARTS[part]
 
 
 def slow_directions(process: Slow, streams: Streams, to_child: FloatArray) -> FloatArray:

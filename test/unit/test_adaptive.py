@@ -15,7 +15,13 @@ from hand_eye_calib.adaptive.increments import (
     linearise,
     parameters_of,
 )
-from hand_eye_calib.adaptive.noise_model import CENTRES, Extent, NoiseModel
+from hand_eye_calib.adaptive.noise_model import (
+    _LONGEST_SHARE,
+    CENTRES,
+    LONGEST_IN_THE_MEAN,
+    Extent,
+    NoiseModel,
+)
 from hand_eye_calib.adaptive.outliers import chi_square_quantile
 from hand_eye_calib.adaptive.state_space import Covariance
 from hand_eye_calib.assessment.covariance import assess_adaptive
@@ -256,6 +262,26 @@ def test_errors_that_last_are_found_and_told_apart(kind):
         squared.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
     assert kinds.count(kind) >= 5
     assert 2.0 < np.median(squared) < 12.0
+
+
+def test_the_mean_of_a_process_that_outlasts_the_recording_is_that_of_the_definition():
+    times = (np.arange(2000) + 0.5) / 2000
+    correlation = np.exp(-np.abs(times[:, None] - times) / _LONGEST_SHARE)
+    assert pytest.approx(correlation.mean(), rel=1e-3) == LONGEST_IN_THE_MEAN
+
+
+def test_flicker_is_stated_beyond_what_was_found(monkeypatch):
+    """Errors that last on all scales: the longest cannot be found, and X takes their mean."""
+    parent = wandering_poses(500)
+    error = sum(lasting(seed, 500, [0.004, 0.004], tau) for seed, tau in enumerate((3, 30, 300)))
+    child = child_of(parent) @ se3.exp(error)
+    stated = estimator.solve(stamps(500), parent, child).cov_parent_child_in_child
+    monkeypatch.setattr(estimator, "LONGEST_IN_THE_MEAN", 0.0)
+    found = estimator.solve(stamps(500), parent, child).cov_parent_child_in_child
+    longer = np.sqrt(np.diag(stated - found))
+    assert (longer > 0.2e-3).all()
+    assert (longer < 4e-3).all()
+    assert np.linalg.eigvalsh(found).min() > 0
 
 
 def test_noise_as_large_as_the_motion_does_not_draw_the_answer():
