@@ -19,7 +19,6 @@ from hand_eye_calib.adaptive.increments import (
     N_SYSTEMATIC,
     SYSTEMATIC,
     Course,
-    Linearisation,
     Streams,
     course_of,
     linearise,
@@ -216,27 +215,23 @@ class _State:
     mean_variances: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(6))
     n_evaluations: int = 0
 
-    def linearised(self, kept: IntArray | None = None) -> tuple[Streams, Course, Linearisation]:
-        """At all or some of the poses."""
-        index = np.arange(len(self.streams)) if kept is None else kept
-        poses, course = self.poses[index], self.course[index]
-        linearisation = linearise(poses, course, self.T, self.parameters)
-        if self.error.any():
-            linearisation = restored(linearisation, self.error[index])
-        return poses, course, linearisation
-
     def space(self, kept: IntArray | None = None, model: NoiseModel | None = None) -> StateSpace:
         """State space of all or some of the poses."""
-        poses, course, linearisation = self.linearised(kept)
-        index = np.arange(len(self.streams)) if kept is None else kept
-        outliers = self.outliers.across(index)
+        poses, course, error, weights = self.poses, self.course, self.error, self.weights
+        outliers = self.outliers
+        if kept is not None:
+            poses, course, error, weights = poses[kept], course[kept], error[kept], weights[kept]
+            outliers = outliers.across(kept)
+        linearisation = linearise(poses, course, self.T, self.parameters)
+        if error.any():
+            linearisation = restored(linearisation, error)
         return (model or self.model).state_space(
             poses,
             linearisation,
             course.twists,
             self.T,
             self.columns,
-            np.where(outliers.spikes, 0.0, self.weights[index]),
+            np.where(outliers.spikes, 0.0, weights),
             outliers.jumps,
         )
 
@@ -354,9 +349,7 @@ def _fitted_at_freed_poses(start: _State, fitted: _State) -> _State:
     """
     fitted = dataclasses.replace(fitted, T=start.T)
     for _ in range(_FREED_ROUNDS):
-        posterior = fitted.posterior()
-        freed = _freed(fitted, posterior.states_after(posterior.normal.step))
-        fitted = _fitted(freed, (fitted.model.walk_by,))
+        fitted = _fitted(_at_freed_poses(fitted), (fitted.model.walk_by,))
     return fitted
 
 
@@ -391,11 +384,9 @@ def _weighed_tails(state: _State) -> _State:
 def _outliers_found(state: _State, rounds: int) -> tuple[_State, FloatArray]:
     """Jumps and spikes in turn, until they stay; and the last chi-squares (N,) of white errors."""
     for _ in range(rounds):
-        posterior = state.posterior()
         if _is_noisy(state):
-            state = _freed(state, posterior.states_after(posterior.normal.step))
-            posterior = state.posterior()
-        of_walk, of_white = surprises(posterior, state.outliers.spikes)
+            state = _at_freed_poses(state)
+        of_walk, of_white = surprises(state.posterior(), state.outliers.spikes)
         outliers = judged(state.outliers, of_walk, of_white, with_spikes=not state.heavy)
         if outliers.same_as(state.outliers):
             break
@@ -494,15 +485,19 @@ def _is_credible(fit: NormalEquations, name: str, known: FloatArray) -> bool:
 
 def _polished(state: _State) -> AdaptiveSolution:
     """X followed to the end, derivatives taken from poses freed of their errors."""
-    converged = False
-    for _ in range(_MAX_ROUNDS):
-        posterior = state.posterior()
-        normal = posterior.normal
-        converged = _is_settled(normal)
-        if converged:
-            break
-        state = _relinearised(state, posterior)
-    return _solution(state.moved(posterior.normal.step), posterior, converged)
+    n_rounds = 1
+    while isinstance(found := _polished_once(state, n_rounds == _MAX_ROUNDS), _State):
+        state, n_rounds = found, n_rounds + 1
+    return found
+
+
+def _polished_once(state: _State, is_last: bool) -> AdaptiveSolution | _State:
+    """The solution if the step is small or this round the last one, otherwise the next state."""
+    posterior = state.posterior()
+    converged = _is_settled(posterior.normal)
+    if converged or is_last:
+        return _solution(state.moved(posterior.normal.step), posterior, converged)
+    return _relinearised(state, posterior)
 
 
 def _is_settled(normal: NormalEquations) -> bool:
@@ -522,6 +517,12 @@ def _relinearised(state: _State, posterior: Posterior) -> _State:
     weights = student_weights(posterior) if state.heavy else state.weights
     state = dataclasses.replace(state, weights=weights, n_evaluations=state.n_evaluations + 1)
     return _freed(state.moved(posterior.normal.step), posterior.states_after(posterior.normal.step))
+
+
+def _at_freed_poses(state: _State) -> _State:
+    """With poses freed of the errors that are known at all poses, X as it is."""
+    posterior = state.posterior()
+    return _freed(state, posterior.states_after(posterior.normal.step))
 
 
 def _freed(state: _State, states: FloatArray) -> _State:

@@ -144,12 +144,12 @@ class NoiseModel:
         ahead, behind = self._entries(streams, linearisation, to_child)
         walk = (_TRANSLATIONS, _both_rotations(to_child))
         white = (_TRANSLATIONS[None], self._white_rotation(streams, to_child))
-        jacobian = linearisation.jacobian[:, :, [*range(6), *(6 + column for column in columns)]]
+        used = [*range(6), *(6 + column for column in columns)]
+        jacobian, residuals = linearisation.jacobian[:, :, used], linearisation.residuals
         return StateSpace(
             intervals_s=np.diff(streams.stamps_s),
             relative=self._relative(streams, linearisation),
-            residuals=linearisation.residuals,
-            jacobian=jacobian,
+            columns=np.concatenate([jacobian, residuals[:, :, None]], axis=2),
             ahead=ahead,
             behind=behind,
             white=white,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hand_eye_calib.adaptive.block_tridiagonal import transposed
 from hand_eye_calib.adaptive.increments import Streams
 from hand_eye_calib.adaptive.reml import walk_covariance
 from hand_eye_calib.adaptive.state_space import WHITE, Posterior
@@ -45,6 +46,9 @@ _STUDENT = 4.0
 _ROUNDING, _LEAST_VARIANCE = 1e-9, 1e-18
 
 _MAX_STEPS = 20
+
+# Increments that are judged at a time, to bound memory.
+_CHUNK = 4096
 
 
 @dataclass(frozen=True)
@@ -118,18 +122,34 @@ def _standing_out(residuals: FloatArray, limits: list[float]) -> BoolArray:
 
 def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Chi-squares of all increments (n,) and of all poses' white errors (N,)."""
-    space = posterior.space
-    states, walk = posterior.restricted()
-    walks = space.walk_covariance(posterior.levels) * space.relative[:, None, None]
-    known = walk_covariance(posterior) + walk[:, :, 1:] @ walk[:, :, 1:].transpose(0, 2, 1)
-    of_walk = _chi_squares(walk[:, :, 0], walks, known, space.cut)
+    states = posterior.restricted()
+    of_walk, of_white = np.empty(len(spikes) - 1), np.empty(len(spikes))
+    for first in range(0, len(spikes), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        of_walk[part] = _of_walk(posterior, states, part)
+        of_white[part] = _of_white(posterior, states, spikes, part)
+    return of_walk, of_white
 
-    own = states[:, :WHITE]
-    weights = np.where(spikes, 1.0, space.weights)
-    whites = space.white_covariance(posterior.levels) / weights[:, None, None]
-    known = posterior.selected_inverse[0][:, :WHITE, :WHITE]
-    known = known + own[:, :, 1:] @ own[:, :, 1:].transpose(0, 2, 1)
-    return of_walk, _chi_squares(own[:, :, 0], whites, known, spikes)
+
+def _of_walk(posterior: Posterior, states: FloatArray, part: slice) -> FloatArray:
+    space, walk = posterior.space, posterior.restricted_walk(states, part)
+    prior = space.walk_covariance(posterior.levels) * space.relative[part, None, None]
+    known = walk_covariance(posterior, part) + _squared(walk[:, :, 1:])
+    return _chi_squares(walk[:, :, 0], prior, known, space.cut[part])
+
+
+def _of_white(
+    posterior: Posterior, states: FloatArray, spikes: BoolArray, part: slice
+) -> FloatArray:
+    own, spikes = states[part, :WHITE], spikes[part]
+    weights = np.where(spikes, 1.0, posterior.space.weights[part])
+    prior = posterior.space.white_covariance(posterior.levels, part) / weights[:, None, None]
+    known = posterior.selected_inverse[0][part, :WHITE, :WHITE] + _squared(own[:, :, 1:])
+    return _chi_squares(own[:, :, 0], prior, known, spikes)
+
+
+def _squared(columns: FloatArray) -> FloatArray:
+    return columns @ transposed(columns)
 
 
 def _chi_squares(

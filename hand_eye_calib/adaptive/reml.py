@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hand_eye_calib.adaptive.block_tridiagonal import transposed
 from hand_eye_calib.adaptive.state_space import WHITE, Markov, Posterior, StateSpace, multiplied
 from hand_eye_calib.arrays import FloatArray
 
@@ -125,7 +126,8 @@ def _step(
 
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """Gradient (m,) of the loss by the log levels and the average information (m, m)."""
-    states, walk = posterior.restricted()
+    states = posterior.restricted()
+    walk = posterior.restricted_walk(states)
     covariance, below = posterior.selected_inverse
     second = covariance + states @ states.transpose(0, 2, 1)
     joined = below + states[1:] @ states[:-1].transpose(0, 2, 1)
@@ -164,14 +166,16 @@ def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
     return 0.5 * np.exp(posterior.levels[first : first + len(traces)]) * traces
 
 
-def walk_covariance(posterior: Posterior) -> FloatArray:
-    """Covariance (n, 6, 6) of the walk's increments for known parameters."""
-    space = posterior.space
+def walk_covariance(posterior: Posterior, part: slice = slice(None)) -> FloatArray:
+    """Covariance (n, 6, 6) of the walk's increments, or of a part of them, for known parameters."""
     covariance, below = posterior.selected_inverse
-    ahead, behind = space.ahead.transpose(0, 2, 1), space.behind.transpose(0, 2, 1)
-    mixed = space.ahead @ below @ behind
-    both = space.ahead @ covariance[1:] @ ahead + space.behind @ covariance[:-1] @ behind
-    return both - mixed - mixed.transpose(0, 2, 1)
+    ahead, behind = posterior.space.ahead[part], posterior.space.behind[part]
+    own = ahead @ covariance[1:][part] @ transposed(ahead)
+    own += behind @ covariance[:-1][part] @ transposed(behind)
+    mixed = ahead @ below[part] @ transposed(behind)
+    own -= mixed
+    own -= transposed(mixed)
+    return own
 
 
 def _markov_gradient(process: Markov, second: FloatArray, joined: FloatArray) -> FloatArray:
@@ -216,8 +220,8 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     columns[space.cut] = 0.0
     weighed, whitened = posterior.halves(columns)
     own = multiplied(columns, weighed) - multiplied(whitened, whitened)
-    of_jacobian = posterior.of_columns[1][:, :, :-1]
-    shared = multiplied(space.jacobian, weighed) - multiplied(of_jacobian, whitened)
+    shared = multiplied(space.columns, weighed) - multiplied(posterior.whitened, whitened)
+    shared = shared[:-1]
     information = 0.5 * (own - shared.T @ posterior.normal.covariance @ shared)
     return 0.5 * (information + information.T)
 

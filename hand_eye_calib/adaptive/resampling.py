@@ -25,10 +25,10 @@ N_PARTS = 20
 def part_products(posterior: Posterior) -> FloatArray:
     """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20."""
     space = posterior.space
-    n, columns = len(space), posterior.columns
+    n, columns = len(space), space.columns
     factor = InOrder(*posterior.precision())
     ends = np.unique(np.linspace(0, n, min(N_PARTS, n) + 1).astype(int))[1:]
-    weighed = posterior.of_columns[0]
+    weighed = posterior.weighed(columns)
     whitened = factor.whiten(space.gathered(weighed))
     totals = np.array([_up_to(end, posterior, factor, weighed, whitened) for end in ends])
     parts = [slice(*part) for part in zip([0, *ends[:-1]], ends, strict=True)]

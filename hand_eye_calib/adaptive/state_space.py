@@ -66,10 +66,8 @@ class StateSpace:
     intervals_s : (n,) array
     relative : (n,) array
         Variance of the walk over each increment, in units of a typical one.
-    residuals : (n, 6) array
-        e.
-    jacobian : (n, 6, p) array
-        J.
+    columns : (n, 6, p + 1) array
+        J and, last, e.
     ahead, behind : (n, 6, d) arrays
         H1 and H0.
     white, walk : tuples of (1 or N, 6, 6) and (6, 6) arrays
@@ -85,8 +83,7 @@ class StateSpace:
 
     intervals_s: FloatArray
     relative: FloatArray
-    residuals: FloatArray
-    jacobian: FloatArray
+    columns: FloatArray
     ahead: FloatArray
     behind: FloatArray
     white: tuple[FloatArray, ...]
@@ -97,7 +94,7 @@ class StateSpace:
     cut: BoolArray
 
     def __len__(self) -> int:
-        return len(self.residuals)
+        return len(self.columns)
 
     @property
     def is_free(self) -> BoolArray:
@@ -114,10 +111,14 @@ class StateSpace:
         """Number of levels of the white errors, the first ones."""
         return len(self.white) + 1
 
-    def white_covariance(self, levels: FloatArray) -> FloatArray:
-        """Covariances (N, 6, 6) of the white errors at log levels, weights left out."""
-        along = np.exp(levels[len(self.white)]) * self.twists
-        return _combined(levels, self.white) + along[:, :, None] * self.twists[:, None, :]
+    def white_covariance(self, levels: FloatArray, part: slice = slice(None)) -> FloatArray:
+        """Covariances (N, 6, 6) of the white errors, or of a part of them, at log levels, weights
+        left out.
+        """
+        bases = tuple(basis if len(basis) == 1 else basis[part] for basis in self.white)
+        twists = self.twists[part]
+        along = np.exp(levels[len(bases)]) * twists
+        return _combined(levels, bases) + along[:, :, None] * twists[:, None, :]
 
     def white_precision(self, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Inverses (N, 6, 6) of :meth:`white_covariance`, logarithms (N,) of its determinants.
@@ -138,9 +139,11 @@ class StateSpace:
         """Covariance (6, 6) of the walk over a typical increment."""
         return _combined(levels[self.n_white :], self.walk)
 
-    def observed(self, states: FloatArray) -> FloatArray:
-        """What states (N, d, k) contribute to the increments, (n, 6, k)."""
-        return self.ahead @ states[1:] - self.behind @ states[:-1]
+    def observed(self, states: FloatArray, part: slice = slice(None)) -> FloatArray:
+        """What states (N, d, k) contribute to the increments, or to a part of them, (n, 6, k)."""
+        observed = self.ahead[part] @ states[1:][part]
+        observed -= self.behind[part] @ states[:-1][part]
+        return observed
 
     def gathered(self, columns: FloatArray) -> FloatArray:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
@@ -270,26 +273,21 @@ class Posterior:
         walk = kept.sum() * self._walk_log_determinant + 6 * np.log(space.relative[kept]).sum()
         return float(walk + self.factor.log_determinant() - prior)
 
-    @cached_property
-    def columns(self) -> FloatArray:
-        """J and, last, e: (n, 6, p + 1)."""
-        return np.concatenate([self.space.jacobian, self.space.residuals[:, :, None]], axis=2)
-
     def halves(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """W Z and Y, (n, 6, k) and (N, d, k), of columns Z (n, 6, k)."""
         weighed = self.weighed(columns)
         return weighed, self.factor.whiten(self.space.gathered(weighed))
 
     @cached_property
-    def of_columns(self) -> tuple[FloatArray, FloatArray]:
-        """:meth:`halves` of :attr:`columns`."""
-        return self.halves(self.columns)
+    def whitened(self) -> FloatArray:
+        """Y (N, d, p + 1) of the space's columns."""
+        return self.halves(self.space.columns)[1]
 
     @cached_property
     def products(self) -> FloatArray:
         """(p + 1, p + 1) array: products of J and, last, e, weighed with V^-1."""
-        weighed, whitened = self.of_columns
-        products = multiplied(self.columns, weighed) - multiplied(whitened, whitened)
+        products = multiplied(self.space.columns, self.weighed(self.space.columns))
+        products -= multiplied(self.whitened, self.whitened)
         return 0.5 * (products + products.T)
 
     @cached_property
@@ -313,17 +311,22 @@ class Posterior:
 
     def states_after(self, step: FloatArray, columns: list[int] | None = None) -> FloatArray:
         """States (N, d) expected after a step of the parameters, or of some of them."""
-        mixing = np.zeros((self.columns.shape[2], 1))
+        mixing = np.zeros((self.whitened.shape[2], 1))
         mixing[slice(-1) if columns is None else columns, 0] = step
         mixing[-1] = 1.0
-        return self.factor.restore(_mixed(self.of_columns[1], mixing))[:, :, 0]
+        return self.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
 
-    def restricted(self) -> tuple[FloatArray, FloatArray]:
-        """States (N, d, 1 + q) and walk (n, 6, 1 + q): expected values and, behind them, what the
-        parameters' uncertainty adds, as columns whose squares sum to it.
+    def restricted(self) -> FloatArray:
+        """States (N, d, 1 + q): expected values and, behind them, what the parameters' uncertainty
+        adds, as columns whose squares sum to it.
         """
-        states = self.factor.restore(_mixed(self.of_columns[1], self.normal.mixing))
-        return states, _mixed(self.columns, self.normal.mixing) - self.space.observed(states)
+        return self.factor.restore(_mixed(self.whitened, self.normal.mixing))
+
+    def restricted_walk(self, states: FloatArray, part: slice = slice(None)) -> FloatArray:
+        """The same of the walk, or of a part of it, (n, 6, 1 + q), from all states."""
+        mixed = _mixed(self.space.columns[part], self.normal.mixing)
+        mixed -= self.space.observed(states, part)
+        return mixed
 
 
 # Information below this share of what a parameter's own diagonal promises is rounding; no diagonal

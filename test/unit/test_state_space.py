@@ -37,11 +37,12 @@ def space_of(seed=1, cut=(4,)):
     ends = [6, 9, 12, 15, 16]
     flags = np.zeros(n, dtype=bool)
     flags[list(cut)] = True
+    residuals = random.standard_normal((n, 6, 1))
+    columns = np.concatenate([random.standard_normal((n, 6, N_PARAMETERS)), residuals], axis=2)
     return StateSpace(
         intervals_s=intervals_s,
         relative=intervals_s / 0.1,
-        residuals=random.standard_normal((n, 6)),
-        jacobian=random.standard_normal((n, 6, N_PARAMETERS)),
+        columns=columns,
         ahead=ahead,
         behind=behind,
         white=(bases[0][None], bases[1][None]),
@@ -51,6 +52,12 @@ def space_of(seed=1, cut=(4,)):
         weights=random.uniform(0.3, 2.0, N_POSES),
         cut=flags,
     )
+
+
+def parameters_and_residuals(space, rows=slice(None)):
+    """J and e of some rows."""
+    columns = space.columns.reshape(-1, N_PARAMETERS + 1)[rows]
+    return columns[:, :-1], columns[:, -1]
 
 
 LEVELS = np.random.default_rng(2).uniform(-1.0, 1.0, N_LEVELS)
@@ -85,7 +92,7 @@ def dense_loss(space, levels):
     """Restricted loss, step and its covariance by their textbook formulas."""
     rows = np.repeat(~space.cut, 6)
     V = dense_covariance(space, levels)[np.ix_(rows, rows)]
-    J, r = space.jacobian.reshape(-1, N_PARAMETERS)[rows], space.residuals.ravel()[rows]
+    J, r = parameters_and_residuals(space, rows)
     information = J.T @ np.linalg.solve(V, J)
     step = -np.linalg.solve(information, J.T @ np.linalg.solve(V, r))
     rest = r + J @ step
@@ -122,7 +129,7 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
     np.testing.assert_allclose(gradient, numerical, atol=1e-7)
 
     rows = np.repeat(~space.cut, 6)
-    J, r = space.jacobian.reshape(-1, N_PARAMETERS)[rows], space.residuals.ravel()[rows]
+    J, r = parameters_and_residuals(space, rows)
     inverse = np.linalg.inv(dense_covariance(space, LEVELS)[np.ix_(rows, rows)])
     P = inverse - inverse @ J @ np.linalg.inv(J.T @ inverse @ J) @ J.T @ inverse
     slopes = [
@@ -146,7 +153,7 @@ def test_surprises_are_what_leaving_one_out_makes_of_it():
     space = space_of(cut=())
     of_walk, _ = surprises(Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool))
     V = dense_covariance(space, LEVELS)
-    J, r = space.jacobian.reshape(-1, N_PARAMETERS), space.residuals.ravel()
+    J, r = parameters_and_residuals(space)
     inverse = np.linalg.inv(V)
     P = inverse - inverse @ J @ np.linalg.inv(J.T @ inverse @ J) @ J.T @ inverse
     u = (P @ r).reshape(-1, 6)
@@ -167,7 +174,7 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
     n_known = 9  # of 14 parts, one increment each
     rows = np.repeat(~space.cut, 6) & (np.arange(6 * len(space)) < 6 * n_known)
     V = dense_covariance(space, LEVELS)[np.ix_(rows, rows)]
-    columns = posterior.columns.reshape(-1, N_PARAMETERS + 1)[rows]
+    columns = space.columns.reshape(-1, N_PARAMETERS + 1)[rows]
     expected = columns.T @ np.linalg.solve(V, columns)
     np.testing.assert_allclose(parts[:n_known].sum(axis=0), expected, atol=1e-8)
     steps = answers_without(parts, 2)
