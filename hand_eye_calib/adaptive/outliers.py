@@ -15,7 +15,7 @@ import numpy as np
 from hand_eye_calib.adaptive.block_tridiagonal import transposed
 from hand_eye_calib.adaptive.increments import Streams
 from hand_eye_calib.adaptive.reml import walk_covariance
-from hand_eye_calib.adaptive.state_space import WHITE, Posterior
+from hand_eye_calib.adaptive.state_space import WHITE, Posterior, chunks
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 
@@ -46,9 +46,6 @@ _STUDENT = 4.0
 _ROUNDING, _LEAST_VARIANCE = 1e-9, 1e-18
 
 _MAX_STEPS = 20
-
-# Increments that are judged at a time, to bound memory.
-_CHUNK = 4096
 
 
 @dataclass(frozen=True)
@@ -124,8 +121,7 @@ def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Floa
     """Chi-squares of all increments (n,) and of all poses' white errors (N,)."""
     states = posterior.restricted()
     of_walk, of_white = np.empty(len(spikes) - 1), np.empty(len(spikes))
-    for first in range(0, len(spikes), _CHUNK):
-        part = slice(first, first + _CHUNK)
+    for part in chunks(len(spikes)):
         of_walk[part] = _of_walk(posterior, states, part)
         of_white[part] = _of_white(posterior, states, spikes, part)
     return of_walk, of_white

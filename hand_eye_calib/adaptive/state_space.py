@@ -35,6 +35,16 @@ FREE = 1.0
 _ROUNDING = 1e-13
 
 
+# Increments that are computed at a time, so that what is computed of them stays in the cache.
+_CHUNK = 4096
+
+
+def chunks(n_increments: int) -> list[slice]:
+    """Parts of the increments to compute one after the other."""
+    ends = [*range(_CHUNK, n_increments, _CHUNK), n_increments]
+    return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+
 @dataclass(frozen=True)
 class Group:
     """States that are independent Gauss-Markov processes with one variance and one time constant.
@@ -147,9 +157,11 @@ class StateSpace:
 
     def gathered(self, columns: FloatArray) -> FloatArray:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
-        states = np.zeros((len(self) + 1, self.n_states, columns.shape[2]))
-        states[1:] = transposed(self.ahead) @ columns
-        states[:-1] -= transposed(self.behind) @ columns
+        states = np.empty((len(self) + 1, self.n_states, columns.shape[2]))
+        states[0] = 0.0
+        for part in chunks(len(self)):
+            np.matmul(transposed(self.ahead[part]), columns[part], out=states[1:][part])
+            states[:-1][part] -= transposed(self.behind[part]) @ columns[part]
         return states
 
 
@@ -240,11 +252,15 @@ class Posterior:
     def precision(self) -> tuple[FloatArray, FloatArray]:
         """Blocks of P on the diagonal (N, d, d) and below it (n, d, d)."""
         space, size = self.space, self.space.n_states
-        ahead, weighed = transposed(space.ahead), self.weighed(space.behind)
-        diagonal = np.zeros((len(space) + 1, size, size))
-        diagonal[1:] = ahead @ self.weighed(space.ahead)
-        diagonal[:-1] += transposed(space.behind) @ weighed
-        below = ahead @ -weighed
+        diagonal = np.empty((len(space) + 1, size, size))
+        below = np.empty((len(space), size, size))
+        diagonal[0] = 0.0
+        for part in chunks(len(space)):
+            ahead, behind = space.ahead[part], space.behind[part]
+            weighed = self._weights[part] @ behind
+            np.matmul(transposed(ahead), self._weights[part] @ ahead, out=diagonal[1:][part])
+            np.matmul(transposed(ahead), np.negative(weighed), out=below[part])
+            diagonal[:-1][part] += transposed(behind) @ weighed
         white = space.weights[:, None, None] * self.white_precision
         white[space.is_free] = FREE * np.eye(WHITE)
         diagonal[:, :WHITE, :WHITE] += white
