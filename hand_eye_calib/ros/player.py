@@ -66,7 +66,7 @@ class Player:
         self,
         topics: Mapping[str, str],
         check: Callable[[], None] = lambda: None,
-        patience_s: float = 30.0,
+        patience_s: float = 120.0,
     ) -> None:
         self._check, self._patience_s = check, patience_s
         self._context = rclpy.Context()

@@ -18,7 +18,7 @@ from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.ros.solving import Checked, Failure, FailureKind, Job, Solved, answers
 from hand_eye_calib.ros.solving_process import SolvingProcess
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 # A solver of the test's own: what it does is in the session's number.
 SLOW = """
