@@ -10,6 +10,9 @@
 #   make bench         benchmarks against the baseline; two minutes (BENCH_ARGS=--full: four)
 #   make bench-node    load, soak and crashes of the node; about four minutes
 #   make dist          wheel and sdist in dist/, checked (RELEASE=1: only if nothing is a placeholder)
+#   make docs          the documentation site in site/; its links, and every command on its pages, are
+#                      tried; nothing is fetched
+#   make notebook      run the notebooks of examples/ again and keep their outputs
 #   make clean         remove everything that the targets above made
 # PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest.
 PYTHON ?= python3
@@ -28,7 +31,7 @@ PIP_FLAGS := --quiet --disable-pip-version-check
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
 .PHONY: help demo test test-oldest coverage coverage-study fuzz paper bench bench-node lint format \
-	dist clean
+	dist docs notebook clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -81,8 +84,19 @@ dist: $(VENV)/.ready-release
 	$(VENV)/bin/python -m build --outdir dist .
 	$(VENV)/bin/twine check --strict dist/*
 
+# ruff breaks the lines of long signatures.
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: export HAND_EYE_CALIB_ALL_PAGES := 1
+docs: $(VENV)/.ready-docs
+	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(VENV)/bin/mkdocs build --strict --quiet
+	$(VENV)/bin/python docs/check_site.py site
+	$(VENV)/bin/python -m pytest test/unit/test_docs.py $(PYTEST_ARGS)
+
+notebook: $(VENV)/.ready-test
+	$(VENV)/bin/python examples/run_notebooks.py
+
 clean:
-	rm -rf $(VENV) $(OLDEST) build install log dist demo_output reproduced *.egg-info .coverage*
+	rm -rf $(VENV) $(OLDEST) build install log dist site demo_output reproduced *.egg-info .coverage*
 	rm -rf .pytest_cache .hypothesis .ruff_cache .mypy_cache
 	find hand_eye_calib reproduction test benchmarks launch -name __pycache__ -type d -prune \
 		-exec rm -rf {} +
@@ -96,7 +110,7 @@ $(OLDEST)/.ready-test: CONSTRAINTS := --constraint requirements/oldest.txt
 $(OLDEST)/.ready-test: requirements/oldest.txt
 
 # What one target needs and nothing else does.
-$(VENV)/.ready-bench $(VENV)/.ready-release: $(VENV)/.ready-%: \
+$(VENV)/.ready-bench $(VENV)/.ready-docs $(VENV)/.ready-release: $(VENV)/.ready-%: \
 		$(VENV)/.ready-test requirements/%.txt
 	@$(VENV)/bin/python -m pip install $(PIP_FLAGS) --requirement requirements/$*.txt
 	@touch $@

@@ -59,8 +59,10 @@ def plot(calibration: Calibration) -> Figure:
         FigureCanvasAgg(figure)
         panels = figure.subplots(2, 2, width_ratios=(3, 1))
         panels[0, 0].sharex(panels[1, 0])
+        panels[0, 0].tick_params(labelbottom=False)
+        panels[0, 0].set_title("residuals of the motion pairs")
         sizes = (residuals.translation_m, residuals.rotation_rad)
-        names = ("translation residual (cm)", "rotation residual (deg)")
+        names = ("translation (cm)", "rotation (deg)")
         for row, size, factor, name in zip(panels, sizes, _CM_DEG, names, strict=True):
             _draw_residuals(row[0], times_s, size * factor, residuals.is_inlier)
             row[0].set_ylabel(name)

@@ -1,0 +1,92 @@
+"""A folder with everything that commands and Python on the pages of the documentation name."""
+
+from pathlib import Path
+
+import numpy as np
+from bag_making import JAZZY, TF, tf_message
+from motions import disturbed, wandering_poses
+from rosbags import rosbag2
+from scipy.spatial.transform import Rotation
+
+import hand_eye_calib as hec
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags.writer import write_streams
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE
+
+# Lidar to camera on the pages: x 0.4 m, z 1.85 m, yaw -90 deg.
+T_LIDAR_CAMERA = se3.from_quat_xyzw(
+    np.array([0.4, 0.0, 1.85]), Rotation.from_euler("z", -90, degrees=True).as_quat()
+)
+_POSES = 400
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_ROBOT = """\
+<robot name="robot">
+  <link name="lidar"/>
+  <link name="camera"/>
+  <joint name="mount" type="fixed">
+    <parent link="lidar"/>
+    <child link="camera"/>
+    <origin xyz="0.4 0 1.85" rpy="0 0 -1.5707963"/>
+  </joint>
+</robot>
+"""
+
+
+def make(folder: Path) -> None:
+    """Fill a folder: ``my_drive/``, ``lidar.tum``, ``camera.tum``, ``camera.csv``, ``ins.csv``,
+    ``flange.tum``, ``camera_on_arm.tum``, ``robot.urdf``, and results.
+    """
+    drive = simulate_drive(7, HILLY_DRIVE).parent[:_POSES]
+    lidar = _noisy(drive.stamps_ns, drive.poses, 1, "lidar", "odom")
+    camera = _noisy(drive.stamps_ns, drive.poses @ T_LIDAR_CAMERA, 2, "camera", "vo")
+    hec.write_trajectory(folder / "lidar.tum", lidar)
+    hec.write_trajectory(folder / "camera.tum", camera)
+    np.savetxt(folder / "camera.csv", _rows(camera, scalar_first=True), "%.9f", delimiter=",")
+    _write_bag(folder / "my_drive", lidar, camera)
+    _write_ins(folder / "ins.csv", camera)
+
+    arm = wandering_poses(_POSES, seed=3)
+    stamps_ns = drive.stamps_ns
+    hec.write_trajectory(folder / "flange.tum", _noisy(stamps_ns, arm, 3))
+    hec.write_trajectory(folder / "camera_on_arm.tum", _noisy(stamps_ns, arm @ T_LIDAR_CAMERA, 4))
+
+    (folder / "robot.urdf").write_text(_ROBOT, encoding="utf-8")
+    result = hec.calibrate(lidar, camera, method="dnlo", reference="B5")
+    for name in ("result", "monday", "tuesday", "wednesday"):
+        hec.save(result, folder / name)
+
+
+def _noisy(stamps_ns, poses, seed, sensor="", world=""):
+    return hec.Trajectory(stamps_ns, disturbed(poses, seed, 1e-3, 5e-4), sensor, world)
+
+
+def _rows(trajectory, scalar_first):
+    quats = se3.to_quat_xyzw(trajectory.poses)
+    quats = np.roll(quats, 1, axis=1) if scalar_first else quats
+    return np.column_stack([trajectory.stamps_ns * 1e-9, trajectory.poses[:, :3, 3], quats])
+
+
+def _write_bag(path, lidar, camera):
+    """Odometry of both sensors, and the lidar's as /tf, too."""
+    storage = rosbag2.StoragePlugin.MCAP
+    with rosbag2.Writer(path, version=9, storage_plugin=storage) as writer:
+        streams = {"/lidar/odometry": (lidar, _ODOMETRY), "/camera/odometry": (camera, _ODOMETRY)}
+        write_streams(writer, streams, "mcap")
+        connection = writer.add_connection("/tf", TF, typestore=JAZZY)
+        for stamp_ns, pose in zip(lidar.stamps_ns.tolist(), lidar.poses, strict=True):
+            message = tf_message([(stamp_ns, "odom", "lidar", pose)])(JAZZY)
+            writer.write(connection, stamp_ns, JAZZY.serialize_cdr(message, TF))
+
+
+def _write_ins(path, trajectory):
+    """Latitude, longitude, height, and angles as an INS has them."""
+    import pymap3d
+
+    lat, lon, height = pymap3d.enu2geodetic(*trajectory.poses[:, :3, 3].T, 60.17, 24.94, 20.0)
+    yaw, pitch, roll = (
+        Rotation.from_matrix(trajectory.poses[:, :3, :3]).as_euler("ZYX", degrees=True).T
+    )
+    columns = [trajectory.stamps_ns * 1e-9, lat, lon, height, roll, -pitch, (90 - yaw) % 360]
+    names = "time,latitude,longitude,height,roll_deg,pitch_deg,heading_deg"
+    np.savetxt(path, np.column_stack(columns), "%.10f", delimiter=",", header=names, comments="")

@@ -1,0 +1,101 @@
+"""What the pages of the documentation show runs as it stands there.
+
+``make test`` runs a few pages, ``make docs`` all (``HAND_EYE_CALIB_ALL_PAGES=1``).
+"""
+
+import os
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import example_recording
+import pytest
+import yaml
+
+from hand_eye_calib.cli.main import main
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+RUNS_ALL = os.environ.get("HAND_EYE_CALIB_ALL_PAGES") == "1"
+FEW = ("how_to.md", "troubleshooting.md", "tutorials/notebook.md")
+# Where a command needs more than files: a node, ROS, a journal, a minute.
+ELSEWHERE = re.compile(r" (calibrator|watch|demo) ?|live/")
+# Exit codes that a page may lead to: 3 is an unobservable axis or "cannot tell", 4 a moved mount.
+FINE = {"compare": (0, 3, 4)}
+
+
+def pages():
+    names = [path.relative_to(DOCS).as_posix() for path in sorted(DOCS.rglob("*.md"))]
+    return [name for name in names if blocks(name) and (RUNS_ALL or name in FEW)]
+
+
+def blocks(name):
+    """Commands and Python of a page in their order."""
+    text = (DOCS / name).read_text(encoding="utf-8")
+    found = []
+    for language, block in re.findall(r"^```(bash|python)\n(.*?)^```", text, re.DOTALL | re.M):
+        if language == "python":
+            found += [("python", block)] if "import hand_eye_calib" in text else []
+        else:
+            lines = block.replace("\\\n", " ").splitlines()
+            found += [("command", line) for line in lines if is_run_here(line)]
+    return found
+
+
+def is_run_here(line):
+    return line.startswith("hand_eye_calib ") and not ELSEWHERE.search(line)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    pytest.importorskip("pymap3d")
+    folder = tmp_path_factory.mktemp("prepared")
+    example_recording.make(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(prepared, tmp_path, monkeypatch):
+    """A copy of the example's folder to work in."""
+    target = tmp_path / "work"
+    shutil.copytree(prepared, target)
+    monkeypatch.chdir(target)
+    return target
+
+
+@pytest.mark.parametrize("name", pages())
+def test_page_runs(name, folder, capsys):
+    names = {}
+    for kind, text in blocks(name):
+        if kind == "python":
+            exec(compile(text, name, "exec"), names)
+            continue
+        command, *arguments = shlex.split(text, comments=True)[1:]
+        code = main([command, *arguments])
+        said = capsys.readouterr()
+        assert code in FINE.get(command, (0, 3)), f"{text}\n{said.out}\n{said.err}"
+        assert "error:" not in said.err
+
+
+def test_commands_of_the_pages_are_found():
+    found = {name: len(blocks(name)) for name in FEW}
+    assert found["how_to.md"] >= 6
+    assert found["tutorials/notebook.md"] >= 5
+    assert len(blocks("cli.md")) >= 12
+
+
+def test_every_page_is_in_the_navigation():
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = set(re.findall(r"([\w/]+\.md)$", text, re.MULTILINE))
+    assert listed >= {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
+    assert yaml.safe_load(text)["theme"]["font"] is False
+
+
+def test_pages_say_bash_where_commands_are():
+    """A command in a block of another language would not be run."""
+    for path in DOCS.rglob("*.md"):
+        text = path.read_text(encoding="utf-8")
+        for language, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.M):
+            if language != "bash":
+                assert not re.search(r"^hand_eye_calib [a-z]", block, re.M), (path, block)
