@@ -132,7 +132,8 @@ class Goal:
         if not self._points or motion_s > self._points[-1].motion_s:
             self._points.append(_Point(motion_s, 1.0 / max(ratios[worst], 1e-12), is_known))
         self._keep_best(calibration, is_known)
-        left_s = np.where(ratios > 1.0, motion_s * (ratios - 1.0), 0.0)
+        # Not 0 seconds of motion: an axis that was not seen at all takes for ever, not "nan".
+        left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
         left_s = np.maximum(left_s, max(_least_motion_s(calibration) - motion_s, 0.0))
         is_done = self._best is not None
         stuck = not is_done and self._is_stuck(float(left_s[worst]))
