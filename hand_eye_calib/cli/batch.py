@@ -343,7 +343,7 @@ def _calibrated(task: Task) -> Outcome:
     if calibration.status.failure:
         found["error"] = calibration.status.failure
     if task.with_report:
-        found["page"] = rendered(calibration, evidence, snapshot.config, replayed.inputs, findings)
+        found["page"] = rendered(calibration, evidence, snapshot.config, replayed.inputs)
     return found
 
 

@@ -142,8 +142,8 @@ def _is_meant(arguments: argparse.Namespace, stream: str, name: str) -> bool:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate from files; returns the exit code."""
-    from hand_eye_calib.cli.findings import with_findings
     from hand_eye_calib.cli.present import deliver
+    from hand_eye_calib.engine.checked import checked
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
     options = options_from(arguments)
@@ -155,15 +155,15 @@ def run(arguments: argparse.Namespace) -> int:
     with waiting_for("solving"):
         calibration = snapshot.estimate()
     with waiting_for("checking the streams"):
-        calibration, findings = with_findings(calibration, snapshot)
-    inputs: dict[str, Any] = {"options": config.to_options()}
+        calibration, snapshot = checked(calibration, snapshot, options)
+    inputs: dict[str, Any] = {"options": snapshot.config.to_options()}
     for stream in STREAMS:
         inputs[stream] = {"file": str(getattr(arguments, stream)), **_extent(trajectories[stream])}
     if arguments.out:
         from hand_eye_calib.cli.replaying import fingerprints
 
         inputs["files"] = fingerprints(_files(arguments))
-    return deliver(calibration, arguments, inputs, snapshot, findings=findings)
+    return deliver(calibration, arguments, inputs, snapshot)
 
 
 def _files(arguments: argparse.Namespace) -> list[Path]:

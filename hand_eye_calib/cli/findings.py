@@ -1,6 +1,5 @@
 """The findings of the stream checks: beside a calibration, and as a table."""
 
-import dataclasses
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.cli.spelling import as_typed, flag
+from hand_eye_calib.engine.checked import checked
 from hand_eye_calib.errors import printable
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ def with_findings(
     snapshot : Snapshot
         The poses it comes from.
     """
-    findings = [finding.to_dict() for finding in snapshot.check(calibration).findings]
-    return dataclasses.replace(calibration, findings=tuple(findings)), findings
+    calibration, _ = checked(calibration, snapshot)
+    return calibration, [dict(finding) for finding in calibration.findings]
 
 
 def verdict(findings: Sequence[Finding]) -> str:

@@ -86,8 +86,7 @@ def deliver(
     )
     write_description(calibration, arguments)
     if evidence is not None and snapshot is not None:
-        findings = more.get("findings", ())
-        write_report(arguments.out, calibration, evidence, snapshot.config, inputs, findings)
+        write_report(arguments.out, calibration, evidence, snapshot.config, inputs)
     code = exit_code(calibration)
     if code == _EXIT_FAILED:
         reason = calibration.reasons[0]
@@ -123,6 +122,7 @@ def as_text(calibration: Calibration, steps: Iterable[str] = ()) -> str:
     lines = [
         calibration.headline,
         *_reason_lines(calibration),
+        *_warning_lines(calibration),
         "",
         f"{child} in {parent}: maps coordinates of {child} into {parent}",
         *_transform_lines(document["T_parent_child"]),
@@ -153,13 +153,17 @@ def _details(calibration: Calibration) -> Iterator[str]:
     yield from _scatter_lines(calibration.cross_check)
     yield from _comparison_lines(calibration)
     yield from _solution_lines(calibration)
-    yield from (f"warning: {warning}" for warning in calibration.warnings)
 
 
 def _reason_lines(calibration: Calibration) -> Iterator[str]:
     for reason in calibration.reasons:
         yield from _wrapped(reason.sentence, "- ", "  ")
         yield from _wrapped(_what_to_do(reason), "  -> ", "     ")
+
+
+def _warning_lines(calibration: Calibration) -> Iterator[str]:
+    for warning in calibration.warnings:
+        yield from _wrapped(f"Note: {warning}", "", "  ")
 
 
 def _what_to_do(reason: Reason) -> str:

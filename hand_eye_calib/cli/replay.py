@@ -116,9 +116,10 @@ def run(arguments: argparse.Namespace) -> int:
 
         return list_bag(arguments.bags, arguments.json)
 
-    from hand_eye_calib.cli.findings import with_findings
+    from hand_eye_calib.cli.options import options_from
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.cli.replaying import fingerprints
+    from hand_eye_calib.engine.checked import checked
 
     replayed = _replayed(arguments)
     if arguments.out:
@@ -126,8 +127,9 @@ def run(arguments: argparse.Namespace) -> int:
     more = {"convergence": replayed.convergence} if arguments.every else {}
     snapshot = replayed.calibrator.snapshot()
     with waiting_for("checking the streams"):
-        calibration, findings = with_findings(replayed.calibration, snapshot)
-    return deliver(calibration, arguments, replayed.inputs, snapshot, findings=findings, **more)
+        calibration, snapshot = checked(replayed.calibration, snapshot, options_from(arguments))
+    inputs = replayed.inputs | {"options": snapshot.config.to_options()}
+    return deliver(calibration, arguments, inputs, snapshot, **more)
 
 
 def _replayed(arguments: argparse.Namespace) -> "Replayed":

@@ -3,7 +3,7 @@ command ``check``.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,14 +57,13 @@ def write_report(
     evidence: "Evidence",
     config: CalibratorConfig,
     inputs: Mapping[str, Any],
-    findings: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     """Write the report into a directory; if a library for it is missing, say so and go on.
 
     Parameters
     ----------
     directory : path-like
-    calibration, evidence, config, inputs, findings
+    calibration, evidence, config, inputs
         Those of :func:`rendered`.
 
     Raises
@@ -74,7 +73,7 @@ def write_report(
     """
     if can_draw(REPORT):
         with waiting_for("writing the report"):
-            page = rendered(calibration, evidence, config, inputs, findings)
+            page = rendered(calibration, evidence, config, inputs)
             path = save_page(Path(directory) / REPORT, page)
         note(f"wrote {path}")
 
@@ -120,7 +119,6 @@ def rendered(
     evidence: "Evidence",
     config: CalibratorConfig,
     inputs: Mapping[str, Any],
-    findings: Sequence[Mapping[str, Any]] = (),
 ) -> str:
     """The report as HTML.
 
@@ -132,8 +130,6 @@ def rendered(
         The options that gave the result.
     inputs : dict
         Where the data came from, in plain values.
-    findings : sequence of dict
-        What the stream checks found.
 
     Returns
     -------
@@ -142,7 +138,7 @@ def rendered(
     from hand_eye_calib.report.report import render
 
     command = static_transform_command(calibration)
-    return render(calibration, config, evidence, inputs=inputs, findings=findings, command=command)
+    return render(calibration, config, evidence, inputs=inputs, command=command)
 
 
 def save_page(path: Path, text: str) -> Path:

@@ -39,7 +39,7 @@ def write(directory: Path, result: "SessionResult") -> None:
     from hand_eye_calib.cli.findings import with_findings
     from hand_eye_calib.cli.reporting import with_cross_check, write_report
 
-    calibration, findings = with_findings(result.calibration, result.snapshot)
+    calibration, _ = with_findings(result.calibration, result.snapshot)
     calibration, evidence = with_cross_check(calibration, result.snapshot)
     config, inputs = result.snapshot.config, result.inputs
-    write_report(directory, calibration, evidence, config, inputs, findings)
+    write_report(directory, calibration, evidence, config, inputs)

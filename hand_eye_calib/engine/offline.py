@@ -5,6 +5,7 @@ from typing import Any, TypeAlias
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig, Prior, prior_fields
+from hand_eye_calib.engine.checked import checked
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -42,7 +43,8 @@ def calibrate(
 
     Each keyword is the option of :class:`~hand_eye_calib.config.CalibratorConfig` of that name,
     which has its meaning, unit, range and default; None stands for the default. All pose pairs are
-    used unless ``max_pairs`` is given.
+    used unless ``max_pairs`` is given. The streams are checked, too: if a check is certain of the
+    time offset or of the scale, and it was not given, it is estimated, and a warning says so.
 
     Parameters
     ----------
@@ -71,7 +73,7 @@ def calibrate(
     config = CalibratorConfig(**(_no_limit(parent, child) | options | prior_fields(prior or {})))
     snapshot = whole_snapshot(config, parent, child)
     if progress is None:
-        return snapshot.estimate()
+        return checked(snapshot.estimate(), snapshot, options)[0]
     # The snapshot keeps what these steps give.
     progress(0.0, "time offset")
     snapshot.resolved()
@@ -79,6 +81,8 @@ def calibrate(
     snapshot.pose_pairs()
     progress(0.3, "solving")
     result = snapshot.estimate()
+    progress(0.8, "checking the streams")
+    result, _ = checked(result, snapshot, options)
     progress(1.0, "done")
     return result
 

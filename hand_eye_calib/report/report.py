@@ -2,7 +2,7 @@
 
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -56,7 +56,6 @@ def render(
     evidence: Evidence,
     *,
     inputs: Plain | None = None,
-    findings: Sequence[Plain] = (),
     command: str = "",
 ) -> str:
     """The report as HTML.
@@ -70,8 +69,6 @@ def render(
         See :func:`~hand_eye_calib.engine.evidence.gather`.
     inputs : mapping, optional
         Where the data came from, in plain values.
-    findings : sequence of dict
-        What the stream checks found.
     command : str
         Shell command that publishes the result; empty for none.
 
@@ -88,7 +85,7 @@ def render(
             advice=what_is_missing(evidence.excitation, calibration),
             command=command,
             figures=_figures(calibration, evidence),
-            findings=list(findings),
+            findings=calibration.findings,
             summary=_summary(calibration, evidence),
             streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
             provenance=_provenance(inputs),

@@ -56,6 +56,7 @@ class TestOptionsOfCalibrate:
             "hand_eye_calib.engine.offline.whole_snapshot",
             lambda config, parent, child: seen.append(config) or _Unsolved(),
         )
+        monkeypatch.setattr("hand_eye_calib.engine.offline.checked", lambda *_: (None, None))
         given = dict(
             method="dnl",
             reference="C7",
@@ -103,7 +104,13 @@ class TestOptionsOfCalibrate:
         told = []
         tell = lambda share, step: told.append((share, step))  # noqa: E731
         result = hec.calibrate(parent, child, reference="B1", progress=tell)
-        assert [step for _, step in told] == ["time offset", "pairing", "solving", "done"]
+        assert [step for _, step in told] == [
+            "time offset",
+            "pairing",
+            "solving",
+            "checking the streams",
+            "done",
+        ]
         assert sorted(told) == told
         assert (told[0][0], told[-1][0]) == (0.0, 1.0)
         again = hec.calibrate(parent, child, reference="B1")
@@ -186,7 +193,7 @@ class TestResiduals:
         residuals = result.residuals()
         assert len(residuals) == len(result.weights) == result.n_pairs
         assert residuals.is_inlier.sum() == result.n_inliers
-        step_ns = 100_000_000 * (2 if METHODS[name].uses_reference else 1)
+        step_ns = 100_000_000 * (2 if METHODS[result.method].uses_reference else 1)
         assert set(residuals.end_ns - residuals.start_ns) == {step_ns}
         crosses = (residuals.start_ns < parent.stamps_ns[40]) & (
             residuals.end_ns >= parent.stamps_ns[40]

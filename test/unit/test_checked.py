@@ -1,0 +1,54 @@
+"""What a stream check is certain of is used, and said."""
+
+import numpy as np
+import pytest
+from motions import as_trajectory, child_of, disturbed, wandering_poses
+
+import hand_eye_calib as hec
+from hand_eye_calib.calibration import Verdict
+from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+
+
+@pytest.fixture(scope="module")
+def streams():
+    poses = wandering_poses(1200)
+    parent = as_trajectory(poses)
+    child = as_trajectory(disturbed(child_of(poses), 1, 0.002, 0.001))
+    return parent, child, hec.calibrate(parent, child, reference="B5").T_parent_child
+
+
+def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
+    parent, child, expected = streams
+    result = hec.calibrate(parent, child.shifted(-0.3), reference="B5")
+    assert result.time_offset_s == pytest.approx(0.3, abs=0.01)
+    assert result.time_offset_sigma_s > 0
+    np.testing.assert_allclose(result.T_parent_child, expected, atol=0.02)
+    (said,) = (text for text in result.warnings if "solved with time_offset estimate" in text)
+    assert "the child's clock is 0.3" in said
+
+
+def test_a_unit_that_is_certain_is_used_and_said(streams):
+    parent, child, expected = streams
+    result = hec.calibrate(parent, child.scaled(1000.0), reference="B5")
+    assert result.scale == 0.001
+    np.testing.assert_allclose(result.T_parent_child, expected, atol=0.01)
+    assert any("solved with scale 0.001" in text for text in result.warnings)
+    assert result.findings == ()
+
+
+def test_what_was_given_is_kept_and_spoils_the_verdict(streams):
+    parent, child, _ = streams
+    result = hec.calibrate(parent, child.scaled(1000.0), reference="B5", scale="none")
+    assert result.scale == 1.0
+    assert result.verdict is Verdict.DO_NOT_USE
+    assert result.reasons[0].options == (("scale", 0.001),)
+
+
+def test_good_streams_are_left_alone(streams):
+    parent, child, _ = streams
+    snapshot = whole_snapshot(offline_config(parent, child, {"reference": "B5"}), parent, child)
+    plain = snapshot.estimate()
+    result, same = checked(plain, snapshot, ())
+    assert same is snapshot
+    assert (result.warnings, result.findings) == (plain.warnings, ())
