@@ -140,6 +140,14 @@ def tidy(
     return trajectory, findings
 
 
+def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
+    """Which intervals (N,) between poses, s, are gaps: longer than may be interpolated across, and
+    than is usual in the stream.
+    """
+    usual_s = float(np.median(intervals_s)) if len(intervals_s) else 0.0
+    return intervals_s > max(max_gap_s, _GAP_INTERVALS * usual_s)
+
+
 def check_stream(
     trajectory: Trajectory, stream: str, max_gap_s: float = CalibratorConfig.max_gap
 ) -> list[Finding]:
@@ -162,7 +170,7 @@ def check_stream(
         return [wording.leaping_stamps(stream, leap)]
     findings = []
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    gaps = intervals_s > max(max_gap_s, _GAP_INTERVALS * float(np.median(intervals_s)))
+    gaps = are_gaps(intervals_s, max_gap_s)
     if gaps.any():
         share = float(intervals_s[gaps].sum() / intervals_s.sum())
         longest_s = float(intervals_s.max())

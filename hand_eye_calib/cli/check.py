@@ -175,4 +175,4 @@ def _text(
         lines.append(
             f"Rotation of the parent in 3 s about its axes, root mean square: {turned} deg"
         )
-    return "\n".join([*lines, "", table(findings), f"Verdict: {verdict(findings)}"])
+    return "\n".join([verdict(findings), "", table(findings), "", *lines])

@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.cli.spelling import as_typed, flag
 from hand_eye_calib.engine.checked import checked
@@ -36,15 +36,16 @@ def verdict(findings: Sequence[Finding]) -> str:
     """What the findings mean for a calibration with these streams, in one sentence."""
     serious = [finding for finding in findings if finding.severity is not Severity.NOTE]
     if not serious:
-        return "nothing speaks against calibrating with these streams."
+        return f"{Verdict.USE.value}: nothing speaks against calibrating with these streams."
+    errors = [finding for finding in serious if finding.makes_unusable]
+    word = (Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE).value
     if all(finding.options for finding in serious):
         options = "".join(_typed_options(finding) for finding in serious).replace(":", "")
-        return f"calibrate with{options}, not without it."
-    errors = [finding for finding in serious if finding.makes_unusable]
+        return f"{word}: not as they are; calibrate with{options}."
     codes = ", ".join(finding.code for finding in errors or serious if not finding.options)
     if not errors:
-        return f"calibrate with care ({codes})."
-    return f"do not calibrate with these streams as they are ({codes or errors[0].code})."
+        return f"{word}: look at the findings first ({codes})."
+    return f"{word}: no result from these streams is right ({codes or errors[0].code})."
 
 
 def table(findings: Sequence[Finding]) -> str:

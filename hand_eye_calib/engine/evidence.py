@@ -12,6 +12,7 @@ from hand_eye_calib.alignment.scale import child_scaled
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.checks.streams import are_gaps
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import Answer, OtherAnswers
 from hand_eye_calib.engine.scatter import CrossCheck, compare_answers
@@ -219,7 +220,7 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
         found = angular_rates(stream, max(3 * step_s, _MIN_WINDOW_S), step_s, max_gap_s)
         steps = np.arange(len(found.values)) * step_s
         rates.append(((found.start_ns - start_ns) * 1e-9 + steps, found.values))
-        gaps = np.flatnonzero(np.diff(stream.stamps_ns) > max_gap_s * 1e9)
+        gaps = np.flatnonzero(are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s))
         edges = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
         spans.append((edges.reshape(-1, 2) - start_ns) * 1e-9)
     lag_s, angles, along_axis, rms_translation = _compared_motions(

@@ -38,7 +38,7 @@ def render_check(
     inputs : sequence of str
         Where the streams came from.
     verdict : str
-        What the findings mean, in a sentence.
+        What the findings mean, in a sentence that begins with USE, USE WITH CARE or DO NOT USE.
     max_gap_s : float
 
     Returns
@@ -58,7 +58,8 @@ def render_check(
             findings=findings,
             tone=tone,
             mark=_MARKS[tone],
-            verdict=verdict,
+            verdict=verdict.partition(": ")[0],
+            meaning=verdict.partition(": ")[2],
             title=TITLES["streams"],
             svg=svg,
             said=said,
@@ -82,7 +83,6 @@ def _figure(
 
 
 def _tone(findings: Sequence[Finding]) -> str:
-    serious = [finding for finding in findings if finding.severity is not Severity.NOTE]
-    if not serious:
-        return "good"
-    return "warn" if all(finding.options for finding in serious) else "bad"
+    if any(finding.makes_unusable for finding in findings):
+        return "bad"
+    return "warn" if any(each.severity is Severity.WARNING for each in findings) else "good"

@@ -11,9 +11,8 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from hand_eye_calib.assessment.covariance import WEAK_ROTATION, WEAK_TRANSLATION
 from hand_eye_calib.assessment.excitation import what_is_missing
-from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.calibration import Calibration, DofVerdict, Reason, Verdict
 from hand_eye_calib.checks.streams import summarise
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import Evidence
@@ -32,6 +31,8 @@ from hand_eye_calib.report.words import (
     size,
     with_sigma,
 )
+from hand_eye_calib.status import amount
+from hand_eye_calib.verdict import target_of
 
 Plain = Mapping[str, Any]
 
@@ -43,8 +44,7 @@ _WORDS = {
 }
 _AXIS_NAMES = {"roll": "about x (roll)", "pitch": "about y (pitch)", "yaw": "about z (yaw)"}
 
-# A bar reaches from a thousandth of the limit beyond which an axis is weak to ten times that, by
-# its logarithm.
+# A bar reaches from a thousandth of the target to ten times the target, by its logarithm.
 _BAR_DECADES, _BAR_ABOVE = 4.0, 1.0
 
 _REFUSED = {"refused_duplicate": "with a repeated stamp", "refused_late": "late arrivals"}
@@ -88,6 +88,9 @@ def render(
             findings=calibration.findings,
             summary=_summary(calibration, evidence),
             streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
+            reasons=[_reason(reason) for reason in calibration.reasons],
+            unknown=_by_hand(calibration),
+            target=listing([amount(axis, target_of(axis, calibration)) for axis in ("x", "yaw")]),
             provenance=_provenance(inputs),
             options={name: value for name, value in config.to_options().items() if value != ""},
         )
@@ -102,8 +105,7 @@ def _result(calibration: Calibration) -> dict[str, Any]:
         "parent": printable(calibration.parent_frame),
         "child": printable(calibration.child_frame),
         "document": document,
-        "verdict": _verdict(calibration),
-        "badge": _badge(calibration),
+        **verdict_of(calibration),
         "directions": [_direction(document[key]) for key in ("T_parent_child", "T_child_parent")],
         "axes": _axes(calibration),
     }
@@ -136,52 +138,30 @@ def environment() -> jinja2.Environment:
 # ---------------------------------------------------------------- the verdict
 
 
-def _badge(calibration: Calibration) -> dict[str, str]:
-    """A mark, the status in a word or two, and a tone for them."""
-    if calibration.status is not SolveStatus.OK:
-        return {"mark": "✗", "text": calibration.status.value.replace("_", " "), "tone": "bad"}
-    if weak := _names(calibration, DofVerdict.WEAK):
-        return {"mark": "!", "text": f"ok, but {listing(weak)} weak", "tone": "warn"}
-    if calibration.warnings:
-        warnings = counted(len(calibration.warnings), "warning")
-        return {"mark": "!", "text": f"ok, with {warnings}", "tone": "warn"}
-    return {"mark": "✓", "text": "ok", "tone": "good"}
+_LOOKS = {
+    Verdict.USE: ("✓", "good"),
+    Verdict.USE_WITH_CARE: ("!", "warn"),
+    Verdict.DO_NOT_USE: ("✗", "bad"),
+}
 
 
-def _names(calibration: Calibration, verdict: DofVerdict) -> list[str]:
-    return [dof.name for dof in calibration.observability if dof.verdict is verdict]
+def verdict_of(calibration: Calibration) -> dict[str, str]:
+    """Verdict, what it says in a sentence, a mark and a tone for it."""
+    mark, tone = _LOOKS[calibration.verdict]
+    verdict, _, said = calibration.headline.partition(": ")
+    return {"mark": mark, "tone": tone, "verdict": verdict, "said": f"{said[:1].upper()}{said[1:]}"}
 
 
-def _verdict(calibration: Calibration) -> str:
-    """What to think of the result, in a sentence."""
-    if failure := calibration.status.failure:
-        return f"{failure.capitalize()}. Do not use this result."
-    hidden, weak = calibration.unobservable(), _names(calibration, DofVerdict.WEAK)
-    if len(hidden) == 6:
-        return "This motion determines nothing of how the sensors are mounted."
-    limits = f"{_limits(calibration)} or better, one standard deviation."
-    if hidden:
-        return (
-            f"This motion does not determine {listing(hidden)}. The other axes are known to "
-            f"{limits}"
-        )
-    if weak:
-        return f"All six axes are known, but {listing(weak)} only weakly: to {limits}"
-    return f"All six axes are known, to {limits}"
+def _reason(reason: Reason) -> dict[str, str]:
+    options = ", ".join(f"{name} {value}" for name, value in reason.options)
+    what_to_do = f"{reason.what_to_do}: {options}" if options else reason.what_to_do
+    return {"sentence": reason.sentence, "what_to_do": what_to_do}
 
 
-def _limits(calibration: Calibration) -> str:
-    """The largest standard deviation of a translation and of a rotation that are known."""
-    texts = []
-    for names in (("x", "y", "z"), ("roll", "pitch", "yaw")):
-        known = [
-            dof for dof in calibration.observability if dof.name in names and np.isfinite(dof.sigma)
-        ]
-        if known:
-            worst = max(known, key=lambda dof: dof.sigma)
-            where = _AXIS_NAMES.get(worst.name, worst.name).partition(" (")[0]
-            texts.append(f"{size(worst.sigma, worst.name)} ({where})")
-    return listing(texts)
+def _by_hand(calibration: Calibration) -> str:
+    """Words of the command that stand for axes to be measured."""
+    words = [value for value in calibration.usable_numbers().values() if isinstance(value, str)]
+    return listing(words)
 
 
 def _direction(transform: Plain) -> dict[str, Any]:
@@ -212,7 +192,7 @@ def _axes(calibration: Calibration) -> list[dict[str, Any]]:
     """Rows of the table of uncertainties, along and about the parent's axes."""
     rows = []
     for dof in calibration.observability:
-        limit = WEAK_TRANSLATION if dof.name in "xyz" else WEAK_ROTATION
+        limit = target_of(dof.name, calibration)
         rows.append(
             {
                 "name": dof.name,
@@ -227,7 +207,7 @@ def _axes(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _bar(ratio: float) -> float:
-    """Length in per cent of the bar for a standard deviation, from its ratio to the weak limit."""
+    """Length in per cent of the bar for a standard deviation, from its ratio to the target."""
     if not ratio > 0:
         return 1.0
     if not np.isfinite(ratio):
@@ -315,12 +295,12 @@ def _provenance(inputs: Plain) -> list[tuple[str, str]]:
         ("Written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")),
         ("Versions", plain(versions | {"python": platform.python_version()})),
     ]
+    # Without folders, which are nobody's business who gets this page; extrinsic.yaml has them.
     rows += [
-        (name.capitalize(), plain(value))
+        (name.capitalize(), plain(_without_folders(value)))
         for name, value in inputs.items()
         if name not in ("parent", "child", "options", "files")
     ]
-    # Without folders, which are nobody's business who gets this page; extrinsic.yaml has them.
     rows += [
         (
             f"File {Path(file['file']).name}",
@@ -329,6 +309,16 @@ def _provenance(inputs: Plain) -> list[tuple[str, str]]:
         for file in inputs.get("files", ())
     ]
     return rows
+
+
+def _without_folders(value: Any) -> Any:
+    """A path, or paths in a list or mapping, as names alone; anything else as it is."""
+    if isinstance(value, Mapping):
+        return {name: _without_folders(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_folders(item) for item in value]
+    is_path = isinstance(value, str) and (value.startswith(("/", "~", "./", "../")))
+    return Path(value).name if is_path and Path(value).exists() else value
 
 
 def _version(name: str) -> str:

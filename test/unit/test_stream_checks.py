@@ -243,7 +243,7 @@ class TestCommand:
     def test_good_streams(self, files, capsys):
         assert main(["check", *files(*drive())]) == 0
         out, err = capsys.readouterr()
-        assert out.endswith("nothing speaks against calibrating with these streams.\n")
+        assert out.startswith("USE: nothing speaks against calibrating with these streams.\n")
         assert "500" in out
         assert err == ""
 
@@ -253,7 +253,7 @@ class TestCommand:
         out, err = capsys.readouterr()
         assert "--time-offset 2.0" in out
         assert "ERROR    time_offset" in out
-        assert out.endswith("Verdict: calibrate with --time-offset 2.0, not without it.\n")
+        assert out.startswith("DO NOT USE: not as they are; calibrate with --time-offset 2.0.\n")
         assert len(err.splitlines()) == 1
         assert main(["check", *files(parent, child.shifted(-2.0)), "--time-offset", "2"]) == 0
 
@@ -316,7 +316,7 @@ class TestCommand:
         )
         assert f"wrote {out / 'check.html'}" in capsys.readouterr().err
         page = (out / "check.html").read_text(encoding="utf-8")
-        assert "Do not calibrate with these streams as they are (quaternion_order)" in page
+        assert "No result from these streams is right (quaternion_order)" in page
         assert "<code>quaternion_order</code> (child, likely)" in page
         assert "100.0" in page.split("<figcaption>")[1].split("added to the child")[0]
         assert page.count("<svg") == 1
