@@ -146,6 +146,8 @@ class AdaptiveSolution:
         Increments (from pose i to i + 1) across which a trajectory jumped for good.
     spikes : (n + 1,) bool array
         Poses that are wrong by themselves, and left out.
+    is_drowned : bool
+        Whether white noise drowns the rotation between poses, so that only some of them were used.
     heavy_tails : bool
         Whether white errors are weighed as of Student's t distribution.
     misfit : float
@@ -179,6 +181,7 @@ class AdaptiveSolution:
     objective: float
     converged: bool
     iterations: int
+    is_drowned: bool = False
 
     @cached_property
     def noise(self) -> NoiseLevels:

@@ -55,6 +55,8 @@ def why_not(
         return ""
     if not model.converged:
         return "its answer did not converge"
+    if model.is_drowned:
+        return "the noise of the poses drowns the rotation between them, and it is of first order"
     jumps = float(np.mean(model.jumps))
     if jumps > MAX_JUMPS:
         return f"{jumps:.0%} of the increments are jumps (at most {MAX_JUMPS:.0%} may be)"

@@ -143,6 +143,7 @@ class TestWhatSpeaksAgainstTheModel:
             ({"jumps": np.arange(39) % 3 == 0}, "33% of the increments are jumps"),
             ({"misfit": 2.1}, "2.1 times the variance"),
             ({"converged": False}, "did not converge"),
+            ({"is_drowned": True}, "drowns the rotation between them"),
             ({"shift_m": 0.1}, "2.9 joint standard deviations"),
         ],
     )
