@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         _web(arguments, board, requests) as server,
         _display(server) as display,
     ):
-        session = _Session(board, arguments.node, requests, display.keys)
+        session = Session(board, arguments.node, requests, display.keys)
         while not stopped() and not session.is_over:
             watcher.spin(_LISTEN_S)
             while not requests.empty():
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class _Session:
+class Session:
     """What the person at the terminal has chosen: the node, and keys that wait for a second press.
 
     Parameters
@@ -138,6 +138,7 @@ class _Screen:
         self._console = Console()
         self._live = Live(console=self._console, screen=True, auto_refresh=False)
         self._footer = footer
+        self._shown: tuple[object, ...] = ()
 
     def __enter__(self) -> "_Screen":
         self._live.start()
@@ -147,11 +148,13 @@ class _Screen:
         self._live.stop()
 
     def show(self, view: "View") -> None:
-        """Draw a view."""
+        """Draw a view, unless it is there already."""
         from hand_eye_calib.watch.terminal import screen
 
-        drawn = screen(view, self._console.width, self._console.height, self._footer)
-        self._live.update(drawn, refresh=True)
+        width, height = self._console.size
+        if (view, width, height) != self._shown:
+            self._live.update(screen(view, width, height, self._footer), refresh=True)
+            self._shown = view, width, height
 
     def keys(self) -> str:
         """The keys pressed since the last call."""

@@ -10,6 +10,8 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import Console
 
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.cli.watch import Session
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.watch import terminal, web
 from hand_eye_calib.watch.board import AXES, Board, Pose, Status, Tone, duration, small
@@ -250,6 +252,61 @@ def test_an_answer_has_a_line_of_its_own():
     log.lines(board.view("", 0.0), 0.0)
     board.answer(NODE, "save", True, "result saved", 0.0)
     assert log.lines(board.view("", 1.0), 1.0) == ["   1.0 s  ✓ save: result saved"]
+
+
+@pytest.fixture
+def typed():
+    """A session at a terminal: function that types keys and returns the view."""
+    board, requests, keys = Board(), queue.SimpleQueue(), []
+    for name in ("/a", "/b"):
+        board.take(name, [progress()], time.monotonic())
+    session = Session(board, "", requests, lambda: keys.pop() if keys else "")
+
+    def type_keys(text):
+        keys.append(text)
+        return session.view()
+
+    type_keys.session, type_keys.requests = session, requests
+    return type_keys
+
+
+def test_keys_ask_the_node_that_is_shown(typed):
+    assert typed("s").node == "/a"
+    assert typed("2w").node == "/b"
+    assert [typed.requests.get(), typed.requests.get()] == [("/a", "solve"), ("/b", "save")]
+    assert typed("9x").node == "/b"
+    assert typed.requests.empty()
+
+
+def test_a_reset_takes_two_presses(typed):
+    assert typed("r").answer.text == "forgets all poses: press r again"
+    assert typed.requests.empty()
+    typed("r")
+    assert typed.requests.get() == ("/a", "reset")
+
+
+def test_q_ends(typed):
+    typed("s")
+    assert not typed.session.is_over
+    typed("q")
+    assert typed.session.is_over
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--web", "high"], "expected PORT or HOST:PORT, got 'high'"),
+        (["--web", "99999"], "expected PORT or HOST:PORT, got '99999'"),
+        (["--key", "word"], "--key is for --web"),
+    ],
+)
+def test_wrong_usage_is_one_line(arguments, text, capsys):
+    try:
+        code = main(["watch", *arguments])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2
+    assert text in capsys.readouterr().err
 
 
 # ------------------------------------------------------------------------ page

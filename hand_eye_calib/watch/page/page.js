@@ -21,6 +21,14 @@ function show(isLive) {
   for (const button of buttons) button.disabled = !isLive;
 }
 
+function put(html) {
+  view.innerHTML = html;
+  const word = view.querySelector("h1").textContent;
+  // Who drives does not look at the page: let the phone shake when it says something else.
+  if (word !== document.title && navigator.vibrate) navigator.vibrate([200, 100, 200]);
+  document.title = word;
+}
+
 function connect() {
   if (source !== null) source.close();
   heardAt = Date.now();
@@ -28,7 +36,7 @@ function connect() {
   source.onmessage = (event) => {
     heardAt = Date.now();
     show(true);
-    if (event.data) view.innerHTML = event.data;
+    if (event.data) put(event.data);
   };
   source.onerror = () => { source.close(); show(false); };
 }
