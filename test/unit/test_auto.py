@@ -93,8 +93,8 @@ class TestWhichAnswerStands:
         child = as_trajectory(
             disturbed(child_of(smooth_poses(times_s + 0.05)), 2, 1e-4, 1e-4), 20.0
         )
-        result = hec.calibrate(parent, child, method="auto")
-        dnlo = hec.calibrate(parent, child, method="dnlo")
+        result = hec.calibrate(parent, child, method="auto", time_offset=0.0)
+        dnlo = hec.calibrate(parent, child, method="dnlo", time_offset=0.0)
         apart = model_fit.squared_distance(
             se3.log(result.T_child_parent @ dnlo.T_parent_child),
             result.covariance + dnlo.covariance,
