@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from hand_eye_calib.cli.moving import add_moving_arguments, move
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.cli.robot import add_description_arguments, write_description
 from hand_eye_calib.errors import ConfigError
@@ -12,7 +13,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = (
         "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json\n"
-        "  hand_eye_calib info result --bundle wrong_answer.zip"
+        "  hand_eye_calib info result --bundle wrong_answer.zip\n"
+        "  hand_eye_calib info result --move camera.tum --to camera_as_lidar.tum"
     )
     parser.add_argument(
         "result", metavar="RESULT", help="extrinsic.yaml, or the directory that holds it"
@@ -25,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write what a report of a wrong answer needs to a zip file: versions, options, "
         "findings, the result and 200 kB of downsampled poses without their place; nothing else",
     )
+    add_moving_arguments(parser)
     add_json_argument(parser)
 
 
@@ -36,6 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     calibration = load_result(arguments.result)
     if arguments.write and not arguments.urdf:
         raise ConfigError("--write needs --urdf: the description to change")
+    move(calibration, arguments)
     if arguments.bundle:
         from hand_eye_calib.cli.bundle import write_bundle
         from hand_eye_calib.cli.console import note

@@ -79,3 +79,19 @@ def test_poses_are_few_and_have_no_place():
     text = tum_text(hec.Trajectory(10**18 + 10**8 * np.arange(50_000), poses))
     assert MOST_BYTES / 4 < len(text) <= MOST_BYTES / 2
     assert text.splitlines()[0].split()[1:4] == ["0.000000000"] * 3
+
+
+def test_the_child_is_moved_to_a_file_or_a_bag(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    result, child = hec.load("files"), hec.read_trajectory(CHILD)
+    expected = result.child_as_parent(child)
+    for name in ("moved.tum", "moved.bag", "moved"):
+        target = str(tmp_path / name)
+        assert main(["info", "files", "--move", CHILD, "--to", target]) == 0
+        topic = None if name == "moved.tum" else "/odometry"
+        moved = hec.read_trajectory(target, topic=topic)
+        np.testing.assert_array_equal(moved.stamps_ns, expected.stamps_ns)
+        np.testing.assert_allclose(moved.poses, expected.poses, atol=1e-9)
+    assert main(["info", "files", "--move", CHILD]) == 2
+    *_, line = capsys.readouterr().err.splitlines()
+    assert "--move CHILD and --to FILE go together" in line

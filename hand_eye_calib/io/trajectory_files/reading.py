@@ -51,13 +51,13 @@ class FileReading(NamedTuple):
 
 
 def read_trajectory(
-    source: _Path | PoseObject,
-    format: str = _USUAL,
+    source: str | Path | PoseObject,
+    format: str = "tum",
     *,
     topic: str | None = None,
     tf: str | None = None,
     columns: str | None = None,
-    times: _Path | ArrayLike | None = None,
+    times: str | Path | ArrayLike | None = None,
     stamp_unit: str | None = None,
     repair: bool = False,
 ) -> Trajectory:
