@@ -545,3 +545,21 @@ class NodeConfig(OptionSet):
         "Broadcast the result on /tf_static once all of it is observable; leave it off if the "
         "robot description has this transform.",
     )
+    installed: str = option(
+        "",
+        "What the robot uses now, to compare the result with: tf (from /tf_static), a URDF, an "
+        "earlier extrinsic.yaml, a bag, or X Y Z ROLL PITCH YAW in m and rad. Empty for nothing.",
+        read_only=True,
+    )
+    base_frame: str = option(
+        "",
+        "State the child sensor's pose in this frame, too, as /tf_static has it; saved files and "
+        "publish_tf are about that edge then. Empty for none.",
+        read_only=True,
+    )
+    monitor: bool = option(
+        False,
+        "Watch the mount against installed, and raise an alarm when it has moved, instead of "
+        "calibrating.",
+        read_only=True,
+    )

@@ -294,6 +294,14 @@ class Calibrator:
             time_offset=self._time_offset,
         )
 
+    def take_pairs(self) -> PosePairs:
+        """Give away the pose pairs made so far; only the last is kept, which the next ones follow
+        and the next call gives again.
+        """
+        made = self._kept
+        self._kept_parts = [made[-1:]]
+        return made
+
     def estimate(self) -> Calibration:
         """Estimate the extrinsic from all poses so far; errors as of `Snapshot.estimate`."""
         return self.snapshot().estimate()

@@ -22,9 +22,11 @@ from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
 from hand_eye_calib.ros.inputs import PoseInput, TopicInput, qos_parameter_names
 from hand_eye_calib.ros.live_session import LiveSession, check_below, output_path
 from hand_eye_calib.ros.log import LOG_PERIOD_S, NodeLog
+from hand_eye_calib.ros.mount import LIMITS, MountWatch
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.report_process import ReportProcess, SessionResult
 from hand_eye_calib.ros.results import ResultFiles, ResultTopics
+from hand_eye_calib.ros.robot import Robot, needs_tf
 from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S
 from hand_eye_calib.ros.solve_cycle import ANSWER_PERIOD_S, SolveCycle
 from hand_eye_calib.ros.tf import TfBroadcaster, message_type
@@ -75,6 +77,11 @@ class CalibratorNode(Node):
         self._topics = ResultTopics(self)
         self._tf = TfBroadcaster(self, self._log)
         self._tf.switch(self._options.node.publish_tf)
+        self._robot = Robot(self, self._log, self._options.node, self._tf)
+        self._mount = None
+        if self._options.node.monitor:
+            self._session.watch_only(LIMITS)
+            self._mount = MountWatch(self._session, self._robot, self._log)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._answered = self.create_guard_condition(self._take_answers)
         self._cycle = SolveCycle(
@@ -82,12 +89,13 @@ class CalibratorNode(Node):
             self._checks,
             self._log,
             self._answered.trigger,
+            self._robot.complete,
             self._publish_result,
             Goal(*self._options.calibrator.targets),
         )
         self._parts = NodeParts(
             self.get_fully_qualified_name(), self._options, self._session, self._inputs,
-            self._cycle, self._checks, self._tf,
+            self._cycle, self._checks, self._tf, self._mount,
         )  # fmt: skip
         self._serve()
         self._start_timers()
@@ -176,10 +184,13 @@ class CalibratorNode(Node):
 
     def _publish_result(self, calibration: Calibration) -> None:
         self._topics.publish(calibration)
-        self._tf.add(calibration, self._checks.faults())
+        if not self._robot.lacks_base(calibration):
+            self._tf.add(calibration, self._checks.faults())
 
     def _publish_diagnostics(self) -> None:
         self._tf.look()
+        if self._mount is not None:
+            self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds
         self._diagnostics.publish(diagnostics(self._parts, time.monotonic(), clock_ns))
 
@@ -192,6 +203,8 @@ class CalibratorNode(Node):
         self._checks.restart()
         self._topics.clear()
         self._tf.restart()
+        if self._mount is not None:
+            self._mount.restart()
         for each in self._inputs:
             each.restart(because_of)
 
@@ -247,6 +260,10 @@ class CalibratorNode(Node):
         """Raise ConfigError if options cannot be had together, or not on this machine."""
         if options.publish_tf:
             message_type()
+        if needs_tf(options):
+            message_type("base_frame" if options.base_frame else "installed: tf")
+        if options.monitor and not options.installed:
+            raise ConfigError("monitor needs installed: what the mount is watched against")
         for name in ("parent", "child"):
             if tf_source(options, name):
                 message_type(f"{name}_tf")

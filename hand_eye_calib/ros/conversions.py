@@ -104,6 +104,16 @@ def to_transform(calibration: Calibration) -> TransformStamped:
     return message
 
 
+def to_mounting(calibration: Calibration) -> TransformStamped:
+    """The child sensor's pose in the frame that it is mounted on, for the transform tree."""
+    mounted_on, T = calibration.mounting
+    message = to_transform(calibration)
+    message.header.frame_id = mounted_on
+    message.transform.translation = _xyz(Vector3, T)
+    message.transform.rotation = _quaternion(T)
+    return message
+
+
 def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamped:
     """The child sensor's pose in the parent sensor's frame as
     geometry_msgs/PoseWithCovarianceStamped (REP-103 covariance).

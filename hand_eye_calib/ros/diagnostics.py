@@ -3,6 +3,7 @@
 A level asks for something: WARN if a person should act, ERROR if something is broken.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from hand_eye_calib.ros.conversions import to_time
 from hand_eye_calib.ros.input_monitor import InputMonitor
 from hand_eye_calib.ros.inputs import PoseInput
 from hand_eye_calib.ros.live_session import LiveSession
+from hand_eye_calib.ros.mount import MountWatch
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.progress import progress_report
 from hand_eye_calib.ros.solve_cycle import SolveCycle
@@ -43,6 +45,7 @@ class NodeParts:
     cycle: SolveCycle
     checks: CheckMonitor
     tf: TfBroadcaster
+    mount: MountWatch | None = None
 
 
 def diagnostics(parts: NodeParts, steady_s: float, clock_ns: int) -> DiagnosticArray:
@@ -56,6 +59,9 @@ def diagnostics(parts: NodeParts, steady_s: float, clock_ns: int) -> DiagnosticA
     clock_ns : int
         The node's clock; 0 if it does not run yet.
     """
+    if parts.mount is not None:
+        reports = {"mount": parts.mount.report(), **_input_reports(parts, steady_s)}
+        return _message(parts.name, reports, clock_ns)
     reports = {
         "extrinsic": extrinsic_report(parts, steady_s, clock_ns),
         "progress": progress_report(parts.cycle.goal.progress, parts.cycle.result),
@@ -63,8 +69,12 @@ def diagnostics(parts: NodeParts, steady_s: float, clock_ns: int) -> DiagnosticA
         "stream checks": parts.checks.report(steady_s),
         "journal": journal_report(parts.session, parts.options.node),
     }
+    return _message(parts.name, reports, clock_ns)
+
+
+def _message(name: str, reports: Mapping[str, Report], clock_ns: int) -> DiagnosticArray:
     message = DiagnosticArray(
-        status=[to_status(parts.name, part, report) for part, report in reports.items()]
+        status=[to_status(name, part, report) for part, report in reports.items()]
     )
     message.header.stamp = to_time(clock_ns)
     return message

@@ -6,6 +6,7 @@ from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.journal import has_session
@@ -36,6 +37,7 @@ class LiveSession:
 
     def __init__(self, log: NodeLog) -> None:
         self.calibrator = Calibrator()
+        self._is_solved = True
         self.number = 0
         self.topics: dict[str, str] = {}
         self.has_new_poses = False
@@ -60,8 +62,13 @@ class LiveSession:
         added = self.calibrator.add_pose(stream, stamp_ns, position, quat_xyzw)
         if added and self._journal is not None:
             self._journal.add_pose(stream, stamp_ns, position, quat_xyzw)
-        self.has_new_poses |= added
+        self.has_new_poses |= added and self._is_solved
         return added
+
+    def watch_only(self, limits: BufferLimits) -> None:
+        """Never solve, and keep few poses: somebody takes the pairs as they are made."""
+        self._is_solved = False
+        self.calibrator = Calibrator(self.calibrator.config, limits)
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
         """Take the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
@@ -75,7 +82,7 @@ class LiveSession:
         if self._journal is not None:
             self._journal.describe(self._about())
         received = sum(self.calibrator.statistics(stream).received for stream in STREAMS)
-        self.has_new_poses = received > 0
+        self.has_new_poses = received > 0 and self._is_solved
 
     def reset(self) -> None:
         """Forget everything and begin a new session; the journal of the old one is kept aside."""
@@ -179,7 +186,7 @@ class LiveSession:
 
 def journal_directory(options: NodeConfig) -> Path | None:
     """Where the options want the journal; None for nowhere."""
-    if not options.output_directory or options.journal == "off":
+    if not options.output_directory or options.journal == "off" or options.monitor:
         return None
     return output_path(options.output_directory) / "journal"
 

@@ -1,5 +1,8 @@
 """How far the session is from its goal: on ``/diagnostics``, and in the log when that changes."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from hand_eye_calib.assessment.covariance import AXES
@@ -55,4 +58,21 @@ def progress_report(progress: Progress, result: Calibration | None) -> Report:
         values[f"seconds_left.{axis}"] = f"{left_s:.0f}" if np.isfinite(left_s) else UNOBSERVABLE
     for number, reason in enumerate(result.reasons if result else (), start=1):
         values[f"reason.{number}"] = f"{reason.sentence}: {reason.what_to_do}"
+    if result is not None and result.comparison:
+        values |= _comparison_values(result.comparison)
     return Report(level, progress.sentence, values)
+
+
+def _comparison_values(comparison: Mapping[str, Any]) -> dict[str, object]:
+    """What is installed, and how the result differs from it, per axis."""
+    values: dict[str, object] = {
+        "comparison": comparison["verdict"],
+        "comparison_sentence": comparison["sentence"],
+        "installed_from": comparison["installed"],
+    }
+    for axis, row in comparison["differences"][0]["axes"].items():
+        sigma = row["sigma"]
+        values[f"installed.{axis}"] = f"{comparison['values'][axis]:.6g}"
+        values[f"difference.{axis}"] = f"{row['difference']:.6g}"
+        values[f"difference_sigma.{axis}"] = UNOBSERVABLE if sigma is None else f"{sigma:.6g}"
+    return values

@@ -37,6 +37,8 @@ class SolveCycle:
     log : NodeLog
     wake : callable
         Called in another thread when :meth:`take_answers` has something to do.
+    complete : callable
+        Called with each usable Calibration; gives it with what there is to add.
     publish : callable
         Called with each usable Calibration.
     goal : Goal
@@ -65,6 +67,7 @@ class SolveCycle:
         checks: CheckMonitor,
         log: NodeLog,
         wake: Callable[[], None],
+        complete: Callable[[Calibration], Calibration],
         publish: Callable[[Calibration], None],
         goal: Goal,
     ) -> None:
@@ -72,7 +75,7 @@ class SolveCycle:
         self.seconds = 0.0
         self.is_solving = False
         self._session, self._checks, self._log = session, checks, log
-        self._publish = publish
+        self._complete, self._publish = complete, publish
         self.goal = goal
         self._progress_log = ProgressLog(log)
         self._rest_until_s = 0.0
@@ -202,6 +205,7 @@ class SolveCycle:
     def _report_result(self, calibration: Calibration) -> tuple[bool, str]:
         if not calibration.status.failure:
             assert self.seen is not None
+            calibration = self._complete(calibration)
             faults = self._checks.faults()
             progress = self.goal.add(calibration, self.seen, faults)
             if not faults:  # which are in the log already

@@ -13,7 +13,7 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.ros.conversions import to_transform
+from hand_eye_calib.ros.conversions import to_mounting
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.settled import SettledRule
 
@@ -130,6 +130,10 @@ class TfBroadcaster:
         self._subscriptions.clear()
         self._withdraw()
 
+    def is_own(self, transform: TransformStamped) -> bool:
+        """Whether this node has broadcast the transform."""
+        return transform in self._own
+
     def add(self, calibration: Calibration, faults: tuple[str, ...]) -> None:
         """Take the next result of the session."""
         self._newest = calibration
@@ -160,7 +164,7 @@ class TfBroadcaster:
 
     def _hear(self, topic: str, message: Any) -> None:
         for transform in message.transforms:
-            if transform not in self._own:
+            if not self.is_own(transform):
                 self._tree.add(transform.header.frame_id, transform.child_frame_id, topic)
         if self._publisher is not None and topic == STATIC_TOPIC:
             self._check()
@@ -168,7 +172,7 @@ class TfBroadcaster:
     def _check(self) -> bool:
         """Whether the newest result may be broadcast."""
         assert self._newest is not None
-        frames = self._newest.parent_frame, self._newest.child_frame
+        frames = self._newest.mounting[0], self._newest.child_frame
         forbidden = self._tree.what_forbids(*frames)
         if forbidden and forbidden != self._forbidden:
             self._log.error(
@@ -191,7 +195,7 @@ class TfBroadcaster:
         if self._publisher is None:
             self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, _STATIC_QOS)
             self._log.info("the result has settled: it is broadcast on /tf_static from now on")
-        transform = to_transform(self._newest)
+        transform = to_mounting(self._newest)
         self._own.append(transform)
         self._publisher.publish(message_type()(transforms=[transform]))
 

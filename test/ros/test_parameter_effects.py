@@ -6,6 +6,7 @@ import importlib.util
 import numpy as np
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from ros_harness import RELIABLE_INPUTS, NodeProcess, Peer, drive, free_domain, message
 
@@ -182,6 +183,32 @@ def tf_is_used(start_node, peer, tmp_path, stream):
     peer.spin_until(lambda: peer.node.count_subscribers("/tf") == 1, "the node to listen to /tf")
 
 
+def installed_is_used(start_node, peer, tmp_path):
+    node = start_node("-p solve_period:=0.2", "-p installed:=1 2 3 0 0 0", *RELIABLE_INPUTS)
+    peer.feed(peer.publishers(), *drive())
+    node.wait_for_log("installed is what 1 2 3 0 0 0 says")
+
+
+def base_frame_is_used(start_node, peer, tmp_path):
+    node = start_node(*QUIET, "-p base_frame:=base_link")
+    if importlib.util.find_spec("tf2_msgs") is None:
+        assert node.wait() == 1
+        assert node.log.startswith("calibrator: base_frame needs the message package tf2_msgs")
+        return
+    peer.spin_until(
+        lambda: peer.node.count_subscribers("/tf_static") == 1, "the node to listen to /tf_static"
+    )
+
+
+def monitor_is_used(start_node, peer, tmp_path):
+    start_node(*QUIET, "-p monitor:=true", "-p installed:=0 0 0 0 0 0")
+    heard = []
+    peer.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    peer.spin_until(lambda: heard, "diagnostics")
+    names = [status.name for status in heard[-1].status]
+    assert names == [f"/calibrator: {part}" for part in ("mount", "parent input", "child input")]
+
+
 EFFECTS = {
     "parent_frame": lambda *fixtures: frame_is_used(*fixtures, "parent", "camera in chosen: "),
     "child_frame": lambda *fixtures: frame_is_used(*fixtures, "child", "chosen in lidar: "),
@@ -194,6 +221,9 @@ EFFECTS = {
     "journal": journal_is_used,
     "report": report_is_used,
     "publish_tf": publish_tf_is_used,
+    "installed": installed_is_used,
+    "base_frame": base_frame_is_used,
+    "monitor": monitor_is_used,
 }
 
 

@@ -1,0 +1,122 @@
+"""What the robot has installed, and its base frame: from files, or from the transform tree."""
+
+import time
+from typing import Any, Protocol
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.config import NodeConfig
+from hand_eye_calib.errors import HandEyeCalibError, InputError, printable
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.geometry.frames import Frames
+from hand_eye_calib.io.installed import of_frames, read_installed
+from hand_eye_calib.ros.log import NodeLog
+from hand_eye_calib.ros.tf import STATIC_TOPIC, message_type
+from hand_eye_calib.session.compare import with_comparison
+from hand_eye_calib.session.installed import with_base
+
+TF = "tf"
+
+# What could not be read is tried again after so long.
+_AGAIN_S = 5.0
+
+_QOS = QoSProfile(
+    depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+
+
+class _Own(Protocol):
+    """Tells the node's own transforms from those of others."""
+
+    def is_own(self, transform: Any) -> bool: ...
+
+
+class Robot:
+    """Completes results with what is installed, and with the pose in the base frame.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    log : NodeLog
+    options : NodeConfig
+        Its ``installed`` and ``base_frame`` do not change while the node runs.
+    own : TfBroadcaster
+
+    Attributes
+    ----------
+    problem : str
+        Why the installed extrinsic or the base frame is not known yet; empty if it is, or if
+        nothing was asked for.
+    """
+
+    def __init__(self, node: Node, log: NodeLog, options: NodeConfig, own: _Own) -> None:
+        self._log, self._own = log, own
+        self._source, self._base_frame = options.installed, options.base_frame
+        self._installed: Extrinsic | None = None
+        self._fixed: dict[str, Any] = {}
+        self._again_at_s = 0.0
+        self.problem = ""
+        if needs_tf(options):
+            node.create_subscription(message_type("installed"), STATIC_TOPIC, self._hear, _QOS)
+
+    def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
+        """What is installed; None if nothing was given, or it is not known (yet)."""
+        if self._installed is None and self._source and time.monotonic() >= self._again_at_s:
+            self._again_at_s = time.monotonic() + _AGAIN_S
+            try:
+                self._installed = self._read(parent_frame, child_frame)
+                self.problem = ""
+                self._log.info(f"installed is what {self._installed.origin} says")
+            except HandEyeCalibError as error:
+                self._report(f"what is installed is not known: {error}")
+        return self._installed
+
+    def complete(self, calibration: Calibration) -> Calibration:
+        """A usable result with its comparison and its pose in the base frame."""
+        installed = self.installed(calibration.parent_frame, calibration.child_frame)
+        if installed is not None:
+            calibration = with_comparison(calibration, installed)
+        if not self._base_frame:
+            return calibration
+        try:
+            T_base_parent = Frames(self._fixed).pose(self._base_frame, calibration.parent_frame)
+        except InputError as error:
+            self._report(f"base_frame {self._base_frame} is not known from {STATIC_TOPIC}: {error}")
+            return calibration
+        return with_base(calibration, self._base_frame, T_base_parent)
+
+    def lacks_base(self, calibration: Calibration) -> bool:
+        """Whether the pose in the base frame was asked for and is not there."""
+        return calibration.base_frame != self._base_frame
+
+    def _read(self, parent_frame: str, child_frame: str) -> Extrinsic:
+        if self._source == TF:
+            return of_frames(Frames(self._fixed), parent_frame, child_frame, STATIC_TOPIC)
+        return read_installed(self._source, parent_frame, child_frame)
+
+    def _report(self, problem: str) -> None:
+        self.problem = problem
+        self._log.warning(problem, "robot", 60.0)
+
+    def _hear(self, message: Any) -> None:
+        for each in message.transforms:
+            if self._own.is_own(each):
+                continue
+            place, rotation = each.transform.translation, each.transform.rotation
+            position = (place.x, place.y, place.z)
+            quat_xyzw = (rotation.x, rotation.y, rotation.z, rotation.w)
+            frame = printable(each.child_frame_id).lstrip("/")
+            try:
+                pose = se3.from_quat_xyzw(position, quat_xyzw)
+            except HandEyeCalibError as error:
+                self._report(f"{STATIC_TOPIC} has an unusable transform of {frame}: {error}")
+                continue
+            self._fixed[frame] = (printable(each.header.frame_id).lstrip("/"), pose)
+
+
+def needs_tf(options: NodeConfig) -> bool:
+    """Whether the transform tree has to be listened to."""
+    return options.installed == TF or bool(options.base_frame)

@@ -1,0 +1,430 @@
+"""The mount monitor: has the child sensor moved against the installed extrinsic?
+
+For days on end, in constant memory. Every second of motion adds its information about a shift from
+the installed extrinsic (:mod:`hand_eye_calib.assessment.mount_change`). The likelihood ratio of a
+shift is taken over the last three seconds of motion, the last four, ... up to twenty minutes, and
+over all of them; the largest tells. It is measured by what the scores really scatter over time.
+
+What was there before a shift, the installed extrinsic is off by: by its own uncertainty, and by the
+common-mode error of both odometries (:mod:`hand_eye_calib.assessment.floor`). That is learned from
+all motion before. Standing still adds nothing. docs/session.md has what the monitor can see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.assessment.floor import common_mode_floor
+from hand_eye_calib.assessment.mount_change import (
+    log_ratio,
+    noise_covariance,
+    residuals_and_jacobians,
+    shift_covariance,
+)
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+# Log likelihood ratio from which on the mount has moved.
+THRESHOLD = 10.0
+
+# Motions over this time (ns) are compared, at most one in each of these steps.
+_LAG_NS, _STEP_NS, _SECOND_NS = 1_000_000_000, 100_000_000, 1_000_000_000
+_MOST_LATE = 1.5
+
+# A second counts if the sensors move by this much within it (m, rad), and by so many times the
+# noise of the rotation.
+_LEAST_MOTION, _LEAST_ROTATION, _LEAST_OF_NOISE = 0.05, float(np.radians(1.5)), 3.0
+
+# Seconds of motion from which the noise is learned before anything is judged; those that are kept
+# for the longest lag; lags, each 1.5 times the one before. The shortest is longer than the motions,
+# so that one jump of a trajectory is no shift.
+LEARNING_S, MEMORY_S = 120, 1200
+_LAGS = np.unique(np.round(np.geomspace(3, MEMORY_S, 16)).astype(int))
+
+# Time over which the noise is followed, and over which older motion is forgotten, in seconds of
+# motion.
+_NOISE_MEMORY_S, _OLD_MEMORY_S = 900.0, 20_000.0
+
+# Factor on the variances that the installed extrinsic states; how much of the common-mode error
+# differs from hour to hour (one standard deviation, as a share).
+_CAUTION, _WANDER = 2.0, 0.25
+
+# Windows (seconds of motion) whose scores show the long-run variance; fewer of them say nothing.
+# What is assumed of it beforehand counts as much as so many windows. It is taken anew every so many
+# seconds. A shift spoils some windows: none counts for more than so many times the typical one.
+_WINDOWS, _FEWEST_WINDOWS = (10, 30, 90, 240), 4
+_ASSUMED, _ASSUMED_WINDOWS = 10.0, 4.0
+_LONG_RUN_EVERY = 10
+_MOST_OF_TYPICAL = 20.0
+# Student's t weights of the motions, as in the kernel.
+_T_DOF = 4.0
+
+# A shift is said to be seen if the ratio exceeds the threshold nine times out of ten: by so many
+# standard deviations.
+_POWER_SIGMAS = 1.28
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alarm:
+    """The mount has moved.
+
+    Attributes
+    ----------
+    since_ns : int
+        About when, parent clock.
+    raised_ns : int
+        When that was clear.
+    shift : (6,) array
+        Along (m) and about (rad) the axes of the parent sensor: child's pose now minus installed.
+    sigmas : (6,) array
+    log_ratio : float
+    """
+
+    since_ns: int
+    raised_ns: int
+    shift: FloatArray
+    sigmas: FloatArray
+    log_ratio: float
+
+
+@dataclass(frozen=True)
+class _Seconds:
+    """Information of seconds of motion, oldest first: stamps (M,), H (M, 6, 6), S (M, 6)."""
+
+    stamps_ns: IntArray
+    H: FloatArray
+    S: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @classmethod
+    def none(cls) -> _Seconds:
+        return cls(np.empty(0, dtype=np.int64), np.empty((0, 6, 6)), np.empty((0, 6)))
+
+    def followed_by(self, newer: _Seconds, most: int) -> _Seconds:
+        """Both, without the oldest beyond so many."""
+        return _Seconds(
+            np.concatenate([self.stamps_ns, newer.stamps_ns])[-most:],
+            np.concatenate([self.H, newer.H])[-most:],
+            np.concatenate([self.S, newer.S])[-most:],
+        )
+
+    def total(self) -> tuple[FloatArray, FloatArray]:
+        """H and S of all of them."""
+        return self.H.sum(axis=0), self.S.sum(axis=0)
+
+    def answer(self) -> FloatArray:
+        """Shift (6,) that all of them together show."""
+        prior = np.linalg.inv(shift_covariance())
+        return np.linalg.solve(self.H.sum(axis=0) + 1e-3 * prior, self.S.sum(axis=0))
+
+
+class MountMonitor:
+    """Watches the pose of the child sensor in the parent sensor's frame.
+
+    Parameters
+    ----------
+    T_parent_child : (4, 4) array
+        The installed extrinsic.
+    covariance : (6, 6) array
+        Of the error xi in ``T_parent_child @ exp(xi)``; zero if it is exact.
+
+    Attributes
+    ----------
+    alarm : Alarm or None
+        The shift that is there now.
+    alarms : int
+        How many there were; one that is over and comes again counts twice.
+    seconds : int
+        Seconds of motion seen so far.
+    """
+
+    def __init__(self, T_parent_child: FloatArray, covariance: FloatArray) -> None:
+        self._installed = np.asarray(T_parent_child, dtype=float)
+        self._covariance = _CAUTION * np.asarray(covariance, dtype=float)
+        self._wander = np.zeros((6, 6))
+        self._old = np.zeros((6, 6)), np.zeros(6)
+        self._before_alarm = np.zeros(6)
+        self._to_parent = np.kron(np.eye(2), self._installed[:3, :3])
+        self._noise: FloatArray | None = None
+        self._learning: list[tuple[int, MotionPairs]] = []
+        self._tail = PosePairs.empty()
+        self._memory = _Seconds.none()
+        self._centre = np.zeros(6)
+        self._last_s = -1
+        self._since_alarm = 0
+        self._motions_per_s = 0.0
+        self.alarm: Alarm | None = None
+        self.alarms = 0
+        self.seconds = 0
+        self.long_run = _ASSUMED
+
+    @property
+    def is_learning(self) -> bool:
+        """Whether the noise is not known yet, so that nothing is judged."""
+        return self._noise is None
+
+    def add(self, pose_pairs: PosePairs) -> Alarm | None:
+        """Take the poses that follow those before.
+
+        Returns
+        -------
+        Alarm or None
+            A new one, if it was raised by these poses.
+        """
+        raised = None
+        for stamp_ns, motions in self._by_second(pose_pairs):
+            if not _is_motion(motions, self._noise):
+                continue
+            self.seconds += 1
+            if self._noise is None:
+                self._learn(stamp_ns, motions)
+            else:
+                self._take(stamp_ns, motions)
+            if self._noise is not None:
+                raised = self._judge() or raised
+        return raised
+
+    def restart(self) -> None:
+        """Forget the stretch before a gap of the streams; what was learned stays."""
+        self._tail = PosePairs.empty()
+
+    # ------------------------------------------------------------- the motions
+
+    def _by_second(self, pose_pairs: PosePairs) -> list[tuple[int, MotionPairs]]:
+        """Motions over a second that end in these poses, by the second in which they begin."""
+        if len(self._tail) and len(pose_pairs):
+            late_ns = int(pose_pairs.stamps_ns[0] - self._tail.stamps_ns[-1])
+            if late_ns <= 0 or late_ns > _MOST_LATE * _LAG_NS:
+                self._tail = PosePairs.empty()
+        poses = PosePairs.concatenate(self._tail, pose_pairs)
+        poses = poses[np.unique(poses.stamps_ns // _STEP_NS, return_index=True)[1]]
+        stamps_ns = poses.stamps_ns
+        j = np.searchsorted(stamps_ns, stamps_ns + _LAG_NS)
+        seconds = stamps_ns // _SECOND_NS
+        # A second is complete once a motion of the next one has its end.
+        ended = j < len(stamps_ns)
+        if not ended.any():
+            self._tail = poses
+            return []
+        complete = ended & (seconds < seconds[ended][-1]) & (seconds > self._last_s)
+        self._tail = poses[seconds >= seconds[ended][-1]]
+        self._last_s = int(seconds[ended][-1]) - 1
+        i = np.flatnonzero(complete)
+        i = i[stamps_ns[j[i]] - stamps_ns[i] <= _MOST_LATE * _LAG_NS]
+        if not len(i):
+            return []
+        pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i])
+        starts = np.flatnonzero(np.diff(seconds[i], prepend=-1))
+        ends = np.append(starts[1:], len(i))
+        return [
+            (int(seconds[i[first]]) * _SECOND_NS, pairs[first:last])
+            for first, last in zip(starts, ends, strict=True)
+        ]
+
+    def _learn(self, stamp_ns: int, motions: MotionPairs) -> None:
+        """Collect motions; once there are enough, learn the noise about their own answer."""
+        self._learning.append((stamp_ns, motions))
+        if len(self._learning) < LEARNING_S:
+            return
+        learned, self._learning = self._learning, []
+        found = [residuals_and_jacobians(each, self._installed) for _, each in learned]
+        residuals, jacobians = (np.concatenate(part) for part in zip(*found, strict=True))
+        self._noise, _ = noise_covariance(residuals)
+        for _ in range(2):
+            H, S, _ = _information(residuals, jacobians, self._noise)
+            shift = _Seconds(np.zeros(1, dtype=np.int64), H[None], S[None]).answer()
+            self._noise, _ = noise_covariance(residuals + jacobians @ shift)
+        floor = _floor([each for _, each in learned], self._installed)
+        self._covariance = self._covariance + floor
+        self._wander = _WANDER**2 * floor
+        for second_ns, each in learned:
+            self._take(second_ns, each)
+
+    def _take(self, stamp_ns: int, motions: MotionPairs) -> None:
+        """Add the information of a second, and follow the noise."""
+        assert self._noise is not None
+        residuals, jacobians = residuals_and_jacobians(motions, self._installed)
+        H, S, scatter = _information(residuals, jacobians, self._noise, self._memory_answer())
+        second = _Seconds(np.array([stamp_ns]), H[None], S[None])
+        if len(self._memory) == MEMORY_S and self.alarm is None:
+            kept = 1.0 - 1.0 / _OLD_MEMORY_S
+            H_old, S_old = self._old
+            self._old = kept * H_old + self._memory.H[0], kept * S_old + self._memory.S[0]
+        self._memory = self._memory.followed_by(second, MEMORY_S)
+        share = 1.0 / _NOISE_MEMORY_S
+        self._noise = (1.0 - share) * self._noise + share * scatter
+        self._motions_per_s += (len(motions) - self._motions_per_s) / min(len(self._memory), 100)
+
+    def _memory_answer(self) -> FloatArray:
+        if self.seconds % _LONG_RUN_EVERY == 0 and len(self._memory) >= LEARNING_S:
+            self._centre = self._memory.answer()
+        return self._centre
+
+    # ------------------------------------------------------------- the judgement
+
+    def _judge(self) -> Alarm | None:
+        """Raise, follow or end an alarm; returns one that is new."""
+        if self.seconds % _LONG_RUN_EVERY == 0 or self.seconds <= LEARNING_S:
+            self.long_run = _long_run_variance(self._memory, self.long_run)
+        if len(self._memory) < _LAGS[0]:
+            return None
+        self._since_alarm += 1
+        if self.alarm is not None and self._is_over():
+            self.alarm = None
+            self._memory = _Seconds.none()
+            return None
+        lags, H, S, before = self._sums()
+        ratios = log_ratio(H, S, 1.0)
+        best = int(np.argmax(ratios))
+        if ratios[best] < (self.alarm.log_ratio if self.alarm else THRESHOLD):
+            return None
+        covariance = np.linalg.inv(H[best] + np.linalg.inv(shift_covariance(1.0, 1.0)))
+        is_new = self.alarm is None
+        stamps_ns = self._memory.stamps_ns
+        self.alarm = Alarm(
+            since_ns=int(stamps_ns[-min(lags[best], len(stamps_ns))]),
+            raised_ns=int(stamps_ns[-1]) if self.alarm is None else self.alarm.raised_ns,
+            shift=self._to_parent @ covariance @ S[best],
+            sigmas=self._sigmas(covariance),
+            log_ratio=float(ratios[best]),
+        )
+        self._before_alarm = before[best]
+        self.alarms += is_new
+        if is_new:
+            self._since_alarm = 0
+        return self.alarm if is_new else None
+
+    def _sums(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+        """Lags, H and S over each with the long-run variance and the uncertainty of what was before
+        counted in, and what was before, (l, 6); the last lag is all there is.
+        """
+        lags = _LAGS[: np.searchsorted(_LAGS, len(self._memory), side="right")]
+        newest_H, newest_S = (
+            np.cumsum(part[::-1], axis=0)[lags - 1] for part in (self._memory.H, self._memory.S)
+        )
+        all_H, all_S = (
+            old + part for old, part in zip(self._old, self._memory.total(), strict=True)
+        )
+        H = np.concatenate([newest_H, all_H[None]]) / self.long_run
+        S = np.concatenate([newest_S, all_S[None]]) / self.long_run
+        known = np.linalg.inv(self._covariance) + H[-1] - H
+        uncertain = np.linalg.inv(known)
+        before = (uncertain @ (S[-1] - S)[..., None])[..., 0]
+        off = S - (H @ before[..., None])[..., 0]
+        reduced = np.linalg.inv(np.eye(6) + H @ (uncertain + self._wander))
+        lags = np.append(lags, len(self._memory))
+        return lags, reduced @ H, (reduced @ off[..., None])[..., 0], before
+
+    def _is_over(self) -> bool:
+        """Whether, over some lag since the alarm, no shift is far more likely than the alarm's."""
+        assert self.alarm is not None
+        lags = _LAGS[_LAGS.searchsorted(0) : _LAGS.searchsorted(self._since_alarm)]
+        lags = lags[lags < len(self._memory)]
+        H = np.cumsum(self._memory.H[::-1], axis=0)[lags - 1] / self.long_run
+        S = np.cumsum(self._memory.S[::-1], axis=0)[lags - 1] / self.long_run
+        shift = self._to_parent.T @ self.alarm.shift
+        off = S - (H @ self._before_alarm)
+        for_shift = off @ shift - 0.5 * np.einsum("i,lij,j->l", shift, H, shift)
+        return bool((for_shift < -THRESHOLD).any())
+
+    def _sigmas(self, covariance: FloatArray) -> FloatArray:
+        in_parent = self._to_parent @ covariance @ self._to_parent.T
+        return np.asarray(np.sqrt(np.diag(in_parent)))
+
+    def visible(self, seconds: float) -> FloatArray:
+        """Shifts (6,) along (m) and about (rad) each axis of the parent sensor that so many seconds
+        of motion like that so far would show nine times out of ten; infinite while learning.
+        """
+        if self.is_learning:
+            return np.full(6, np.inf)
+        H_old, _ = self._old
+        known = (H_old + self._memory.H.sum(axis=0)) / self.long_run
+        before = np.linalg.inv(np.linalg.inv(self._covariance) + known) + self._wander
+        H = self._memory.H.mean(axis=0)
+        H[:3, :3] -= self._motions_per_s * self._information_of_noise()
+        H *= seconds / self.long_run
+        scale = np.sqrt(np.diag(shift_covariance(100.0, np.pi)))
+        values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
+        root = scale[:, None] * vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
+        covariance = root @ root.T + before
+        # A shift along an axis of z standard deviations has the ratio z^2 / 2 less this.
+        _, log_volume = np.linalg.slogdet(
+            np.eye(6) + shift_covariance() @ np.linalg.inv(covariance)
+        )
+        seen_sigmas = np.sqrt(2.0 * THRESHOLD + log_volume) + _POWER_SIGMAS
+        return seen_sigmas * self._sigmas(covariance)
+
+    def _information_of_noise(self) -> FloatArray:
+        """What the rotation noise of a motion seems to tell of a translation, (3, 3), on average:
+        rotations that never took place reveal nothing.
+        """
+        assert self._noise is not None
+        turns = se3.skew(np.eye(3))
+        precision = np.linalg.inv(self._noise)[:3, :3]
+        return np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, precision, turns)
+
+
+def _floor(learned: list[MotionPairs], T_parent_child: FloatArray) -> FloatArray:
+    """Common-mode floor (6, 6) of motions like these; never singular."""
+    parent, child = (
+        np.concatenate([getattr(each, name) for each in learned])
+        for name in ("Ts_parenti_parentj", "Ts_childi_childj")
+    )
+    index = np.arange(len(parent))
+    pairs = MotionPairs(parent, child, index, index + 1)
+    floor = common_mode_floor(pairs, np.ones(len(parent)), T_parent_child)
+    return floor + shift_covariance(1e-3, 1e-4)
+
+
+def _is_motion(motions: MotionPairs, noise: FloatArray | None) -> bool:
+    """Whether the sensors move: where they stand, noise would look like information."""
+    parent = motions.Ts_parenti_parentj
+    rotation = float(np.median(se3.rotation_angle(parent[:, :3, :3])))
+    distance = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1)))
+    least = _LEAST_ROTATION
+    if noise is not None:
+        least = max(least, _LEAST_OF_NOISE * float(np.sqrt(np.trace(noise[3:, 3:]) / 3)))
+    return rotation > least or distance > _LEAST_MOTION
+
+
+def _information(
+    residuals: FloatArray,
+    jacobians: FloatArray,
+    noise: FloatArray,
+    shift: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """H (6, 6), S (6,) of motions, and their weighted scatter (6, 6) about a shift."""
+    precision = np.linalg.inv(noise)
+    centred = residuals if shift is None else residuals + jacobians @ shift
+    squared = np.einsum("ki,ki->k", centred @ precision, centred)
+    weights = (_T_DOF + 6.0) / (_T_DOF + squared)
+    whitened = np.swapaxes(jacobians, 1, 2) @ precision * weights[:, None, None]
+    H = (whitened @ jacobians).sum(axis=0)
+    S = -np.einsum("kij,kj->i", whitened, residuals)
+    return H, S, (weights[:, None] * centred).T @ centred / len(centred)
+
+
+def _long_run_variance(memory: _Seconds, known: float) -> float:
+    """Long-run variance of the scores in units of the information: the largest over windows of
+    several lengths, each about the answer of all; what is known while there are too few.
+    """
+    centred = memory.S - memory.H @ memory.answer()
+    ridge = 1e-3 * np.linalg.inv(shift_covariance())
+    found = []
+    for length in _WINDOWS:
+        n_windows = len(memory) // length
+        if n_windows < _FEWEST_WINDOWS:
+            break
+        edges = len(memory) - length * np.arange(n_windows, 0, -1)
+        H = np.add.reduceat(memory.H, edges)
+        S = np.add.reduceat(centred, edges)
+        squared = (S * np.linalg.solve(H + ridge, S[..., None])[..., 0]).sum(axis=1)
+        seen = np.minimum(squared, _MOST_OF_TYPICAL * np.median(squared)).sum() / 6
+        found.append((seen + _ASSUMED_WINDOWS * _ASSUMED) / (n_windows + _ASSUMED_WINDOWS))
+    return max(found, default=known)

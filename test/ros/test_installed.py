@@ -1,0 +1,92 @@
+"""The node against what is installed: compared while it calibrates, and watched by the monitor."""
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive
+
+from hand_eye_calib.geometry import se3
+
+NUMBERS = " ".join(
+    f"{value:.9f}"
+    for value in (*T_PARENT_CHILD[:3, 3], *se3.rotation_to_rpy(T_PARENT_CHILD[:3, :3]))
+)
+
+
+@pytest.fixture
+def status(peer):
+    """``status(part, condition)``: the first status of a part that meets a condition."""
+    heard = []
+    peer.node.create_subscription(
+        DiagnosticArray,
+        "/diagnostics",
+        lambda array: heard.append({each.name: each for each in array.status}),
+        10,
+    )
+
+    def wait(part, condition):
+        name = f"/calibrator: {part}"
+        peer.spin_until(
+            lambda: heard and name in heard[-1] and condition(heard[-1][name]), f"such a {part}"
+        )
+        found = heard[-1][name]
+        return found, {pair.key: pair.value for pair in found.values}
+
+    return wait
+
+
+def noisy(stamps_ns, Ts_pw_p, Ts_cw_c):
+    noise = np.random.default_rng(0).normal(size=(2, len(stamps_ns), 6)) * 1e-3
+    return stamps_ns, Ts_pw_p @ se3.exp(noise[0]), Ts_cw_c @ se3.exp(noise[1])
+
+
+def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, tmp_path):
+    moved = NUMBERS.split()
+    moved[2] = f"{float(moved[2]) + 0.2:.6f}"
+    start_node("-p solve_period:=0.3", f"-p installed:={' '.join(moved)}", *RELIABLE_INPUTS)
+    peer.feed(peer.publishers(), *noisy(*drive(400)))
+    _, values = status("progress", lambda each: "comparison" in {p.key for p in each.values})
+    assert values["comparison"] == "moved"
+    assert float(values["difference.z"]) == pytest.approx(-0.2, abs=0.02)
+    assert float(values["installed.z"]) == pytest.approx(float(moved[2]))
+    assert 0 < float(values["difference_sigma.z"]) < 0.02
+    assert values["verdict"].startswith(("USE", "DO NOT"))
+
+
+def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_moves(
+    start_node, peer, status, tmp_path
+):
+    node = start_node(
+        "-p monitor:=true", f"-p installed:={NUMBERS}", f"-p output_directory:={tmp_path}",
+        *RELIABLE_INPUTS,
+    )  # fmt: skip
+    publishers = peer.publishers()
+    stamps_ns, Ts_pw_p, Ts_cw_c = noisy(*drive(2400))
+    peer.feed(publishers, stamps_ns[:1800], Ts_pw_p[:1800], Ts_cw_c[:1800])
+    quiet, values = status("mount", lambda each: "has not moved" in each.message)
+    assert quiet.level == DiagnosticStatus.OK
+    assert values["alarms"] == "0"
+    assert all(float(values[f"visible_10min.{axis}"]) < 0.01 for axis in ("x", "y", "z", "yaw"))
+    knocked = se3.exp(np.array([0, 0, 0, 0, 0, np.radians(1.0)]))
+    peer.feed(publishers, stamps_ns[1800:], Ts_pw_p[1800:], Ts_cw_c[1800:] @ knocked)
+    alarm, values = status("mount", lambda each: each.level == DiagnosticStatus.ERROR)
+    assert alarm.message.startswith("the mount has moved: ")
+    since_s = (int(values["since_ns"]) - stamps_ns[1800]) * 1e-9
+    assert abs(since_s) < 10.0
+    node.wait_for_log("the mount has moved: ")
+    assert "extrinsic" not in node.log
+    assert not (tmp_path / "journal").exists()
+
+
+def test_a_monitor_without_what_is_installed_does_not_start(start_node):
+    node = start_node("-p monitor:=true")
+    assert node.wait() == 1
+    assert node.log == ("calibrator: monitor needs installed: what the mount is watched against\n")
+
+
+def test_what_cannot_be_read_is_said(start_node, peer, status, tmp_path):
+    start_node("-p monitor:=true", f"-p installed:={tmp_path / 'robot.urdf'}", *RELIABLE_INPUTS)
+    peer.feed(peer.publishers(), *drive(100))
+    mount, _ = status("mount", lambda each: "what is installed is not known" in each.message)
+    assert mount.level == DiagnosticStatus.WARN
+    assert "file that exists" in mount.message

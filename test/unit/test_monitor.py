@@ -1,0 +1,129 @@
+"""The mount monitor: quiet without a shift, quick with one, and honest about what it cannot see."""
+
+import numpy as np
+import pytest
+
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.session.monitor import LEARNING_S, MEMORY_S, MountMonitor
+
+X = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
+EXACT = np.zeros((6, 6))
+SECOND_NS = 1_000_000_000
+
+
+def motion(duration_s, seed=0, flat=False, sigma=(0.003, 0.002), start_s=0.0, rate_hz=10.0):
+    """Pose pairs with white errors, that turn about all axes or about z only."""
+    s = start_s + np.arange(round(duration_s * rate_hz)) / rate_hz
+    turns = np.stack(
+        [0.5 * np.sin(0.7 * s), 0.4 * np.sin(0.9 * s + 1.0), 0.8 * np.sin(0.4 * s)], axis=1
+    ) * ([0, 0, 1] if flat else [1, 1, 1])
+    places = np.stack([s, 2.0 * np.sin(0.5 * s), np.zeros_like(s)], axis=1)
+    Ts = se3.from_rotation_translation(se3.rotation_exp(turns), places)
+    errors = np.random.default_rng(seed).normal(size=(2, len(s), 6)) * np.repeat(sigma, 3)
+    stamps_ns = (s * SECOND_NS).astype(np.int64)
+    return PosePairs(stamps_ns, Ts @ se3.exp(errors[0]), Ts @ X @ se3.exp(errors[1]))
+
+
+def shifted(pairs, from_s, axis, size):
+    """The child knocked at a time, along or about an axis of the parent."""
+    xi = np.kron(np.eye(2), X[:3, :3].T) @ (np.eye(6)[axis] * size)
+    child = pairs.Ts_cw_c.copy()
+    after = pairs.stamps_ns >= from_s * SECOND_NS
+    child[after] = child[after] @ se3.exp(xi)
+    return PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, child)
+
+
+def fed(pairs, covariance=EXACT, T=X, chunk=37):
+    monitor = MountMonitor(T, covariance)
+    alarms = [monitor.add(pairs[first : first + chunk]) for first in range(0, len(pairs), chunk)]
+    return monitor, [alarm for alarm in alarms if alarm is not None]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_mount_that_stays_raises_no_alarm(seed):
+    monitor, alarms = fed(motion(1500.0, seed))
+    assert (alarms, monitor.alarms, monitor.alarm) == ([], 0, None)
+    assert monitor.seconds == pytest.approx(1500, abs=3)
+    assert 1.0 < monitor.long_run < 20.0
+
+
+def test_the_size_of_the_chunks_changes_nothing():
+    pairs = shifted(motion(300.0), 200.0, 5, np.radians(0.5))
+    (one,), (other,) = fed(pairs, chunk=7)[1], fed(pairs, chunk=600)[1]
+    np.testing.assert_array_equal(one.shift, other.shift)
+    assert one.raised_ns == other.raised_ns
+
+
+@pytest.mark.parametrize(("axis", "size"), [(0, 0.03), (2, -0.03), (4, 0.02), (5, -0.02)])
+def test_a_shift_is_found_with_its_axis_size_and_time(axis, size):
+    monitor, alarms = fed(shifted(motion(400.0), 250.0, axis, size))
+    assert len(alarms) == monitor.alarms == 1
+    assert 250.0 <= alarms[0].raised_ns / SECOND_NS < 300.0
+    assert abs(monitor.alarm.since_ns / SECOND_NS - 250.0) < 30.0
+    off = (monitor.alarm.shift - np.eye(6)[axis] * size) / monitor.alarm.sigmas
+    assert np.abs(off).max() < 4.0
+    assert np.argmax(np.abs(monitor.alarm.shift) / monitor.alarm.sigmas) == axis
+
+
+def test_a_shift_that_was_there_from_the_beginning_is_found_after_learning():
+    monitor, alarms = fed(shifted(motion(400.0), 0.0, 5, np.radians(2.0)))
+    assert monitor.alarms == 1
+    assert alarms[0].raised_ns / SECOND_NS == pytest.approx(LEARNING_S, abs=10)
+
+
+def test_an_alarm_ends_when_the_sensor_is_put_back_and_can_come_again():
+    pairs = shifted(motion(900.0), 300.0, 5, np.radians(1.0))
+    pairs = shifted(pairs, 450.0, 5, -np.radians(1.0))
+    pairs = shifted(pairs, 700.0, 5, np.radians(1.0))
+    monitor, alarms = fed(pairs)
+    assert [round(alarm.raised_ns / SECOND_NS, -2) for alarm in alarms] == [300, 700]
+    assert monitor.alarm is not None
+
+
+def test_what_is_installed_may_be_off_by_its_own_standard_deviation():
+    covariance = np.diag(np.repeat([0.02, 0.02], 3) ** 2)
+    off = X @ se3.exp(np.array([0.02, -0.01, 0.015, 0.02, -0.03, 0.01]))
+    assert fed(motion(600.0), covariance, off)[0].alarms == 0
+    assert fed(motion(600.0), EXACT, off)[0].alarms == 1
+
+
+def test_what_cannot_be_seen_is_said_before():
+    level = fed(motion(400.0, flat=True))[0].visible(600.0)
+    assert level[2] > 0.5
+    assert (level[:2] < 0.1).all()
+    assert np.isinf(MountMonitor(X, EXACT).visible(600.0)).all()
+
+
+def test_standing_still_and_gaps_add_nothing():
+    pairs = motion(200.0)
+    errors = np.random.default_rng(1).normal(size=(2, 20_000, 6)) * np.repeat([0.003, 0.002], 3)
+    still = PosePairs(
+        pairs.stamps_ns[-1] + SECOND_NS + np.arange(20_000) * 100_000_000,
+        pairs.Ts_pw_p[-1] @ se3.exp(errors[0]),
+        pairs.Ts_cw_c[-1] @ se3.exp(errors[1]),
+    )
+    monitor, _ = fed(pairs)
+    before = monitor.seconds
+    for first in range(0, len(still), 500):
+        monitor.add(still[first : first + 500])
+    assert monitor.seconds <= before + 3
+    # The worlds may be others after a gap.
+    world = se3.exp(np.array([5.0, 2.0, 1.0, 0.3, 0.2, 1.0]))
+    later = motion(200.0, 2, start_s=5000.0)
+    monitor.add(PosePairs(later.stamps_ns, world @ later.Ts_pw_p, later.Ts_cw_c))
+    assert monitor.alarms == 0
+
+
+def test_a_jump_of_one_trajectory_is_no_shift():
+    pairs = motion(600.0)
+    child = pairs.Ts_cw_c.copy()
+    for at, jump in ((3000, 0.3), (4000, -0.5), (4500, 0.2)):
+        child[at:] = se3.exp(np.array([jump, 0.1, 0, 0, 0, jump / 5])) @ child[at:]
+    assert fed(PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, child))[0].alarms == 0
+
+
+def test_memory_stays_constant():
+    monitor, _ = fed(motion(MEMORY_S + 200.0, rate_hz=4.0), chunk=400)
+    assert len(monitor._memory) == MEMORY_S
+    assert len(monitor._tail) < 20
