@@ -261,7 +261,7 @@ class CalibratorNode(Node):
         if options.publish_tf:
             message_type()
         if needs_tf(options):
-            message_type("base_frame" if options.base_frame else "installed: tf")
+            message_type("base_frame" if options.base_frame else "installed")
         if options.monitor and not options.installed:
             raise ConfigError("monitor needs installed: what the mount is watched against")
         for name in ("parent", "child"):

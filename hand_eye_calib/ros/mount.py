@@ -21,6 +21,7 @@ LIMITS = BufferLimits(
 )
 
 # An axis is watched if ten minutes of motion would show a change of so many targets.
+_UNKNOWN = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)  # m, rad: as good as nothing
 _TARGETS, _MINUTE_S, _LONG_S = 5.0, 60.0, 600.0
 
 
@@ -128,8 +129,8 @@ def _quiet(visible: FloatArray, watched: np.ndarray) -> str:
 
 def _per_axis(name: str, values: FloatArray) -> dict[str, object]:
     return {
-        f"{name}.{axis}": f"{value:.6g}" if np.isfinite(value) else "unknown"
-        for axis, value in zip(AXES, values, strict=True)
+        f"{name}.{axis}": f"{value:.6g}" if value < unknown else "unknown"
+        for axis, value, unknown in zip(AXES, values, _UNKNOWN, strict=True)
     }
 
 

@@ -38,6 +38,8 @@ _INSTEAD = {
     "publish_tf": "leave publish_tf off and use the launch file that ~/save writes",
     "parent_tf": "give the poses of the parent sensor as a topic, parent_odom",
     "child_tf": "give the poses of the child sensor as a topic, child_odom",
+    "base_frame": "leave base_frame empty and give --base-frame and --urdf to replay",
+    "installed": "give a URDF, an extrinsic.yaml or numbers instead of tf",
 }
 
 # Own broadcasts that are recognised when they are heard.
