@@ -13,6 +13,7 @@ import example_recording
 import pytest
 import yaml
 
+import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,3 +100,12 @@ def test_pages_say_bash_where_commands_are():
         for language, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.M):
             if language != "bash":
                 assert not re.search(r"^hand_eye_calib [a-z]", block, re.M), (path, block)
+
+
+def test_every_public_name_is_on_the_reference_page():
+    text = (DOCS / "python.md").read_text(encoding="utf-8")
+    described = set(re.findall(r"^::: (\S+)$", text, re.MULTILINE))
+    public = {getattr(hec, name) for name in hec.__all__}
+    homes = {f"{each.__module__}.{each.__name__}" for each in public}
+    missing = {home for home in homes - described if home.rpartition(".")[0] not in described}
+    assert missing == set()
