@@ -101,7 +101,8 @@ clean:
 	find hand_eye_calib reproduction test benchmarks launch -name __pycache__ -type d -prune \
 		-exec rm -rf {} +
 
-# The package is installed editable: what runs and what is tested is this work tree. A stamp file is
+# The package is installed editable: what runs and what is tested is this work tree. It is compiled
+# here, as pip does with packages that are not editable: commands start faster. A stamp file is
 # touched last, so that set-up is repeated if it was interrupted or a file it depends on is newer.
 $(VENV)/.ready-demo: EXTRAS := ros
 $(VENV)/.ready-test: EXTRAS := ros,cluster,fleet,gnss,notebook,test,lint
@@ -119,4 +120,5 @@ $(VENV)/.ready-demo $(VENV)/.ready-test $(OLDEST)/.ready-test: $(SETUP_FILES)
 	@PYTHON="$(PYTHON)" sh requirements/make_venv.sh $(@D)
 	@echo "installing hand_eye_calib with [$(EXTRAS)] into $(@D)"
 	@$(@D)/bin/python -m pip install $(PIP_FLAGS) $(CONSTRAINTS) --editable ".[$(EXTRAS)]"
+	@$(@D)/bin/python -m compileall -q hand_eye_calib
 	@touch $@

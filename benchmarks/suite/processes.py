@@ -2,6 +2,7 @@
 and bags.
 """
 
+import compileall
 import os
 import subprocess
 import sys
@@ -48,6 +49,7 @@ def process_rows(drives):
     """From two TUM files to the result with covariance, and the time until the command line shows
     its help.
     """
+    compileall.compile_dir(PROJECT / "hand_eye_calib", quiet=1)  # as pip installs it
     with tempfile.TemporaryDirectory() as folder:
         files = [str(Path(folder, name)) for name in ("parent.txt", "child.txt")]
         for file, trajectory in zip(files, drives[LONG].trajectories(), strict=True):

@@ -142,10 +142,12 @@ def _is_meant(arguments: argparse.Namespace, stream: str, name: str) -> bool:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate from files; returns the exit code."""
+    from hand_eye_calib.cli.memory import keep_freed_memory
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.engine.checked import checked
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
+    keep_freed_memory()
     options = options_from(arguments)
     trajectories, repairs = read_files(arguments)
     for text in repairs:

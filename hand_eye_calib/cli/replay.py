@@ -116,11 +116,13 @@ def run(arguments: argparse.Namespace) -> int:
 
         return list_bag(arguments.bags, arguments.json)
 
+    from hand_eye_calib.cli.memory import keep_freed_memory
     from hand_eye_calib.cli.options import options_from
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.cli.replaying import fingerprints
     from hand_eye_calib.engine.checked import checked
 
+    keep_freed_memory()
     replayed = _replayed(arguments)
     if arguments.out:
         replayed.inputs["files"] = fingerprints(replayed.files)

@@ -101,14 +101,14 @@ def write_description(calibration: Calibration, arguments: argparse.Namespace) -
 
 
 def _installed(calibration: Calibration, arguments: argparse.Namespace) -> "Extrinsic | None":
+    if not arguments.installed and not arguments.urdf:
+        return None
     from hand_eye_calib.io.installed import of_frames, read_installed
 
     frames = calibration.parent_frame, calibration.child_frame
     if arguments.installed:
         return read_installed(arguments.installed, *frames)
-    if arguments.urdf:
-        return of_frames(_frames(arguments), *frames, str(arguments.urdf))
-    return None
+    return of_frames(_frames(arguments), *frames, str(arguments.urdf))
 
 
 def _frames(arguments: argparse.Namespace) -> "Frames":

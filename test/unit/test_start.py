@@ -9,6 +9,8 @@ import sys
 import pytest
 
 from hand_eye_calib.cli.main import COMMANDS, main
+from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.simulation.drive import simulate_drive
 from reproduction.command import EXPERIMENTS
 
 # Each takes from a tenth of a second to a second to load.
@@ -43,6 +45,19 @@ def test_the_engine_loads_only_what_it_computes_with():
     assert not {name.partition(".")[0] for name in loaded} & (HEAVY - {"numpy", "scipy"})
     # Any part of scipy takes as long as all the rest, but for the wrapper of LAPACK alone.
     assert {name for name in loaded if name.startswith("scipy")} <= {"scipy.linalg._flapack"}
+
+
+def test_calibrating_two_files_loads_no_writer_of_results(tmp_path):
+    drive = simulate_drive(0)
+    for name, trajectory in (("parent", drive.parent), ("child", drive.child)):
+        write_trajectory(tmp_path / name, trajectory)
+    code = (
+        "import sys; from hand_eye_calib.cli.main import main; "
+        "main(sys.argv[1:]); print('loaded', *sys.modules, file=sys.stderr)"
+    )
+    loaded = loaded_by(code, "calibrate", str(tmp_path / "parent"), str(tmp_path / "child"))
+    assert "loaded" in loaded
+    assert not loaded & {"yaml", "urllib.request", "importlib.metadata", "matplotlib", "casadi"}
 
 
 def test_commands_use_one_thread_unless_told_otherwise(monkeypatch):

@@ -1,0 +1,19 @@
+"""Memory of a command that computes."""
+
+import ctypes
+
+# Names of glibc's malloc.h, and the largest values that are of use here, bytes.
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_MOST_KEPT, _LARGEST_KEPT = 256 << 20, 32 << 20
+
+
+def keep_freed_memory() -> None:
+    """Let the process keep up to 256 MB that it has freed, if the C library is glibc.
+
+    A solve takes and frees arrays of a few MB by the thousand. By default glibc gives each back to
+    the system, which has to clear its pages the next time: a tenth of the time of a command.
+    """
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option is not None:
+        set_option(_M_TRIM_THRESHOLD, _MOST_KEPT)
+        set_option(_M_MMAP_THRESHOLD, _LARGEST_KEPT)
