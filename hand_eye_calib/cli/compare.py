@@ -2,11 +2,10 @@
 
 import argparse
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import InputError, printable
@@ -92,7 +91,7 @@ def _table(difference: "Difference") -> Iterator[str]:
     yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
     for axis, row in difference.to_dict()["axes"].items():
         is_angle = axis in ("roll", "pitch", "yaw")
-        factor, unit = (float(np.degrees(1.0)), "deg") if is_angle else (100.0, "cm")
+        factor, unit = (math.degrees(1.0), "deg") if is_angle else (100.0, "cm")
         numbers = (row["difference"], row["sigma"], row["visible"])
         cells = ["unknown" if value is None else f"{factor * value:.2f}" for value in numbers]
         yield f"  {axis:<6}{cells[0]:>12}{cells[1]:>10}{cells[2]:>12} {unit:<4}{row['verdict']}"

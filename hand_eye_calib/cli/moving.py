@@ -2,10 +2,13 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.errors import ConfigError
+
+if TYPE_CHECKING:
+    from hand_eye_calib.calibration import Calibration
 
 _TEXT = (".tum", ".txt")
 
@@ -26,7 +29,7 @@ def add_moving_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def move(calibration: Calibration, arguments: argparse.Namespace) -> None:
+def move(calibration: "Calibration", arguments: argparse.Namespace) -> None:
     """Write the moved trajectory if it was asked for.
 
     Raises

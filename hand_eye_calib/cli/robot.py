@@ -4,12 +4,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.status import listing
 
 if TYPE_CHECKING:
+    from hand_eye_calib.calibration import Calibration
     from hand_eye_calib.geometry.extrinsic import Extrinsic
     from hand_eye_calib.geometry.frames import Frames
 
@@ -45,7 +45,7 @@ def add_description_arguments(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def with_robot(calibration: Calibration, arguments: argparse.Namespace) -> Calibration:
+def with_robot(calibration: "Calibration", arguments: argparse.Namespace) -> "Calibration":
     """The result with its comparison and its pose in the base frame, if they were asked for.
 
     Raises
@@ -69,7 +69,7 @@ def with_robot(calibration: Calibration, arguments: argparse.Namespace) -> Calib
     return with_base(calibration, arguments.base_frame, T_base_parent)
 
 
-def write_description(calibration: Calibration, arguments: argparse.Namespace) -> None:
+def write_description(calibration: "Calibration", arguments: argparse.Namespace) -> None:
     """Write the changed robot description, if it was asked for.
 
     Raises
@@ -79,6 +79,7 @@ def write_description(calibration: Calibration, arguments: argparse.Namespace) -
     """
     if not arguments.write:
         return
+    from hand_eye_calib.calibration import SolveStatus, Verdict
     from hand_eye_calib.io.files import write_atomically
     from hand_eye_calib.io.urdf import RobotDescription
 
@@ -100,7 +101,7 @@ def write_description(calibration: Calibration, arguments: argparse.Namespace) -
     note(f"wrote {arguments.write}: joint {description.joint_name(*frames)} changed")
 
 
-def _installed(calibration: Calibration, arguments: argparse.Namespace) -> "Extrinsic | None":
+def _installed(calibration: "Calibration", arguments: argparse.Namespace) -> "Extrinsic | None":
     if not arguments.installed and not arguments.urdf:
         return None
     from hand_eye_calib.io.installed import of_frames, read_installed
