@@ -225,6 +225,8 @@ def _document(
         **frames,
         "bag": str(bag_path),
         "poses": {"parent": len(drive.parent), "child": len(drive.child)},
+        "verdict": offline.verdict.value,
+        "headline": offline.headline,
         "status": offline.status.value,
         "truth": _both_directions(drive.T_parent_child),
         "offline": _estimate(offline.T_parent_child, drive.T_parent_child)
@@ -264,7 +266,7 @@ _ROWS = {"truth": "truth", "offline": "replay of the bag", "online": "live node"
 
 def _text(document: Mapping[str, Any]) -> str:
     parent, child = document["parent_frame"], document["child_frame"]
-    lines = []
+    lines = [document["headline"]]
     directions = (("T_parent_child", child, parent), ("T_child_parent", parent, child))
     for direction, source, target in directions:
         lines.append(
