@@ -121,9 +121,9 @@ class Rule:
 _Found: TypeAlias = tuple[str, str, tuple[str, ...], tuple[tuple[str, Any], ...]]
 
 # Other answers contradict a result if they lie farther away than so many joint standard deviations
-# and than this share of the target; other references also if they scatter by so many of its own
-# standard deviations and so many targets: that they are uncertain themselves does not excuse a
-# large scatter. From even more targets on nothing of it may be used.
+# and than this share of the target; other references that are about as certain also if they scatter
+# by so many of its own standard deviations and so many targets: that they are uncertain themselves
+# does not excuse a large scatter. From even more targets on nothing of it may be used.
 CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
 HOPELESS_TARGETS = 10.0
 
@@ -257,11 +257,12 @@ def _far(result: Judged, kind: str) -> dict[str, float]:
         scatter = row.get(f"of_{kind}")
         if scatter is None or not math.isfinite(sigmas[axis]):
             continue
-        own = scatter / max(sigmas[axis], 1e-12)
         # Older files have no distances.
-        excess = row.get(f"excess_of_{kind}") or own
+        own = scatter / max(sigmas[axis], 1e-12)
+        excess = row.get(f"excess_of_{kind}", own) or 0.0
+        over_own = row.get("excess_over_own", own) or 0.0
         of_target = scatter / target_of(axis, result)
-        is_beyond_all = kind == "methods" and own > CONTRADICTED_SIGMAS
+        is_beyond_all = kind == "methods" and over_own > CONTRADICTED_SIGMAS
         if (excess > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE) or (
             is_beyond_all and of_target > CONTRADICTED_TARGETS
         ):
@@ -339,8 +340,10 @@ def _condition(kind: str) -> str:
         f"standard deviations and {CONTRADICTED_SHARE:g} of the target"
     )
     if kind == "methods":
-        text += f", or {CONTRADICTED_SIGMAS:g} of the result's own and {CONTRADICTED_TARGETS:g} "
-        text += "targets"
+        text += (
+            f"; or those about as certain by {CONTRADICTED_SIGMAS:g} of the result's own and "
+            f"{CONTRADICTED_TARGETS:g} targets"
+        )
     return text
 
 

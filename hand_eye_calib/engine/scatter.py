@@ -23,6 +23,10 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 # Fewest other answers that have a scatter.
 _MIN_OTHERS = 3
 
+# Answers whose standard deviation is below so many of the result's are about as certain. Fewest of
+# them that say something.
+_AS_CERTAIN, _MIN_AS_CERTAIN = 3.0, 2
+
 # Smallest joint standard deviation (m, rad) to divide by: noise-free data has none.
 _ROUNDING = 1e-9
 
@@ -52,6 +56,9 @@ class CrossCheck:
     excess_of_methods, excess_of_halves, excess_of_model : (6,) arrays
         Distance of the answers in their joint standard deviations (of the methods: the median over
         that of a normal variable). Those of methods and model contain the common-mode floor.
+    excess_over_own : (6,) array
+        Distance of other methods and references in the result's own standard deviations, over those
+        that are not much less certain; NaN if there are fewer than two.
     """
 
     axes: tuple[str, ...]
@@ -62,6 +69,7 @@ class CrossCheck:
     excess_of_methods: FloatArray
     excess_of_halves: FloatArray
     excess_of_model: FloatArray
+    excess_over_own: FloatArray
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON or YAML; None for what is not known."""
@@ -141,6 +149,7 @@ def compare_answers(
         excess_of_methods=np.where(known, excess_of_methods, np.nan),
         excess_of_halves=np.where(known, excess_of_halves, np.nan),
         excess_of_model=np.where(known, excess_of_model, np.nan),
+        excess_over_own=np.where(known, _over_own(calibration, robust), np.nan),
     )
 
 
@@ -158,6 +167,20 @@ def _scatter(
     allowed = np.array([joint for _, joint in distances])
     apart[:, np.isfinite(apart).sum(axis=0) < _MIN_OTHERS] = np.nan
     return _median(apart) / _MEDIAN_OF_NORMAL, _median(apart / allowed) / _MEDIAN_OF_NORMAL
+
+
+def _over_own(calibration: Calibration, others: Sequence[Calibration]) -> FloatArray:
+    """Median distance (6,) of other answers in the result's own standard deviations, over that of a
+    normal variable.
+    """
+    if not others:
+        return np.full(6, np.nan)
+    own = np.maximum(calibration.sigmas, _ROUNDING)
+    as_certain = np.array([other.sigmas for other in others]) < _AS_CERTAIN * own
+    apart = np.array([_apart(calibration, other)[0] for other in others])
+    apart[~as_certain] = np.nan
+    apart[:, np.isfinite(apart).sum(axis=0) < _MIN_AS_CERTAIN] = np.nan
+    return _median(apart) / own / _MEDIAN_OF_NORMAL
 
 
 def _median(values: FloatArray) -> FloatArray:
