@@ -268,6 +268,8 @@ _ERROR_WORDS = {"mount": "MOUNT MOVED", "parent input": "BAD INPUT", "child inpu
 
 def _of_progress(progress: Status) -> tuple[Tone, str, str]:
     sentence = _sentence(progress.text)
+    if sentence.startswith("Stop: "):  # the result was good, the streams no longer are
+        return Tone.ACT, "CHECK THE STREAMS", sentence
     if progress.values.get("done") == "true":
         return Tone.GOOD, "DONE", sentence
     if progress.values.get("verdict") == "no result":
@@ -354,7 +356,10 @@ def small(value: float, unit: str) -> str:
 
 
 def _short(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 9.95 else f"{value:.2g}"
+    """Two digits, and not more than three decimals."""
+    if abs(value) >= 9.95:
+        return f"{value:.0f}"
+    return f"{value:.2g}" if abs(value) >= 0.01 else f"{value:.3f}"
 
 
 def duration(seconds: float) -> str:

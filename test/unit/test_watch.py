@@ -58,6 +58,10 @@ def view_of(*statuses, now_s=0.5, pose=POSE, node=""):
         ([progress(), *inputs()], 0.5, Tone.BUSY, "GO ON", "Go on for about 25 s"),
         ([progress(1), *inputs()], 0.5, Tone.ACT, "CHANGE THE MOTION", "Go on"),
         ([progress(1, verdict="no result")], 0.5, Tone.BUSY, "START", "Go on"),
+        (
+            [progress(done="true", sentence="Stop: the streams are faulty: feet.")],
+            *(0.5, Tone.ACT, "CHECK THE STREAMS", "Stop: "),
+        ),
         ([progress(done="true"), *inputs()], 0.5, Tone.GOOD, "DONE", "Go on"),
         ([progress(), *inputs(child=1)], 0.5, Tone.ACT, "CHECK INPUT", "/odom has been silent"),
         ([progress(), *inputs(1, 2)], 0.5, Tone.BAD, "BAD INPUT", "/odom: bad quaternion."),
@@ -196,6 +200,8 @@ def test_an_answer_is_shown_for_a_while():
         (0.5, "m", "50 cm"),
         (12.3, "m", "12 m"),
         (0.001, "rad", "0.057 deg"),
+        (0.0001, "rad", "0.006 deg"),
+        (-0.0003, "m", "-0.3 mm"),
         (float("nan"), "m", ""),
     ],
 )
