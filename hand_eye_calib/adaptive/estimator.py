@@ -173,9 +173,7 @@ def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) ->
     spikes[kept[fewer.spikes]] = True
     weights = np.ones(len(spikes))
     weights[kept] = fewer.weights
-    return dataclasses.replace(
-        fewer, jumps=jumps, spikes=spikes, weights=weights, is_drowned=True
-    )
+    return dataclasses.replace(fewer, jumps=jumps, spikes=spikes, weights=weights, is_drowned=True)
 
 
 @dataclass(frozen=True)

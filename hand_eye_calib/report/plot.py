@@ -11,7 +11,6 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.report.style import (
     BLUE,
-    GREY,
     LIGHT_GREY,
     PAGE_WIDTH,
     VERMILION,
@@ -67,8 +66,7 @@ def plot(calibration: Calibration) -> Figure:
             _draw_residuals(row[0], times_s, size * factor, residuals.is_inlier)
             row[0].set_ylabel(name)
         panels[1, 0].set_xlabel("time (s)")
-        handles, labels = panels[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+        panels[1, 0].legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2, frameon=False)
         for index, unit in enumerate(("cm", "deg")):
             _draw_axes(panels[index, 1], calibration, index, unit)
         figure.suptitle(calibration.headline, fontsize=8, fontweight="bold")
@@ -89,13 +87,13 @@ def _draw_axes(panel: Axes, calibration: Calibration, index: int, unit: str) -> 
     sigmas = [row["sigma"] for row in calibration.rows().values()][3 * index : 3 * index + 3]
     values = np.array(sigmas) * _CM_DEG[index]
     known = np.isfinite(values)
-    longest = 1.25 * values[known].max(initial=_SMALLEST)
-    lengths = np.where(known, values, longest)
+    longest = values[known].max(initial=_SMALLEST)
     colours = [BLUE if is_known else LIGHT_GREY for is_known in known]
-    panel.barh(range(3), lengths, color=colours, height=0.6)
+    panel.barh(range(3), np.where(known, values, longest), color=colours, height=0.6)
     for row, (value, is_known) in enumerate(zip(values, known, strict=True)):
-        text = f"{value:.2g}" if is_known else "unknown"
-        panel.text(0.02 * longest, row, text, va="center", color="white" if is_known else GREY)
-    panel.set(yticks=range(3), yticklabels=names, xlim=(0, longest), title=f"sigma ({unit})")
+        at, text = (value, f"{value:.2g}") if is_known else (0.0, "unknown")
+        panel.text(at + 0.04 * longest, row, text, va="center")
+    limits = (0, 1.5 * longest)
+    panel.set(yticks=range(3), yticklabels=names, xlim=limits, title=f"sigma ({unit})")
     panel.set_xticks([])
     panel.invert_yaxis()
