@@ -91,37 +91,62 @@ class Alarm:
     log_ratio: float
 
 
-@dataclass(frozen=True)
 class _Seconds:
-    """Information of seconds of motion, oldest first: stamps (M,), H (M, 6, 6), S (M, 6)."""
+    """Information of the newest seconds of motion, as running sums; at most MEMORY_S of them."""
 
-    stamps_ns: IntArray
-    H: FloatArray
-    S: FloatArray
+    def __init__(self) -> None:
+        self._stamps_ns = np.zeros(2 * MEMORY_S, dtype=np.int64)
+        self._H = np.zeros((2 * MEMORY_S + 1, 6, 6))
+        self._S = np.zeros((2 * MEMORY_S + 1, 6))
+        self._end = self._count = 0
 
     def __len__(self) -> int:
-        return len(self.stamps_ns)
+        return self._count
 
-    @classmethod
-    def none(cls) -> _Seconds:
-        return cls(np.empty(0, dtype=np.int64), np.empty((0, 6, 6)), np.empty((0, 6)))
+    def add(self, stamp_ns: int, H: FloatArray, S: FloatArray) -> None:
+        """Append a second; the oldest goes if there are too many."""
+        if self._end == 2 * MEMORY_S:
+            self._make_room()
+        self._stamps_ns[self._end] = stamp_ns
+        self._end += 1
+        self._H[self._end] = self._H[self._end - 1] + H
+        self._S[self._end] = self._S[self._end - 1] + S
+        self._count = min(self._count + 1, MEMORY_S)
 
-    def followed_by(self, newer: _Seconds, most: int) -> _Seconds:
-        """Both, without the oldest beyond so many."""
-        return _Seconds(
-            np.concatenate([self.stamps_ns, newer.stamps_ns])[-most:],
-            np.concatenate([self.H, newer.H])[-most:],
-            np.concatenate([self.S, newer.S])[-most:],
-        )
+    def _make_room(self) -> None:
+        start = self._end - self._count
+        self._stamps_ns[: self._count] = self._stamps_ns[start : self._end]
+        for sums in (self._H, self._S):
+            sums[: self._count + 1] = sums[start : self._end + 1] - sums[start]
+        self._end = self._count
 
-    def total(self) -> tuple[FloatArray, FloatArray]:
-        """H and S of all of them."""
-        return self.H.sum(axis=0), self.S.sum(axis=0)
+    def newest(self, lags: IntArray | int) -> tuple[FloatArray, FloatArray]:
+        """H (..., 6, 6) and S (..., 6) of so many of the newest seconds."""
+        start = self._end - lags
+        return self._H[self._end] - self._H[start], self._S[self._end] - self._S[start]
+
+    def oldest(self) -> tuple[FloatArray, FloatArray]:
+        """H (6, 6) and S (6,) of the oldest second."""
+        start = self._end - self._count
+        return self._H[start + 1] - self._H[start], self._S[start + 1] - self._S[start]
+
+    def windows(self, length: int) -> tuple[FloatArray, FloatArray]:
+        """H (w, 6, 6) and S (w, 6) of windows of so many seconds, back from the newest."""
+        edges = self._end - length * np.arange(self._count // length, -1, -1)
+        return np.diff(self._H[edges], axis=0), np.diff(self._S[edges], axis=0)
+
+    def stamp_ns(self, lag: int) -> int:
+        """When the newest so many seconds began."""
+        return int(self._stamps_ns[self._end - min(lag, self._count)])
 
     def answer(self) -> FloatArray:
         """Shift (6,) that all of them together show."""
-        prior = np.linalg.inv(shift_covariance())
-        return np.linalg.solve(self.H.sum(axis=0) + 1e-3 * prior, self.S.sum(axis=0))
+        return _shift_shown(*self.newest(self._count))
+
+
+def _shift_shown(H: FloatArray, S: FloatArray) -> FloatArray:
+    prior = np.linalg.inv(shift_covariance())
+    return np.asarray(np.linalg.solve(H + 1e-3 * prior, S))
 
 
 class MountMonitor:
@@ -154,7 +179,7 @@ class MountMonitor:
         self._noise: FloatArray | None = None
         self._learning: list[tuple[int, MotionPairs]] = []
         self._tail = PosePairs.empty()
-        self._memory = _Seconds.none()
+        self._memory = _Seconds()
         self._centre = np.zeros(6)
         self._last_s = -1
         self._since_alarm = 0
@@ -238,7 +263,7 @@ class MountMonitor:
         self._noise, _ = noise_covariance(residuals)
         for _ in range(2):
             H, S, _ = _information(residuals, jacobians, self._noise)
-            shift = _Seconds(np.zeros(1, dtype=np.int64), H[None], S[None]).answer()
+            shift = _shift_shown(H, S)
             self._noise, _ = noise_covariance(residuals + jacobians @ shift)
         floor = _floor([each for _, each in learned], self._installed)
         self._covariance = self._covariance + floor
@@ -251,12 +276,11 @@ class MountMonitor:
         assert self._noise is not None
         residuals, jacobians = residuals_and_jacobians(motions, self._installed)
         H, S, scatter = _information(residuals, jacobians, self._noise, self._memory_answer())
-        second = _Seconds(np.array([stamp_ns]), H[None], S[None])
         if len(self._memory) == MEMORY_S and self.alarm is None:
             kept = 1.0 - 1.0 / _OLD_MEMORY_S
-            H_old, S_old = self._old
-            self._old = kept * H_old + self._memory.H[0], kept * S_old + self._memory.S[0]
-        self._memory = self._memory.followed_by(second, MEMORY_S)
+            H_oldest, S_oldest = self._memory.oldest()
+            self._old = kept * self._old[0] + H_oldest, kept * self._old[1] + S_oldest
+        self._memory.add(stamp_ns, H, S)
         share = 1.0 / _NOISE_MEMORY_S
         self._noise = (1.0 - share) * self._noise + share * scatter
         self._motions_per_s += (len(motions) - self._motions_per_s) / min(len(self._memory), 100)
@@ -277,7 +301,7 @@ class MountMonitor:
         self._since_alarm += 1
         if self.alarm is not None and self._is_over():
             self.alarm = None
-            self._memory = _Seconds.none()
+            self._memory = _Seconds()
             return None
         lags, H, S, before = self._sums()
         ratios = log_ratio(H, S, 1.0)
@@ -286,10 +310,9 @@ class MountMonitor:
             return None
         covariance = np.linalg.inv(H[best] + np.linalg.inv(shift_covariance(1.0, 1.0)))
         is_new = self.alarm is None
-        stamps_ns = self._memory.stamps_ns
         self.alarm = Alarm(
-            since_ns=int(stamps_ns[-min(lags[best], len(stamps_ns))]),
-            raised_ns=int(stamps_ns[-1]) if self.alarm is None else self.alarm.raised_ns,
+            since_ns=self._memory.stamp_ns(int(lags[best])),
+            raised_ns=self._memory.stamp_ns(1) if self.alarm is None else self.alarm.raised_ns,
             shift=self._to_parent @ covariance @ S[best],
             sigmas=self._sigmas(covariance),
             log_ratio=float(ratios[best]),
@@ -305,11 +328,10 @@ class MountMonitor:
         counted in, and what was before, (l, 6); the last lag is all there is.
         """
         lags = _LAGS[: np.searchsorted(_LAGS, len(self._memory), side="right")]
-        newest_H, newest_S = (
-            np.cumsum(part[::-1], axis=0)[lags - 1] for part in (self._memory.H, self._memory.S)
-        )
+        newest_H, newest_S = self._memory.newest(lags)
         all_H, all_S = (
-            old + part for old, part in zip(self._old, self._memory.total(), strict=True)
+            old + newer
+            for old, newer in zip(self._old, self._memory.newest(len(self._memory)), strict=True)
         )
         H = np.concatenate([newest_H, all_H[None]]) / self.long_run
         S = np.concatenate([newest_S, all_S[None]]) / self.long_run
@@ -324,10 +346,8 @@ class MountMonitor:
     def _is_over(self) -> bool:
         """Whether, over some lag since the alarm, no shift is far more likely than the alarm's."""
         assert self.alarm is not None
-        lags = _LAGS[_LAGS.searchsorted(0) : _LAGS.searchsorted(self._since_alarm)]
-        lags = lags[lags < len(self._memory)]
-        H = np.cumsum(self._memory.H[::-1], axis=0)[lags - 1] / self.long_run
-        S = np.cumsum(self._memory.S[::-1], axis=0)[lags - 1] / self.long_run
+        lags = _LAGS[: np.searchsorted(_LAGS, min(self._since_alarm, len(self._memory)))]
+        H, S = (part / self.long_run for part in self._memory.newest(lags))
         shift = self._to_parent.T @ self.alarm.shift
         off = S - (H @ self._before_alarm)
         for_shift = off @ shift - 0.5 * np.einsum("i,lij,j->l", shift, H, shift)
@@ -344,9 +364,10 @@ class MountMonitor:
         if self.is_learning:
             return np.full(6, np.inf)
         H_old, _ = self._old
-        known = (H_old + self._memory.H.sum(axis=0)) / self.long_run
+        H, _ = self._memory.newest(len(self._memory))
+        known = (H_old + H) / self.long_run
         before = np.linalg.inv(np.linalg.inv(self._covariance) + known) + self._wander
-        H = self._memory.H.mean(axis=0)
+        H /= len(self._memory)
         H[:3, :3] -= self._motions_per_s * self._information_of_noise()
         H *= seconds / self.long_run
         scale = np.sqrt(np.diag(shift_covariance(100.0, np.pi)))
@@ -414,16 +435,15 @@ def _long_run_variance(memory: _Seconds, known: float) -> float:
     """Long-run variance of the scores in units of the information: the largest over windows of
     several lengths, each about the answer of all; what is known while there are too few.
     """
-    centred = memory.S - memory.H @ memory.answer()
+    answer = memory.answer()
     ridge = 1e-3 * np.linalg.inv(shift_covariance())
     found = []
     for length in _WINDOWS:
         n_windows = len(memory) // length
         if n_windows < _FEWEST_WINDOWS:
             break
-        edges = len(memory) - length * np.arange(n_windows, 0, -1)
-        H = np.add.reduceat(memory.H, edges)
-        S = np.add.reduceat(centred, edges)
+        H, S = memory.windows(length)
+        S = S - H @ answer
         squared = (S * np.linalg.solve(H + ridge, S[..., None])[..., 0]).sum(axis=1)
         seen = np.minimum(squared, _MOST_OF_TYPICAL * np.median(squared)).sum() / 6
         found.append((seen + _ASSUMED_WINDOWS * _ASSUMED) / (n_windows + _ASSUMED_WINDOWS))
