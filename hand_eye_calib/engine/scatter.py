@@ -19,6 +19,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import OtherAnswers
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.verdict import FEWEST_INLIERS
 
 # Fewest other answers that have a scatter.
 _MIN_OTHERS = 3
@@ -121,8 +122,9 @@ def compare_answers(
     calibration : Calibration
         The result.
     others : sequence of Calibration
-        From other methods and references. Only methods that reject outliers count: with jumps, the
-        others disagree for a reason that says nothing about the result.
+        From other methods and references. Only those count that reject outliers, and do not reject
+        a large part of the motion pairs: the others disagree for a reason that says nothing about
+        the result.
     halves : sequence of Calibration
         From the first and the second half of the recording, or fewer.
 
@@ -130,7 +132,7 @@ def compare_answers(
     -------
     CrossCheck
     """
-    robust = [other for other in others if METHODS[other.method].rejects_outliers]
+    robust = [other for other in others if _is_sound(other)]
     of_methods, excess_of_methods = _scatter(calibration, robust)
     of_halves = excess_of_halves = np.full(6, np.nan)
     if len(halves) == 2:
@@ -167,6 +169,11 @@ def _scatter(
     allowed = np.array([joint for _, joint in distances])
     apart[:, np.isfinite(apart).sum(axis=0) < _MIN_OTHERS] = np.nan
     return _median(apart) / _MEDIAN_OF_NORMAL, _median(apart / allowed) / _MEDIAN_OF_NORMAL
+
+
+def _is_sound(other: Calibration) -> bool:
+    share = other.n_inliers / max(other.n_pairs, 1)
+    return METHODS[other.method].rejects_outliers and share >= FEWEST_INLIERS
 
 
 def _over_own(calibration: Calibration, others: Sequence[Calibration]) -> FloatArray:
