@@ -1,7 +1,7 @@
 """Load, soak and crashes of the node, measured.
 
     OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [ipopt] [slow] [share] [busy] [watch]
-    [solver] [soak] [kill] [--seconds 60] [--hours 10] [--kills 20]
+    [monitor] [solver] [soak] [kill] [--seconds 60] [--hours 10] [--kills 20]
 
 load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages
        lost, latency of the callbacks, CPU
@@ -10,6 +10,7 @@ slow   the same while every solve takes two seconds of pure Python
 share  the same with a share of a core for the node and for its solving process (cgroups v1)
 busy   the same while other programs load all cores: messages lost against messages reported lost
 watch  the same while somebody watches, on a terminal and in a browser
+monitor  the same of a node that watches the mount
 solver the same while the solving process is killed again and again
 soak   10 hours of 2 x 100 Hz, simulated, through the engine: memory and solve time hour by hour
 kill   kill -9 of the node at random moments, and resuming: what is lost
@@ -50,7 +51,7 @@ from hand_eye_calib.geometry import se3  # noqa: E402
 from hand_eye_calib.io.journal import read_journal  # noqa: E402
 from hand_eye_calib.io.results import load_result, save_result  # noqa: E402
 
-PARTS = ("load", "ipopt", "slow", "share", "busy", "watch", "solver", "soak", "kill")
+PARTS = ("load", "ipopt", "slow", "share", "busy", "watch", "monitor", "solver", "soak", "kill")
 STREAMS = ("parent", "child")
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 START_NS = 1_700_000_000_000_000_000
@@ -355,19 +356,21 @@ def watcher(node, report, domain):
     return end
 
 
-def watched(folder, seconds):
-    """Rows of the node while somebody watches."""
-    seen = loaded_node(folder, "watch", seconds, disturb=watcher)
-    cost, views = json.loads((folder / "watch.watched").read_text())
-    rows = load(seen)
+def watched(folder, name, seconds, options=()):
+    """Rows of the node while somebody watches, and of a node that watches the mount."""
+    seen = loaded_node(folder, name, seconds, disturb=watcher, more=options)
+    cost, views = json.loads((folder / f"{name}.watched").read_text())
+    rows = load(seen, solves="monitor" not in dict(options))
     return [*rows, ("watch: CPU (cores), views", f"{cost:.3f}, {views}", "views > 5", views > 5)]
 
 
-def loaded_node(folder, name, seconds, backend="fast", disturb=None, **environment):
+def loaded_node(folder, name, seconds, backend="fast", disturb=None, more=(), **environment):
     """What the node saw of two streams at 400 Hz.
 
     Parameters
     ----------
+    more : mapping
+        Other parameters.
     disturb : callable, optional
         Given the node's process, its report and the domain, makes life hard for the node; returns
         what undoes that.
@@ -383,6 +386,7 @@ def loaded_node(folder, name, seconds, backend="fast", disturb=None, **environme
         "output_directory": folder / name,
         "report": "false",  # it would load the machine in the next part
     }
+    options |= dict(more)
     parameters = [
         word for option, value in options.items() for word in ("-p", f"{option}:={value}")
     ]
@@ -404,7 +408,7 @@ def loaded_node(folder, name, seconds, backend="fast", disturb=None, **environme
     return seen | {"published": 2 * n_poses, "ended_s": ended_s, "code": code}
 
 
-def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
+def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False, solves=True):
     """Rows (what, value, promise, kept) of the node under load."""
     latency, duration = seen["latency"], seen["duration"]
     lost, reported = seen["published"] - seen["received"], seen["lost_as_reported"]
@@ -422,7 +426,12 @@ def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
         ),
         ("callback p50 / p99 / p99.9 / max (ms)", _ms(duration), "", True),
         ("CPU (cores)", f"{seen['cpu']:.2f}", "", True),
-        ("solves", str(seen["solves"]), promise and "> 0", may_lose or seen["solves"] > 0),
+        (
+            "solves",
+            str(seen["solves"]),
+            "> 0" if promise and solves else "",
+            may_lose or not solves or seen["solves"] > 0,
+        ),
         ("pairs, inliers of the last", f"{seen['pairs']}, {seen['inliers']}", "", True),
         ("error of the last (mm)", f"{1000 * (seen['error_m'] or 0):.2f}", "", True),
         ("end after Ctrl-C (s), code", f"{seen['ended_s']:.2f}, {code}", "code 0", code == 0),
@@ -434,6 +443,12 @@ def solver(folder, seconds):
     seen = loaded_node(folder, "solver", seconds, disturb=solver_killer)
     killed = int((folder / "solver.killed").read_text())
     return [*load(seen), ("solving process killed", str(killed), "20", killed == 20)]
+
+
+def in_words(T):
+    """X Y Z ROLL PITCH YAW, as the parameter installed takes it."""
+    values = (*T[:3, 3], *se3.rotation_to_rpy(T[:3, :3]))
+    return " ".join(f"{value:.9f}" for value in values)
 
 
 def _ms(values):
@@ -689,7 +704,13 @@ def main(arguments):
                 ),
                 may_lose=True,
             ),
-            "watch": lambda: watched(folder, options.seconds),
+            "watch": lambda: watched(folder, "watch", options.seconds),
+            "monitor": lambda: watched(
+                folder,
+                "monitor",
+                options.seconds,
+                {"monitor": "true", "installed": f'"{in_words(T_PARENT_CHILD)}"'},
+            ),
             "solver": lambda: solver(folder, options.seconds),
             "soak": lambda: soak(options.hours),
             "kill": lambda: kill(folder, options.kills),

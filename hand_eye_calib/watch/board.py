@@ -387,7 +387,7 @@ def _values(node: _Node) -> Iterator[tuple[str, str]]:
 
 # ------------------------------------------------- health, verdict, comparison
 
-_PARTS = ("parent input", "child input", "stream checks", "mount", "journal")
+_PARTS = ("parent input", "child input", "stream checks", "journal")
 _TONES = {OK: Tone.GOOD, WARN: Tone.ACT}
 
 
@@ -437,16 +437,15 @@ def _comparison(values: Mapping[str, str]) -> Line:
 
 
 def _watched(axis: str, values: Mapping[str, str]) -> Line:
-    """Whether an axis of a watched mount has moved, or which change of it would be seen."""
+    """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
     unit = AXES[axis]
     shift, sigma = _number(values, f"shift.{axis}"), _number(values, f"shift_sigma.{axis}")
     if abs(shift) > _CLEARLY * sigma:
         return Line(Tone.BAD, axis, f"moved by {small(shift, unit)} ± {small(sigma, unit)}")
     visible = _number(values, f"visible_10min.{axis}")
     if math.isfinite(visible):
-        shown = f"ten minutes of motion would show a change of {small(visible, unit)}"
-        return Line(Tone.GOOD, axis, shown)
-    return Line(Tone.UNKNOWN, axis, "cannot be watched with the motion so far")
+        return Line(Tone.GOOD, axis, f"a change of {small(visible, unit)}")
+    return Line(Tone.UNKNOWN, axis, "nothing yet")
 
 
 def _difference(axis: str, values: Mapping[str, str]) -> str:

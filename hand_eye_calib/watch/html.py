@@ -18,7 +18,9 @@ def fragment(view: View) -> str:
             f"{escape(view.word)}</h1><p>{escape(view.sentence)}</p></section>",
             _answer(view.answer),
             _section("axes", "precision against the target", map(_bar, view.bars)),
-            _section("axes", "the mount, axis by axis", map(_line, view.watched)),
+            _section(
+                "axes", "the mount: what ten minutes of motion would show", map(_line, view.watched)
+            ),
             _section("pose", view.title, _pose(view)),
             _section("health", "result and inputs", _health(view)),
         )

@@ -24,6 +24,7 @@ _WIDE = 76
 _HIGH = 30
 
 KEYS = "s solve   w save   r reset   q quit"
+WATCHING_KEYS = "q quit"
 
 
 def screen(view: View, width: int, height: int, footer: str = "") -> RenderableType:
@@ -43,12 +44,16 @@ def screen(view: View, width: int, height: int, footer: str = "") -> RenderableT
     if view.answer is not None:
         parts += [_lines((view.answer,)), *space]
     parts += [_bars(view, width), *space, *_pose(view), *space] if view.bars else []
-    parts += [_lines(view.watched), *space] if view.watched else []
+    if view.watched:
+        title = Text("the mount: what ten minutes of motion would show", style="dim")
+        parts += [title, _lines(view.watched), *space]
     parts.append(_lines((*view.result, *view.health)))
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
-    title = f"hand_eye_calib watch {view.node}".rstrip()
-    keys = Text(" " + "   ".join(filter(None, (KEYS, footer))), style="dim")
-    body = Panel(Group(*parts), title=Text(title), title_align="left")
+    name = f"hand_eye_calib watch {view.node}".rstrip()
+    keys = Text(
+        " " + "   ".join(filter(None, (KEYS if view.bars else WATCHING_KEYS, footer))), style="dim"
+    )
+    body = Panel(Group(*parts), title=Text(name), title_align="left")
     return Group(keys, *([_choices(view)] if len(view.nodes) > 1 else []), body)
 
 

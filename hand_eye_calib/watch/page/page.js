@@ -4,6 +4,7 @@
 const address = new URLSearchParams(location.search);
 const view = document.getElementById("view");
 const connection = document.getElementById("connection");
+const footer = document.querySelector("footer");
 const buttons = document.querySelectorAll("button");
 
 // The server sends something every second. A connection that is silent for longer is opened anew:
@@ -23,6 +24,8 @@ function show(isLive) {
 
 function put(html) {
   view.innerHTML = html;
+  // A node that only watches the mount has no bars, and nothing to solve, save or reset.
+  footer.hidden = view.querySelector("progress") === null;
   const word = view.querySelector("h1").textContent;
   // Who drives does not look at the page: let the phone shake when it says something else.
   if (word !== document.title && navigator.vibrate) navigator.vibrate([200, 100, 200]);
