@@ -40,10 +40,11 @@ EXPERIMENTS = {
     "repeats": "study: stated sigmas against the spread of repeats on real recordings",
     "unlike": "study: simulations unlike the paper's (--data simulated)",
     "certificate": "study: which answers are proved to be global minima",
+    "faults": "study: faults on purpose, what is found and what the verdict is",
     "all": "all figures and tables of the paper, its conclusions and our findings",
 }
 
-STUDIES = ("adaptive", "repeats", "unlike", "certificate")
+STUDIES = ("adaptive", "repeats", "unlike", "certificate", "faults")
 
 _EPILOG = (
     "\n".join(f"{name:<13}{about}" for name, about in EXPERIMENTS.items())
@@ -125,8 +126,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the experiment; returns the exit code."""
     from reproduction.catalogue import Experiment
 
-    source, theirs = _sources(arguments)
     jobs = _cores() if arguments.jobs is None else arguments.jobs
+    if arguments.id == "faults":
+        return _run_faults(arguments, jobs)
+    source, theirs = _sources(arguments)
     if jobs < 1:
         raise ConfigError(f"--jobs must be at least 1; got {jobs}")
     if arguments.page is not None and arguments.id not in STUDIES:
@@ -146,6 +149,17 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.json
         else _text(document, files)
     )
+    return 0
+
+
+def _run_faults(arguments: argparse.Namespace, jobs: int) -> int:
+    """Run the study of faults, which has recordings of its own; returns the exit code."""
+    from reproduction import faults
+
+    folder = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
+    folder = Path(folder) if folder else None
+    with _progress(len(faults.cases(folder))) as advance:
+        print(faults.run(folder, arguments.out, arguments.page, jobs, advance))
     return 0
 
 

@@ -366,3 +366,123 @@ FAULTS = (
     Fault("clock", "child's clock", (0.02, 0.05, 0.2), late, "s", frozenset({"time_offset"})),
     Fault("S15", "jumps", (0.003, 0.01, 0.03), jumping, "share", frozenset({"jumps"})),
 )
+
+
+# ------------------------------------------- faults that no limit was set with
+
+
+def upright(parent: Trajectory, child: Trajectory, share: float, random: Any) -> Streams:
+    """Orientations with yaw only, or with a share less of roll and pitch."""
+    angles = Rotation.from_matrix(child.poses[:, :3, :3]).as_euler("ZYX")
+    angles[:, 1:] *= 1.0 - share
+    return parent, with_poses(child, Rotation.from_euler("ZYX", angles).as_matrix())
+
+
+def rounded_stamps(parent: Trajectory, child: Trajectory, step_s: float, random: Any) -> Streams:
+    """Stamps cut to a coarse clock; of equal ones the first."""
+    step_ns = round(step_s * 1e9)
+    stamps_ns, first = np.unique(child.stamps_ns // step_ns * step_ns, return_index=True)
+    return parent, Trajectory(stamps_ns, child.poses[first])
+
+
+def repeated(parent: Trajectory, child: Trajectory, share: float, random: Any) -> Streams:
+    """The last share of the child's recording is a copy of the part before it."""
+    n = int(share * len(child))
+    poses = child.poses.copy()
+    poses[-n:] = poses[-2 * n : -n]
+    return parent, dataclasses.replace(child, poses=poses)
+
+
+def restarted(parent: Trajectory, child: Trajectory, gap_s: float, random: Any) -> Streams:
+    """The child's world starts anew half-way, after a gap."""
+    half = len(child) // 2
+    poses = child.poses.copy()
+    poses[half:] = se3.inverse(poses[half]) @ poses[half:]
+    gone = (child.stamps_ns > child.stamps_ns[half]) & (
+        child.stamps_ns < child.stamps_ns[half] + gap_s * 1e9
+    )
+    return parent, Trajectory(child.stamps_ns[~gone], poses[~gone])
+
+
+def flipped(parent: Trajectory, child: Trajectory, part: float, random: Any) -> Streams:
+    """One component of every quaternion has the wrong sign: as in left-handed axes."""
+    quats = se3.to_quat_xyzw(child.poses)
+    quats[:, int(part)] *= -1.0
+    return parent, Trajectory(child.stamps_ns, se3.from_quat_xyzw(child.poses[:, :3, 3], quats))
+
+
+def slow_clock(parent: Trajectory, child: Trajectory, drift_s: float, random: Any) -> Streams:
+    """The child's latency grows from zero over the recording."""
+    elapsed = child.stamps_ns - child.stamps_ns[0]
+    late = (elapsed * (drift_s / (elapsed[-1] * 1e-9))).astype(np.int64)
+    return parent, Trajectory(child.stamps_ns + late, child.poses)
+
+
+def smooth_parent(parent: Trajectory, child: Trajectory, tau_s: float, random: Any) -> Streams:
+    """The parent's orientations are low-passed and shifted back by the delay."""
+    late = with_poses(parent, _low_passed_rotations(parent, tau_s))
+    back = late.shifted(-tau_s).at(parent.stamps_ns, extrapolate=True)
+    return with_poses(parent, back[:, :3, :3]), child
+
+
+def in_unit(parent: Trajectory, child: Trajectory, factor: float, random: Any) -> Streams:
+    """Lengths in another unit."""
+    return parent, child.scaled(factor)
+
+
+def degrees_as_radians(parent: Trajectory, child: Trajectory, which: float, random: Any) -> Streams:
+    """Euler angles in degrees that are read as radians: all, yaw only, or roll and pitch only."""
+    angles = Rotation.from_matrix(child.poses[:, :3, :3]).as_euler("ZYX")
+    parts = {0.0: slice(None), 1.0: slice(0, 1), 2.0: slice(1, 3)}[which]
+    angles[:, parts] = np.degrees(angles[:, parts])
+    return parent, with_poses(child, Rotation.from_euler("ZYX", angles).as_matrix())
+
+
+def remounted(parent: Trajectory, child: Trajectory, degrees: float, random: Any) -> Streams:
+    """Two recordings, a minute apart, with another mount and other worlds in the second."""
+    _, moved = loosened(parent, child, degrees, random)
+    worlds = [se3.exp(random.standard_normal(6)) for _ in range(2)]
+    half_ns = child.stamps_ns[len(child) // 2]
+
+    def second(stream: Trajectory, world: FloatArray) -> Trajectory:
+        is_late = stream.stamps_ns >= half_ns
+        poses = stream.poses.copy()
+        poses[is_late] = world @ poses[is_late]
+        return Trajectory(stream.stamps_ns + 60_000_000_000 * is_late, poses)
+
+    return second(parent, worlds[0]), second(moved, worlds[1])
+
+
+def held(parent: Trajectory, child: Trajectory, interval_s: float, random: Any) -> Streams:
+    """A slow source published fast: each pose is repeated until there is a new one."""
+    elapsed_s = (child.stamps_ns - child.stamps_ns[0]) * 1e-9
+    steps = (elapsed_s / interval_s).astype(int)
+    first = np.unique(steps, return_index=True)[1]
+    return parent, dataclasses.replace(child, poses=child.poses[first[steps]])
+
+
+def mixed(parent: Trajectory, child: Trajectory, metres: float, random: Any) -> Streams:
+    """Two sensors on one topic, in no order."""
+    offset = se3.from_rotation_translation(np.eye(3), [metres, 0.0, 0.0])
+    is_other = random.random(len(child)) < 0.5
+    poses = child.poses.copy()
+    poses[is_other] = poses[is_other] @ offset
+    return parent, dataclasses.replace(child, poses=poses)
+
+
+_ANY = frozenset({"*"})
+
+UNTUNED = (
+    Fault("U1", "orientations with yaw only", (0.2, 0.5, 1.0), upright, "share", _ANY),
+    Fault("U2", "coarse stamps", (0.01, 0.05, 0.1), rounded_stamps, "s", _ANY),
+    Fault("U3", "part of the child repeated", (0.1, 0.25, 0.5), repeated, "share", _ANY),
+    Fault("U4", "child restarted half-way", (0.0, 1.0, 10.0), restarted, "s gap", _ANY),
+    Fault("U5", "quaternion with one wrong sign", (0.0, 1.0, 2.0), flipped, "(part)", _ANY),
+    Fault("U6", "latency that grows", (0.02, 0.05, 0.2), slow_clock, "s", _ANY),
+    Fault("U7", "parent's orientations smoothed", (0.05, 0.1, 0.2), smooth_parent, "s", _ANY),
+    Fault("U8", "another unit", (100.0, 1000.0, 3.28084), in_unit, "", _ANY),
+    Fault("U9", "degrees read as radians", (0.0, 1.0, 2.0), degrees_as_radians, "(which)", _ANY),
+    Fault("U10", "two recordings, remounted", (1.0, 2.0, 5.0), remounted, "deg", _ANY),
+    Fault("U11", "poses held", (0.1, 0.2, 0.5), held, "s", _ANY),
+    Fault("U12", "two sensors, no order", (0.03, 0.1, 0.3), mixed, "m", _ANY),
+)
