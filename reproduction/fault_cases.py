@@ -30,7 +30,7 @@ class Fault:
     what : str
         What is wrong, in words.
     severities : tuple
-        Three values, the weakest first.
+        Three values, the weakest first; one if it has no degrees.
     damage : callable
         Damages (parent, child, severity, generator).
     unit : str

@@ -40,7 +40,7 @@ _TANGO = ("tango_caligula_mars", "tango_mars_nero")
 _LIMIT_Z = 3.0
 
 # Poses are downsampled to so many for the solves; the checks see all.
-_MAX_PAIRS = 800
+_MAX_PAIRS = 400
 
 _NO_ANSWER = "no answer"
 
@@ -101,7 +101,7 @@ def run(
             file.write(json.dumps(asdict(found)) + "\n")
             file.flush()
             advance(found.key)
-    text = report([known[case.key] for case in cases(folder)], false_alarms(folder))
+    text = report(list(known.values()), false_alarms(folder))
     (out / "faults.md").write_text(text, encoding="utf-8")
     if page is not None:
         put_into_page(page, "faults", text)
@@ -122,17 +122,18 @@ def recordings(folder: Path | None) -> list[str]:
 
 def cases(folder: Path | None) -> list[Case]:
     """All cases of the study."""
-    found = []
-    for recording in recordings(folder):
-        for method in METHODS:
-            of_all = {"recording": recording, "method": method}
-            found.append(Case(fault="clean", severity=0, **of_all))
-            found += [
-                Case(fault=fault.code, severity=severity, **of_all)
-                for fault in (*FAULTS, *UNTUNED)
-                for severity in range(len(fault.severities))
-            ]
-    return found
+    return [
+        Case(fault=code, severity=severity, recording=recording, method=method)
+        for code, count in _severities().items()
+        for severity in range(count)
+        for recording in recordings(folder)
+        for method in METHODS
+    ]
+
+
+def _severities() -> dict[str, int]:
+    """Number of severities of each fault, and one of no fault."""
+    return {"clean": 1} | {fault.code: len(fault.severities) for fault in (*FAULTS, *UNTUNED)}
 
 
 def outcome(case: Case, folder: Path | None) -> Outcome:

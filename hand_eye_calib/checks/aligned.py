@@ -10,13 +10,14 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.mount_change import find_change, information
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Finding, Severity
-from hand_eye_calib.checks.response import Quantity, Response, response, rotation_gains
+from hand_eye_calib.checks.response import Response, response, rotation_gains
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 
-# Significance that every one of these findings needs, in standard deviations.
-_SIGMAS = 6.0
+# Significance that every one of these findings needs, in standard deviations, and how many times it
+# must exceed what noise may make of it.
+_SIGMAS, _SMOOTHING_SIGMAS, _BIASES = 6.0, 8.0, 2.0
 
 # Two frames are one if they are this close (m, rad), within their standard deviations, which must
 # not be larger than these.
@@ -25,16 +26,16 @@ _MAX_SIGMA_M, _MAX_SIGMA_RAD = 0.01, float(np.radians(0.5))
 _WITHIN = 3.0
 
 # Gains of rotations, less 1, from which on there is a warning, an error.
-# They must exceed what noise makes of them.
-_GAIN_WARNING, _GAIN_ERROR, _BIASES = 0.003, 0.015, 3.0
+_GAIN_WARNING, _GAIN_ERROR = 0.003, 0.03
 
 # Delays of positions against orientations (s, intervals of the poses), and smoothing (s^2, squared
 # intervals), from which on they count.
-_DELAY_S, _DELAY_INTERVALS = 0.035, 0.35
-_SMOOTHING_S2, _SMOOTHING_INTERVALS2 = 0.002, 0.1
+_DELAY_S, _DELAY_INTERVALS = 0.02, 0.2
+_SMOOTHING_S2, _SMOOTHING_INTERVALS2 = {"position": 0.004, "rotation": 0.002}, 0.1
 
-# Shifts (m) by a delay or by smoothing from which on a result is unusable.
-_SHIFT_ERROR_M = 0.03
+# Shifts (m) by a delay or by smoothing from which on they count, and from which on a result is
+# unusable.
+_SHIFT_M, _SHIFT_ERROR_M = 0.008, 0.03
 
 # Shifts of the mount (m, rad) from which on they count, and from which on a result is unusable.
 _MOVED_M, _MOVED_RAD = 0.005, float(np.radians(0.2))
@@ -111,23 +112,22 @@ def _check_response(found: Response) -> list[Finding]:
     """Findings about delays and smoothing of one part of the poses."""
     late = found.position_delay
     shift_m = abs(late.value) * found.rms_speed
-    if _counts(late, max(_DELAY_S, _DELAY_INTERVALS * found.interval_s)):
+    least_s = max(_DELAY_S, _DELAY_INTERVALS * found.interval_s, _SIGMAS * late.sigma)
+    if abs(late.value) > least_s and shift_m > _SHIFT_M:
         return [wording.position_clock(late, shift_m, _severity(shift_m))]
-    least = _SMOOTHING_S2 + _SMOOTHING_INTERVALS2 * found.interval_s**2
-    for part in ("position", "rotation"):
+    for part, least_s2 in _SMOOTHING_S2.items():
+        least = least_s2 + _SMOOTHING_INTERVALS2 * found.interval_s**2
         smoothing = getattr(found, f"{part}_smoothing")
         for stream in ("child", "parent"):
             quantity = getattr(smoothing, stream)
-            if not quantity.exceeds(least, _SIGMAS):
+            if not quantity.exceeds(least + _BIASES * quantity.bias, _SMOOTHING_SIGMAS):
                 continue
             shift_m = float(np.sqrt(quantity.value)) * found.rms_speed
+            if shift_m < _SHIFT_M:
+                continue
             name = {"position": "positions", "rotation": "orientations"}[part]
             return [wording.smoothed(name, stream, quantity, _severity(shift_m), shift_m)]
     return []
-
-
-def _counts(quantity: Quantity, least: float) -> bool:
-    return abs(quantity.value) > max(least, _SIGMAS * quantity.sigma)
 
 
 def _severity(shift_m: float) -> Severity:

@@ -40,7 +40,7 @@ _DELAY_STEP_S, _N_DELAYS = 0.05, 5
 
 # Instants of a stencil may be off by this share of a step.
 _TOLERANCE = 0.3
-_MAX_INSTANTS, _MIN_INSTANTS = 1500, 60
+_MAX_INSTANTS, _MIN_INSTANTS = 1500, 150
 _BLOCKS = 10
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
@@ -67,8 +67,8 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Gain(Quantity):
-    """A gain, and by how much noise of the rotations may make it too small."""
+class Biased(Quantity):
+    """A value, its standard deviation, and by how much noise of the rotations may push it."""
 
     bias: float
 
@@ -77,8 +77,8 @@ class Gain(Quantity):
 class Smoothing:
     """By how much each stream is smoothed: c in s^2."""
 
-    parent: Quantity
-    child: Quantity
+    parent: Biased
+    child: Biased
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class Response:
     rms_speed: float
 
 
-def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Gain, ...], FloatArray]:
+def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Biased, ...], FloatArray]:
     """Factors of the child's rotations about the principal axes of the motion, the axis with the
     most rotation first, and those axes in the parent sensor's frame, as columns.
 
@@ -127,7 +127,7 @@ def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Gain, ...],
     # Little rotation beside much may come from an axis that is slightly off.
     biases = np.where(squared < _LITTLE**2 * squared[0], 1.0, variance / (squared + 1e-300))
     gains = zip(found.values, found.sigmas, biases, strict=False)
-    return tuple(Gain(1.0 + value, sigma, bias) for value, sigma, bias in gains), axes
+    return tuple(Biased(1.0 + value, sigma, bias) for value, sigma, bias in gains), axes
 
 
 def response(
@@ -148,8 +148,9 @@ def response(
     if stencil is None:
         return None
     R = T_parent_child[:3, :3]
-    delay, of_rotations = _rotations(pose_pairs, stencil, R, np.eye(3) if gain is None else gain)
-    late, of_positions = _positions(pose_pairs, stencil, R)
+    gain = np.eye(3) if gain is None else gain
+    delay, of_rotations, variance = _rotations(pose_pairs, stencil, R, gain)
+    late, of_positions = _positions(pose_pairs, stencil, R, variance)
     p = pose_pairs.Ts_pw_p[:, :3, 3]
     speeds = np.linalg.norm(p[stencil.at[2]] - p[stencil.at[-2]], axis=1) / (4 * stencil.step_s)
     return Response(
@@ -205,8 +206,10 @@ class _Stencil:
 
 def _rotations(
     pose_pairs: PosePairs, stencil: _Stencil, R: FloatArray, gain: FloatArray
-) -> tuple[Quantity, Smoothing]:
-    """Delay and smoothing of the child's orientations."""
+) -> tuple[Quantity, Smoothing, float]:
+    """Delay and smoothing of the child's orientations, and variance of what remains (rad^2 per
+    axis).
+    """
     turns, bends, changes = [], [], []
     for poses, to_parent in ((pose_pairs.Ts_pw_p, np.eye(3)), (pose_pairs.Ts_cw_c, R)):
         angles = _Angles(poses[:, :3, :3], stencil.at, to_parent)
@@ -234,7 +237,8 @@ def _rotations(
         )
         for change, bend in zip(changes, bends, strict=True)
     ]
-    return found[0].quantity(3), _smoothing(found[0].quantity(4), found[1].quantity(4))
+    smoothing = _smoothing(found[0].quantity(4), found[1].quantity(4), 0.0)
+    return found[0].quantity(3), smoothing, found[0].sigma ** 2
 
 
 @dataclass(frozen=True)
@@ -251,15 +255,22 @@ class _Angles:
         return se3.rotation_log(np.swapaxes(start, 1, 2) @ end) @ self.to_parent.T
 
 
-def _smoothing(by_parent: Quantity, by_child: Quantity) -> Smoothing:
+def _smoothing(by_parent: Quantity, by_child: Quantity, bias: float) -> Smoothing:
     """A smoother parent is a child that is less smooth."""
-    return Smoothing(parent=Quantity(-by_parent.value, by_parent.sigma), child=by_child)
+    return Smoothing(
+        parent=Biased(-by_parent.value, by_parent.sigma, bias),
+        child=Biased(by_child.value, by_child.sigma, bias),
+    )
 
 
 def _positions(
-    pose_pairs: PosePairs, stencil: _Stencil, R: FloatArray
+    pose_pairs: PosePairs, stencil: _Stencil, R: FloatArray, variance: float
 ) -> tuple[Quantity, Smoothing]:
-    """Delay and smoothing of the child's positions."""
+    """Delay and smoothing of the child's positions.
+
+    Noise of the parent's orientations moves a long lever arm more than a short one, which would
+    favour delays with a short one. It has half of the ``variance`` of the rotations.
+    """
     at, step_s = stencil.at, stencil.step_s
     parent = _Displacements(pose_pairs.Ts_pw_p, np.eye(3), at)
     child = _Displacements(pose_pairs.Ts_cw_c, R, at)
@@ -268,27 +279,38 @@ def _positions(
     chords = np.swapaxes(rotations[at[0]], 1, 2) @ (rotations[at[2]] - rotations[at[-2]])
     base = np.concatenate([chords, -se3.skew(x)], axis=2)
     delays = np.arange(-_N_DELAYS, _N_DELAYS + 1)
-    tried = [_regress(base, child.over(2, int(k) * stencil.delay) - x) for k in delays]
-    costs = np.array([found.block_costs for found in tried])
-    delay = _best_delay(costs, stencil.delay * stencil.interval_s)
-    best = int(np.argmin(costs.sum(axis=1)))
-    shift = int(delays[best]) * stencil.delay
-    target = child.over(2, shift) - x
+    targets = [child.over(2, int(k) * stencil.delay) - x for k in delays]
+    tried = [_regress(base, target, variance=variance) for target in targets]
+    best = int(np.argmin([found.less_noise().sum() for found in tried]))
+    # With the weights of the best, costs are a parabola.
+    weights = tried[best].weights
+    weighted = [_regress(base, target, weights, variance) for target in targets]
+    costs = np.array([found.less_noise() for found in weighted])
+    delay = _best_delay(costs, best, stencil.delay * stencil.interval_s)
+    shift, target = int(delays[best]) * stencil.delay, targets[best]
+    bends = [bend / (3 * step_s**2) for bend in (parent.bend(0), child.bend(shift))]
     smoothing = [
         _regress(
-            np.concatenate([base, bend[:, :, None] / (3 * step_s**2)], axis=2), target
+            np.concatenate([base, bend[:, :, None]], axis=2), target, variance=variance
         ).quantity(6)
-        for bend in (parent.bend(0), child.bend(shift))
+        for bend in bends
     ]
-    return delay, _smoothing(*smoothing)
+    # The same noise of an orientation turns a displacement and its bend.
+    bias = variance * _rms(x) / max(_rms(bends[0]), 1e-12)
+    return delay, _smoothing(smoothing[0], smoothing[1], bias)
 
 
-def _best_delay(costs: FloatArray, step_s: float) -> Quantity:
-    """Vertex of the parabola through the costs (delays, blocks) around the smallest, with the
-    jackknife over blocks.
+def _rms(vectors: FloatArray) -> float:
+    """Robust root mean square length."""
+    return float(np.median(np.linalg.norm(vectors, axis=1)))
+
+
+def _best_delay(costs: FloatArray, best: int, step_s: float) -> Quantity:
+    """Vertex of the parabola through the costs (delays, blocks) around the best, with the jackknife
+    over blocks.
     """
     total = costs.sum(axis=1)
-    middle = int(np.clip(np.argmin(total), 1, len(total) - 2))
+    middle = int(np.clip(best, 1, len(total) - 2))
 
     def vertex(sums: FloatArray) -> float:
         below, top, above = sums[middle - 1 : middle + 2]
@@ -315,8 +337,8 @@ class _Displacements:
     def _p(self, k: int, shift: int) -> FloatArray:
         return self.poses[self.at[k] + shift, :3, 3]
 
-    def _in_body(self, vectors: FloatArray) -> FloatArray:
-        rotations = self.poses[self.at[0], :3, :3]
+    def _in_body(self, vectors: FloatArray, k: int = 0) -> FloatArray:
+        rotations = self.poses[self.at[k], :3, :3]
         return np.einsum("kji,kj->ki", rotations, vectors) @ self.to_parent.T
 
     def over(self, k: int, shift: int = 0) -> FloatArray:
@@ -325,44 +347,78 @@ class _Displacements:
 
     def bend(self, shift: int) -> FloatArray:
         """Difference of the accelerations at both ends of :meth:`over` two steps, times 3 steps
-        squared, from other poses than those ends.
+        squared, from other poses than those ends, and turned by other orientations.
         """
         ahead = self._p(4, shift) - self._p(3, shift) - self._p(1, shift) + self._p(0, shift)
         behind = self._p(0, shift) - self._p(-1, shift) - self._p(-3, shift) + self._p(-4, shift)
-        return self._in_body(ahead - behind)
+        bend = ahead - behind
+        return 0.5 * (self._in_body(bend, -1) + self._in_body(bend, 1))
 
 
 @dataclass(frozen=True)
 class _Regression:
-    """Values and standard deviations (m,), and the robust cost of each block of time."""
+    """Values and standard deviations (m,), the robust cost of each block of time, the weights (K,)
+    and their sum in each block, the standard deviation of what remains, and what noise adds to the
+    products (3, 3) of the first three columns.
+    """
 
     values: FloatArray
     sigmas: FloatArray
     block_costs: FloatArray
+    weights: FloatArray
+    block_weights: FloatArray
+    sigma: float
+    of_noise: FloatArray
+
+    def less_noise(self) -> FloatArray:
+        """Cost of each block without what noise of rotations makes of a lever arm, the first three
+        values.
+        """
+        lever_arm = self.values[:3]
+        of_noise = float(lever_arm @ self.of_noise @ lever_arm)
+        return self.block_costs - of_noise * self.block_weights / self.block_weights.sum()
 
     def quantity(self, k: int) -> Quantity:
         return Quantity(float(self.values[k]), float(self.sigmas[k]))
 
 
-def _regress(columns: FloatArray, target: FloatArray) -> _Regression:
-    """Robust linear regression of (K, 3) on (K, 3, m), with the jackknife over blocks of time."""
+def _regress(
+    columns: FloatArray,
+    target: FloatArray,
+    given: FloatArray | None = None,
+    variance: float = 0.0,
+) -> _Regression:
+    """Robust linear regression of (K, 3) on (K, 3, m), with the jackknife over blocks of time; not
+    robust, but weighted, with given weights. ``variance`` is that of noise in the first three
+    columns, which would make their values too small.
+    """
     K, _, m = columns.shape
     flat = np.concatenate([columns, target[:, :, None]], axis=2)
     edges = np.linspace(0, K, _BLOCKS + 1).astype(int)[:-1]
     products = np.einsum("kai,kaj->kij", flat, flat).reshape(K, -1)
-    weights = np.ones(K)
-    for _ in range(_ROUNDS):
+    weights = np.ones(K) if given is None else given
+    for _ in range(_ROUNDS if given is None else 1):
         blocks = np.add.reduceat(products * weights[:, None], edges).reshape(_BLOCKS, m + 1, m + 1)
         total = blocks.sum(axis=0)
         ridge = np.diag(1e-9 * np.diag(total)[:m] + 1e-300)
+        of_noise = _of_noise(total[:3, :3], variance * weights.sum())
+        ridge[:3, :3] -= of_noise
         values = np.linalg.solve(total[:m, :m] + ridge, total[:m, m])
         lengths = np.linalg.norm(target - columns @ values, axis=1)
         sigma = max(float(np.median(lengths)) / _MEDIAN_LENGTH, 1e-12)
         squared = (lengths / sigma) ** 2 / (3 * _TUNING**2)
-        weights = 1.0 / (1.0 + squared) ** 2
+        weights = 1.0 / (1.0 + squared) ** 2 if given is None else given
     rest = total - blocks
-    left_out = np.linalg.solve(rest[:, :m, :m] + ridge, rest[:, :m, m:])[..., 0]
+    shares = rest[:, :m, :m] + (1.0 - 1.0 / _BLOCKS) * ridge
+    left_out = np.linalg.solve(shares, rest[:, :m, m:])[..., 0]
     spread = left_out - left_out.mean(axis=0)
-    costs = np.add.reduceat(sigma**2 * squared / (1.0 + squared), edges)
+    costs = weights * lengths**2 if given is not None else sigma**2 * squared / (1.0 + squared)
     sigmas = np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum(axis=0))
-    return _Regression(values, sigmas, costs)
+    block_costs, block_weights = (np.add.reduceat(each, edges) for each in (costs, weights))
+    return _Regression(values, sigmas, block_costs, weights, block_weights, sigma, of_noise)
+
+
+def _of_noise(gram: FloatArray, amount: float) -> FloatArray:
+    """What noise of this amount adds to sums of products (3, 3): at most half of them."""
+    sizes, directions = np.linalg.eigh(gram)
+    return (directions * np.minimum(amount, 0.5 * np.maximum(sizes, 0.0))) @ directions.T
