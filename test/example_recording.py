@@ -18,7 +18,7 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE
 T_LIDAR_CAMERA = se3.from_quat_xyzw(
     np.array([0.4, 0.0, 1.85]), Rotation.from_euler("z", -90, degrees=True).as_quat()
 )
-_POSES = 400
+_POSES = 250
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _ROBOT = """\
 <robot name="robot">
