@@ -1,6 +1,6 @@
 """Frames that are fixed to each other: a tree of static transforms."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,9 +8,23 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
 
 # Frames that are listed in a message.
 _MOST_LISTED = 20
+
+
+def checked_pose(position: Sequence[float], quat_xyzw: Sequence[float]) -> FloatArray:
+    """Pose (4, 4) of a transform as it comes from outside.
+
+    Raises
+    ------
+    InputError
+        If it is not finite, or the quaternion is not of unit length.
+    """
+    stamps_ns = np.zeros(1, dtype=np.int64)
+    poses = Trajectory.from_quat_xyzw(stamps_ns, np.array([position]), np.array([quat_xyzw])).poses
+    return np.asarray(poses[0])
 
 
 @dataclass(frozen=True)

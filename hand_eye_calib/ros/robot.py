@@ -9,9 +9,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import HandEyeCalibError, InputError, printable
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
-from hand_eye_calib.geometry.frames import Frames
+from hand_eye_calib.geometry.frames import Frames, checked_pose
 from hand_eye_calib.io.installed import of_frames, read_installed
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.tf import STATIC_TOPIC, message_type
@@ -110,7 +109,7 @@ class Robot:
             quat_xyzw = (rotation.x, rotation.y, rotation.z, rotation.w)
             frame = printable(each.child_frame_id).lstrip("/")
             try:
-                pose = se3.from_quat_xyzw(position, quat_xyzw)
+                pose = checked_pose(position, quat_xyzw)
             except HandEyeCalibError as error:
                 self._report(f"{STATIC_TOPIC} has an unusable transform of {frame}: {error}")
                 continue

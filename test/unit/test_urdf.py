@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bag_making import TF, tf_message, write_messages
 
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
@@ -109,3 +110,31 @@ def test_installed_from_numbers_and_descriptions(urdf):
         read_installed("robot.urdf", "lidar", "camera")
     with pytest.raises(InputError, match="no frame 'radar'"):
         read_installed(str(urdf), "lidar", "radar")
+
+
+class TestBag:
+    """What is installed, from the static transforms of a bag."""
+
+    def bag(self, path, *edges):
+        messages = [
+            (number, "/tf_static", TF, tf_message([(0, *edge)]))
+            for number, edge in enumerate(edges, start=1)
+        ]
+        return write_messages(path / "bag", messages)
+
+    def test_its_last_static_transforms_count(self, tmp_path):
+        T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+        bag = self.bag(
+            tmp_path, ("base", "lidar", T), ("base", "camera", T), ("base", "camera", T @ T)
+        )
+        found = read_installed(str(bag), "lidar", "camera")
+        np.testing.assert_allclose(found.T_parent_child, T, atol=1e-12)
+        with pytest.raises(InputError, match="no frame 'radar'; found base, camera, lidar"):
+            read_installed(str(bag), "lidar", "radar")
+
+    def test_a_transform_that_is_none_is_an_error_in_one_line(self, tmp_path):
+        T = np.eye(4)
+        T[0, 3] = np.nan
+        bag = self.bag(tmp_path, ("base", "lidar", T))
+        with pytest.raises(InputError, match="not finite"):
+            read_installed(str(bag), "base", "lidar")

@@ -12,7 +12,7 @@ from hand_eye_calib.arrays import BoolArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import Frames
+from hand_eye_calib.geometry.frames import Frames, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.blocks import (
     Message,
@@ -397,9 +397,8 @@ class PoseBag:
         for transform, is_static, _ in self._transforms():
             tree.note(transform, is_static)
             if is_static:
-                poses[transform.sensor_frame or ""] = se3.from_quat_xyzw(
-                    transform.position, transform.quat_xyzw
-                )
+                pose = checked_pose(transform.position, transform.quat_xyzw)
+                poses[transform.sensor_frame or ""] = pose
         fixed = {
             frame: (edge.parent, poses[frame])
             for frame, edge in tree.edges.items()
