@@ -39,6 +39,9 @@ SHIFTS = {
 _BEFORE_S, _AFTER_S = 900.0, 1800.0
 _DRIVE_S = 360.0
 
+# The monitor takes no more poses a second than this.
+_RATE_HZ = 10.0
+
 _SECOND_NS = 1_000_000_000
 _MOUNT_SEED = 11
 
@@ -73,7 +76,8 @@ class Delay:
 
 def pieces(name: str, seed: int, X: FloatArray, duration_s: float) -> Iterator[PosePairs]:
     """Synchronised poses of a class that follow each other, with this extrinsic."""
-    kind = dataclasses.replace(CLASSES[name], duration_s=min(duration_s, PIECE_S))
+    rate_hz = min(CLASSES[name].rate_hz, _RATE_HZ)
+    kind = dataclasses.replace(CLASSES[name], duration_s=min(duration_s, PIECE_S), rate_hz=rate_hz)
     for number in range(round(duration_s / kind.duration_s)):
         made = simulate(kind, (_MOUNT_SEED, seed, number, sorted(CLASSES).index(name)))
         child = dataclasses.replace(

@@ -89,11 +89,12 @@ def _earliest(kept: Kept, factor: float) -> float:
 
 
 def table(stops: Sequence[Stop]) -> str:
-    """A row per kind and target."""
+    """A row per kind with the default targets, and one for all with each other target."""
     rows = []
     for factor in FACTORS:
         of_factor = [stop for stop in stops if stop.factor == factor]
-        for kind in dict.fromkeys(stop.kind for stop in of_factor):
+        kinds = dict.fromkeys(stop.kind for stop in of_factor if factor == 1.0)
+        for kind in kinds:
             rows.append(_row(kind, factor, [s for s in of_factor if s.kind == kind]))
         rows.append(_row("**all**", factor, of_factor))
     header = (
