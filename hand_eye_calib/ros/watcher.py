@@ -1,10 +1,10 @@
 """Listens to the nodes for ``watch``, and passes the presses of its buttons on."""
 
 import os
+import re
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
-from itertools import groupby
 from types import TracebackType
 from typing import Any, Self
 
@@ -27,6 +27,8 @@ _LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 _DIAGNOSTICS_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+_NODE_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 # A service that has not answered for so long will not (s): a solve takes seconds.
 _PATIENCE_S = 60.0
@@ -92,7 +94,7 @@ class Watcher:
 
     def _take(self, message: DiagnosticArray) -> None:
         now_s = time.monotonic()
-        for node, statuses in _by_node(message.status):
+        for node, statuses in by_node(message.status).items():
             self._board.take(node, statuses, now_s)
             if node not in self._heard:
                 self._heard.add(node)
@@ -130,13 +132,15 @@ class Watcher:
         self._board.answer(*key, good, text, time.monotonic())
 
 
-def _by_node(
-    statuses: Iterable[DiagnosticStatus],
-) -> Iterator[tuple[str, list[Status]]]:
-    """The statuses of each calibrator among those of a message."""
-    ours = [each for each in statuses if each.hardware_id == HARDWARE_ID]
-    for node, group in groupby(ours, key=lambda each: each.name.rpartition(": ")[0]):
-        yield printable(node), [_status(each) for each in group]
+def by_node(statuses: Iterable[DiagnosticStatus]) -> dict[str, list[Status]]:
+    """The statuses of each calibrator among those of a message, by the node's name."""
+    nodes: dict[str, list[Status]] = {}
+    for each in statuses:
+        node = each.name.rpartition(": ")[0]
+        # Anybody may publish anything: services and topics must be possible below the name.
+        if each.hardware_id == HARDWARE_ID and _NODE_NAME.fullmatch(node):
+            nodes.setdefault(node, []).append(_status(each))
+    return nodes
 
 
 def _status(message: DiagnosticStatus) -> Status:

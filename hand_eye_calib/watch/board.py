@@ -363,7 +363,11 @@ def _short(value: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds, or minutes."""
+    """Seconds, minutes or hours."""
+    if seconds >= 86_400:
+        return "more than a day"
+    if seconds >= 5400:
+        return f"{seconds / 3600:.0f} h"
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 

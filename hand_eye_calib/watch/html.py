@@ -21,8 +21,10 @@ def fragment(view: View) -> str:
             _section(
                 "axes", "the mount: what ten minutes of motion would show", map(_line, view.watched)
             ),
+            '<div class="side">',
             _section("pose", view.title, _pose(view)),
             _section("health", "result and inputs", _health(view)),
+            "</div>",
         )
     )
 

@@ -211,7 +211,9 @@ def test_small_lengths_and_angles(value, unit, text):
 
 
 def test_durations():
-    assert (duration(89), duration(120)) == ("89 s", "2 min")
+    assert [duration(seconds) for seconds in (89, 120, 7200, 1e300)] == [
+        *("89 s", "2 min", "2 h", "more than a day"),
+    ]
 
 
 # -------------------------------------------------------------------- terminal
