@@ -83,11 +83,11 @@ def draw_all(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "methods": _methods,
         "halves": _halves,
     }
-    with _page_style():
+    with page_style():
         drawn = {name: make(calibration, evidence) for name, make in makers.items()}
         names = (calibration.parent_frame, calibration.child_frame)
         drawn["streams"] = _streams(evidence.streams, names)
-        return {name: _svg(figure, name) for name, figure in drawn.items() if figure}
+        return {name: as_svg(figure, name) for name, figure in drawn.items() if figure}
 
 
 def draw_streams(seen: StreamView, names: tuple[str, str]) -> str:
@@ -99,19 +99,19 @@ def draw_streams(seen: StreamView, names: tuple[str, str]) -> str:
     names : (str, str)
         Of the parent and the child.
     """
-    with _page_style():
-        return _svg(_streams(seen, names), "streams")
+    with page_style():
+        return as_svg(_streams(seen, names), "streams")
 
 
 @contextmanager
-def _page_style() -> Iterator[None]:
+def page_style() -> Iterator[None]:
     with house_style(), drawing_style(_STYLE), warnings.catch_warnings():
         # Text is drawn by the browser, with its own fonts.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         yield
 
 
-def _svg(figure: Figure, name: str) -> str:
+def as_svg(figure: Figure, name: str) -> str:
     """The figure as an element of a page: no prologue, ids of its own, the page's colours."""
     written = io.StringIO()
     figure.savefig(

@@ -14,6 +14,7 @@ from fuzz import bag_inputs, text_inputs
 from fuzz.chaos import Chaos
 
 from hand_eye_calib.cli import batch
+from hand_eye_calib.cli.batch.store import stored
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -124,9 +125,9 @@ def batches(chaos, folder):
         return 2
     for task in tasks:
         target = Path(os.path.normpath(folder / "out" / task.name))
-        if target.parent != folder / "out" or task.name in ("summary.json",):
+        if target.parent != folder / "out" or task.name in ("summary.json", "index.html"):
             raise Finding(f"results of {task.name!r} would go to {target}")
-        batch._stored(task, folder / "out")
+        stored(task, folder / "out")
     return 0
 
 

@@ -75,6 +75,8 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "rosbags": "io/bags/writer.py",
     "backports": "io/bags/decompression.py",
     "lz4": "io/bags/decompression.py",
+    "fsspec": "io/remote.py",
+    "pyarrow": "io/tables.py",
     "pymap3d": "io/trajectory_files/geodetic.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",

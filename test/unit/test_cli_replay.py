@@ -1,24 +1,20 @@
-"""``replay``: sources, listing, convergence, and many bags at once."""
+"""``replay``: sources, listing and convergence."""
 
 import copy
 import json
 import re
-import sys
 
 import numpy as np
 import pytest
-import yaml
 from bag_making import TF, path_message, tf_message, write_messages
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 from published_data import data_folder
 
-from hand_eye_calib.cli import batch
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.journal import ABOUT_NAME, JournalWriter, write_about
-from hand_eye_calib.io.results import load_result
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]
@@ -274,178 +270,6 @@ def test_every_says_why_there_is_no_estimate_yet(run, bag):
     assert "after 0.5 s: no estimate yet, 10 synchronised pose pairs are needed, found 5" in err
 
 
-# ---- many bags
-
-
-@pytest.fixture
-def fleet(tmp_path):
-    """Three drives, a bag that is missing, and the file that names them."""
-    for number in range(3):
-        poses = wandering_poses(60, seed=number)
-        streams = {
-            "/a": (as_trajectory(poses, sensor_frame="lidar"), ODOMETRY),
-            "/b": (as_trajectory(child_of(poses), sensor_frame="camera"), ODOMETRY),
-        }
-        write_bag(tmp_path / "bags" / f"drive{number}", streams)
-    document = {
-        "options": {"reference": "B5"},
-        "parent_topic": "/a",
-        "child_topic": "/b",
-        "bags": [
-            "bags/drive*",
-            {"bag": "absent", "name": "gone"},
-            {"bag": ["bags/drive0"], "name": "again", "options": {"reference": "B1"}},
-        ],
-    }
-    path = tmp_path / "fleet.yaml"
-    path.write_text(yaml.safe_dump(document))
-    return path
-
-
-def assert_is_result_of_the_fleet(code, out, err):
-    summary = json.loads(out)
-    assert code == 1
-    assert summary["failures"] == ["gone"]
-    assert "note: gone failed: no bag at " in err
-    rows = {row["name"]: row for row in summary["results"]}
-    assert list(rows) == ["drive0", "drive1", "drive2", "gone", "again"]
-    for name, row in rows.items():
-        if name != "gone":
-            np.testing.assert_allclose(
-                row["calibration"]["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
-            )
-            assert row["calibration"]["reference"] == ("B1" if name == "again" else "B5")
-
-
-def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, monkeypatch):
-    out_dir = tmp_path / "out"
-    assert_is_result_of_the_fleet(*run("--batch", fleet, "--out", out_dir, "--json", "--jobs", "2"))
-    np.testing.assert_allclose(
-        load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-6
-    )
-    assert (out_dir / "drive1" / "static_transform.launch.py").exists()
-    assert "Both streams before any solve" in (out_dir / "drive1" / "report.html").read_text(
-        encoding="utf-8"
-    )
-    done = []
-    monkeypatch.setattr(batch, "_on_cores", lambda jobs: here(done))
-    code, out, err = run("--batch", fleet, "--out", out_dir, "--json")
-    assert_is_result_of_the_fleet(code, out, err)
-    assert done == ["gone"]
-    assert "4 of 5 bags are done already" in err
-    # Another option or another bag is another task.
-    write_bag(tmp_path / "absent", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)})
-    fleet.write_text(fleet.read_text().replace("B1", "B2"))
-    done.clear()
-    code, out, err = run("--batch", fleet, "--out", out_dir)
-    assert (code, done) == (0, ["gone", "again"])
-    assert re.search(r"^ ?again +ok +0\.\d+ \+/- 0\.\d+ ", out, re.MULTILINE)
-    assert "5 of 5 bags calibrated, 0 failed" in out
-
-
-def here(done):
-    """Stands in for processes: does the work in this one and notes what was done."""
-    from contextlib import nullcontext
-
-    def outcomes(tasks):
-        for task in tasks:
-            done.append(task.name)
-            yield task, batch.work(task)
-
-    return nullcontext(outcomes)
-
-
-def test_a_batch_checks_the_streams_as_a_single_bag_does(run, tmp_path):
-    poses = wandering_poses(300)
-    streams = [
-        as_trajectory(each, sensor_frame=name)
-        for each, name in ((poses, "lidar"), (child_of(poses), "camera"))
-    ]
-    write_bag(
-        tmp_path / "short",
-        {"/a": (streams[0], ODOMETRY), "/b": (streams[1].scaled(1000.0), ODOMETRY)},
-    )
-    fleet = tmp_path / "fleet.yaml"
-    fleet.write_text(yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": ["short"]}))
-    (row,) = json.loads(run("--batch", fleet, "--json", "--jobs", "1")[1])["results"]
-    alone = json.loads(run(tmp_path / "short", *STREAMS, "--json")[1])
-    assert [finding["code"] for finding in row["findings"]] == ["units"]
-    assert row["findings"] == alone["findings"]
-    assert row["calibration"]["warnings"] == alone["warnings"]
-
-
-def test_a_batch_on_a_dask_cluster(run, fleet):
-    distributed = pytest.importorskip(
-        "dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'"
-    )
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
-    ) as cluster:
-        assert_is_result_of_the_fleet(
-            *run("--batch", fleet, "--json", "--dask", cluster.scheduler_address)
-        )
-
-
-def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
-    monkeypatch.setitem(sys.modules, "dask.distributed", None)
-    code, out, err = run("--batch", fleet, "--dask", "tcp://127.0.0.1:1")
-    assert (code, out) == (1, "")
-    assert "pip install 'hand_eye_calib[cluster]'" in err
-
-
-def test_a_defect_in_one_bag_leaves_the_others_alone(fleet, monkeypatch):
-    tasks = batch.read_batch(fleet, {}, {})
-    monkeypatch.setattr(batch, "replay", lambda *_, **__: 1 / 0)
-    outcome = batch.work(tasks[0])
-    assert outcome["error"] == "unexpected ZeroDivisionError: division by zero"
-    assert "ZeroDivisionError" in outcome["traceback"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("3", "expected a list of bags, or a mapping with one under 'bags'"),
-        ("bags: []", "expected a list of bags"),
-        (
-            "[{bag: a, colour: red}]",
-            "entry 1: unknown key 'colour'; known are bag, name, options, parent_topic",
-        ),
-        ("[a, {name: b}]", "entry 2: expected a bag's path or a list of paths; got None"),
-        ("[{bag: a, options: {method: magic}}]", "entry 1: method must be one of"),
-        ("[{bag: a, options: 3}]", "entry 1: options must be a mapping"),
-        ("{bags: [a], parent_tf: odom}", "entry 1: expected two frames as WORLD:SENSOR"),
-    ],
-)
-def test_batch_files_that_are_wrong(run, tmp_path, text, message):
-    path = tmp_path / "fleet.yaml"
-    path.write_text(text)
-    code, out, err = run("--batch", path)
-    assert (code, out) == (2, "")
-    assert message in err
-
-
-def test_a_batch_file_that_cannot_be_read(run, tmp_path):
-    code, _, err = run("--batch", tmp_path / "absent.yaml")
-    assert (code, "cannot read" in err) == (1, True)
-
-
-def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
-    path = tmp_path / "fleet.yaml"
-    path.write_text(
-        "{parent_tf: 'odom:lidar', options: {method: dnl}, bags: [a, {bag: b/a, "
-        "parent_topic: /p, options: {reference: A}}]}"
-    )
-    first, second = batch.read_batch(
-        path, {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"}
-    )
-    assert first.options == {"method": "dnl", "max_gap": 0.3}
-    assert first.sources == {"parent_tf": "odom:lidar", "child_topic": "/c"}
-    assert second.options == {"method": "dnl", "max_gap": 0.3, "reference": "A"}
-    assert second.sources == {"parent_topic": "/p", "child_topic": "/c"}
-    assert (first.name, second.name) == ("a", "b_a")
-    assert first.bags == (str(tmp_path / "a"),)
-
-
 # ---- bags of others
 
 
@@ -467,12 +291,3 @@ def test_every_bag_of_other_programs_is_listed_or_refused_in_one_line(run):
         assert len(err.splitlines()) == 1, err
         refused.append(path.name)
     assert refused == ["empty-file.bag"]
-
-
-def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
-    for folder in ("monday", "tuesday"):
-        (tmp_path / folder / "bag").mkdir(parents=True)
-    path = tmp_path / "fleet.yaml"
-    path.write_text("bags: ['*/bag', other, other, {bag: monday/bag, name: first}]")
-    names = [task.name for task in batch.read_batch(path, {}, {})]
-    assert names == ["monday_bag", "tuesday_bag", "other", "other_2", "first"]

@@ -16,6 +16,7 @@ from motions import as_trajectory, child_of, wandering_poses
 from result_making import calibration
 
 from hand_eye_calib.cli import batch
+from hand_eye_calib.cli.batch.store import stored
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -204,6 +205,9 @@ def bag(tmp_path):
         "{bag: '..'}",
         "{bag: bag/..}",
         "{bag: bag, name: summary.json}",
+        "{bag: bag, name: Index.html}",
+        "{bag: bag, vehicle: {a: b}}",
+        '{bag: bag, vehicle: "a\\e[2Jb"}',
         '{bag: bag, name: "a\\0b"}',
         '{bag: bag, name: "a\\e[2Jb"}',
         "{bag: bag, name: {a: b}}",
@@ -251,7 +255,7 @@ def test_a_damaged_state_of_a_batch_is_done_again(tmp_path, state):
     task = batch.Task(name="a", bags=("absent",))
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "batch.json").write_text(state.replace("K", task.key()))
-    assert batch._stored(task, tmp_path) is None
+    assert stored(task, tmp_path) is None
 
 
 # ---- trajectories as text

@@ -28,6 +28,8 @@ DECLARED_AS = {
     "compression": (None, None),  # the standard library of Python 3.14
     "lz4": (None, None),
     "dask": ("distributed", None),  # optional, for replay --batch --dask alone
+    "fsspec": ("fsspec", None),  # optional, for bags at URLs alone
+    "pyarrow": ("pyarrow", None),  # optional, for Parquet alone
     "pymap3d": ("pymap3d", None),  # optional, for latitude and longitude alone
     "casadi": ("casadi", "casadi-pip"),
     "jinja2": ("jinja2", "python3-jinja2"),

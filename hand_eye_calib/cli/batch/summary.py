@@ -1,0 +1,125 @@
+"""What all recordings say together: rows, recordings of one vehicle compared, the index page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.cli.batch.calibrating import Outcome
+from hand_eye_calib.cli.batch.rows import COLUMNS, Row, row_of
+from hand_eye_calib.cli.batch.store import write
+from hand_eye_calib.cli.batch.tasks import INDEX, SUMMARY, TABLE
+from hand_eye_calib.cli.reporting import REPORT, can_draw, save_page
+from hand_eye_calib.session.agreement import Agreement, Kind, agreement_of, sentence
+
+_FAILURES = (SolveStatus.NOT_CONVERGED, SolveStatus.CONTRADICTED)
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """The recordings of one rig, in the order of time.
+
+    Attributes
+    ----------
+    name : str
+        Empty if the batch file names none.
+    frames : (str, str)
+        Of parent and child.
+    rows : tuple of dict
+    agreement : Agreement
+    sentence : str
+        What the comparison found.
+    """
+
+    name: str
+    frames: tuple[str, str]
+    rows: tuple[Row, ...]
+    agreement: Agreement
+    sentence: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values."""
+        found, names = self.agreement, [row["name"] for row in self.rows]
+        return {
+            "vehicle": self.name,
+            "frames": list(self.frames),
+            "recordings": names,
+            "kind": found.kind.value,
+            "apart": [names[index] for index in found.apart],
+            "sentence": self.sentence,
+            "chi2": found.chi2,
+            "degrees_of_freedom": found.dof,
+            "p_value": found.p_value,
+            "scatter": found.scatter,
+            "T_parent_child": found.T_parent_child.tolist(),
+            "covariance": found.covariance.tolist(),
+        }
+
+
+def vehicles_of(outcomes: Sequence[Outcome]) -> list[Vehicle]:
+    """The calibrated recordings of each vehicle, compared with each other.
+
+    Recordings of other frames are another rig. What failed, and what must not be used, is left out.
+    """
+    groups: dict[tuple[str, tuple[str, str]], list[tuple[Row, Calibration]]] = {}
+    for outcome in outcomes:
+        if outcome["calibration"]:
+            row, calibration = row_of(outcome), Calibration.from_dict(outcome["calibration"])
+            if calibration.status not in _FAILURES:
+                frames = (calibration.parent_frame, calibration.child_frame)
+                groups.setdefault((row["vehicle"], frames), []).append((row, calibration))
+    return [_vehicle(name, frames, group) for (name, frames), group in sorted(groups.items())]
+
+
+def _vehicle(name: str, frames: tuple[str, str], group: list[tuple[Row, Calibration]]) -> Vehicle:
+    ordered = sorted(group, key=lambda one: (one[0]["start_ns"] or 0, one[0]["name"]))
+    rows = tuple(row for row, _ in ordered)
+    found = agreement_of(
+        np.array([calibration.T_parent_child for _, calibration in ordered]),
+        np.array([calibration.covariance_with_floor for _, calibration in ordered]),
+    )
+    return Vehicle(name, frames, rows, found, sentence(found, [row["name"] for row in rows]))
+
+
+def write_summary(
+    directory: Path, batch: str, outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]
+) -> list[Path]:
+    """Write the rows as tables, everything as JSON, and the index page; returns their paths.
+
+    Raises
+    ------
+    InputError
+        If they cannot be written.
+    """
+    from hand_eye_calib.io.tables import write_table
+
+    rows = [row_of(outcome) for outcome in outcomes]
+    write(directory / SUMMARY, document_of(batch, outcomes, vehicles))
+    paths = write_table(directory, Path(TABLE).stem, COLUMNS, rows)
+    if can_draw(INDEX):
+        from hand_eye_calib.report.batch_page import render_batch
+
+        with_report = [(directory / row["name"] / REPORT).exists() for row in rows]
+        page = render_batch(batch, rows, [vars(vehicle) for vehicle in vehicles], with_report)
+        paths.append(save_page(directory / INDEX, page))
+    return paths
+
+
+def document_of(
+    batch: str, outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]
+) -> dict[str, Any]:
+    """Everything as plain values."""
+    return {
+        "batch": batch,
+        "results": list(outcomes),
+        "failures": [outcome["name"] for outcome in outcomes if outcome["error"]],
+        "vehicles": [vehicle.to_dict() for vehicle in vehicles],
+    }
+
+
+def is_apart(vehicle: Vehicle) -> bool:
+    """Whether its recordings contradict each other."""
+    return vehicle.agreement.kind in (Kind.ONE_OFF, Kind.MOVED, Kind.DIFFER)

@@ -1,0 +1,186 @@
+"""Bags in object storage and on web servers: whatever fsspec reaches, such as ``s3://bucket/run_1``,
+``gs://...``, ``https://host/run_1.mcap``.
+
+A bag is copied to a temporary folder, read there, and the copy removed.
+"""
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
+
+from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
+from hand_eye_calib.io.limits import MOST_BAG_FILES
+
+_Plain = TypeVar("_Plain")
+
+_MARK = "://"
+# What a store says of a file that changes if its content does.
+_STATES = (
+    *("ETag", "etag", "md5Hash", "md5", "content_md5", "checksum", "generation"),
+    *("LastModified", "last_modified", "mtime", "updated", "created"),
+)
+# Files of a bag, as their names end.
+_SUFFIXES = (".yaml", ".mcap", ".db3", ".bag", ".zstd")
+
+
+def is_url(path: str) -> bool:
+    """Whether a bag is named by a URL rather than a path."""
+    return _MARK in path
+
+
+def public(url: str) -> str:
+    """A URL without what gives access: user and password, and a signature in its query.
+
+    Paths stay as they are.
+    """
+    if not is_url(url):
+        return url
+    protocol, _, rest = url.partition("?")[0].partition(_MARK)
+    host, slash, path = rest.partition("/")
+    return f"{protocol}{_MARK}{host.rpartition('@')[2]}{slash}{path}"
+
+
+def expanded(pattern: str) -> list[str]:
+    """URLs that a pattern with ``*`` stands for, sorted.
+
+    Raises
+    ------
+    InputError
+        If the store cannot be reached.
+    MissingDependencyError
+        If fsspec, or what it needs for the store, is not installed.
+    """
+    with _reaching(pattern):
+        system, path = _opened(pattern)
+        return sorted(system.unstrip_protocol(found) for found in system.glob(path.rstrip("/")))
+
+
+def states(url: str) -> list[list[str]]:
+    """Name, size and what else the store says of each file of a bag, from which one sees whether it
+    has changed.
+
+    Raises
+    ------
+    InputError
+        If the store cannot be reached, or there is no bag.
+    """
+    with _reaching(url):
+        system, path = _opened(url)
+        files = _files(system, path)
+        return [
+            [name, str(info.get("size")), *(f"{key}={info[key]}" for key in _STATES if key in info)]
+            for name, info in ((name, system.info(name)) for name in files)
+        ]
+
+
+@contextmanager
+def local_copies(
+    paths: Sequence[str],
+) -> Iterator[tuple[list[str], Callable[[_Plain], _Plain]]]:
+    """Paths of the same bags on this machine; what is remote is copied for as long as the block
+    lasts.
+
+    Yields
+    ------
+    paths : list of str
+    as_given : callable
+        Puts the URLs back into plain values that name the copies.
+
+    Raises
+    ------
+    InputError
+        If a store cannot be reached, or there is no bag.
+    """
+    with tempfile.TemporaryDirectory(prefix="hand_eye_calib_") as folder:
+        urls: dict[str, str] = {}
+        local = []
+        for number, path in enumerate(paths):
+            if is_url(path):
+                copy = str(_copied(path, Path(folder, str(number))))
+                urls[copy] = public(path).rstrip("/")
+                path = copy
+            local.append(path)
+        yield local, lambda value: _renamed(value, urls)
+
+
+def _copied(url: str, folder: Path) -> Path:
+    """Copy the files of a bag into a new folder; returns where it is."""
+    with _reaching(url):
+        system, path = _opened(url)
+        files = _files(system, path)
+        name = _name(path.rstrip("/"))
+        target = folder / name if files == [path] else folder
+        folder.mkdir()
+        for file in files:
+            # The name's last part only: a store does not choose where things go.
+            system.get_file(file, str(folder / _name(file)))
+        return target
+
+
+def _opened(url: str) -> tuple[Any, str]:
+    """The file system of a URL, and the path in it."""
+    try:
+        from fsspec.core import url_to_fs
+    except ModuleNotFoundError:
+        raise MissingDependencyError(
+            f"{public(url)} needs the package fsspec, which is not installed: "
+            "pip install 'hand_eye_calib[fleet]'"
+        ) from None
+    try:
+        system, path = url_to_fs(url)
+    except ImportError as error:
+        raise MissingDependencyError(f"cannot read {public(url)}: {error}") from None
+    return system, str(path)
+
+
+def _files(system: Any, path: str) -> list[str]:
+    """Paths of the files of a bag."""
+    if PurePosixPath(_name(path)).suffix in _SUFFIXES:
+        return [path]
+    listed = system.ls(path, detail=True)
+    names = [entry["name"] for entry in listed if entry.get("type") == "file"]
+    files = sorted(name for name in names if PurePosixPath(_name(name)).suffix in _SUFFIXES)
+    if not files:
+        raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
+    if len(files) > MOST_BAG_FILES:
+        raise InputError(f"more than {MOST_BAG_FILES} files; read them in parts")
+    return files
+
+
+def _name(path: str) -> str:
+    """Last part of a path, without the query of a URL."""
+    return PurePosixPath(path.partition("?")[0]).name
+
+
+@contextmanager
+def _reaching(url: str) -> Iterator[None]:
+    """Turn whatever a store answers into one line.
+
+    Each kind of store has errors of its own. Only code of fsspec runs inside, so no defect of the
+    rest is hidden.
+    """
+    try:
+        yield
+    except MissingDependencyError:
+        raise
+    except HandEyeCalibError as error:
+        raise InputError(f"cannot read {public(url)}: {error}") from None
+    except Exception as error:
+        reason = " ".join([f"{type(error).__name__}:", *str(error).split()]).rstrip(".:")
+        raise InputError(
+            f"cannot read {public(url)}: {reason}; check the address and the permission to read it"
+        ) from error
+
+
+def _renamed(value: Any, names: dict[str, str]) -> Any:
+    """Plain values with some texts in them replaced."""
+    if isinstance(value, dict):
+        return {key: _renamed(item, names) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_renamed(item, names) for item in value]
+    if isinstance(value, str):
+        for old, new in names.items():
+            value = value.replace(old, new)
+    return value

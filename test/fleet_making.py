@@ -1,0 +1,80 @@
+"""Recordings of a fleet, and workers that die: importable by processes of a pool."""
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+from result_making import calibration
+
+from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.cli.batch.calibrating import failed
+from hand_eye_calib.geometry import se3
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+DAY_NS = 86_400_000_000_000
+
+
+def dies_once(task):
+    """Work whose process dies if the task names a file that does not exist yet."""
+    marker = Path(task.options.get("marker", __file__))
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return failed(task, "done")
+
+
+def always_dies(task):
+    """Work whose process dies of the task called bad."""
+    if task.name == "bad":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return failed(task, "done")
+
+
+def recordings_of(seed, count, unknown_z=False):
+    """Extrinsics (N, 4, 4) of one rig as a calibration finds them, and covariances (N, 6, 6)."""
+    random = np.random.default_rng(seed)
+    X = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
+    Ts, covariances = [], []
+    for _ in range(count):
+        root = random.normal(size=(6, 6)) * np.r_[np.full(3, 0.003), np.full(3, 0.001)]
+        covariance = root @ root.T + np.diag([1e-6] * 3 + [1e-8] * 3)
+        T = X @ se3.exp(random.multivariate_normal(np.zeros(6), covariance))
+        if unknown_z:
+            up = T[2, :3].copy()  # of the parent, in the child
+            covariance[:3, :3] += 9.0 * np.outer(up, up)
+            T[2, 3] = 0.0
+        Ts.append(T)
+        covariances.append(covariance)
+    return np.array(Ts), np.array(covariances)
+
+
+def outcome(name, vehicle, T, covariance, day=0):
+    """What a batch keeps of a recording."""
+    sigmas = np.sqrt(np.diag(covariance)).tolist()
+    found = calibration(
+        T_parent_child=T,
+        covariance=covariance,
+        status=SolveStatus.OK,
+        observability=tuple(
+            DofObservability(axis, DofVerdict.OBSERVED, sigma)
+            for axis, sigma in zip(AXES, sigmas, strict=True)
+        ),
+        warnings=(),
+        child_frame="camera",
+    )
+    stamps = {"first_stamp_ns": day * DAY_NS + 1, "last_stamp_ns": day * DAY_NS + 10**10 + 1}
+    return {
+        "name": name,
+        "vehicle": vehicle,
+        "bags": [f"bags/{name}"],
+        "calibration": found.to_dict(),
+        "findings": [],
+        "inputs": {"parent": stamps, "child": stamps},
+        "error": None,
+    }
+
+
+def calibration_of(outcome_):
+    """The calibration that an outcome has."""
+    return Calibration.from_dict(outcome_["calibration"])

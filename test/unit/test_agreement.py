@@ -1,0 +1,81 @@
+"""Results of one rig agree, scatter, or have one among them that does not belong there."""
+
+import numpy as np
+import pytest
+from fleet_making import recordings_of
+
+from hand_eye_calib.assessment.metrics import deviation
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.session.agreement import Kind, agreement_of, sentence
+
+
+def turned(Ts, indices, by):
+    Ts = Ts.copy()
+    Ts[indices] = se3.exp(np.array([0, 0, 0, 0, 0, by])) @ Ts[indices]
+    return Ts
+
+
+@pytest.mark.parametrize("unknown_z", [False, True])
+@pytest.mark.parametrize("count", [2, 3, 8, 30])
+def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
+    found = [agreement_of(*recordings_of(seed, count, unknown_z)) for seed in range(40 if count < 10 else 15)]
+    alarms = sum(one.kind is not Kind.AGREE for one in found)
+    assert alarms <= 4  # 0.8 expected, 5 or more once in 800
+    p_values = np.array([one.p_value for one in found])
+    assert 0.35 < p_values.mean() < 0.65
+    assert all(one.dof == (5 if unknown_z else 6) * (count - 1) for one in found)
+
+
+def test_the_common_extrinsic_is_better_than_each_and_says_how_good():
+    X = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
+    distances = []
+    for seed in range(100):
+        found = agreement_of(*recordings_of(seed, 5))
+        error = deviation(found.T_parent_child, X)
+        distances.append(error @ np.linalg.solve(found.covariance, error))
+    assert 5.0 < np.mean(distances) < 7.0  # 6 expected, 0.35 its standard error
+
+
+@pytest.mark.parametrize("unknown_z", [False, True])
+@pytest.mark.parametrize(
+    ("apart", "kind"),
+    [([4], Kind.ONE_OFF), ([0], Kind.ONE_OFF), ([7], Kind.ONE_OFF), ([5, 6, 7], Kind.MOVED)],
+)
+def test_which_one_is_off_and_since_when(apart, kind, unknown_z):
+    for seed in range(10):
+        Ts, covariances = recordings_of(seed, 8, unknown_z)
+        found = agreement_of(turned(Ts, apart, 0.06), covariances)
+        assert (found.kind, list(found.apart)) == (kind, apart)
+        error = (found.difference[5] - 0.06) / found.difference_sigmas[5]
+        assert abs(error) < 4
+        assert np.isnan(found.difference[2]) == unknown_z
+        assert found.p_value < 1e-6
+
+
+def test_results_that_all_scatter_more_than_stated_accuse_none():
+    kinds = []
+    for seed in range(20):
+        Ts, covariances = recordings_of(seed, 12)
+        kinds.append(agreement_of(Ts, covariances / 4).kind)
+        if kinds[-1] is Kind.SCATTER:
+            assert 1.5 < agreement_of(Ts, covariances / 4).scatter < 2.5
+    assert kinds.count(Kind.SCATTER) >= 19
+
+
+def test_of_two_that_differ_none_is_accused():
+    Ts, covariances = recordings_of(3, 2)
+    found = agreement_of(turned(Ts, [1], 0.06), covariances)
+    assert (found.kind, found.apart) == (Kind.DIFFER, ())
+    assert sentence(found, ["a", "b"]).startswith("a and b do not agree (chi-square ")
+
+
+def test_a_single_result_and_one_that_knows_nothing():
+    Ts, covariances = recordings_of(3, 2)
+    found = agreement_of(Ts[:1], covariances[:1])
+    assert (found.kind, found.dof, found.p_value) == (Kind.SINGLE, 0, 1.0)
+    np.testing.assert_allclose(found.T_parent_child, Ts[0])
+    covariances[1] = np.diag([np.inf] * 6)
+    found = agreement_of(Ts, covariances)
+    assert (found.kind, found.dof) == (Kind.AGREE, 0)
+    np.testing.assert_allclose(found.T_parent_child, Ts[0], atol=1e-9)
+    assert np.isnan(found.deviations[1]).all()

@@ -1,0 +1,502 @@
+"""``replay --batch``: many recordings, wherever they are and wherever the work is done; what they
+say together.
+"""
+
+import csv
+import functools
+import http.server
+import json
+import re
+import sys
+import threading
+
+import numpy as np
+import pytest
+import yaml
+from fleet_making import always_dies, dies_once, outcome, recordings_of
+from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+
+from hand_eye_calib.cli import batch
+from hand_eye_calib.cli.batch import calibrating
+from hand_eye_calib.cli.batch import run as batch_run
+from hand_eye_calib.cli.batch.rows import COLUMNS, content_hash, row_of
+from hand_eye_calib.cli.batch.summary import vehicles_of
+from hand_eye_calib.cli.batch.workers import on_cores, on_dask
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io import remote
+from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.results import load_result
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]
+
+
+@pytest.fixture
+def run(capsys):
+    """Runs replay in this process; returns exit code, stdout and stderr."""
+
+    def call(*arguments):
+        try:
+            code = main(["replay", *map(str, arguments)])
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def write_drive(path, n_poses, seed):
+    """A bag without noise."""
+    poses = wandering_poses(n_poses, seed=seed)
+    streams = {
+        "/a": (as_trajectory(poses, sensor_frame="lidar"), ODOMETRY),
+        "/b": (as_trajectory(child_of(poses), sensor_frame="camera"), ODOMETRY),
+    }
+    write_bag(path, streams)
+
+
+@pytest.fixture
+def fleet(tmp_path):
+    """Three drives, a bag that is missing, and the file that names them."""
+    for number in range(3):
+        write_drive(tmp_path / "bags" / f"drive{number}", 60, number)
+    document = {
+        "options": {"reference": "B5"},
+        "parent_topic": "/a",
+        "child_topic": "/b",
+        "bags": [
+            "bags/drive*",
+            {"bag": "absent", "name": "gone"},
+            {"bag": ["bags/drive0"], "name": "again", "options": {"reference": "B1"}},
+        ],
+    }
+    path = tmp_path / "fleet.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def assert_is_result_of_the_fleet(code, out, err):
+    summary = json.loads(out)
+    assert code == 1
+    assert summary["failures"] == ["gone"]
+    assert "note: gone failed: no bag at " in err
+    rows = {row["name"]: row for row in summary["results"]}
+    assert list(rows) == ["drive0", "drive1", "drive2", "gone", "again"]
+    for name, row in rows.items():
+        if name != "gone":
+            np.testing.assert_allclose(
+                row["calibration"]["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+            )
+            assert row["calibration"]["reference"] == ("B1" if name == "again" else "B5")
+
+
+def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, monkeypatch):
+    out_dir = tmp_path / "out"
+    assert_is_result_of_the_fleet(*run("--batch", fleet, "--out", out_dir, "--json", "--jobs", "2"))
+    np.testing.assert_allclose(
+        load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-6
+    )
+    assert (out_dir / "drive1" / "static_transform.launch.py").exists()
+    assert "Both streams before any solve" in (out_dir / "drive1" / "report.html").read_text(
+        encoding="utf-8"
+    )
+    page = (out_dir / "index.html").read_text(encoding="utf-8")
+    assert page.count('href="drive1/report.html"') == 1
+    assert 'href="gone/' not in page
+    done = []
+    monkeypatch.setattr(batch_run, "on_cores", lambda jobs: here(done))
+    code, out, err = run("--batch", fleet, "--out", out_dir, "--json")
+    assert_is_result_of_the_fleet(code, out, err)
+    assert done == ["gone"]
+    assert "4 of 5 bags are done already" in err
+    # Another option or another bag is another task.
+    write_drive(tmp_path / "absent", 100, seed=7)
+    fleet.write_text(fleet.read_text().replace("B1", "B2"))
+    done.clear()
+    code, out, err = run("--batch", fleet, "--out", out_dir)
+    assert (code, done) == (0, ["gone", "again"])
+    assert re.search(r"^ ?again +USE[A-Z ]* +0\.\d+ \+/- 0\.\d+ ", out, re.MULTILINE)
+    assert "5 of 5 bags calibrated, 0 failed" in out
+
+
+def here(done):
+    """Stands in for processes: does the work in this one and notes what was done."""
+    from contextlib import nullcontext
+
+    def outcomes(tasks):
+        for task in tasks:
+            done.append(task.name)
+            yield task, batch.work(task)
+
+    return nullcontext(outcomes)
+
+
+def test_a_batch_checks_the_streams_as_a_single_bag_does(run, tmp_path):
+    poses = wandering_poses(300)
+    streams = [
+        as_trajectory(each, sensor_frame=name)
+        for each, name in ((poses, "lidar"), (child_of(poses), "camera"))
+    ]
+    write_bag(
+        tmp_path / "short",
+        {"/a": (streams[0], ODOMETRY), "/b": (streams[1].scaled(1000.0), ODOMETRY)},
+    )
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text(yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": ["short"]}))
+    (row,) = json.loads(run("--batch", fleet, "--json", "--jobs", "1")[1])["results"]
+    alone = json.loads(run(tmp_path / "short", *STREAMS, "--json")[1])
+    assert [finding["code"] for finding in row["findings"]] == ["units"]
+    assert row["findings"] == alone["findings"]
+    assert row["calibration"]["warnings"] == alone["warnings"]
+
+
+def test_a_batch_on_a_dask_cluster(run, fleet):
+    distributed = pytest.importorskip(
+        "dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'"
+    )
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+    ) as cluster:
+        assert_is_result_of_the_fleet(
+            *run("--batch", fleet, "--json", "--dask", cluster.scheduler_address)
+        )
+
+
+def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    code, out, err = run("--batch", fleet, "--dask", "tcp://127.0.0.1:1")
+    assert (code, out) == (1, "")
+    assert "pip install 'hand_eye_calib[cluster]'" in err
+
+
+def test_a_defect_in_one_bag_leaves_the_others_alone(fleet, monkeypatch):
+    tasks = batch.read_batch(fleet, {}, {})
+    monkeypatch.setattr(calibrating, "replay", lambda *_, **__: 1 / 0)
+    outcome = batch.work(tasks[0])
+    assert outcome["error"] == "unexpected ZeroDivisionError: division by zero"
+    assert "ZeroDivisionError" in outcome["traceback"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("3", "expected a list of bags, or a mapping with one under 'bags'"),
+        ("bags: []", "expected a list of bags"),
+        (
+            "[{bag: a, colour: red}]",
+            "entry 1: unknown key 'colour'; known are bag, name, vehicle, options, parent_topic",
+        ),
+        ("[a, {name: b}]", "entry 2: expected a bag's path or a list of paths; got None"),
+        ("[{bag: a, options: {method: magic}}]", "entry 1: method must be one of"),
+        ("[{bag: a, options: 3}]", "entry 1: options must be a mapping"),
+        ("{bags: [a], parent_tf: odom}", "entry 1: expected two frames as WORLD:SENSOR"),
+    ],
+)
+def test_batch_files_that_are_wrong(run, tmp_path, text, message):
+    path = tmp_path / "fleet.yaml"
+    path.write_text(text)
+    code, out, err = run("--batch", path)
+    assert (code, out) == (2, "")
+    assert message in err
+
+
+def test_a_batch_file_that_cannot_be_read(run, tmp_path):
+    code, _, err = run("--batch", tmp_path / "absent.yaml")
+    assert (code, "cannot read" in err) == (1, True)
+
+
+def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
+    path = tmp_path / "fleet.yaml"
+    path.write_text(
+        "{parent_tf: 'odom:lidar', options: {method: dnl}, bags: [a, {bag: b/a, "
+        "parent_topic: /p, options: {reference: A}}]}"
+    )
+    first, second = batch.read_batch(
+        path, {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"}
+    )
+    assert first.options == {"method": "dnl", "max_gap": 0.3}
+    assert first.sources == {"parent_tf": "odom:lidar", "child_topic": "/c"}
+    assert second.options == {"method": "dnl", "max_gap": 0.3, "reference": "A"}
+    assert second.sources == {"parent_topic": "/p", "child_topic": "/c"}
+    assert (first.name, second.name) == ("a", "b")
+    assert first.bags == (str(tmp_path / "a"),)
+
+
+def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
+    for folder in ("monday", "tuesday"):
+        (tmp_path / folder / "bag").mkdir(parents=True)
+    path = tmp_path / "fleet.yaml"
+    path.write_text("bags: ['*/bag', other, other, {bag: monday/bag, name: first}]")
+    names = [task.name for task in batch.read_batch(path, {}, {})]
+    assert names == ["monday", "tuesday", "other", "other_2", "first"]
+
+
+@pytest.mark.parametrize(
+    ("bags", "names"),
+    [
+        (["a/monday/bag", "b/monday/bag", "b/tuesday/bag"], ["a_monday", "b_monday", "b_tuesday"]),
+        (["a/monday/bag", "b/monday/bag"], ["a", "b"]),
+        (["bag", "deep/bag"], ["bag", "deep"]),
+        (["x/run.mcap", "y/run.bag"], ["x", "y"]),
+        (["one.mcap", "two.mcap"], ["one", "two"]),
+        (["a/one", "b/two"], ["one", "two"]),
+        (["s3://fleet/t1/run.mcap?sig=a/b", "s3://fleet/t2/run.mcap"], ["t1", "t2"]),
+    ],
+)
+def test_names_come_from_the_folders_that_differ(tmp_path, bags, names):
+    path = tmp_path / "fleet.yaml"
+    path.write_text(yaml.safe_dump({"bags": bags}))
+    assert [task.name for task in batch.read_batch(path, {}, {})] == names
+
+
+# ---- workers
+
+
+def tasks_of(*names, **options):
+    return [batch.Task(name=name, bags=(), options=options.get(name, {})) for name in names]
+
+
+def done_by(workers, tasks):
+    with workers as do:
+        return {task.name: found["error"] for task, found in do(tasks)}
+
+
+NAMES = ("a", "b", "c", "d", "bad")
+
+
+def test_what_a_worker_that_dies_had_to_do_is_done_again(tmp_path):
+    tasks = tasks_of(*NAMES, b={"marker": str(tmp_path / "marker")})
+    assert done_by(on_cores(2, dies_once), tasks) == dict.fromkeys(NAMES, "done")
+    assert (tmp_path / "marker").exists()
+
+
+def test_a_recording_of_which_workers_die_takes_no_other_along():
+    found = done_by(on_cores(2, always_dies), tasks_of(*NAMES))
+    assert found.pop("bad") == "worker processes die of it, perhaps for lack of memory"
+    assert found == dict.fromkeys(NAMES[:-1], "done")
+
+
+def test_a_dask_cluster_does_what_a_worker_that_dies_had_to_do(tmp_path):
+    distributed = pytest.importorskip(
+        "dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'"
+    )
+    tasks = tasks_of(*NAMES, b={"marker": str(tmp_path / "marker")})
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        found = done_by(on_dask(cluster.scheduler_address, dies_once), tasks)
+    assert found == dict.fromkeys(NAMES, "done")
+    assert (tmp_path / "marker").exists()
+
+
+# ---- rows
+
+
+def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path, monkeypatch):
+    monkeypatch.setattr(batch_run, "can_draw", lambda _: False)  # no reports: they take long
+    tables = {}
+    for jobs in ("1", "2"):
+        out_dir = tmp_path / jobs
+        code, _, err = run("--batch", fleet, "--out", out_dir, "--jobs", jobs)
+        assert code == 1
+        tables[jobs] = (out_dir / "rows.csv").read_text()
+        assert f"wrote {out_dir / 'rows.csv'}" in err
+    assert tables["1"] == tables["2"]
+    rows = list(csv.DictReader(tables["1"].splitlines()))
+    assert [row["name"] for row in rows] == ["drive0", "drive1", "drive2", "gone", "again"]
+    assert list(rows[0]) == list(COLUMNS)
+    assert rows[0]["start"] == "2023-11-14T22:13:20+00:00"
+    assert rows[0]["sha256"] == rows[4]["sha256"] != rows[1]["sha256"]
+    assert (rows[3]["x_m"], rows[3]["error"][:10]) == ("", "no bag at ")
+    np.testing.assert_allclose(float(rows[0]["z_m"]), T_PARENT_CHILD[2, 3], atol=1e-6)
+    pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    table = pq.read_table(tmp_path / "1" / "rows.parquet").to_pylist()
+    assert [row["x_m"] for row in table[:3]] == [float(row["x_m"]) for row in rows[:3]]
+    assert table[3]["x_m"] is None
+    page = (tmp_path / "1" / "index.html").read_text(encoding="utf-8")
+    assert "report.html" not in page
+    assert "The 4 recordings agree within their standard deviations" in page
+
+
+def test_the_digest_of_a_recording_is_that_of_sha256sum():
+    one = {"file": "a/run.mcap", "sha256": "aa", "bytes": 1}
+    assert content_hash([one]) == "aa"
+    two = {"file": "https://host/b/metadata.yaml", "sha256": "bb", "bytes": 1}
+    # printf 'bb  metadata.yaml\naa  run.mcap\n' | sha256sum
+    assert content_hash([one, two]) == content_hash([two, one])
+    assert content_hash([one, two]).startswith("d82160c1")
+
+
+def test_a_cell_cannot_become_a_formula(tmp_path):
+    from hand_eye_calib.io.tables import write_table
+
+    write_table(tmp_path, "rows", {"name": str, "x": float}, [{"name": "=1+1", "x": -1.5}])
+    assert (tmp_path / "rows.csv").read_text() == "name,x\n'=1+1,-1.5\n"
+
+
+# ---- bags at URLs
+
+
+def outcomes_of(path, bags, **common):
+    path.write_text(
+        yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": bags, **common})
+    )
+    tasks = batch.read_batch(path, {"reference": "B5"}, {}, with_fingerprints=True)
+    return tasks, [batch.work(task) for task in tasks]
+
+
+@pytest.fixture
+def memory(tmp_path):
+    """A store with two bags in folders."""
+    fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed: '.[fleet]'")
+    store = fsspec.filesystem("memory")
+    for number in range(2):
+        write_drive(tmp_path / f"drive{number}", 60, number)
+        store.put(f"{tmp_path}/drive{number}/", f"/fleet/run{number}/drive", recursive=True)
+    yield store
+    store.rm("/fleet", recursive=True)
+
+
+def test_bags_in_a_store_give_what_they_give_here(tmp_path, memory):
+    _, local = outcomes_of(tmp_path / "fleet.yaml", ["drive0", "drive1"])
+    tasks, remotely = outcomes_of(tmp_path / "fleet.yaml", ["memory://fleet/*/drive"])
+    assert [task.name for task in tasks] == ["run0", "run1"]
+    for here, there, task in zip(local, remotely, tasks, strict=True):
+        assert there["error"] is None
+        assert there["calibration"] == here["calibration"]
+        assert there["inputs"]["bag"] == task.bags[0] == f"memory:///fleet/{task.name}/drive"
+        files = [file["file"] for file in there["inputs"]["files"]]
+        assert all(file.startswith(task.bags[0] + "/") for file in files)
+        assert row_of(there)["sha256"] == row_of(here)["sha256"]
+
+
+def test_a_bag_that_changes_in_its_store_is_done_again(tmp_path, memory):
+    (task, _), _ = outcomes_of(tmp_path / "fleet.yaml", ["memory://fleet/*/drive"])
+    before = task.key()
+    assert task.key() == before
+    (name,) = memory.glob("/fleet/run0/drive/*.mcap")
+    memory.pipe(name, memory.cat(name) + b"more")
+    assert task.key() != before
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        """Say nothing."""
+
+
+def test_bags_on_a_web_server(tmp_path):
+    pytest.importorskip("fsspec", reason="fsspec is not installed: '.[fleet]'")
+    pytest.importorskip("aiohttp", reason="aiohttp is not installed: '.[fleet]'")
+    write_drive(tmp_path / "served" / "drive", 60, 3)
+    handler = functools.partial(Quiet, directory=tmp_path / "served")
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}"
+        file = next((tmp_path / "served" / "drive").glob("*.mcap")).name
+        bags = [f"{address}/drive", f"{address}/drive/{file}?sig=secret", f"{address}/none.mcap"]
+        tasks, (folder, single, absent) = outcomes_of(tmp_path / "fleet.yaml", bags)
+        assert tasks[0].key() != tasks[1].key()
+        server.shutdown()
+    assert folder["error"] is None
+    assert single["calibration"]["T_parent_child"] == folder["calibration"]["T_parent_child"]
+    assert single["inputs"]["files"][0]["file"] == f"{address}/drive/{file}"
+    assert "secret" not in json.dumps(single)
+    assert absent["error"].startswith(f"cannot read {address}/none.mcap: FileNotFoundError")
+    assert "\n" not in absent["error"]
+
+
+def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
+    class Hostile:
+        def ls(self, path, detail):
+            return [{"name": "bag/../../../../outside.mcap", "type": "file"}]
+
+        def get_file(self, name, target):
+            copied.append(target)
+
+    copied = []
+    monkeypatch.setattr(remote, "_opened", lambda url: (Hostile(), "bag"))
+    with remote.local_copies(["s3://bag"]) as (paths, _):
+        assert copied == [f"{paths[0]}/outside.mcap"]
+
+
+def test_without_fsspec_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "fsspec.core", None)
+    _, (found,) = outcomes_of(tmp_path / "fleet.yaml", ["s3://fleet/run.mcap"])
+    assert found["error"] == (
+        "s3://fleet/run.mcap needs the package fsspec, which is not installed: "
+        "pip install 'hand_eye_calib[fleet]'"
+    )
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("s3://fleet/run.mcap", "s3://fleet/run.mcap"),
+        ("https://user:pass@host/a@b.mcap?X-Signature=1", "https://host/a@b.mcap"),
+        ("local/path?x", "local/path?x"),
+    ],
+)
+def test_urls_are_shown_without_what_gives_access(url, shown):
+    assert remote.public(url) == shown
+
+
+def test_a_store_out_of_reach_is_one_line():
+    pytest.importorskip("fsspec", reason="fsspec is not installed: '.[fleet]'")
+    with pytest.raises(InputError, match="cannot read memory://nowhere: ") as caught:
+        remote.states("memory://nowhere")
+    assert "\n" not in str(caught.value)
+
+
+# ---- what the recordings of a vehicle say together
+
+
+def fleet_outcomes(vehicle, count, seed, shift=(), by=0.02):
+    Ts, covariances = recordings_of(seed, count)
+    for index in shift:
+        Ts[index] = se3.exp(np.array([0, 0, 0, 0, 0, by])) @ Ts[index]
+    return [
+        outcome(f"{vehicle}_{day}", vehicle, Ts[day], covariances[day], day) for day in range(count)
+    ]
+
+
+def test_recordings_are_compared_with_those_of_their_vehicle():
+    outcomes = [
+        *fleet_outcomes("b", 6, 1, shift=(4, 5)),
+        *fleet_outcomes("a", 5, 2),
+        *fleet_outcomes("c", 5, 3, shift=(1,)),
+        *fleet_outcomes("d", 1, 4),
+        {**outcome("x", "a", *(one[0] for one in recordings_of(9, 1))), "calibration": None},
+    ]
+    random = np.random.default_rng(0)
+    found = {one.name: one for one in vehicles_of(random.permutation(outcomes).tolist())}
+    assert [(name, one.agreement.kind.value) for name, one in found.items()] == [
+        ("a", "agree"),
+        ("b", "moved"),
+        ("c", "one off"),
+        ("d", "single"),
+    ]
+    assert found["b"].sentence.startswith("The mount has moved before b_4: +1.")
+    assert " deg about z" in found["b"].sentence
+    assert found["c"].sentence.startswith("c_1 does not agree with the others: +1.")
+    document = json.loads(json.dumps(found["b"].to_dict(), allow_nan=False))
+    assert document["apart"] == ["b_4", "b_5"]
+
+
+def test_the_index_page_shows_each_vehicle(tmp_path):
+    from hand_eye_calib.report.batch_page import render_batch
+
+    outcomes = [*fleet_outcomes("<b>", 6, 1, shift=(4, 5)), *fleet_outcomes("a", 2, 2)]
+    outcomes.append({**outcomes[0], "name": "lost", "calibration": None, "error": "no <bag>"})
+    rows = [row_of(one) for one in outcomes]
+    vehicles = [vars(one) for one in vehicles_of(outcomes)]
+    page = render_batch("path/fleet.yaml", rows, vehicles, [True] * 8 + [False])
+    assert "<b>" not in page
+    assert "no &lt;bag&gt;" in page
+    assert page.count("<svg") == 2
+    assert "path/fleet.yaml" not in page
+    assert page.count("/report.html") == 8
+    for address in re.findall(r'(?:href|src)="([^"]*)"', page):
+        assert not re.match(r"\w+:|//", address), f"not on this disk: {address}"
+    assert page == render_batch("path/fleet.yaml", rows, vehicles, [True] * 8 + [False])
