@@ -112,6 +112,7 @@ setup(
     extras_require={
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         "cluster": ["distributed>=2024.1"],
+        "completion": ["argcomplete>=2.0"],
         "fleet": ["fsspec[http]>=2024.2", "pyarrow>=14.0"],
         "gnss": ["pymap3d>=3.0"],
         "notebook": ["ipykernel>=6.29", "pandas>=2.1"],

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from hand_eye_calib.cli import completion
 from hand_eye_calib.cli.console import fail
 from hand_eye_calib.cli.parser import EXIT_USAGE, CommandParser
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
@@ -29,6 +30,7 @@ COMMANDS = {
     "compare": "compare results with what is installed, or with each other",
     "info": "show a saved result",
     "simulate": "simulate trajectories or a bag with known truth",
+    "completion": "print what a shell needs to complete commands and options",
     "demo": "simulate a recording and calibrate from it, offline and live",
 }
 
@@ -102,14 +104,13 @@ def named_command() -> int:
 
 
 def _run(argv: Sequence[str]) -> int:
+    if completion.is_asked_for():
+        return _complete()
     chosen = next((argument for argument in argv if not argument.startswith("-")), None)
     parser, of_commands = _parsers()
     module: Any = None
     if chosen in of_commands:
-        module = importlib.import_module(f"hand_eye_calib.cli.{chosen}")
-        command_parser = of_commands[chosen]
-        module.add_arguments(command_parser)
-        command_parser.add_help_all()
+        module, command_parser = _with_arguments(chosen, of_commands)
         if command_parser.get_default("passed_on") is None:
             command_parser.refuse_unknown(argv[list(argv).index(chosen) + 1 :])
     arguments, rest = parser.parse_known_args(argv)
@@ -118,6 +119,27 @@ def _run(argv: Sequence[str]) -> int:
     arguments.passed_on = rest
     arguments.typed = list(argv)
     return module.run(arguments)
+
+
+def _complete() -> int:
+    """Tell the shell what could be typed next."""
+    parser, of_commands = _parsers()
+    chosen = completion.command_in_line()
+    if chosen in of_commands:
+        _with_arguments(chosen, of_commands)
+    completion.answer(parser)
+    return 0
+
+
+def _with_arguments(
+    chosen: str, of_commands: dict[str, CommandParser]
+) -> tuple[Any, CommandParser]:
+    """The module of a command, and its parser with all arguments."""
+    module = importlib.import_module(f"hand_eye_calib.cli.{chosen}")
+    command_parser = of_commands[chosen]
+    module.add_arguments(command_parser)
+    command_parser.add_help_all()
+    return module, command_parser
 
 
 def _parsers() -> tuple[CommandParser, dict[str, CommandParser]]:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from hand_eye_calib.cli.completion import offer
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.cli.spelling import OPTION_FIELDS, flag
@@ -51,7 +52,7 @@ def _add_option(group: argparse._ArgumentGroup, name: str) -> argparse.Action:
     meta = field.metadata
     unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
     default = "" if field.default == "" else f" Default: {field.default}."
-    return group.add_argument(
+    action = group.add_argument(
         f"--{flag(name)}",
         dest=_DEST + name,
         default=argparse.SUPPRESS,
@@ -59,6 +60,10 @@ def _add_option(group: argparse._ArgumentGroup, name: str) -> argparse.Action:
         metavar=_metavar(name, meta),
         help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
     )
+    words = [*(meta["choices"] or ()), *meta["words"]]
+    if words:
+        offer(action, lambda _: words)
+    return action
 
 
 def _add_prior_and_config(group: argparse._ArgumentGroup) -> None:

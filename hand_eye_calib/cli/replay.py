@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hand_eye_calib.cli.completion import offer, topics_of
 from hand_eye_calib.cli.console import waiting_for
 from hand_eye_calib.cli.options import (
     add_config_arguments,
@@ -66,12 +67,13 @@ def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("pose streams", "may be left out if the bag has only two")
     for stream in ("parent", "child"):
         source = group.add_mutually_exclusive_group()
-        source.add_argument(
+        topic = source.add_argument(
             f"--{stream}-topic",
             metavar="TOPIC",
             help=f"poses of the {stream} sensor: Odometry, PoseStamped, PoseWithCovarianceStamped, "
             "TransformStamped or Path",
         )
+        offer(topic, lambda typed: topics_of(typed.bags))
         source.add_argument(
             f"--{stream}-tf",
             metavar="WORLD:SENSOR",

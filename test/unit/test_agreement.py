@@ -18,7 +18,8 @@ def turned(Ts, indices, by):
 @pytest.mark.parametrize("unknown_z", [False, True])
 @pytest.mark.parametrize("count", [2, 3, 8, 30])
 def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
-    found = [agreement_of(*recordings_of(seed, count, unknown_z)) for seed in range(40 if count < 10 else 15)]
+    seeds = range(40 if count < 10 else 15)
+    found = [agreement_of(*recordings_of(seed, count, unknown_z)) for seed in seeds]
     alarms = sum(one.kind is not Kind.AGREE for one in found)
     assert alarms <= 4  # 0.8 expected, 5 or more once in 800
     p_values = np.array([one.p_value for one in found])

@@ -30,6 +30,7 @@ DECLARED_AS = {
     "dask": ("distributed", None),  # optional, for replay --batch --dask alone
     "fsspec": ("fsspec", None),  # optional, for bags at URLs alone
     "pyarrow": ("pyarrow", None),  # optional, for Parquet alone
+    "argcomplete": ("argcomplete", None),  # optional, for the command completion alone
     "pymap3d": ("pymap3d", None),  # optional, for latitude and longitude alone
     "casadi": ("casadi", "casadi-pip"),
     "jinja2": ("jinja2", "python3-jinja2"),
