@@ -4,10 +4,10 @@ import traceback
 from typing import Any
 
 from hand_eye_calib.cli.batch.tasks import Task
-from hand_eye_calib.cli.findings import with_findings
 from hand_eye_calib.cli.replaying import fingerprints, replay
 from hand_eye_calib.cli.reporting import rendered, with_cross_check
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.checked import checked
 from hand_eye_calib.errors import HandEyeCalibError
 
 # What came of a task, in plain values.
@@ -63,17 +63,18 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
     if task.with_fingerprints:
         replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
     snapshot = replayed.calibrator.snapshot()
-    calibration, findings = with_findings(replayed.calibration, snapshot)
+    calibration, snapshot = checked(replayed.calibration, snapshot, task.options)
     calibration, evidence = with_cross_check(calibration, snapshot)
+    inputs = replayed.inputs | {"options": snapshot.config.to_options()}
     found: Outcome = {
         "calibration": calibration.to_dict(),
-        "findings": findings,
-        "inputs": replayed.inputs,
+        "findings": [dict(finding) for finding in calibration.findings],
+        "inputs": inputs,
     }
     if calibration.status.failure:
         found["error"] = calibration.status.failure
     if task.with_report:
-        found["page"] = rendered(calibration, evidence, snapshot.config, replayed.inputs)
+        found["page"] = rendered(calibration, evidence, snapshot.config, inputs)
     return found
 
 

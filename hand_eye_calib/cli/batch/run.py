@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.batch.calibrating import Outcome
 from hand_eye_calib.cli.batch.printing import print_results
 from hand_eye_calib.cli.batch.store import store, stored_outcomes
@@ -14,8 +15,8 @@ from hand_eye_calib.cli.batch.tasks import SOURCES, Task, read_batch
 from hand_eye_calib.cli.batch.workers import on_cores, on_dask
 from hand_eye_calib.cli.console import note, waiting_for, with_progress
 from hand_eye_calib.cli.options import options_from
+from hand_eye_calib.cli.present import exit_code
 from hand_eye_calib.cli.reporting import REPORT, can_draw
-from hand_eye_calib.verdict import Verdict
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
@@ -90,10 +91,4 @@ def _finish(outcomes: Sequence[Outcome], arguments: argparse.Namespace) -> int:
         note(f"wrote {path}")
     if any(outcome["error"] for outcome in outcomes):
         return 1
-    return 3 if any(map(_is_bad, outcomes)) else 0
-
-
-def _is_bad(outcome: Outcome) -> bool:
-    """Whether an axis is unobservable, or the result must not be used."""
-    calibration = outcome["calibration"]
-    return calibration["status"] != "ok" or calibration["verdict"] == Verdict.DO_NOT_USE.value
+    return max(exit_code(Calibration.from_dict(outcome["calibration"])) for outcome in outcomes)
