@@ -40,9 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="BAG",
         nargs="*",
         type=Path,
-        help="rosbag2 directory, .mcap or .db3 file of one, or rosbag1 .bag file; several are the "
-        "parts of one recording. Or the journal of a session of the node: the directory journal, "
-        "or the output directory that holds it",
+        help="rosbag2 directory, .mcap, .db3 or .bag file; several are the parts of one recording. "
+        "Or the journal of a node's session, or the output directory that holds it",
     )
     _add_stream_arguments(parser)
     parser.add_argument(
@@ -54,8 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--every",
         metavar="DURATION",
         type=_duration_s,
-        help="also estimate after every such period of bag time, for example 5s, and print how the "
-        "estimate converges",
+        help="also estimate after every such period of bag time, for example 5s",
     )
     _add_batch_arguments(parser)
     add_config_arguments(parser)
@@ -64,22 +62,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("pose streams", "may be left out if the bag has only two")
+    group = parser.add_argument_group(
+        "pose streams",
+        "Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Path; may be left "
+        "out if the bag has only two",
+    )
     for stream in ("parent", "child"):
         source = group.add_mutually_exclusive_group()
         topic = source.add_argument(
             f"--{stream}-topic",
             metavar="TOPIC",
-            help=f"poses of the {stream} sensor: Odometry, PoseStamped, PoseWithCovarianceStamped, "
-            "TransformStamped or Path",
+            help=f"poses of the {stream} sensor, of any type",
         )
         offer(topic, lambda typed: topics_of(typed.bags))
         source.add_argument(
             f"--{stream}-tf",
             metavar="WORLD:SENSOR",
             type=_tf_source,
-            help=f"poses of the {stream} sensor from /tf and /tf_static: the fixed frame and the "
-            "sensor's, such as odom:lidar",
+            help="the same from /tf and /tf_static: the fixed frame and the sensor's, as odom:lidar",
         )
 
 

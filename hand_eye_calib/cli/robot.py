@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import note
+from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.status import listing
 
@@ -23,11 +24,12 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
         help="compare the result with this: a URDF, an earlier extrinsic.yaml, a bag with "
         '/tf_static, or "X Y Z ROLL PITCH YAW" in m and rad. Default: --urdf, if it is given',
     )
-    group.add_argument(
+    base_frame = group.add_argument(
         "--base-frame",
         metavar="FRAME",
         help="state the child's pose in this frame too, as --urdf or the bag's /tf_static has it",
     )
+    advanced(base_frame)
     add_description_arguments(group)
 
 
@@ -36,13 +38,14 @@ def add_description_arguments(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--urdf", metavar="FILE", type=Path, help="robot description with both sensors' frames"
     )
-    parser.add_argument(
+    write = parser.add_argument(
         "--write",
         metavar="FILE",
         type=Path,
         help="write the description of --urdf with the result in it: one joint's origin changes, "
         "nothing else",
     )
+    advanced(write)
 
 
 def with_robot(calibration: "Calibration", arguments: argparse.Namespace) -> "Calibration":

