@@ -79,7 +79,7 @@ def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
             f"--{stream}-tf",
             metavar="WORLD:SENSOR",
             type=_tf_source,
-            help="the same from /tf and /tf_static: the fixed frame and the sensor's, as odom:lidar",
+            help="the same from /tf and /tf_static: fixed frame and the sensor's, as odom:lidar",
         )
 
 

@@ -30,22 +30,21 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
         help="state the child's pose in this frame too, as --urdf or the bag's /tf_static has it",
     )
     advanced(base_frame)
-    add_description_arguments(group)
+    advanced(add_description_arguments(group))
 
 
-def add_description_arguments(parser: argparse._ActionsContainer) -> None:
-    """Add ``--urdf`` and ``--write``."""
+def add_description_arguments(parser: argparse._ActionsContainer) -> argparse.Action:
+    """Add ``--urdf`` and ``--write``; returns the latter."""
     parser.add_argument(
         "--urdf", metavar="FILE", type=Path, help="robot description with both sensors' frames"
     )
-    write = parser.add_argument(
+    return parser.add_argument(
         "--write",
         metavar="FILE",
         type=Path,
         help="write the description of --urdf with the result in it: one joint's origin changes, "
         "nothing else",
     )
-    advanced(write)
 
 
 def with_robot(calibration: "Calibration", arguments: argparse.Namespace) -> "Calibration":
