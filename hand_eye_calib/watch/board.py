@@ -359,7 +359,9 @@ def _short(value: float) -> str:
     """Two digits, and not more than three decimals."""
     if abs(value) >= 9.95:
         return f"{value:.0f}"
-    return f"{value:.2g}" if abs(value) >= 0.01 else f"{value:.3f}"
+    if abs(value) >= 0.01:
+        return f"{value:.2g}"
+    return f"{value:.3f}" if abs(value) >= 0.0005 else "0"
 
 
 def duration(seconds: float) -> str:

@@ -203,6 +203,7 @@ def test_an_answer_is_shown_for_a_while():
         (0.001, "rad", "0.057 deg"),
         (0.0001, "rad", "0.006 deg"),
         (-0.0003, "m", "-0.3 mm"),
+        (-0.000001, "rad", "0 deg"),
         (float("nan"), "m", ""),
     ],
 )
