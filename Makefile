@@ -79,8 +79,8 @@ format: $(VENV)/.ready-test
 	$(VENV)/bin/ruff format .
 
 dist: $(VENV)/.ready-release
-	rm -rf dist
 	$(if $(RELEASE),! grep -n "\.example" package.xml)
+	rm -rf dist
 	$(VENV)/bin/python -m build --outdir dist .
 	$(VENV)/bin/twine check --strict dist/*
 
