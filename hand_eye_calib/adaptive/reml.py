@@ -200,23 +200,22 @@ def _phi_slope(process: Markov) -> FloatArray:
 def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
     space = posterior.space
     variances = np.exp(posterior.levels)
-    columns = np.empty((len(space), 6, len(variances)))
+    moved = np.zeros((*states.shape, len(variances)))
     pulled = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
     pulled[space.is_free] = 0.0
-    along = space.twists * (space.twists * pulled).sum(axis=1, keepdims=True)
-    moved = [*((basis @ pulled[:, :, None])[:, :, 0] for basis in space.white), along]
-    parts = variances[: len(moved)] * np.stack(moved, axis=2)
-    columns[:, :, : len(moved)] = parts[1:] - space.behind[:, :, :WHITE] @ parts[:-1]
-    pushed = walk @ posterior.walk_precision
-    for index, basis in enumerate(space.walk, start=space.n_white):
-        columns[:, :, index] = variances[index] * pushed @ basis
+    for index, basis in enumerate(space.white):
+        moved[:, :WHITE, index] = variances[index] * (basis @ pulled[:, :, None])[:, :, 0]
+    along = variances[len(space.white)] * (space.twists * pulled).sum(axis=1)
+    moved[:, :WHITE, len(space.white)] = along[:, None] * space.twists
     for process in posterior.markov:
         group = process.group
         values = states[:, group.states]
-        for index, part in ((group.variance, values), (group.tau, _by_tau(process, values))):
-            ahead = space.ahead[:, :, group.states] @ part[1:, :, None]
-            behind = space.behind[:, :, group.states] @ part[:-1, :, None]
-            columns[:, :, index] = (ahead - behind)[:, :, 0]
+        moved[:, group.states, group.variance] = values
+        moved[:, group.states, group.tau] = _by_tau(process, values)
+    columns = space.observed(moved)
+    pushed = walk @ posterior.walk_precision
+    for index, basis in enumerate(space.walk, start=space.n_white):
+        columns[:, :, index] = variances[index] * pushed @ basis
     columns[space.cut] = 0.0
     weighed, whitened = posterior.halves(columns)
     own = multiplied(columns, weighed) - multiplied(whitened, whitened)
