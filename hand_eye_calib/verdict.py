@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol, TypeAlias
 
+from hand_eye_calib.methods import METHODS
 from hand_eye_calib.status import (
     ROTATIONS,
     TRANSLATIONS,
@@ -88,6 +89,8 @@ class Judged(Protocol):
     @property
     def findings(self) -> Sequence[Mapping[str, Any]]: ...
     @property
+    def method(self) -> str: ...
+    @property
     def n_pairs(self) -> int: ...
     @property
     def n_inliers(self) -> int: ...
@@ -127,8 +130,9 @@ _Found: TypeAlias = tuple[str, str, tuple[str, ...], tuple[tuple[str, Any], ...]
 CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
 HOPELESS_TARGETS = 10.0
 
-# Smallest share of the motion pairs that are inliers in a recording whose noise is understood.
-FEWEST_INLIERS = 0.7
+# Smallest share of the motion pairs that are inliers in a recording whose noise is understood; of
+# the poses, for a method that models the noise and need not reject what is merely noisy.
+FEWEST_INLIERS, FEWEST_OF_MODEL = 0.7, 0.9
 
 _OTHERS = {
     "model": "dnlo and adaptive, which assume different noise,",
@@ -281,7 +285,8 @@ def _hidden(result: Judged) -> Iterator[_Found]:
 
 def _few_inliers(result: Judged) -> Iterator[_Found]:
     share = result.n_inliers / max(result.n_pairs, 1)
-    if share < FEWEST_INLIERS:
+    uses_reference = METHODS[result.method].uses_reference
+    if share < (FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
         yield text, "find out why the odometry jumps, and record again", (), ()
 
@@ -383,7 +388,8 @@ RULES = (
     Rule(
         "outliers",
         _CARE,
-        f"more than {1 - FEWEST_INLIERS:.0%} of the motion pairs are outliers",
+        f"more than {1 - FEWEST_INLIERS:.0%} of the motion pairs are outliers; more than "
+        f"{1 - FEWEST_OF_MODEL:.0%} with method adaptive",
         _few_inliers,
     ),
     Rule(

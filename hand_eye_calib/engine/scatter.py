@@ -56,7 +56,7 @@ class CrossCheck:
         Distance from the answer under other assumptions on the noise; NaN if there is none.
     excess_of_methods, excess_of_halves, excess_of_model : (6,) arrays
         Distance of the answers in their joint standard deviations (of the methods: the median over
-        that of a normal variable). Those of methods and model contain the common-mode floor.
+        that of a normal variable). Those of methods contain the common-mode floor.
     excess_over_own : (6,) array
         Distance of other methods and references in the result's own standard deviations, over those
         that are not much less certain; NaN if there are fewer than two.
@@ -221,5 +221,5 @@ def _from_other_model(calibration: Calibration) -> tuple[FloatArray, FloatArray]
     T_other, covariance = calibration.other_answer
     distance = np.abs(deviation(T_other, calibration.T_parent_child))
     to_parent = np.kron(np.eye(2), T_other[:3, :3])
-    variances = np.diag(to_parent @ covariance @ to_parent.T) + calibration.sigmas_with_floor**2
+    variances = np.diag(to_parent @ covariance @ to_parent.T) + calibration.sigmas**2
     return distance, distance / np.sqrt(np.maximum(variances, _ROUNDING**2))

@@ -26,7 +26,7 @@ ENGINE = {
     "config": {"errors", "methods"},
     "geometry": GROUND,
     "status": set(),
-    "verdict": {"status"},
+    "verdict": {"methods", "status"},
     "tables": {"errors"},
     "calibration": GROUND | {"geometry", "status", "tables", "verdict"},
     "pairing": GROUND | {"geometry"},
