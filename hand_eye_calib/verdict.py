@@ -170,6 +170,15 @@ def verdict_of(found: Sequence[Reason]) -> Verdict:
     return Verdict.USE
 
 
+def shown(found: Sequence[Reason]) -> tuple[Reason, ...]:
+    """The reasons that a person has to read: under DO NOT USE those that lead to it, because the
+    others may be its consequences; otherwise all.
+    """
+    if verdict_of(found) is not Verdict.DO_NOT_USE:
+        return tuple(found)
+    return tuple(reason for reason in found if reason.verdict is Verdict.DO_NOT_USE)
+
+
 def headline(result: Judged, found: Sequence[Reason]) -> str:
     """The verdict with its gravest reason, or with what is known, in one line."""
     decided = verdict_of(found)

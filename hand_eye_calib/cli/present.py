@@ -19,6 +19,7 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.words import given_or_estimated, listing, with_sigma
 from hand_eye_calib.status import amount
+from hand_eye_calib.verdict import shown
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
@@ -156,8 +157,9 @@ def _details(calibration: Calibration) -> Iterator[str]:
 
 
 def _reason_lines(calibration: Calibration) -> Iterator[str]:
-    for reason in calibration.reasons:
-        yield from _wrapped(reason.sentence, "- ", "  ")
+    for reason in shown(calibration.reasons):
+        if not calibration.headline.endswith(reason.sentence):
+            yield from _wrapped(reason.sentence, "- ", "  ")
         yield from _wrapped(_what_to_do(reason), "  -> ", "     ")
 
 
@@ -193,10 +195,11 @@ def next_steps(
         steps.append(motion)
     extra = [
         f"--{flag(name)} {value}"
-        for reason in calibration.reasons
+        for reason in shown(calibration.reasons)
         for name, value in reason.options
     ]
-    extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.unobservable()[:3]]
+    if calibration.verdict is not Verdict.DO_NOT_USE:
+        extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.unobservable()[:3]]
     if not extra and not arguments.out:
         extra = ["--out result"]  # figures that show where the disagreement comes from
     typed = getattr(arguments, "typed", [])

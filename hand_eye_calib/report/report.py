@@ -32,7 +32,7 @@ from hand_eye_calib.report.words import (
     with_sigma,
 )
 from hand_eye_calib.status import amount
-from hand_eye_calib.verdict import target_of
+from hand_eye_calib.verdict import shown, target_of
 
 Plain = Mapping[str, Any]
 
@@ -82,13 +82,13 @@ def render(
         .get_template("report.html")
         .render(
             **_result(calibration),
-            advice=what_is_missing(evidence.excitation, calibration),
+            advice=_advice(calibration, evidence),
             command=command,
             figures=_figures(calibration, evidence),
             findings=calibration.findings,
             summary=_summary(calibration, evidence),
             streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
-            reasons=[_reason(reason) for reason in calibration.reasons],
+            reasons=[_reason(reason) for reason in shown(calibration.reasons)],
             unknown=_by_hand(calibration),
             target=listing([amount(axis, target_of(axis, calibration)) for axis in ("x", "yaw")]),
             provenance=_provenance(inputs),
@@ -156,6 +156,13 @@ def _reason(reason: Reason) -> dict[str, str]:
     options = ", ".join(f"{name} {value}" for name, value in reason.options)
     what_to_do = f"{reason.what_to_do}: {options}" if options else reason.what_to_do
     return {"sentence": reason.sentence, "what_to_do": what_to_do}
+
+
+def _advice(calibration: Calibration, evidence: Evidence) -> str:
+    """The motion that would help, if the result is one to improve."""
+    if calibration.verdict is Verdict.DO_NOT_USE:
+        return ""
+    return what_is_missing(evidence.excitation, calibration)
 
 
 def _by_hand(calibration: Calibration) -> str:

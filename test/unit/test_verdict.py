@@ -151,6 +151,8 @@ def test_the_gravest_reason_comes_first_and_decides():
     result = good(**CASES["target"] | CASES["error_finding"] | CASES["outliers"])
     assert [reason.rule for reason in result.reasons] == ["error_finding", "outliers", "target"]
     assert result.headline == "DO NOT USE: lengths are in mm"
+    assert [reason.rule for reason in rules.shown(result.reasons)] == ["error_finding"]
+    assert len(rules.shown(good(**CASES["target"] | CASES["outliers"]).reasons)) == 2
 
 
 def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
