@@ -289,7 +289,7 @@ def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_ba
     )
     text = as_text(calibration)
     assert text.startswith(
-        "DO NOT USE: the solver did not converge\n- the solver did not converge\n"
+        "DO NOT USE: the solver did not converge\n  -> record more varied motion\nNote: look here\n"
     )
     assert "Note: look here" in text
     assert "static_transform_publisher" not in text
