@@ -94,6 +94,11 @@ _LONGER_SIZES = np.array([0.0, 0.0625, 0.25, 1.0])
 _LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5])
 _MOST_GROWTH = 5.0
 
+# Each parameter of a systematic error must lower the weighted squared residual by so much: one that
+# is not there is chosen once in forty to five hundred recordings. Schwarz's criterion would ask for
+# 7 to 10, as if every increment were evidence of errors that add up over all of them.
+_PENALTY = 5.0
+
 # Blocks of the jackknife of systematic errors, and what chi-square with nine degrees of freedom,
 # per degree, exceeds once in ten times.
 _BLOCKS, _CHANCE = 10, 1.63
@@ -121,7 +126,7 @@ def solve(
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of both sensors in their own worlds at these stamps.
     systematic : sequence of str
-        Systematic errors to choose from, by Schwarz's criterion (BIC); "none" must be among them.
+        Systematic errors to choose from; "none" must be among them.
     quick : bool
         Stop at white noise, drift and outliers: neither errors that last nor heavy tails.
 
@@ -444,33 +449,44 @@ def _mean_variances(found: _State, kept: IntArray | None) -> FloatArray:
 
 
 def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
-    """The model of systematic errors that Schwarz's criterion asks for, one step from where the
-    search stands, at poses freed of their errors. All models are judged under the same noise.
+    """The model of systematic errors that the data ask for, one step from where the search stands,
+    at poses freed of their errors. All models are judged under the same noise.
     """
     every = dataclasses.replace(state, columns=list(range(N_SYSTEMATIC)))
     posterior = every.posterior()
-    n_observations = 6 * int((~state.outliers.jumps).sum())
 
     def columns_of(name: str) -> list[int]:
         return [*range(6), *(6 + column for column in parameters_of(name))]
 
-    def criterion(name: str) -> float:
-        return fits[name].cost + len(parameters_of(name)) * np.log(max(n_observations, 2))
+    def criterion(name: str, cost: float) -> float:
+        return cost + _PENALTY * len(parameters_of(name))
+
+    def at_its_own(name: str) -> _State:
+        return dataclasses.replace(state, systematic=name, columns=parameters_of(name)).moved(
+            fits[name].step
+        )
 
     fits = {
         name: NormalEquations(selected(posterior.products, columns_of(name))) for name in systematic
     }
     known = fits["none"].covariance
     credible = [name for name, fit in fits.items() if _is_credible(fit, name, known)]
-    best = min(credible, key=criterion)
+    best = min(credible, key=lambda name: criterion(name, fits[name].cost))
+    if "bias" in best:
+        # A scale is not of first order if it is large, and then a bias along the direction of
+        # travel seems to be nearer: both are judged at their own parameters.
+        scales = [name for name in credible if "scale" in name]
+        rivals = sorted(scales, key=lambda name: criterion(name, fits[name].cost))[:1]
+        best = min(
+            (best, *rivals),
+            key=lambda name: criterion(name, at_its_own(name).posterior().normal.cost),
+        )
     sigmas = np.zeros(N_SYSTEMATIC)
     for name in {"scale", "time"} & set(fits):
         sigmas[parameters_of(name)] = np.sqrt(np.diag(fits[name].covariance)[6:])
-    chosen = dataclasses.replace(
-        state, systematic=best, columns=parameters_of(best), other_sigmas=sigmas
-    )
+    chosen = dataclasses.replace(at_its_own(best), other_sigmas=sigmas)
     states = posterior.states_after(fits[best].step, columns_of(best))
-    return _freed(chosen.moved(fits[best].step), states)
+    return _freed(chosen, states)
 
 
 def _is_credible(fit: NormalEquations, name: str, known: FloatArray) -> bool:

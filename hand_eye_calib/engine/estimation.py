@@ -9,6 +9,7 @@ import numpy as np
 
 from hand_eye_calib.adaptive import estimator as adaptive_estimator
 from hand_eye_calib.adaptive.estimator import AdaptiveSolution
+from hand_eye_calib.adaptive.increments import Streams, course_of
 from hand_eye_calib.alignment.scale import Scale, child_scaled, estimate_scale
 from hand_eye_calib.alignment.similarity import MAX_UNEXPLAINED_TRANSLATION
 from hand_eye_calib.alignment.time_offset import TimeOffset
@@ -205,8 +206,8 @@ def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
     floor = common_mode_floor(*by_model.spans, solution.T_parent_child)
     misfit = why_not(solution, by_model.assessment, _answer(dnlo), floor)
     if misfit and solution.systematic != "none":
-        # DNLO does not know of a scale or a time offset. Without them it may agree.
-        corrected = _corrected(pose_pairs, solution)
+        # DNLO does not know of systematic errors. Without them it may agree.
+        corrected = _without_biases(_corrected(pose_pairs, solution), solution)
         witness = _solve_pairs(corrected, replace(with_dnlo, reference=dnlo.reference))
         misfit = why_not(solution, by_model.assessment, _answer(witness), floor)
     compared = f"dnlo on reference {dnlo.reference}"
@@ -308,6 +309,18 @@ def _corrected(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
     child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).scaled(solution.scale)
     Ts_cw_c = child.shifted(solution.time_offset_s).at(stamps_ns, extrapolate=True)
     return PosePairs(stamps_ns, pose_pairs.Ts_pw_p, Ts_cw_c)
+
+
+def _without_biases(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
+    """The poses without the biases per metre of path that the solution found."""
+    stamps_ns = pose_pairs.stamps_ns
+    Ts_pw_p, Ts_cw_c = pose_pairs.Ts_pw_p.copy(), pose_pairs.Ts_cw_c.copy()
+    streams = Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c)
+    course = course_of(streams, solution.T_parent_child)
+    of_child, of_parent = solution.biases
+    Ts_cw_c[:, :3, 3] -= course.along_c @ of_child
+    Ts_pw_p[:, :3, 3] -= course.along_p @ of_parent
+    return PosePairs(stamps_ns, Ts_pw_p, Ts_cw_c)
 
 
 def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation:

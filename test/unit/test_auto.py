@@ -21,6 +21,9 @@ from hand_eye_calib.assessment.reference_selection import ReferenceChoice
 from hand_eye_calib.engine import estimation
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.solvers.registry import Method
 
 
 def noisy_streams(n_poses=150):
@@ -102,6 +105,27 @@ class TestWhichAnswerStands:
         assert apart > 22.46
         assert result.method == "adaptive"
         assert result.time_offset_s == pytest.approx(0.05, abs=1e-3)
+
+    def test_the_witness_gets_poses_without_the_bias_that_was_found(self):
+        """Of a path that is off by so much per metre, DNLO knows nothing."""
+        parent = smooth_poses(np.arange(400) / 10)
+        child = child_of(parent)
+        steps = np.linalg.norm(np.diff(child[:, :3, 3], axis=0), axis=1)
+        drift = child[:-1, :3, :3] @ [0.0, 0.06, 0.0] * steps[:, None]
+        child[1:, :3, 3] += np.cumsum(drift, axis=0)
+        given = PosePairs(np.arange(400) * 10**8, parent, disturbed(child, 1, 1e-4, 1e-4))
+        solution = estimator.solve(given.stamps_ns, given.Ts_pw_p, given.Ts_cw_c)
+        assert "bias" in solution.systematic
+        off = [
+            np.linalg.norm(
+                Method("dnlo")
+                .solve(motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, "B5"))
+                .T_parent_child[:3, 3]
+                - T_PARENT_CHILD[:3, 3]
+            )
+            for poses in (given, estimation._without_biases(given, solution))
+        ]
+        assert off[1] < 0.2 * off[0]
 
     def test_few_poses_are_not_compared(self):
         result = hec.calibrate(*noisy_streams(12), method="auto")
