@@ -19,7 +19,8 @@ OK, WARN, ERROR = 0, 1, 2
 # A node that has said nothing for so long is silent; it reports once a second (s).
 SILENT_AFTER_S = 3.5
 
-SILENT = "SILENT"
+# Words whose sentence counts seconds.
+SILENT, LEARNING = COUNTING = "SILENT", "LEARNING"
 
 # A shift is told from this many standard deviations on.
 _CLEARLY = 3.0
@@ -284,7 +285,7 @@ def _of_mount(status: Status) -> tuple[Tone, str, str]:
     if status.level != OK:
         return Tone.ACT, "NOT WATCHING", _sentence(status.text)
     if status.text.startswith("learning"):
-        return Tone.BUSY, "LEARNING", _sentence(status.text)
+        return Tone.BUSY, LEARNING, _sentence(status.text)
     return Tone.GOOD, "WATCHING", _sentence(status.text)
 
 

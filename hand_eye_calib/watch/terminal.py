@@ -5,7 +5,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from hand_eye_calib.watch.board import SILENT, Bar, Line, Tone, View
+from hand_eye_calib.watch.board import COUNTING, Bar, Line, Tone, View
 
 _STYLES = {
     Tone.GOOD: "bold green",
@@ -114,7 +114,7 @@ class LineLog:
 
     def lines(self, view: View, elapsed_s: float) -> list[str]:
         """What is new since the last call, with the seconds since the start."""
-        sentence = "" if view.word == SILENT else view.sentence  # that one counts the seconds
+        sentence = "" if view.word in COUNTING else view.sentence
         said = view.node, view.word, sentence, view.result
         lines = []
         if said != self._said:

@@ -254,6 +254,8 @@ def test_lines_are_printed_when_something_new_is_said():
     assert log.lines(view_of(progress(done="true")), 3.0)
     assert log.lines(view_of(progress(), now_s=9.0), 9.0)
     assert log.lines(view_of(progress(), now_s=10.0), 10.0) == []  # still silent
+    learning = [Status("mount", 0, f"learning: {second} of 120 s") for second in (1, 2)]
+    assert [len(log.lines(view_of(each), 11.0)) for each in learning] == [1, 0]
 
 
 def test_an_answer_has_a_line_of_its_own():
