@@ -74,6 +74,7 @@ _PLAIN_LATER = (
     "target_translation",
     "target_rotation",
     "comparison",
+    "goal",
 )
 
 # Of other values than numbers.
@@ -81,7 +82,7 @@ _KINDS: dict[str, Any] = (
     dict.fromkeys(("method", "reference", "backend", "parent_frame", "child_frame"), str)
     | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
     | dict.fromkeys(("method_reason", "reference_reason", "proved_global"), str)
-    | dict.fromkeys(("noise", "cross_check", "comparison"), (dict, type(None)))
+    | dict.fromkeys(("noise", "cross_check", "comparison", "goal"), (dict, type(None)))
     | {"contradictions": dict}
 )
 
@@ -197,6 +198,9 @@ class Calibration:
     comparison : dict or None
         Comparison with what is installed, in plain values
         (:meth:`~hand_eye_calib.session.compare.Comparison.to_dict`); None without one.
+    goal : dict or None
+        How far the session was from its goal when the result was saved, in plain values
+        (:meth:`~hand_eye_calib.session.goal.Progress.to_dict`); None without a session.
     base_frame : str
         Frame of the robot in which the child's pose is stated as well; empty for none.
     T_base_parent : (4, 4) array or None
@@ -240,6 +244,7 @@ class Calibration:
     target_translation: float = CalibratorConfig.target_translation
     target_rotation: float = CalibratorConfig.target_rotation
     comparison: dict[str, Any] | None = None
+    goal: dict[str, Any] | None = None
     base_frame: str = ""
     T_base_parent: FloatArray | None = None
     stamp_ns: int = 0
@@ -634,8 +639,9 @@ def _check_values(data: Mapping[str, Any]) -> None:
         if not {*row} >= {"sigma", "of_methods", "of_halves"}:
             raise TypeError("cross_check lacks values")
         _infinite(row.values())
-    if not isinstance((data.get("comparison") or {"sentence": ""}).get("sentence"), str):
-        raise TypeError("comparison has no sentence")
+    for name in ("comparison", "goal"):
+        if not isinstance((data.get(name) or {"sentence": ""}).get("sentence"), str):
+            raise TypeError(f"{name} has no sentence")
 
 
 def _transform(data: Mapping[str, Any]) -> FloatArray:

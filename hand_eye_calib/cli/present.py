@@ -293,7 +293,9 @@ def _scatter_lines(cross_check: Mapping[str, Mapping[str, Any]] | None) -> Itera
 
 
 def _comparison_lines(calibration: Calibration) -> Iterator[str]:
-    """The comparison with what is installed."""
+    """The goal of the session, and the comparison with what is installed."""
+    if calibration.goal:
+        yield f"the session: {calibration.goal['sentence']}"
     if calibration.comparison:
         yield (
             f"compared with what is installed ({calibration.comparison.get('installed', '')}): "

@@ -4,6 +4,7 @@ Solves run in a process of their own; everything else happens in the executor's 
 nothing here needs a lock.
 """
 
+import dataclasses
 import time
 from pathlib import Path
 
@@ -211,10 +212,13 @@ class CalibratorNode(Node):
     def _save(self) -> tuple[bool, str]:
         options, cycle = self._options.node, self._cycle
         inputs = self._session.inputs()
-        saved, text = self._files.save(cycle.result, options.output_directory, inputs)
-        if saved and options.report and cycle.result is not None and cycle.snapshot is not None:
+        result = cycle.result
+        if result is not None:
+            result = dataclasses.replace(result, goal=cycle.goal.progress.to_dict())
+        saved, text = self._files.save(result, options.output_directory, inputs)
+        if saved and options.report and result is not None and cycle.snapshot is not None:
             path = output_path(options.output_directory)
-            self._report.write(path, SessionResult(cycle.result, cycle.snapshot, inputs))
+            self._report.write(path, SessionResult(result, cycle.snapshot, inputs))
             text += ", report.html follows"
         return saved, text
 

@@ -9,6 +9,7 @@ docs/session.md.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -60,6 +61,24 @@ class Progress:
     is_done: bool
     will_not_get_there: bool
     sentence: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values; None for what is unknown."""
+        columns = zip(AXES, self.sigmas, self.targets, self.seconds_left, strict=True)
+        return {
+            "sentence": self.sentence,
+            "done": self.is_done,
+            "limiting_axis": self.limiting_axis,
+            "will_not_get_there": self.will_not_get_there,
+            "axes": {
+                axis: {
+                    "sigma": _finite(sigma),
+                    "target": _finite(target),
+                    "seconds_left": _finite(left_s),
+                }
+                for axis, sigma, target, left_s in columns
+            },
+        }
 
 
 @dataclass(frozen=True)
@@ -198,6 +217,10 @@ class Goal:
     def targets(self) -> FloatArray:
         """(6,) array: targets of x, y, z (m), roll, pitch, yaw (rad)."""
         return self._targets
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def _settled_by_prior(calibration: Calibration) -> BoolArray:

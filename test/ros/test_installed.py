@@ -6,6 +6,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive
 
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.results import load_result
 
 NUMBERS = " ".join(
     f"{value:.9f}"
@@ -43,14 +44,25 @@ def noisy(stamps_ns, Ts_pw_p, Ts_cw_c):
 def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, tmp_path):
     moved = NUMBERS.split()
     moved[2] = f"{float(moved[2]) + 0.2:.6f}"
-    start_node("-p solve_period:=0.3", f"-p installed:={' '.join(moved)}", *RELIABLE_INPUTS)
-    peer.feed(peer.publishers(), *noisy(*drive(400)))
-    _, values = status("progress", lambda each: "comparison" in {p.key for p in each.values})
-    assert values["comparison"] == "moved"
+    start_node(
+        "-p solve_period:=0.3", f"-p installed:={' '.join(moved)}",
+        f"-p output_directory:={tmp_path}", "-p report:=false", *RELIABLE_INPUTS,
+    )  # fmt: skip
+    peer.solve(peer.publishers(), *noisy(*drive(400)))
+
+    def is_told(each):
+        return {pair.key: pair.value for pair in each.values}.get("comparison") == "moved"
+
+    _, values = status("progress", is_told)
     assert float(values["difference.z"]) == pytest.approx(-0.2, abs=0.02)
     assert float(values["installed.z"]) == pytest.approx(float(moved[2]))
     assert 0 < float(values["difference_sigma.z"]) < 0.02
     assert values["verdict"].startswith(("USE", "DO NOT"))
+    assert peer.trigger("save").success
+    saved = load_result(tmp_path)
+    assert saved.comparison["verdict"] == "moved"
+    assert saved.goal["axes"]["x"]["target"] == 0.02
+    assert saved.goal["done"] is False
 
 
 def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_moves(

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from result_making import calibration as made
 
+import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.cli.present import as_text
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.session.goal import Goal, helpful_motion
@@ -99,6 +101,16 @@ def test_the_best_result_stays_when_the_robot_is_parked_or_later_ones_are_worse(
     assert goal.best is best
     goal.restart()
     assert (goal.best, goal.progress.is_done) == (None, False)
+
+
+def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
+    progress = Goal(*TARGETS).add(result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0))
+    hec.save(dataclasses.replace(made(), goal=progress.to_dict()), tmp_path)
+    found = hec.load(tmp_path).goal
+    assert found == progress.to_dict()
+    assert found["sentence"] == progress.sentence
+    assert found["axes"]["z"] == {"sigma": None, "target": 0.02, "seconds_left": None}
+    assert f"the session: {progress.sentence}" in as_text(hec.load(tmp_path))
 
 
 class TestNotGettingThere:
