@@ -206,7 +206,7 @@ class Goal:
             return f"No usable result: {calibration.status.failure}."
         if self._best is not None:
             return f"Done: {_precision(self._best)}. Stop and save.{_floor(self._best, self)}"
-        motion = helpful_motion(axis, seen.rotation)
+        motion = helpful_motion(axis, seen)
         if stuck:
             return f"This motion will not show {_called(axis)} well enough: {motion}."
         if not np.isfinite(left_s):
@@ -235,7 +235,7 @@ def _least_motion_s(calibration: Calibration) -> float:
     return max(_MIN_MOTION_S, _CORRELATION_TIMES * float(slowest_s))
 
 
-def helpful_motion(axis: str, rotation: FloatArray) -> str:
+def helpful_motion(axis: str, seen: Excitation) -> str:
     """The motion that would tell most about an axis, in words.
 
     A rotation about one axis tells about offsets and angles across it, never about those along it.
@@ -244,16 +244,22 @@ def helpful_motion(axis: str, rotation: FloatArray) -> str:
     ----------
     axis : str
         x, y, z, roll, pitch or yaw.
-    rotation : (3,) array
-        Rotation seen so far about the axes of the parent sensor, rad.
+    seen : Excitation
+        The motion so far, about the axes of the parent sensor.
     """
+    rotation = seen.rotation
     if rotation.max() < MIN_ROTATION:
-        return "move in curves, to both sides"
+        return (
+            "move in curves, to both sides" if seen.drives else "rotate the sensors, about all axes"
+        )
     main = int(np.argmax(rotation))
+    others = " and ".join(name for index, name in enumerate("xyz") if index != main)
     is_planar = int((rotation < MIN_ROTATION).sum()) == 2
     along = (TRANSLATIONS if axis in TRANSLATIONS else ROTATIONS).index(axis)
+    is_planar = is_planar and (seen.drives or along == main)
     if is_planar and along == main and axis in TRANSLATIONS:
-        return "tilt the sensors over a ramp or a kerb, or measure it by hand"
+        tilt = "over a ramp or a kerb" if seen.drives else f"about {others}"
+        return f"tilt the sensors {tilt}, or measure it by hand"
     if is_planar and along == main:
         return "move farther, straight on and in curves"
     if is_planar:
