@@ -30,7 +30,7 @@ _GAIN_WARNING, _GAIN_ERROR = 0.003, 0.03
 
 # Delays of positions against orientations (s, intervals of the poses), and smoothing (s^2, squared
 # intervals), from which on they count.
-_DELAY_S, _DELAY_INTERVALS = 0.02, 0.2
+_DELAY_S, _DELAY_INTERVALS = 0.015, 0.15
 _SMOOTHING_S2, _SMOOTHING_INTERVALS2 = {"position": 0.004, "rotation": 0.002}, 0.1
 
 # Shifts (m) by a delay or by smoothing from which on they count, and from which on a result is

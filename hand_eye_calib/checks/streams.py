@@ -36,6 +36,11 @@ _MAX_FROZEN = 0.02
 _ALTERNATES, _MAX_PERIOD, _LEAST_LEVELS_M = 2.0, 6, 0.01
 _MIN_POSES_OF_TURNS, _MAX_REPEATS = 60, 0.1
 
+# Two sensors in no order: how many times more a pose is off along one direction than along others,
+# its largest kurtosis there (3 for noise, 2 for two levels), and largest growth with the lag (1 for
+# noise and levels, 4 for curves).
+_MIN_POSES_OF_MIX, _ONE_DIRECTION, _FEW_AMOUNTS, _STEADY = 300, 8.0, 2.4, 1.5
+
 # Positions are on a grid if this share of so many differences, those of a few steps, are multiples
 # of the smallest, to this share of a step. Steps (m) from which on that matters.
 _MIN_GRID, _ON_GRID, _GRID_TOLERANCE, _MAX_MULTIPLE = 30, 0.98, 0.06, 200.0
@@ -179,6 +184,8 @@ def check_stream(
         return [*findings, wording.interleaved(stream, *levels)]
     if coarse := _check_grid(trajectory.poses[:, :3, 3], stream):
         return [*findings, coarse]
+    if levels := _mixed(trajectory):
+        return [*findings, wording.interleaved(stream, *levels)]
     share = float(_jumps(trajectory).mean())
     if share > _MIN_JUMPS:
         findings.append(wording.jumps(stream, share))
@@ -200,6 +207,41 @@ def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
     if rough[0] < max(_ALTERNATES * smoothest, _LEAST_LEVELS_M):
         return None
     return rough[0] / smoothest, rough[0]
+
+
+def _mixed(trajectory: Trajectory) -> tuple[float, float] | None:
+    """Like :func:`_interleaved`, for two sensors in no order: seen from the sensor, a pose is off
+    those around it along one direction, by one of few amounts.
+    """
+    if len(trajectory) < _MIN_POSES_OF_MIX:
+        return None
+    near, far = (_off_in_body(trajectory, lag) for lag in (1, 2))
+    sizes, directions = np.linalg.eigh(near.T @ near / len(near))
+    along = near @ directions[:, -1]
+    peakedness = float(np.mean(along**4) / max(np.mean(along**2) ** 2, 1e-300))
+    growth = _rms(far) / max(_rms(near), 1e-300)
+    is_mixed = (
+        sizes[2] > max(_ONE_DIRECTION * sizes[1], _LEAST_LEVELS_M**2 / 4)
+        and peakedness < _FEW_AMOUNTS
+        and growth < _STEADY
+    )
+    # A quarter of the poses are off by the distance of the levels, half by a half of it.
+    return (1.0 / growth, float(np.sqrt(sizes[2] / 0.375))) if is_mixed else None
+
+
+def _off_in_body(trajectory: Trajectory, lag: int) -> FloatArray:
+    """How far (M, 3) each pose is off the middle of those ``lag`` poses before and after, in its
+    own axes.
+    """
+    poses = trajectory.poses
+    positions = poses[:, :3, 3]
+    middles = 0.5 * (positions[2 * lag :] + positions[: -2 * lag])
+    rotations = poses[lag:-lag, :3, :3]
+    return np.einsum("kji,kj->ki", rotations, positions[lag:-lag] - middles)
+
+
+def _rms(vectors: FloatArray) -> float:
+    return float(np.sqrt(np.mean((vectors**2).sum(axis=1))))
 
 
 def _roughness(positions: FloatArray, stamps_ns: IntArray, lag: int) -> float:
