@@ -25,6 +25,9 @@ _SAME_M, _SAME_RAD = 0.005, float(np.radians(0.3))
 _MAX_SIGMA_M, _MAX_SIGMA_RAD = 0.01, float(np.radians(0.5))
 _WITHIN = 3.0
 
+# Nearly one: hardly two sensors fit so close.
+_NEARLY_M, _NEARLY_WITHIN = 0.012, 4.0
+
 # Gains of rotations, less 1, from which on there is a warning, an error.
 _GAIN_WARNING, _GAIN_ERROR = 0.003, 0.03
 
@@ -35,7 +38,7 @@ _SMOOTHING_S2, _SMOOTHING_INTERVALS2 = {"position": 0.004, "rotation": 0.002}, 0
 
 # Shifts (m) by a delay or by smoothing from which on they count, and from which on a result is
 # unusable.
-_SHIFT_M, _SHIFT_ERROR_M = 0.008, 0.03
+_SHIFT_M, _SHIFT_ERROR_M = 0.008, 0.05
 
 # Shifts of the mount (m, rad) from which on they count, and from which on a result is unusable.
 _MOVED_M, _MOVED_RAD = 0.005, float(np.radians(0.2))
@@ -85,11 +88,13 @@ def _check_same(aligned: Aligned) -> list[Finding]:
         return []
     distance_m = float(np.linalg.norm(T[:3, 3]))
     angle_rad = float(se3.rotation_angle(T[:3, :3]))
-    if distance_m > max(_SAME_M, _WITHIN * sigmas[:3].max()):
+    if distance_m > max(_NEARLY_M, _NEARLY_WITHIN * sigmas[:3].max()):
         return []
+    is_exact = distance_m < max(_SAME_M, _WITHIN * sigmas[:3].max())
+    severity = Severity.ERROR if is_exact else Severity.WARNING
     if angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max()):
-        return [wording.same_frame(distance_m, angle_rad)]
-    return [wording.same_position(distance_m, float(sigmas[:3].max()))]
+        return [wording.same_frame(distance_m, angle_rad, severity)]
+    return [wording.same_position(distance_m, float(sigmas[:3].max()), severity)]
 
 
 def _check_gains(aligned: Aligned) -> tuple[FloatArray, list[Finding]]:

@@ -442,12 +442,12 @@ def one_axis(direction: FloatArray, hidden: Sequence[str], main: str) -> Finding
     )
 
 
-def same_frame(distance_m: float, angle_rad: float) -> Finding:
+def same_frame(distance_m: float, angle_rad: float, severity: Severity) -> Finding:
     """The extrinsic is the identity."""
     return Finding(
         code="same_frame",
         stream="both",
-        severity=Severity.ERROR,
+        severity=severity,
         confidence=Confidence.LIKELY,
         what="both streams are of one and the same frame: the extrinsic is the identity, to "
         f"{1e3 * distance_m:.1f} mm and {np.degrees(angle_rad):.2f} deg",
@@ -458,12 +458,12 @@ def same_frame(distance_m: float, angle_rad: float) -> Finding:
     )
 
 
-def same_position(distance_m: float, sigma_m: float) -> Finding:
+def same_position(distance_m: float, sigma_m: float, severity: Severity) -> Finding:
     """The translation is zero."""
     return Finding(
         code="same_position",
         stream="both",
-        severity=Severity.ERROR,
+        severity=severity,
         confidence=Confidence.LIKELY,
         what="both streams have the same positions and other orientations: the translation "
         f"between the sensors is zero ({1e3 * distance_m:.1f} +/- {1e3 * sigma_m:.1f} mm)",
