@@ -39,7 +39,7 @@ def ratios(rows, memory):
     found = {}
     seconds = {(row.name, row.size): row.seconds for row in rows}
     for (name, size), own in seconds.items():
-        against = {_AGAINST.get(name), FLOOR if name != FLOOR else None}
+        against = {_AGAINST.get(name), FLOOR if name != FLOOR and _is_compared(name) else None}
         if name == "dnlo fast":
             against.add("opencv, the fastest")
         if name.removesuffix(", processor") in _PROCESSES:
