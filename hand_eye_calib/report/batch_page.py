@@ -64,7 +64,7 @@ def render_batch(
     rows : sequence of dict
         One for each recording.
     vehicles : sequence of dict
-        ``name``, ``frames``, ``rows``, ``agreement`` and ``sentence`` of each vehicle.
+        ``name``, ``frames``, ``rows``, ``agreement``, ``sentence`` and ``newest`` of each vehicle.
     with_report : sequence of bool
         Whether a recording has a report.
 
@@ -92,7 +92,7 @@ def render_batch(
 
 def _vehicle(vehicle: Plain, number: int) -> dict[str, Any]:
     found: Agreement = vehicle["agreement"]
-    rows = vehicle["rows"]
+    rows, newest = vehicle["rows"], vehicle["newest"]
     tone = _TONES[found.kind]
     return {
         "title": vehicle["name"] or "All recordings",
@@ -100,6 +100,9 @@ def _vehicle(vehicle: Plain, number: int) -> dict[str, Any]:
         "frames": " in ".join(reversed(vehicle["frames"])),
         "count": counted(len(rows), "recording"),
         "sentence": vehicle["sentence"],
+        "newest": f"{rows[-1]['name']} against the earlier ones: {newest.sentence}."
+        if newest
+        else "",
         "tone": tone,
         "mark": _MARKS[tone],
         "values": _common(found),

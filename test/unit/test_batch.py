@@ -468,6 +468,7 @@ def test_recordings_are_compared_with_those_of_their_vehicle():
         *fleet_outcomes("a", 5, 2),
         *fleet_outcomes("c", 5, 3, shift=(1,)),
         *fleet_outcomes("d", 1, 4),
+        *fleet_outcomes("e", 6, 1, shift=(5,), by=0.1),
         {**outcome("x", "a", *(one[0] for one in recordings_of(9, 1))), "calibration": None},
     ]
     random = np.random.default_rng(0)
@@ -477,10 +478,14 @@ def test_recordings_are_compared_with_those_of_their_vehicle():
         ("b", "moved"),
         ("c", "one off"),
         ("d", "single"),
+        ("e", "one off"),
     ]
     assert found["b"].sentence.startswith("The mount has moved before b_4: +1.")
     assert " deg about z" in found["b"].sentence
     assert found["c"].sentence.startswith("c_1 does not agree with the others: +1.")
+    assert found["e"].newest.sentence.startswith("moved: ")
+    assert "moved" not in found["a"].newest.sentence
+    assert found["d"].newest is None
     document = json.loads(json.dumps(found["b"].to_dict(), allow_nan=False))
     assert document["apart"] == ["b_4", "b_5"]
 
@@ -496,6 +501,7 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
     assert "<b>" not in page
     assert "no &lt;bag&gt;" in page
     assert page.count("<svg") == 2
+    assert page.count(" against the earlier ones: ") == 2
     assert "path/fleet.yaml" not in page
     assert page.count("/report.html") == 8
     for address in re.findall(r'(?:href|src)="([^"]*)"', page):

@@ -36,7 +36,13 @@ def print_results(outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]) -> N
 
 
 def _said(vehicle: Vehicle) -> str:
-    return f"{vehicle.name}: {vehicle.sentence}" if vehicle.name else vehicle.sentence
+    """What all recordings say, and the newest against the earlier ones."""
+    head = f"{vehicle.name}: " if vehicle.name else ""
+    newest = vehicle.rows[-1]["name"]
+    tail = (
+        f" {newest} against the earlier ones: {vehicle.newest.sentence}." if vehicle.newest else ""
+    )
+    return f"{head}{vehicle.sentence}{tail}"
 
 
 def _cells(outcome: Outcome) -> list[str]:

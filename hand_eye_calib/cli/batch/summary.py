@@ -13,7 +13,9 @@ from hand_eye_calib.cli.batch.rows import COLUMNS, Row, row_of
 from hand_eye_calib.cli.batch.store import write
 from hand_eye_calib.cli.batch.tasks import INDEX, SUMMARY, TABLE
 from hand_eye_calib.cli.reporting import REPORT, can_draw, save_page
-from hand_eye_calib.session.agreement import Agreement, Kind, agreement_of, sentence
+from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.session.agreement import Agreement, agreement_of, sentence
+from hand_eye_calib.session.compare import Comparison, compare
 
 _FAILURES = (SolveStatus.NOT_CONVERGED, SolveStatus.CONTRADICTED)
 
@@ -31,7 +33,9 @@ class Vehicle:
     rows : tuple of dict
     agreement : Agreement
     sentence : str
-        What the comparison found.
+        What the comparison of all found.
+    newest : Comparison or None
+        Of the newest recording with what the earlier ones say together.
     """
 
     name: str
@@ -39,6 +43,7 @@ class Vehicle:
     rows: tuple[Row, ...]
     agreement: Agreement
     sentence: str
+    newest: Comparison | None
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values."""
@@ -55,7 +60,8 @@ class Vehicle:
             "p_value": found.p_value,
             "scatter": found.scatter,
             "T_parent_child": found.T_parent_child.tolist(),
-            "covariance": found.covariance.tolist(),
+            "covariance_in_parent": found.covariance.tolist(),
+            "newest": self.newest.to_dict() if self.newest else None,
         }
 
 
@@ -77,11 +83,29 @@ def vehicles_of(outcomes: Sequence[Outcome]) -> list[Vehicle]:
 def _vehicle(name: str, frames: tuple[str, str], group: list[tuple[Row, Calibration]]) -> Vehicle:
     ordered = sorted(group, key=lambda one: (one[0]["start_ns"] or 0, one[0]["name"]))
     rows = tuple(row for row, _ in ordered)
-    found = agreement_of(
-        np.array([calibration.T_parent_child for _, calibration in ordered]),
-        np.array([calibration.covariance_with_floor for _, calibration in ordered]),
+    calibrations = [calibration for _, calibration in ordered]
+    found = _agreement_of(calibrations)
+    said = sentence(found, [row["name"] for row in rows])
+    return Vehicle(name, frames, rows, found, said, _newest(calibrations, rows[-1]["name"]))
+
+
+def _agreement_of(calibrations: Sequence[Calibration]) -> Agreement:
+    return agreement_of(
+        np.array([calibration.T_parent_child for calibration in calibrations]),
+        np.array([calibration.covariance_with_floor for calibration in calibrations]),
     )
-    return Vehicle(name, frames, rows, found, sentence(found, [row["name"] for row in rows]))
+
+
+def _newest(calibrations: Sequence[Calibration], name: str) -> Comparison | None:
+    """The newest recording against what the earlier ones say together; None if there are none."""
+    *earlier, newest = calibrations
+    if not earlier:
+        return None
+    found = _agreement_of(earlier)
+    to_child = np.kron(np.eye(2), found.T_parent_child[:3, :3].T)
+    covariance = to_child @ found.covariance @ to_child.T
+    common = Extrinsic(found.T_parent_child, "earlier recordings", covariance, is_calibration=True)
+    return compare([newest], common, [name])
 
 
 def write_summary(
@@ -118,8 +142,3 @@ def document_of(
         "failures": [outcome["name"] for outcome in outcomes if outcome["error"]],
         "vehicles": [vehicle.to_dict() for vehicle in vehicles],
     }
-
-
-def is_apart(vehicle: Vehicle) -> bool:
-    """Whether its recordings contradict each other."""
-    return vehicle.agreement.kind in (Kind.ONE_OFF, Kind.MOVED, Kind.DIFFER)
