@@ -19,7 +19,6 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import OtherAnswers
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.verdict import FEWEST_INLIERS
 
 # Fewest other answers that have a scatter.
 _MIN_OTHERS = 3
@@ -27,6 +26,10 @@ _MIN_OTHERS = 3
 # Answers whose standard deviation is below so many of the result's are about as certain. Fewest of
 # them that say something.
 _AS_CERTAIN, _MIN_AS_CERTAIN = 3.0, 2
+
+# An answer from a smaller share of the motion pairs says nothing about others: DNLO keeps half of
+# them at least, however noisy they are.
+_FEWEST_INLIERS = 0.55
 
 # Smallest joint standard deviation (m, rad) to divide by: noise-free data has none.
 _ROUNDING = 1e-9
@@ -122,9 +125,8 @@ def compare_answers(
     calibration : Calibration
         The result.
     others : sequence of Calibration
-        From other methods and references. Only those count that reject outliers, and do not reject
-        a large part of the motion pairs: the others disagree for a reason that says nothing about
-        the result.
+        From other methods and references. Only those count that reject outliers, and not half of
+        the motion pairs: the others disagree for a reason that says nothing about the result.
     halves : sequence of Calibration
         From the first and the second half of the recording, or fewer.
 
@@ -173,7 +175,7 @@ def _scatter(
 
 def _is_sound(other: Calibration) -> bool:
     share = other.n_inliers / max(other.n_pairs, 1)
-    return METHODS[other.method].rejects_outliers and share >= FEWEST_INLIERS
+    return METHODS[other.method].rejects_outliers and share > _FEWEST_INLIERS
 
 
 def _over_own(calibration: Calibration, others: Sequence[Calibration]) -> FloatArray:
