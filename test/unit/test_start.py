@@ -75,4 +75,5 @@ def test_commands_use_one_thread_unless_told_otherwise(monkeypatch):
 def test_the_help_names_every_experiment():
     from reproduction import catalogue
 
-    assert tuple(EXPERIMENTS) == tuple(catalogue.EXPERIMENTS)
+    # The study of faults has recordings of its own, and none of the cells of the others.
+    assert [name for name in EXPERIMENTS if name != "faults"] == list(catalogue.EXPERIMENTS)
