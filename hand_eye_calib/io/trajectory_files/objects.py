@@ -202,6 +202,8 @@ def to_nanoseconds(times: Any, stamp_unit: str | None = None) -> IntArray:
     factor = STAMP_UNITS[stamp_unit or _unit_of(stamps)]
     if len(stamps) and np.abs(stamps).max() > np.iinfo(np.int64).max / factor:
         raise InputError("stamps are too large for their unit; name it with `stamp_unit`")
+    if stamps.dtype.kind != "f":
+        return np.asarray(stamps.astype(np.int64) * factor)
     whole = np.floor(stamps)
     # The fraction by itself, so that no digit of an epoch second is lost.
     fraction_ns = np.rint((stamps - whole) * factor).astype(np.int64)
