@@ -45,6 +45,10 @@ _LEAST_MOTION, _LEAST_ROTATION, _LEAST_OF_NOISE = 0.05, float(np.radians(1.5)), 
 LEARNING_S, MEMORY_S = 120, 1200
 _LAGS = np.unique(np.round(np.geomspace(3, MEMORY_S, 16)).astype(int))
 
+# What a knock may be: a translation, a rotation, both. A knock that only turns the sensor shows
+# sooner against the second.
+_KNOCKS = np.array([shift_covariance(radians=1e-6), shift_covariance(1e-6), shift_covariance()])
+
 # Time over which the noise is followed, and over which older motion is forgotten, in seconds of
 # motion.
 _NOISE_MEMORY_S, _OLD_MEMORY_S = 900.0, 20_000.0
@@ -304,7 +308,7 @@ class MountMonitor:
             self._memory = _Seconds()
             return None
         lags, H, S, before = self._sums()
-        ratios = log_ratio(H, S, 1.0)
+        ratios = log_ratio(H, S, 1.0, _KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
         if ratios[best] < (self.alarm.log_ratio if self.alarm else THRESHOLD):
             return None
@@ -374,12 +378,11 @@ class MountMonitor:
         values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
         root = scale[:, None] * vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
         covariance = root @ root.T + before
-        # A shift along an axis of z standard deviations has the ratio z^2 / 2 less this.
-        _, log_volume = np.linalg.slogdet(
-            np.eye(6) + shift_covariance() @ np.linalg.inv(covariance)
-        )
-        seen_sigmas = np.sqrt(2.0 * THRESHOLD + log_volume) + _POWER_SIGMAS
-        return seen_sigmas * self._sigmas(covariance)
+        # A shift along or about an axis of z standard deviations has the ratio z^2 / 2 less this.
+        information = np.linalg.inv(covariance)
+        _, log_volumes = np.linalg.slogdet(np.eye(6) + _KNOCKS[:2] @ information)
+        seen_sigmas = np.sqrt(2.0 * THRESHOLD + log_volumes) + _POWER_SIGMAS
+        return np.repeat(seen_sigmas, 3) * self._sigmas(covariance)
 
     def _information_of_noise(self) -> FloatArray:
         """What the rotation noise of a motion seems to tell of a translation, (3, 3), on average:

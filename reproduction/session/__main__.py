@@ -125,8 +125,11 @@ def _visible(visible: np.ndarray) -> tuple[str, str]:
 
 
 def _delays(arguments: argparse.Namespace) -> str:
-    tasks = [(kind, seed) for kind in mount.SHIFTED for seed in range(2 * arguments.seeds)]
-    found: list[mount.Delay] = sum(in_parallel(mount.delays, tasks, arguments.jobs), [])
+    tasks = [(kind, seed) for kind in mount.SHIFTED for seed in range(arguments.seeds)]
+    return _delay_table(sum(in_parallel(mount.delays, tasks, arguments.jobs), []))
+
+
+def _delay_table(found: Sequence[mount.Delay]) -> str:
     rows = [
         (kind, size, *_delay_row([d for d in found if (d.kind, d.size) == (kind, size)]))
         for kind in mount.SHIFTED
