@@ -292,7 +292,7 @@ def assert_data_files(prefix):
     assert (prefix / "share/ament_index/resource_index/packages" / PACKAGE).is_file()
     share = prefix / "share" / PACKAGE
     assert (share / "package.xml").is_file()
-    for folder, pattern in (("config", "*.yaml"), ("launch", "*.launch.py")):
+    for folder, pattern in (("config", "*.*"), ("launch", "*.launch.py")):
         expected = {path.name for path in (ROOT / folder).glob(pattern)}
         assert expected, f"{folder} is empty"
         assert {path.name for path in (share / folder).iterdir() if path.is_file()} == expected
