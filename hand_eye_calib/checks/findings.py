@@ -269,7 +269,7 @@ def no_rotation() -> Finding:
         "both",
         "the streams hardly rotate, or at a constant rate, so that neither clock nor extrinsic can "
         "be checked",
-        "drive curves, over slopes if there are any",
+        "rotate about several axes (a vehicle: curves, and slopes if there are any)",
         Confidence.LIKELY,
     )
 
@@ -437,7 +437,8 @@ def one_axis(direction: FloatArray, hidden: Sequence[str], main: str) -> Finding
         confidence=Confidence.LIKELY,
         what=f"nearly all rotation is about one axis, ({axis}) in the parent sensor's frame: the "
         f"translation along it, {' and '.join(hidden)}, will be unobservable",
-        advice=f"drive over slopes or kerbs, or measure {main} and give it",
+        advice=f"rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {main} "
+        "and give it",
         options=((f"prior.{main}", "VALUE+/-SIGMA"),),
     )
 
