@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hand_eye_calib.cli.console import waiting_for
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import InputError, printable
 
@@ -58,7 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.io.installed import read_installed
 
         frames = results[0].parent_frame, results[0].child_frame
-        installed = read_installed(arguments.installed, *frames)
+        with waiting_for(f"reading {arguments.installed}"):
+            installed = read_installed(arguments.installed, *frames)
     found = compare(results, installed, _names(arguments.results))
     if arguments.json:
         print(json.dumps(found.to_dict(), indent=2, allow_nan=False))

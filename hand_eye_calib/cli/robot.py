@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import note
+from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.status import listing
@@ -110,7 +110,8 @@ def _installed(calibration: "Calibration", arguments: argparse.Namespace) -> "Ex
 
     frames = calibration.parent_frame, calibration.child_frame
     if arguments.installed:
-        return read_installed(arguments.installed, *frames)
+        with waiting_for(f"reading {arguments.installed}"):
+            return read_installed(arguments.installed, *frames)
     return of_frames(_frames(arguments), *frames, str(arguments.urdf))
 
 
