@@ -239,6 +239,7 @@ def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
     [
         (["a/monday/bag", "b/monday/bag", "b/tuesday/bag"], ["a_monday", "b_monday", "b_tuesday"]),
         (["a/monday/bag", "b/monday/bag"], ["a", "b"]),
+        (["a/1", "a/2", "b/1", "b/2", "c/3"], ["a_1", "a_2", "b_1", "b_2", "3"]),
         (["bag", "deep/bag"], ["bag", "deep"]),
         (["x/run.mcap", "y/run.bag"], ["x", "y"]),
         (["one.mcap", "two.mcap"], ["one", "two"]),

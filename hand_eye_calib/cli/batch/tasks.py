@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from glob import glob, has_magic
@@ -235,14 +236,14 @@ def _names(recordings: Sequence[_Recording]) -> list[str]:
     called alike are named by the folders in which they differ, as monday and tuesday of monday/bag
     and tuesday/bag.
     """
-    places = [_place(paths[0]) for _, paths, entry in recordings if not entry.get("name")]
-    alike: dict[str, list[tuple[str, ...]]] = {}
-    for place in dict.fromkeys(places):
-        alike.setdefault(place[-1], []).append(place)
+    unnamed = [_place(paths[0]) for _, paths, entry in recordings if not entry.get("name")]
+    places = list(dict.fromkeys(unnamed))
+    stems = Counter(place[-1] for place in places)
+    alike = [place for place in places if stems[place[-1]] > 1]
     names: list[str] = []
     for where, paths, entry in recordings:
         place = _place(paths[0])
-        usual = "_".join(_distinct(place, alike.get(place[-1], [])))
+        usual = "_".join(_distinct(place, alike) if place in alike else place[-1:])
         names.append(_free(_name(where, entry.get("name") or usual), set(names)))
     return names
 
@@ -254,9 +255,7 @@ def _place(bag: str) -> tuple[str, ...]:
 
 
 def _distinct(place: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    """The parts of a place in which it differs from others; the last part if there are none."""
-    if len(others) < 2:
-        return place[-1:]
+    """The parts of a place in which several places differ; the last part if it has none."""
     first = next(k for k in count() if len({one[k : k + 1] for one in others}) > 1)
     last = next(k for k in count(1) if len({one[-k : len(one) - k + 1] for one in others}) > 1)
     return place[first : len(place) - last + 1] or place[-1:]
