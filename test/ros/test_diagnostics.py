@@ -99,9 +99,8 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, heard, tmp_pa
             publisher.publish(message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame))
     parent = wait(peer, heard, "parent input", lambda status: "set time_offset" in status.message)
     assert parent.level == DiagnosticStatus.WARN
-    assert float(values(parent)["clock offset to the other input seen (s)"]) == pytest.approx(
-        5.0, abs=2.0
-    )
+    # By the times of arrival: more on a busy machine.
+    assert float(values(parent)["clock offset to the other input seen (s)"]) > 3.0
     assert peer.set_parameter("time_offset", 5.0).successful
     good = wait(
         peer,
