@@ -254,21 +254,22 @@ def report(outcomes: Sequence[Outcome], alarms: Sequence[tuple[str, int, list[st
     """Text of the page."""
     by_key = {found.key: found for found in outcomes}
     parts = [
-        f"{len(outcomes)} calibrations: `{'`, `'.join(METHODS)}`, three simulated hilly drives of "
-        "120 s at 1.5 m/s, and two recordings of hand-held devices (tango), whose answer without "
-        "the fault counts as the truth. z is the largest error of an axis in its stated standard "
-        "deviations; z and the error are the largest of all recordings and methods. Findings and "
-        "verdicts are counted over recordings and methods.",
+        f"{len(outcomes)} calibrations with `{'` or `'.join(METHODS)}`: of simulated hilly drives "
+        "of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), whose answer "
+        "without the fault counts as the truth. z is the largest error of an axis in its stated "
+        "standard deviations; z and the error are the largest of all recordings and methods. "
+        "Findings and verdicts are counted over recordings and methods, so that the verdicts say "
+        "how many there are.",
         _unsafe_text(outcomes),
         "### Faults\n\n" + _table(FAULTS, by_key),
     ]
-    if UNTUNED:
+    if any(found.key.startswith(UNTUNED[0].code + " ") for found in outcomes):
         parts.append("### Faults that no limit was set with\n\n" + _table(UNTUNED, by_key))
     clean = [found for found in outcomes if found.key.startswith("clean ")]
     parts.append(
         "### No false alarms\n\nWithout a fault, the recordings above end in "
         f"{_counted(found.verdict for found in clean)}; z is at most "
-        f"{max(found.z for found in clean):.1f}.\n\n" + _alarm_table(alarms)
+        f"{max((found.z for found in clean), default=0.0):.1f}.\n\n" + _alarm_table(alarms)
     )
     return "\n\n".join(parts)
 

@@ -210,6 +210,12 @@ class TestOneStream:
         parent, child = drive()
         assert grave(check_streams(parent[:3], child)) == [("too_short", "parent")]
 
+    @pytest.mark.parametrize("n_poses", [18, 25])
+    def test_too_short_for_the_scale_is_no_error(self, n_poses):
+        parent, child = drive(n_poses=n_poses)
+        codes = [found for found, _ in grave(check_streams(parent, child, scale=1.0))]
+        assert "scale" not in codes
+
     def test_numbers(self):
         summary = summarise(drive(noise=0.0)[0])
         assert (summary.poses, summary.rate_hz) == (500, pytest.approx(10.0))
