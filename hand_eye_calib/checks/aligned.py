@@ -31,9 +31,9 @@ _NEARLY_M, _NEARLY_WITHIN = 0.012, 4.0
 # Gains of rotations, less 1, from which on there is a warning, an error.
 _GAIN_WARNING, _GAIN_ERROR = 0.003, 0.03
 
-# Delays of positions against orientations (s, intervals of the poses), and smoothing (s^2, squared
-# intervals), from which on they count.
-_DELAY_S, _DELAY_INTERVALS = 0.015, 0.15
+# Delays of positions against orientations (s, squared intervals of the poses), and smoothing (s^2,
+# squared intervals), from which on they count.
+_DELAY_S, _DELAY_INTERVALS2 = 0.015, 1.5
 _SMOOTHING_S2, _SMOOTHING_INTERVALS2 = {"position": 0.004, "rotation": 0.002}, 0.1
 
 # Shifts (m) by a delay or by smoothing from which on they count, and from which on a result is
@@ -117,7 +117,7 @@ def _check_response(found: Response) -> list[Finding]:
     """Findings about delays and smoothing of one part of the poses."""
     late = found.position_delay
     shift_m = abs(late.value) * found.rms_speed
-    least_s = max(_DELAY_S, _DELAY_INTERVALS * found.interval_s, _SIGMAS * late.sigma)
+    least_s = max(_DELAY_S, _DELAY_INTERVALS2 * found.interval_s**2, _SIGMAS * late.sigma)
     if abs(late.value) > least_s and shift_m > _SHIFT_M:
         return [wording.position_clock(late, shift_m, _severity(shift_m))]
     for part, least_s2 in _SMOOTHING_S2.items():
