@@ -86,7 +86,7 @@ _NOISY, _FREED_ROUNDS = 0.2, 2
 _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
 
 # Sizes of errors that last longer than those found, as shares of their variance.
-_LONGER_SIZES = np.array([0.0, 0.0625, 0.25, 1.0])
+_LONGER_SIZES = np.array([0.0, 0.25, 1.0])
 
 # Systematic errors larger than this (of the length, m/m, s) are none: a wrong unit, a clock that
 # was not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground a

@@ -34,8 +34,9 @@ SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
 _BLOCKS = 10
 _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 
-# Expected ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance.
-_CHANCE = np.array([0.10, 0.29, 0.58, 0.98, 1.56, 2.49])
+# What the ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance
+# exceed once in ten times.
+_CHANCE = np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28])
 
 # What the squared distance of two halves in units of their joint covariance exceeds once in ten
 # recordings: a chi-squared with 6 degrees of freedom.
@@ -257,7 +258,7 @@ def beyond_chance(model: FloatArray, resampled: FloatArray) -> FloatArray:
     chance makes of it.
 
     The ratios of the jackknife to a model that is right scatter: with ten blocks the largest of six
-    is 2.5 on average. They are divided by what is expected.
+    exceeds 3.3 once in ten recordings. They are divided by what is exceeded so often.
     """
     return _raised(model, resampled, _CHANCE)
 
