@@ -111,9 +111,8 @@ def _watched(found: Sequence[mount.Watched]) -> str:
     hours, alarms = sum(w.hours for w in found), sum(w.alarms for w in found)
     header = ("recordings", "hours", "alarms", "f", "x, y, z (cm)", "roll, pitch, yaw (deg)")
     return (
-        f"{alarms} alarms in {hours:g} h without a shift, {100 * alarms / hours:.2g} in 100 h. The "
-        "last columns: which shift ten minutes of motion would show nine times out of ten.\n\n"
-        + markdown_table(header, rows)
+        f"{alarms} alarms in {hours:g} h of motion without a shift. The last columns: which shift "
+        "ten minutes of motion would show nine times out of ten.\n\n" + markdown_table(header, rows)
     )
 
 
@@ -158,7 +157,7 @@ def _memory(arguments: argparse.Namespace) -> str:
     early, late = mount.memory_mb("agv_long", 1000.0)
     return (
         f"Largest memory of the process: {early:.0f} MB after 10 hours, {late:.0f} MB after 1,000 "
-        "hours of a robot that drives for six minutes of each."
+        "hours of a robot that drives for a minute of each."
     )
 
 

@@ -37,7 +37,7 @@ SHIFTS = {
     "2 deg": np.radians(2.0), "1 cm": 0.01, "2 cm": 0.02, "5 cm": 0.05,
 }  # fmt: skip
 _BEFORE_S, _AFTER_S = 900.0, 1800.0
-_DRIVE_S = 360.0
+_DRIVE_S = 60.0
 
 # The monitor takes no more poses a second than this.
 _RATE_HZ = 10.0
@@ -169,7 +169,7 @@ def _delay(
 
 def memory_mb(name: str, hours: float) -> tuple[float, float]:
     """Largest memory (MB) of the process after ten hours, and after so many, of a robot that drives
-    for six minutes of each hour and stands switched off for the rest.
+    for a minute of each hour and stands switched off for the rest.
     """
     X = mount(name, 0)
     monitor = MountMonitor(X, np.zeros((6, 6)))
