@@ -33,7 +33,7 @@ _GAIN_WARNING, _GAIN_ERROR = 0.003, 0.03
 
 # Delays of positions against orientations (s, squared intervals of the poses), and smoothing (s^2,
 # squared intervals), from which on they count.
-_DELAY_S, _DELAY_INTERVALS2 = 0.015, 1.5
+_DELAY_S, _DELAY_INTERVALS2 = 0.015, 2.0
 _SMOOTHING_S2, _SMOOTHING_INTERVALS2 = {"position": 0.004, "rotation": 0.002}, 0.1
 
 # Shifts (m) by a delay or by smoothing from which on they count, and from which on a result is
@@ -118,7 +118,8 @@ def _check_response(found: Response) -> list[Finding]:
     late = found.position_delay
     shift_m = abs(late.value) * found.rms_speed
     least_s = max(_DELAY_S, _DELAY_INTERVALS2 * found.interval_s**2, _SIGMAS * late.sigma)
-    if abs(late.value) > least_s and shift_m > _SHIFT_M:
+    is_sure = late.is_clear and abs(late.value) > max(least_s, _BIASES * late.bias)
+    if is_sure and shift_m > _SHIFT_M:
         return [wording.position_clock(late, shift_m, _severity(shift_m))]
     for part, least_s2 in _SMOOTHING_S2.items():
         least = least_s2 + _SMOOTHING_INTERVALS2 * found.interval_s**2

@@ -23,7 +23,7 @@ that the parent is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,13 @@ _BLOCKS = 10
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING, _ROUNDS, _MEDIAN_LENGTH = 3.0, 4, 1.538
+
+# What remains without a delay is at least so many times of what remains with it. Without a delay,
+# it was at most 1.2 in noise of any size.
+_CONTRAST = 1.5
+
+# Shares of the estimated noise of rotations that may be true as well.
+_DOUBTS = (0.5, 1.5)
 
 # An axis whose root mean square rotation is below this share of the main axis's has no gain.
 _LITTLE = 0.1
@@ -73,6 +80,18 @@ class Biased(Quantity):
     bias: float
 
 
+@dataclass(frozen=True)
+class Delay(Biased):
+    """A delay, s, and how many times what remains without it is of what remains with it."""
+
+    contrast: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the positions agree so much better with it that it is no accident of noise."""
+        return self.contrast > _CONTRAST
+
+
 @dataclass(frozen=True, kw_only=True)
 class Smoothing:
     """By how much each stream is smoothed: c in s^2."""
@@ -87,7 +106,8 @@ class Response:
 
     Attributes
     ----------
-    rotation_delay, position_delay : Quantity
+    rotation_delay : Quantity
+    position_delay : Delay
         s; positive if the child is late.
     rotation_smoothing, position_smoothing : Smoothing
     interval_s : float
@@ -98,7 +118,7 @@ class Response:
 
     rotation_delay: Quantity
     rotation_smoothing: Smoothing
-    position_delay: Quantity
+    position_delay: Delay
     position_smoothing: Smoothing
     interval_s: float
     rms_speed: float
@@ -265,11 +285,13 @@ def _smoothing(by_parent: Quantity, by_child: Quantity, bias: float) -> Smoothin
 
 def _positions(
     pose_pairs: PosePairs, stencil: _Stencil, R: FloatArray, variance: float
-) -> tuple[Quantity, Smoothing]:
+) -> tuple[Delay, Smoothing]:
     """Delay and smoothing of the child's positions.
 
     Noise of the parent's orientations moves a long lever arm more than a short one, which would
-    favour delays with a short one. It has half of the ``variance`` of the rotations.
+    favour delays with a short one. It has half of the ``variance`` of the rotations. A delay that
+    depends on how well that is known is worth little: its bias is how far it moves if half of the
+    noise more or less is assumed.
     """
     at, step_s = stencil.at, stencil.step_s
     parent = _Displacements(pose_pairs.Ts_pw_p, np.eye(3), at)
@@ -280,13 +302,11 @@ def _positions(
     base = np.concatenate([chords, -se3.skew(x)], axis=2)
     delays = np.arange(-_N_DELAYS, _N_DELAYS + 1)
     targets = [child.over(2, int(k) * stencil.delay) - x for k in delays]
-    tried = [_regress(base, target, variance=variance) for target in targets]
-    best = int(np.argmin([found.less_noise().sum() for found in tried]))
-    # With the weights of the best, costs are a parabola.
-    weights = tried[best].weights
-    weighted = [_regress(base, target, weights, variance) for target in targets]
-    costs = np.array([found.less_noise() for found in weighted])
-    delay = _best_delay(costs, best, stencil.delay * stencil.interval_s)
+    spacing_s = stencil.delay * stencil.interval_s
+    delay, best = _delay(base, targets, variance, spacing_s)
+    others = [_delay(base, targets, factor * variance, spacing_s)[0] for factor in _DOUBTS]
+    delay = replace(delay, bias=max(abs(other.value - delay.value) for other in others))
+    best = best if delay.is_clear else _N_DELAYS
     shift, target = int(delays[best]) * stencil.delay, targets[best]
     bends = [bend / (3 * step_s**2) for bend in (parent.bend(0), child.bend(shift))]
     smoothing = [
@@ -300,14 +320,26 @@ def _positions(
     return delay, _smoothing(smoothing[0], smoothing[1], bias)
 
 
+def _delay(
+    base: FloatArray, targets: list[FloatArray], variance: float, spacing_s: float
+) -> tuple[Delay, int]:
+    """The delay at which the positions agree best, and which of those tried is nearest to it."""
+    tried = [_regress(base, target, variance=variance) for target in targets]
+    best = int(np.argmin([found.less_noise().sum() for found in tried]))
+    # With the weights of the best, costs are a parabola.
+    weights = tried[best].weights
+    weighted = [_regress(base, target, weights, variance) for target in targets]
+    return _best_delay(np.array([found.less_noise() for found in weighted]), best, spacing_s), best
+
+
 def _rms(vectors: FloatArray) -> float:
     """Robust root mean square length."""
     return float(np.median(np.linalg.norm(vectors, axis=1)))
 
 
-def _best_delay(costs: FloatArray, best: int, step_s: float) -> Quantity:
+def _best_delay(costs: FloatArray, best: int, step_s: float) -> Delay:
     """Vertex of the parabola through the costs (delays, blocks) around the best, with the jackknife
-    over blocks.
+    over blocks, and no bias.
     """
     total = costs.sum(axis=1)
     middle = int(np.clip(best, 1, len(total) - 2))
@@ -322,8 +354,12 @@ def _best_delay(costs: FloatArray, best: int, step_s: float) -> Quantity:
     left_out = np.array([vertex(total - costs[:, b]) for b in range(costs.shape[1])])
     n = len(left_out)
     sigma = np.sqrt((n - 1) / n * ((left_out - left_out.mean()) ** 2).sum())
-    value = middle - _N_DELAYS + vertex(total)
-    return Quantity(float(value * step_s), float(sigma * step_s))
+    offset = vertex(total)
+    below, top, above = total[middle - 1 : middle + 2]
+    least = top - 0.5 * (below - 2 * top + above) * offset**2
+    contrast = total[_N_DELAYS] / max(least, 1e-9 * abs(total[_N_DELAYS]), 1e-300)
+    value = middle - _N_DELAYS + offset
+    return Delay(float(value * step_s), float(sigma * step_s), 0.0, float(contrast))
 
 
 @dataclass(frozen=True)
