@@ -70,15 +70,21 @@ def _with(calibration: Calibration, findings: Collection[Finding]) -> Calibratio
 def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, Any]:
     """Options that mend a finding for certain and were not given, by name.
 
-    A unit is set as it is. Anything else is estimated, so that its uncertainty counts.
+    A unit is set as it is. Anything else is estimated, so that its uncertainty counts. Lengths that
+    differ by a few per cent only give a warning: odometry whose scale drifts looks like that, too.
     """
     return {
         name: value if finding.code == "units" else "estimate"
         for finding in findings
-        if finding.severity is not Severity.NOTE and finding.confidence is Confidence.CERTAIN
+        if finding.confidence is Confidence.CERTAIN
         for name, value in finding.options
-        if name in _MENDED and name not in given
+        if name in _MENDED and name not in given and _is_grave(finding, name)
     }
+
+
+def _is_grave(finding: Finding, option: str) -> bool:
+    least = (Severity.ERROR,) if option == "scale" else (Severity.ERROR, Severity.WARNING)
+    return finding.severity in least
 
 
 def _serious(calibration: Calibration) -> int:

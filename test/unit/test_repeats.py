@@ -129,7 +129,10 @@ def test_a_page_must_have_the_marks_of_the_study(tmp_path, capsys):
         put_into_page(tmp_path / "absent.md", "unlike", "| table |")
     assert page.read_text() == "no marks"
     assert main(["fig4", "--data", "simulated", "--page", str(page)]) == 2
-    assert "--page is for adaptive, repeats, unlike; got fig4" in capsys.readouterr().err
+    assert (
+        "--page is for adaptive, repeats, unlike, certificate, faults; got fig4"
+        in capsys.readouterr().err
+    )
 
 
 def test_unlike_writes_and_prints_its_table(tmp_path, capsys, monkeypatch):
