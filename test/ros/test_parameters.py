@@ -48,7 +48,7 @@ def test_changes_are_applied_or_rejected_with_the_reason(start_node, peer):
     start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
     publishers = peer.publishers()
     answer, _ = peer.solve(publishers, *drive())
-    assert "; dnlo " in answer.message
+    assert "; adaptive " in answer.message
     assert peer.set_parameter("method", "dnl").successful
     assert peer.set_parameter("reference", "B3").successful
     assert "; dnl B3: " in peer.trigger("solve").message
