@@ -218,7 +218,10 @@ def log_ratio(
         L; :func:`shift_covariance` if left out.
     """
     L = shift_covariance() if shift is None else shift
-    solved = np.linalg.solve(H + long_run * np.linalg.inv(L), S[..., None])[..., 0]
+    matrices = H + long_run * np.linalg.inv(L)
+    # As many dimensions as the matrices: else NumPy 1 takes the columns for vectors.
+    columns = np.broadcast_to(S, matrices.shape[:-1])[..., None]
+    solved = np.linalg.solve(matrices, columns)[..., 0]
     _, log_volume = np.linalg.slogdet(np.eye(6) + L @ H / long_run)
     return 0.5 * (S * solved).sum(axis=-1) / long_run - 0.5 * log_volume
 
