@@ -62,7 +62,7 @@ def _parquet(columns: Mapping[str, type], rows: Sequence[Mapping[str, Any]]) -> 
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ModuleNotFoundError:
+    except ImportError:  # not installed, or for another version of NumPy
         return None
     types = {str: pa.string(), int: pa.int64(), float: pa.float64()}
     schema = pa.schema([(name, types[kind]) for name, kind in columns.items()])

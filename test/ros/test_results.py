@@ -20,7 +20,7 @@ FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]
     "use_sim_time", ["false", "true"]
 )  # true, and no /clock: as with a bag that is paused
 def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer, use_sim_time):
-    node = start_node("-p solve_period:=0.2", f"-p use_sim_time:={use_sim_time}")
+    node = start_node("-p solve_period:=0.2", f"-p use_sim_time:={use_sim_time}", *RELIABLE_INPUTS)
     extrinsics = peer.listen(TransformStamped, "extrinsic")
     poses = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
     peer.feed(peer.publishers(), *drive())

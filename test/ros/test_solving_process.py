@@ -101,7 +101,9 @@ def same(first, second):
     )
 
 
-@pytest.mark.parametrize("options", [{}, {"method": "adaptive"}, {"backend": "ipopt"}])
+@pytest.mark.parametrize(
+    "options", [{}, {"method": "adaptive"}, {"method": "dnlo", "backend": "ipopt"}]
+)
 def test_gives_the_same_bits_as_here(start, announced, options):
     process, work = start(), snapshot(**options)
     process.submit(Job(5, work, check=True))

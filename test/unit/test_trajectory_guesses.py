@@ -4,6 +4,7 @@ their units, latitude and longitude, repeated stamps.
 
 import json
 import os
+import subprocess
 import sys
 
 import numpy as np
@@ -399,3 +400,15 @@ def test_python_reads_what_a_file_looks_like_with_a_warning(tmp_path):
     with pytest.warns(UserWarning, match="read with the scalar first"):
         trajectory = hec.read_trajectory(path, "auto")
     np.testing.assert_allclose(trajectory.poses, driven().poses, atol=1e-12)
+
+
+def test_reading_latitude_and_longitude_leaves_numpy_as_it_was():
+    pytest.importorskip("pymap3d", reason="pymap3d is not installed: pip install '.[gnss]'")
+    code = (
+        "import numpy as np\n"
+        "from hand_eye_calib.io.trajectory_files.geodetic import local_positions\n"
+        "before = np.geterr()\n"
+        "local_positions(np.array([1.0, 1.1]), np.array([0.4, 0.5]), np.zeros(2))\n"
+        "assert np.geterr() == before\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

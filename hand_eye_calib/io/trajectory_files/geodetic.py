@@ -38,7 +38,8 @@ def local_positions(
         If pymap3d is not installed.
     """
     try:
-        from pymap3d import geodetic2enu
+        with np.errstate():  # importing it makes NumPy raise where it warns, for good
+            from pymap3d import geodetic2enu
     except ModuleNotFoundError:
         raise MissingDependencyError(
             "latitude and longitude need the package pymap3d, which is not installed: "
