@@ -196,9 +196,10 @@ def test_an_interrupted_run_goes_on_where_it_ended(tmp_path, rows):
     def interrupt(cell):
         raise KeyboardInterrupt
 
+    others = set(multiprocessing.active_children())
     with pytest.raises(KeyboardInterrupt):
         runner.run(SOURCE, CELLS, runner.Store(tmp_path, SOURCE.configuration()), 1, interrupt)
-    assert multiprocessing.active_children() == []
+    assert not set(multiprocessing.active_children()) - others
     store = runner.Store(tmp_path, SOURCE.configuration())
     kept = [cell for cell in CELLS if store.load(cell) is not None]
     assert len(kept) == 1
