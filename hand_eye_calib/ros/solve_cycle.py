@@ -51,7 +51,7 @@ class SolveCycle:
         Duration of the last one.
     is_solving : bool
     result : Calibration or None
-        The session's result: the newest usable one or, once the goal is reached, the best. The
+        The session's result: the newest usable one; once the goal is reached, the one kept. The
         newest was found at ``solved_at_s`` (steady time).
     snapshot : Snapshot or None
         The poses and options that gave that result.

@@ -25,6 +25,10 @@ _RESULTS = 2
 # ... after so many seconds of motion, and so many correlation times of errors that last.
 _MIN_MOTION_S, _CORRELATION_TIMES = 30.0, 10.0
 
+# Standard deviations are estimates too: a result with more motion replaces the best one unless its
+# own are larger by more than this factor.
+_AS_GOOD = 1.25
+
 # The motion will not get there if it would take longer than this (s), ...
 _TOO_LONG_S = 1200.0
 # ... or if, over so many seconds of motion, the information on the worst axis has grown by less
@@ -93,7 +97,8 @@ class _Point:
 class Goal:
     """Judges the results of a session, one after the other.
 
-    Once the goal is reached, it stays reached, and the best of the results that reach it is kept.
+    Once the goal is reached, it stays reached. Of the results that reach it, the newest is kept, but
+    not one that is clearly worse than the best.
 
     Parameters
     ----------
@@ -147,10 +152,11 @@ class Goal:
         motion_s = seen.motion_s
         is_known = calibration.status is SolveStatus.OK and not faults and ratios[worst] <= 1.0
         is_known = is_known and motion_s >= _least_motion_s(calibration)
+        point = _Point(motion_s, 1.0 / max(ratios[worst], 1e-12), is_known)
         # Every result of a robot that stands still is the same result.
         if not self._points or motion_s > self._points[-1].motion_s:
-            self._points.append(_Point(motion_s, 1.0 / max(ratios[worst], 1e-12), is_known))
-        self._keep_best(calibration, is_known)
+            self._points.append(point)
+        self._keep_best(calibration, point)
         # Not 0 seconds of motion: an axis that was not seen at all takes for ever, not "nan".
         left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
         left_s = np.maximum(left_s, max(_least_motion_s(calibration) - motion_s, 0.0))
@@ -167,12 +173,13 @@ class Goal:
         )
         return self.progress
 
-    def _keep_best(self, calibration: Calibration, is_known: bool) -> None:
+    def _keep_best(self, calibration: Calibration, point: _Point) -> None:
         recent = list(self._points)[-_RESULTS:]
-        if not is_known or len(recent) < _RESULTS or not all(each.is_known for each in recent):
+        if not point.is_known or len(recent) < _RESULTS or not all(p.is_known for p in recent):
             return
-        if self._best is None or recent[-1].information >= self._best_information:
-            self._best, self._best_information = calibration, recent[-1].information
+        if point.information * _AS_GOOD**2 >= self._best_information:
+            self._best = calibration
+            self._best_information = max(point.information, self._best_information)
 
     def _is_stuck(self, left_s: float) -> bool:
         newest = self._points[-1]

@@ -89,7 +89,7 @@ def test_what_was_measured_by_hand_need_not_be_shown_by_motion():
     assert goal.add(by_hand, seen(42.0)).is_done
 
 
-def test_the_best_result_stays_when_the_robot_is_parked_or_later_ones_are_worse():
+def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_worse():
     goal = Goal(*TARGETS)
     goal.add(result(), seen(40.0))
     goal.add(result(), seen(42.0))
@@ -101,6 +101,18 @@ def test_the_best_result_stays_when_the_robot_is_parked_or_later_ones_are_worse(
     assert goal.best is best
     goal.restart()
     assert (goal.best, goal.progress.is_done) == (None, False)
+
+
+def test_the_newest_of_equally_good_results_is_kept():
+    goal = Goal(*TARGETS)
+    for motion_s in (40.0, 42.0):
+        goal.add(result(sigmas_m=0.004), seen(motion_s))
+    for motion_s, sigma_m in ((44.0, 0.0045), (46.0, 0.0049)):
+        newest = result(sigmas_m=sigma_m)
+        goal.add(newest, seen(motion_s))
+        assert goal.best is newest
+    goal.add(result(sigmas_m=0.0055), seen(48.0))  # a quarter worse than the best there was
+    assert goal.best is newest
 
 
 def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
