@@ -75,14 +75,16 @@ _PLAIN_LATER = (
     "target_rotation",
     "comparison",
     "goal",
+    "measured",
+    "rate_bias",
 )
 
 # Of other values than numbers.
 _KINDS: dict[str, Any] = (
     dict.fromkeys(("method", "reference", "backend", "parent_frame", "child_frame"), str)
     | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
-    | dict.fromkeys(("method_reason", "reference_reason", "proved_global"), str)
-    | dict.fromkeys(("noise", "cross_check", "comparison", "goal"), (dict, type(None)))
+    | dict.fromkeys(("method_reason", "reference_reason", "proved_global", "measured"), str)
+    | dict.fromkeys(("noise", "cross_check", "comparison", "goal", "rate_bias"), (dict, type(None)))
     | {"contradictions": dict}
 )
 
@@ -158,6 +160,9 @@ class Calibration:
     status : SolveStatus
     observability : tuple of DofObservability
         x, y, z, roll, pitch, yaw in the parent sensor's frame.
+    measured : {"poses", "rotations", "positions"}
+        What the streams give together. Rotations, or angular rates, say nothing of the translation,
+        positions nothing of the rotation: :attr:`out_of_reach`.
     T_method : (4, 4) array or None
         The method's own answer, before directions that the motion does not reveal are set and
         priors are added. None in a result read from a file that does not have it.
@@ -180,6 +185,9 @@ class Calibration:
     scale, scale_sigma : float
         Factor applied to the child's translations, and one standard deviation: 0 if the method took
         the scale as given.
+    rate_bias : dict or None
+        Bias of the angular rates: ``of`` which sensor, ``rad_per_s`` and ``sigma`` along its axes;
+        None if neither stream is one of rates.
     method_reason, reference_reason : str
         Why ``auto`` chose the method, the reference; empty if it was given.
     noise : dict or None
@@ -221,6 +229,7 @@ class Calibration:
     covariance: FloatArray
     status: SolveStatus
     observability: tuple[DofObservability, ...]
+    measured: str = "poses"
     T_method: FloatArray | None = None
     floor: FloatArray | None = None
     objective: float
@@ -234,6 +243,7 @@ class Calibration:
     time_offset_sigma_s: float = 0.0
     scale: float = 1.0
     scale_sigma: float = 0.0
+    rate_bias: dict[str, Any] | None = None
     proved_global: str = "not tried"
     method_reason: str = ""
     reference_reason: str = ""
@@ -353,6 +363,13 @@ class Calibration:
     def headline(self) -> str:
         """The verdict with its gravest reason, or with what is known, in one line."""
         return headline(self, self.reasons)
+
+    @property
+    def out_of_reach(self) -> tuple[str, ...]:
+        """Axes that streams of this kind say nothing about, and no prior either."""
+        silent = {"rotations": TRANSLATIONS, "positions": ROTATIONS}.get(self.measured, ())
+        unknown = self.unobservable()
+        return tuple(axis for axis in silent if axis in unknown)
 
     @property
     def T_child_parent(self) -> FloatArray:

@@ -20,6 +20,8 @@ _MOST_SHOWN = 80
 
 REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})"
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
+# What a sensor may measure of its poses.
+MEASURES = ("poses", "positions", "rotations", "rates")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (
     "auto",
@@ -27,6 +29,9 @@ POSE_TYPES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/NavSatFix",
+    "geometry_msgs/msg/PointStamped",
 )
 
 OptionValue: TypeAlias = bool | int | float | str
@@ -312,6 +317,16 @@ def _tf_source(stream: str) -> Any:
     )
 
 
+def _measures(stream: str) -> Any:
+    return option(
+        "auto",
+        f"What the {stream} sensor measures: poses; positions (a GNSS antenna, a prism); rotations "
+        "without positions; or angular rates. auto takes it from the message type or the columns.",
+        choices=("auto", *MEASURES),
+        read_only=True,
+    )
+
+
 def parse_pose(name: str, text: str) -> tuple[float, ...]:
     """The six numbers of ``X Y Z ROLL PITCH YAW``, in m and rad; units may be given, as in
     ``40cm 0 1.85 0 0 -90deg``.
@@ -448,6 +463,8 @@ class CalibratorConfig(OptionSet):
         minimum=1e-6,
         maximum=1e6,
     )
+    parent_measures: str = _measures("parent")
+    child_measures: str = _measures("child")
     prior_x: str = _prior("x")
     prior_y: str = _prior("y")
     prior_z: str = _prior("z")
@@ -485,6 +502,27 @@ class CalibratorConfig(OptionSet):
     child_frame: str = option(
         "", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True
     )
+
+    @property
+    def measured(self) -> str:
+        """What both sensors measure together: poses, rotations or positions.
+
+        Raises
+        ------
+        ConfigError
+            If that is nothing: positions without poses.
+        """
+        found = {self.parent_measures, self.child_measures} - {"auto", "poses"}
+        if not found:
+            return "poses"
+        if "positions" not in found:
+            return "rotations"
+        if found != {"positions"} or self.parent_measures == self.child_measures:
+            raise ConfigError(
+                "positions show a lever arm only beside poses of the other sensor; the parent "
+                f"measures {self.parent_measures}, the child {self.child_measures}"
+            )
+        return "positions"
 
     @property
     def targets(self) -> tuple[float, float]:

@@ -81,6 +81,8 @@ class Judged(Protocol):
     @property
     def observability(self) -> tuple[DofObservability, ...]: ...
     @property
+    def out_of_reach(self) -> tuple[str, ...]: ...
+    @property
     def sigmas_of_floor(self) -> Any: ...
     @property
     def contradictions(self) -> Mapping[str, float]: ...
@@ -223,7 +225,7 @@ def _contradicted(result: Judged) -> Iterator[_Found]:
 
 
 def _nothing_known(result: Judged) -> Iterator[_Found]:
-    if len(_unobservable(result)) == len(result.observability):
+    if len(_unobservable(result)) == _n_within_reach(result):
         text = "the motion shows nothing of how the sensors are mounted"
         yield text, "record motion with rotations about all axes", (), ()
 
@@ -285,7 +287,7 @@ def _far(result: Judged, kind: str) -> dict[str, float]:
 
 def _hidden(result: Judged) -> Iterator[_Found]:
     axes = _unobservable(result)
-    if axes and len(axes) < len(result.observability):
+    if axes and len(axes) < _n_within_reach(result):
         priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
         it = "it" if len(axes) == 1 else "them"
         text = f"the motion does not show {listing(axes)}"
@@ -330,7 +332,16 @@ def _floor(result: Judged) -> Iterator[_Found]:
 
 
 def _unobservable(result: Judged) -> tuple[str, ...]:
-    return tuple(dof.name for dof in result.observability if dof.verdict is DofVerdict.UNOBSERVABLE)
+    """Axes that the motion does not show, of those that the streams can show."""
+    return tuple(
+        dof.name
+        for dof in result.observability
+        if dof.verdict is DofVerdict.UNOBSERVABLE and dof.name not in result.out_of_reach
+    )
+
+
+def _n_within_reach(result: Judged) -> int:
+    return len(result.observability) - len(result.out_of_reach)
 
 
 def _motion_for(axes: Sequence[str]) -> str:
@@ -341,10 +352,22 @@ def _known(result: Judged) -> str:
     """The largest standard deviations of a translation and of a rotation."""
     texts = []
     for names in (TRANSLATIONS, ROTATIONS):
-        worst = max(
-            (dof for dof in result.observability if dof.name in names), key=lambda dof: dof.sigma
+        known = [
+            dof
+            for dof in result.observability
+            if dof.name in names and dof.name not in result.out_of_reach
+        ]
+        if known:
+            worst = max(known, key=lambda dof: dof.sigma)
+            texts.append(amount(worst.name, worst.sigma))
+    if result.out_of_reach:
+        known_axes = [
+            dof.name for dof in result.observability if dof.name not in result.out_of_reach
+        ]
+        return (
+            f"{listing(known_axes)} are known to {listing(texts)} or better, one standard "
+            f"deviation; {listing(result.out_of_reach)} are out of reach of these streams"
         )
-        texts.append(amount(worst.name, worst.sigma))
     return f"all six axes are known to {texts[0]} and {texts[1]} or better, one standard deviation"
 
 

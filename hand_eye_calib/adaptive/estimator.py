@@ -88,10 +88,10 @@ _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
 # Sizes of errors that last longer than those found, as shares of their variance.
 _LONGER_SIZES = np.array([0.0, 0.25, 1.0])
 
-# Systematic errors larger than this (of the length, m/m, s) are none: a wrong unit, a clock that
-# was not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground a
-# child that slips sideways looks like one that is mounted askew.
-_LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5])
+# Systematic errors larger than this (of the length, m/m, s, rad/s) are none: a wrong unit, a clock
+# that was not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground
+# a child that slips sideways looks like one that is mounted askew.
+_LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5, 1.0, 1.0, 1.0])
 _MOST_GROWTH = 5.0
 
 # Each parameter of a systematic error must lower the weighted squared residual by so much: one that
@@ -126,7 +126,7 @@ def solve(
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of both sensors in their own worlds at these stamps.
     systematic : sequence of str
-        Systematic errors to choose from; "none" must be among them.
+        Systematic errors to choose from, the plainest first; the choice if there is only one.
     quick : bool
         Stop at white noise, drift and outliers: neither errors that last nor heavy tails.
 
@@ -136,7 +136,7 @@ def solve(
     """
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     streams = Streams(stamps_s, Ts_pw_p, Ts_cw_c)
-    start = _start(streams, len(systematic) > 1)
+    start = _start(streams, _while_fitting(systematic))
     plain = _fitted(start)
     if _is_noisy(plain):
         plain = _fitted_at_freed_poses(start, plain)
@@ -148,8 +148,13 @@ def solve(
     found = plain if quick else _with_lasting_errors(plain)
     solution = _polished(_with_systematic_errors(found, systematic))
     if not solution.converged:
-        solution = _polished(_with_systematic_errors(plain, ("none",)))
+        solution = _polished(_with_systematic_errors(plain, systematic[:1]))
     return solution
+
+
+def _while_fitting(systematic: Sequence[str]) -> list[int]:
+    """Parameters of systematic errors that are in the model while the noise levels are fitted."""
+    return _WHILE_FITTING if len(systematic) > 1 else parameters_of(systematic[0])
 
 
 def _strided(state: _State) -> IntArray:
@@ -193,9 +198,9 @@ class _State:
         Those errors.
     columns : list of int
         Parameters of systematic errors in the model.
-    parameters : (8,) array
+    parameters : (11,) array
         Their values.
-    other_sigmas : (8,) array
+    other_sigmas : (11,) array
         Standard deviations of parameters that are not in the model.
     mean_variances : (6,) array
         Of X, by errors that last too long to be found.
@@ -251,7 +256,7 @@ class _State:
         return dataclasses.replace(self, T=self.T @ se3.exp(step[:6]), parameters=parameters)
 
 
-def _start(streams: Streams, with_systematic: bool) -> _State:
+def _start(streams: Streams, columns: list[int]) -> _State:
     """Robust first answer, and what it says about jumps, noise and the centre of its rotation."""
     pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, _START_REFERENCE)
     T = Method("dnlo").solve(pairs).T_parent_child
@@ -278,7 +283,7 @@ def _start(streams: Streams, with_systematic: bool) -> _State:
         levels=levels,
         outliers=outliers,
         weights=np.ones(len(streams)),
-        columns=_WHILE_FITTING if with_systematic else [],
+        columns=columns,
     )
 
 
@@ -452,11 +457,11 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     """The model of systematic errors that the data ask for, one step from where the search stands,
     at poses freed of their errors. All models are judged under the same noise.
     """
-    every = dataclasses.replace(state, columns=list(range(N_SYSTEMATIC)))
-    posterior = every.posterior()
+    tried = sorted({column for name in systematic for column in parameters_of(name)})
+    posterior = dataclasses.replace(state, columns=tried).posterior()
 
     def columns_of(name: str) -> list[int]:
-        return [*range(6), *(6 + column for column in parameters_of(name))]
+        return [*range(6), *(6 + tried.index(column) for column in parameters_of(name))]
 
     def criterion(name: str, cost: float) -> float:
         return cost + _PENALTY * len(parameters_of(name))
@@ -469,8 +474,11 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     fits = {
         name: NormalEquations(selected(posterior.products, columns_of(name))) for name in systematic
     }
-    known = fits["none"].covariance
-    credible = [name for name, fit in fits.items() if _is_credible(fit, name, known)]
+    plainest = systematic[0]
+    known = fits[plainest].covariance
+    credible = [
+        name for name, fit in fits.items() if name == plainest or _is_credible(fit, name, known)
+    ]
     best = min(credible, key=lambda name: criterion(name, fits[name].cost))
     if "bias" in best:
         # A scale is not of first order if it is large, and then a bias along the direction of
@@ -491,8 +499,6 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
 
 def _is_credible(fit: NormalEquations, name: str, known: FloatArray) -> bool:
     """Whether systematic errors are of a size that sensors have, and X can be told from them."""
-    if name == "none":
-        return True
     if (np.abs(fit.step[6:]) > _LARGEST[parameters_of(name)]).any():
         return False
     growth = np.linalg.eigvals(np.linalg.pinv(known, hermitian=True) @ fit.covariance[:6, :6])
@@ -553,7 +559,7 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
     normal, streams = posterior.normal, state.streams
     n_columns = len(state.columns)
     n_evidence = int((~state.outliers.jumps).sum()) - int(state.outliers.spikes.sum())
-    misfit = normal.cost / max(6 * n_evidence - 6 - n_columns, 1)
+    misfit = normal.cost / max(streams.n_rows * n_evidence - 6 - n_columns, 1)
     # Steps smaller than predicted do not make what was learned over long baselines more certain.
     covariance = max(misfit, 1.0) * normal.covariance
     covariance[:6, :6] += np.diag(state.mean_variances)
@@ -582,7 +588,7 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
 
 
 def _sigmas(state: _State, covariance: FloatArray, parts: FloatArray) -> FloatArray:
-    """Standard deviations (8,) of all parameters: of those in the model by their covariance or, if
+    """Standard deviations (11,) of all parameters: of those in the model by their covariance or, if
     that is larger beyond chance, the jackknife over ten blocks; of the scale and the time offset
     otherwise by the models that have them.
     """

@@ -26,13 +26,15 @@ from hand_eye_calib.geometry import se3
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
 # of the child's or of the parent's path along the axes of that sensor (m/m), by how much the
-# child's stamps are late (s).
+# child's stamps are late (s), the bias of the child's rates minus that of the parent's, along the
+# axes of the child (rad/s).
 _PARAMETERS: dict[str, list[int]] = {
     "none": [],
     "scale": [0],
     "bias": [1, 2, 3],
     "parent bias": [4, 5, 6],
     "time": [7],
+    "rate": [8, 9, 10],
 }
 SYSTEMATIC = (
     "none",
@@ -44,7 +46,9 @@ SYSTEMATIC = (
     "bias+time",
     "parent bias+time",
 )
-N_SYSTEMATIC = 8
+# Of streams without positions, and of those whose rotations are integrated rates.
+SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("rate+time",)
+N_SYSTEMATIC = 11
 
 # Steps count as noise until they differ from their neighbours by so many times its variance.
 _CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
@@ -52,7 +56,7 @@ _CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
 # Steps that vary by less than this share are alike.
 _EVEN = 0.2
 
-SCALE, TIME = 0, 7
+SCALE, TIME, RATE = 0, 7, slice(8, 11)
 
 
 def parameters_of(systematic: str) -> list[int]:
@@ -82,6 +86,14 @@ class Streams:
     def typical_turn(self) -> float:
         """Median angle (rad) that the parent turns by from pose to pose."""
         return float(np.median(se3.rotation_angle(motions(self.Ts_pw_p)[:, :3, :3])))
+
+    @cached_property
+    def n_rows(self) -> int:
+        """Values that an increment tells: 6, or 3 if neither sensor ever leaves its place, because
+        only rotations are measured.
+        """
+        positions = np.concatenate([self.Ts_pw_p[:, :3, 3], self.Ts_cw_c[:, :3, 3]], axis=1)
+        return 6 if np.ptp(positions, axis=0).any() else 3
 
     def __getitem__(self, index: IntArray) -> Streams:
         return Streams(self.stamps_s[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
@@ -187,7 +199,7 @@ class Linearisation:
     ----------
     residuals : (n, 6) array
         e.
-    jacobian : (n, 6, 6 + 8) array
+    jacobian : (n, 6, 6 + 11) array
         Derivatives by xi in ``X Exp(xi)`` and by the parameters of all systematic errors.
     adjoints : (n, 6, 6) array
         Ad(B^-1).
@@ -215,7 +227,7 @@ def linearise(
     course : Course
         At the same poses.
     T_parent_child : (4, 4) array
-    parameters : (8,) array
+    parameters : (11,) array
         Of all systematic errors, see the module.
     """
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
@@ -228,6 +240,9 @@ def linearise(
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
     by_child, by_parent = motions(Ts_cw_c), motions(streams.Ts_pw_p)
+    by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
+    if parameters[RATE].any():
+        by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
     by_child[:, :3, 3] *= 1.0 + parameters[SCALE]
     by_child[:, :3, 3] -= metres_c @ parameters[1:4]
     by_parent[:, :3, 3] -= metres_p @ parameters[4:7]
@@ -243,6 +258,15 @@ def linearise(
     axes = T_parent_child[:3, :3].T @ np.swapaxes(by_parent[:, :3, :3], 1, 2)
     by[:, :3, 4:7] = -axes @ metres_p
     by[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+    by[:, 3:, RATE] = by_rate
     residuals = se3.log(back @ as_child)
     by_scale = by[:, :, SCALE : SCALE + 1].copy()
     return Linearisation(residuals, jacobian, adjoints, by_scale, np.linalg.norm(step, axis=1))
+
+
+def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
+    """What a bias of the rates (rad/s) adds to the rotations (n, 3, 3) over each interval: (n, 3,
+    3), the mean of the body's axes at both ends as seen at the end.
+    """
+    mean_axes: FloatArray = 0.5 * (np.eye(3) + np.swapaxes(rotations, 1, 2))
+    return intervals_s[:, None, None] * mean_axes

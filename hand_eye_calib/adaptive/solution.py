@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import SCALE, TIME
+from hand_eye_calib.adaptive.increments import RATE, SCALE, SYSTEMATIC, TIME
 from hand_eye_calib.adaptive.noise_model import (
     JITTER,
     N_FAST,
@@ -137,10 +137,10 @@ class AdaptiveSolution:
         Of the poses' white errors; other than 1 where tails are heavy.
     systematic : str
         Which systematic errors the data asks for, one of ``increments.SYSTEMATIC``.
-    parameters : (8,) array
+    parameters : (11,) array
         Parameters of all systematic errors, see :attr:`scale`, :attr:`biases` and
         :attr:`time_offset_s`; zero for those that are not assumed.
-    parameter_sigmas : (8,) array
+    parameter_sigmas : (11,) array
         Their standard deviations: for those not assumed, what they would be known to.
     jumps : (n,) bool array
         Increments (from pose i to i + 1) across which a trajectory jumped for good.
@@ -204,6 +204,13 @@ class AdaptiveSolution:
         along the axes of its sensor.
         """
         return self.parameters[1:7].reshape(2, 3)
+
+    @property
+    def rate_bias(self) -> FloatArray:
+        """(2, 3) array: bias of the child's rates less that of the parent's, along the axes of the
+        child, and its standard deviations, rad/s.
+        """
+        return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
 
     @property
     def time_offset_s(self) -> float:
@@ -274,6 +281,13 @@ class AdaptiveSolution:
 
     def _noise_in_words(self) -> list[str]:
         noise, per_metre = self.noise, self._after_a_metre
+        if not self.metres_per_pose:
+            return [
+                f"each pose is off by {_angle(noise.rotation_white)} per axis (both sensors "
+                f"together), and what stays grows by {_angle(noise.rotation_drift)} from pose to "
+                "pose",
+                *map(_slow_in_words, (slow for slow in noise.slow if slow.part == "rotation")),
+            ]
         said = [
             f"each pose is off by {_length(noise.translation_white)} and "
             f"{_angle(noise.rotation_white)} per axis (both sensors together)"
@@ -310,7 +324,14 @@ class AdaptiveSolution:
                     f"the {sensor}'s path is off by {along} mm per metre travelled, "
                     "along its own axes"
                 )
-        if "time" in systematic:
+        if "rate" in systematic:
+            bias, sigmas = np.degrees(self.rate_bias)
+            told = ", ".join(
+                f"{axis} {value:.3g} +/- {sigma:.1g}"
+                for axis, value, sigma in zip("xyz", bias, sigmas, strict=True)
+            )
+            said.append(f"bias of the angular rates, along the child's axes: {told} deg/s")
+        if "time" in systematic and self.systematic in SYSTEMATIC:
             offset_ms = 1000 * self.time_offset_s
             said.append(
                 f"the child's stamps are {abs(offset_ms):.1f} +/- "

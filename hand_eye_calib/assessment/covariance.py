@@ -36,11 +36,15 @@ _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 
 # What the ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance
 # exceed once in ten times.
-_CHANCE = np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28])
+# The same of three.
+_CHANCE = {6: np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28]), 3: np.array([0.64, 1.31, 2.44])}
 
 # What the squared distance of two halves in units of their joint covariance exceeds once in ten
-# recordings: a chi-squared with 6 degrees of freedom.
-_HALVES_BY_CHANCE = 10.64
+# recordings: a chi-squared with 6, or 3, degrees of freedom.
+_HALVES_BY_CHANCE = {6: 10.64, 3: 6.25}
+
+# An unseen direction with at least this length in its rotation is not one of translation alone.
+_SHARE_OF_ROTATION = 0.5
 
 # Standard deviations that stand for "unknown" in the covariance: the distance between sensors on a
 # large machine. An unknown direction is never exactly an axis of the parent sensor, so that part of
@@ -124,6 +128,32 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         covariance = widened_by_halves(covariance, solution.part_products, solution.misfit)
     unseen = [*solution.unseen.T, *_noise_driven_baselines(pose_pairs.Ts_pw_p, solution)]
     return _combine(solution.T_parent_child, covariance, None, _basis(unseen))
+
+
+def assess_rotation(solution: AdaptiveSolution) -> Assessment:
+    """Covariance and observability of an answer of the adaptive estimator from rotations alone.
+
+    Parameters
+    ----------
+    solution : AdaptiveSolution
+
+    Returns
+    -------
+    Assessment
+        The translation is unknown.
+    """
+    rotation, unseen = slice(3, 6), solution.unseen[3:]
+    covariance = solution.cov_parent_child_in_child[rotation, rotation]
+    if len(solution.jumps) >= _BLOCKS * _MIN_PAIRS_PER_BLOCK:
+        steps = answers_without(solution.part_products, _BLOCKS)[:, rotation]
+        covariance = beyond_chance(covariance, _spread_of_blocks(steps))
+        products, misfit = solution.part_products, solution.misfit
+        covariance = widened_by_halves(covariance, products, misfit, rotation)
+    whole = np.zeros((6, 6))
+    whole[rotation, rotation] = covariance
+    hidden = unseen[:, np.linalg.norm(unseen, axis=0) > _SHARE_OF_ROTATION]
+    unknown = [*np.eye(6)[:3], *(np.r_[np.zeros(3), direction] for direction in hidden.T)]
+    return _combine(solution.T_parent_child, whole, None, _basis(unknown))
 
 
 def _noise_driven_baselines(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> list[FloatArray]:
@@ -260,12 +290,14 @@ def beyond_chance(model: FloatArray, resampled: FloatArray) -> FloatArray:
     The ratios of the jackknife to a model that is right scatter: with ten blocks the largest of six
     exceeds 3.3 once in ten recordings. They are divided by what is exceeded so often.
     """
-    return _raised(model, resampled, _CHANCE)
+    return _raised(model, resampled, _CHANCE[len(model)])
 
 
-def widened_by_halves(model: FloatArray, products: FloatArray, misfit: float) -> FloatArray:
-    """The model's covariance (6, 6), widened along the direction in which both halves of the
-    recording disagree by more than chance.
+def widened_by_halves(
+    model: FloatArray, products: FloatArray, misfit: float, part: slice = slice(0, 6)
+) -> FloatArray:
+    """The model's covariance (6, 6), or that of a part of xi, widened along the direction in which
+    both halves of the recording disagree by more than chance.
 
     Parameters
     ----------
@@ -274,6 +306,8 @@ def widened_by_halves(model: FloatArray, products: FloatArray, misfit: float) ->
         What each part of the recording adds, see :mod:`~hand_eye_calib.adaptive.resampling`.
     misfit : float
         Factor of the covariances of the halves.
+    part : slice
+        Of xi.
     """
     half = len(products) // 2
     first, second = (
@@ -281,9 +315,10 @@ def widened_by_halves(model: FloatArray, products: FloatArray, misfit: float) ->
     )
     if first.unseen.size or second.unseen.size:
         return model
-    difference = (first.step - second.step)[:6]
-    away = np.linalg.solve(misfit * (first.covariance + second.covariance)[:6, :6], difference)
-    excess = float(difference @ away) / _HALVES_BY_CHANCE
+    difference = (first.step - second.step)[part]
+    joint = misfit * (first.covariance + second.covariance)[part, part]
+    away = np.linalg.solve(joint, difference)
+    excess = float(difference @ away) / _HALVES_BY_CHANCE[len(model)]
     if excess <= 1.0:
         return model
     error = model @ away

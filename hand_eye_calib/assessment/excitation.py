@@ -170,7 +170,10 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     str
         Empty if nothing is missing.
     """
-    hidden = calibration.unobservable() if calibration else seen.hidden_axes()
+    hidden = seen.hidden_axes()
+    if calibration:
+        reach = set(calibration.out_of_reach)
+        hidden = tuple(axis for axis in calibration.unobservable() if axis not in reach)
     if not hidden:
         return _weak(calibration, seen) if calibration else ""
     angles = dict(zip("xyz", seen.rotation.tolist(), strict=True))

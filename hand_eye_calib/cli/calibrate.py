@@ -2,6 +2,7 @@
 
 import argparse
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,8 +76,16 @@ def add_file_arguments(parser: argparse.ArgumentParser) -> None:
             advanced(group.add_argument(option, dest=f"{stream}_{name}", **of_one))
 
 
-def read_files(arguments: argparse.Namespace) -> tuple[dict[str, "Trajectory"], list[str]]:
+def read_files(
+    arguments: argparse.Namespace, options: Mapping[str, Any]
+) -> tuple[dict[str, "Trajectory"], list[str]]:
     """Read both files as the options of :func:`add_file_arguments` say, and say what was guessed.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+    options : mapping
+        Options of the engine by their public names.
 
     Returns
     -------
@@ -100,6 +109,7 @@ def read_files(arguments: argparse.Namespace) -> tuple[dict[str, "Trajectory"], 
                 getattr(arguments, stream),
                 _given(arguments, stream, "format") or AUTO,
                 repair=True,
+                measures=options.get(f"{stream}_measures", AUTO),
                 **_settings_of(arguments, stream),
             )
         for text in guesses:
@@ -149,7 +159,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     keep_freed_memory()
     options = options_from(arguments)
-    trajectories, repairs = read_files(arguments)
+    trajectories, repairs = read_files(arguments, options)
     for text in repairs:
         note(text)
     config = offline_config(trajectories["parent"], trajectories["child"], options)

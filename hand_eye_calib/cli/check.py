@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.calibrate import STREAMS, add_file_arguments, read_files
 from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
-from hand_eye_calib.cli.options import add_config_arguments, add_json_argument, config_from
+from hand_eye_calib.cli.options import (
+    add_config_arguments,
+    add_json_argument,
+    config_from,
+    options_from,
+)
 from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
@@ -61,6 +66,11 @@ def run(arguments: argparse.Namespace) -> int:
     read = _read_bag if len(arguments.inputs) == 1 else _read_files
     trajectories, sources, of_files = read(arguments)
     parent, child = (trajectories[stream] for stream in STREAMS)
+    if {parent.measures, child.measures} != {"poses"}:
+        raise ConfigError(
+            "check looks at two streams of poses; of positions, rotations or rates the command "
+            "that calibrates says what is wrong with them"
+        )
     # What is to be estimated is not known yet: the checks say what it is.
     offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
     scale = config.scale if isinstance(config.scale, float) else 1.0
@@ -97,7 +107,7 @@ def _read_files(arguments: argparse.Namespace) -> _Read:
     from hand_eye_calib.checks.findings import repaired_file
 
     arguments.parent, arguments.child = arguments.inputs
-    trajectories, repairs = read_files(arguments)
+    trajectories, repairs = read_files(arguments, options_from(arguments))
     findings = [repaired_file(text) for text in repairs]
     return trajectories, dict(zip(STREAMS, arguments.inputs, strict=True)), findings
 

@@ -101,9 +101,12 @@ def topics_of(bags: Any) -> list[str]:
     """Topics of a bag with poses; none if it cannot be read."""
     from hand_eye_calib.io.bags import PoseBag
     from hand_eye_calib.io.bags.messages import PATH_TYPE, POSE_TYPES
+    from hand_eye_calib.io.bags.parts import PART_TYPES
+
+    usable = (*POSE_TYPES, PATH_TYPE, *PART_TYPES)
 
     try:
         with PoseBag(*bags) as bag:
-            return [topic.name for topic in bag.topics() if topic.type in (*POSE_TYPES, PATH_TYPE)]
+            return [topic.name for topic in bag.topics() if topic.type in usable]
     except HandEyeCalibError:
         return []

@@ -75,7 +75,7 @@ def deliver(
     if arguments.out:
         from hand_eye_calib.io.results import keep_earlier_results, save_result
 
-        if snapshot is not None:
+        if snapshot is not None and calibration.measured == "poses":
             with waiting_for("cross-checks with other methods and halves of the recording"):
                 calibration, evidence = with_cross_check(calibration, snapshot)
         keep_earlier_results(arguments.out)
@@ -99,7 +99,8 @@ def exit_code(calibration: Calibration) -> int:
     """0 good; 1 failed; 3 solved, but an axis is unobservable or the verdict is DO NOT USE."""
     if calibration.status.failure:
         return _EXIT_FAILED
-    is_all = calibration.verdict is not Verdict.DO_NOT_USE and not calibration.unobservable()
+    hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
+    is_all = calibration.verdict is not Verdict.DO_NOT_USE and not hidden
     return 0 if is_all else _EXIT_NOT_ALL
 
 
@@ -126,10 +127,10 @@ def as_text(calibration: Calibration, steps: Iterable[str] = ()) -> str:
         *_warning_lines(calibration),
         "",
         f"{child} in {parent}: maps coordinates of {child} into {parent}",
-        *_transform_lines(document["T_parent_child"]),
+        *_transform_lines(document["T_parent_child"], calibration.out_of_reach),
         "",
         f"{parent} in {child}: maps coordinates of {parent} into {child}",
-        *_transform_lines(document["T_child_parent"]),
+        *_transform_lines(document["T_child_parent"], calibration.out_of_reach),
         "",
         *_base_lines(calibration),
         *(["Next", *(f"  {step}" for step in steps), ""] if steps else []),
@@ -144,7 +145,8 @@ def _base_lines(calibration: Calibration) -> Iterator[str]:
     """The child's pose in the base frame, if there is one."""
     if calibration.T_base_child is not None:
         yield f"{calibration.child_frame} in {calibration.base_frame}"
-        yield from _transform_lines(calibration.to_dict()["T_base_child"])
+        document = calibration.to_dict()["T_base_child"]
+        yield from _transform_lines(document, calibration.out_of_reach)
         yield ""
 
 
@@ -200,7 +202,7 @@ def next_steps(
     ]
     if calibration.verdict is not Verdict.DO_NOT_USE:
         extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.unobservable()[:3]]
-    if not extra and not arguments.out:
+    if not extra and not arguments.out and calibration.measured == "poses":
         extra = ["--out result"]  # figures that show where the disagreement comes from
     typed = getattr(arguments, "typed", [])
     if typed and extra:
@@ -213,6 +215,8 @@ def _motion_advice(calibration: Calibration, snapshot: "Snapshot") -> str:
     from hand_eye_calib.assessment.excitation import excitation, what_is_missing
 
     if calibration.status.failure or calibration.verdict is Verdict.DO_NOT_USE:
+        return ""
+    if calibration.measured != "poses":
         return ""
     return what_is_missing(excitation(snapshot.pose_pairs()), calibration)
 
@@ -235,11 +239,19 @@ def _values(names: tuple[str, ...] | str, values: list[float], decimals: int) ->
     )
 
 
-def _transform_lines(transform: Mapping[str, Any]) -> Iterator[str]:
+def _transform_lines(
+    transform: Mapping[str, Any], out_of_reach: tuple[str, ...] = ()
+) -> Iterator[str]:
     """A row for each number that is printed, with one standard deviation."""
-    sigmas_m = transform["sigma_translation"]
-    for name, value, sigma in zip("xyz", transform["translation"], sigmas_m, strict=True):
-        yield f"  {name:<6} {with_sigma(value, sigma, 3):>24} m"
+    if set(out_of_reach) & set("xyz"):
+        yield "  x, y and z are not estimated"
+    else:
+        sigmas_m = transform["sigma_translation"]
+        for name, value, sigma in zip("xyz", transform["translation"], sigmas_m, strict=True):
+            yield f"  {name:<6} {with_sigma(value, sigma, 3):>24} m"
+    if set(out_of_reach) & set(_ROTATIONS):
+        yield "  roll, pitch and yaw are not estimated"
+        return
     names, kind, note_on = _ROTATIONS, "rpy", ""
     if "rotation_vector_deg" in transform:
         names, kind = _ROTATION_VECTOR, "rotation_vector"
@@ -255,9 +267,15 @@ def _observability(calibration: Calibration) -> str:
     """Axes by verdict: ``x, y and yaw observed; z unobservable``."""
     texts = []
     for verdict, words in _VERDICTS.items():
-        names = [dof.name for dof in calibration.observability if dof.verdict is verdict]
+        names = [
+            dof.name
+            for dof in calibration.observability
+            if dof.verdict is verdict and dof.name not in calibration.out_of_reach
+        ]
         if names:
             texts.append(f"{listing(names)} {words}")
+    if calibration.out_of_reach:
+        texts.append(f"{listing(calibration.out_of_reach)} out of reach")
     return "; ".join(texts)
 
 

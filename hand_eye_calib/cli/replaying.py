@@ -100,6 +100,7 @@ def replay(
     convergence = Convergence(calibrator, every_s) if every_s else None
     with PoseBag(*paths) as bag:
         sources = _sources(bag, parent, child, output)
+        calibrator.reconfigure(_measuring(bag, sources, config))
         warnings = _read(bag, sources, calibrator, convergence, output)
         files = bag.files()
     for text in warnings:
@@ -172,6 +173,17 @@ def _sources(
     return sources
 
 
+def _measuring(
+    bag: "PoseBag", sources: Mapping[str, Any], config: CalibratorConfig
+) -> CalibratorConfig:
+    """The options with what the messages of each stream measure."""
+    names = {stream: f"{stream}_measures" for stream in _STREAMS}
+    measured: dict[str, Any] = {
+        name: bag.measured(sources[stream], getattr(config, name)) for stream, name in names.items()
+    }
+    return dataclasses.replace(config, **measured)
+
+
 def _read(
     bag: "PoseBag",
     sources: Mapping[str, Any],
@@ -181,7 +193,9 @@ def _read(
 ) -> list[str]:
     """Give all poses of a bag to the engine; returns what there is to say of the bag."""
     parent, child = (sources[stream] for stream in _STREAMS)
-    blocks = bag.blocks(parent, child, calibrator.config.max_gap)
+    config = calibrator.config
+    measures = {"parent": config.parent_measures, "child": config.child_measures}
+    blocks = bag.blocks(parent, child, config.max_gap, measures)
     with output.waiting_for(f"opening {bag}"):
         blocks = _started(blocks)
     expected = bag.expected(parent, child)

@@ -32,6 +32,8 @@ def calibrate(
     max_gap: float | None = None,
     time_offset: float | str | None = None,
     scale: float | str | None = None,
+    parent_measures: str | None = None,
+    child_measures: str | None = None,
     prior: Prior | None = None,
     target_translation: float | None = None,
     target_rotation: float | None = None,
@@ -49,7 +51,12 @@ def calibrate(
     Parameters
     ----------
     parent, child : Trajectory
-        Poses of each sensor in its own world.
+        Poses of each sensor in its own world. One of them may be positions
+        (:meth:`Trajectory.from_positions`): the result is the lever arm. Either may be rotations or
+        angular rates (:meth:`Trajectory.from_rates`): the result is the rotation, with the bias of
+        the rates.
+    parent_measures, child_measures : str, optional
+        What counts of a trajectory of poses: "positions" or "rotations" alone.
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.config.Prior`.
@@ -70,7 +77,8 @@ def calibrate(
     for name in ("parent", "child", "prior", "progress"):
         del options[name]
     options = {name: value for name, value in options.items() if value is not None}
-    config = CalibratorConfig(**(_no_limit(parent, child) | options | prior_fields(prior or {})))
+    of_streams = _no_limit(parent, child) | _measures(parent, child)
+    config = CalibratorConfig(**(of_streams | options | prior_fields(prior or {})))
     snapshot = whole_snapshot(config, parent, child)
     if progress is None:
         return checked(snapshot.estimate(), snapshot, options)[0]
@@ -102,7 +110,8 @@ def offline_config(
     """The CalibratorConfig for two whole trajectories, from options by their public names: no limit
     on the pairs unless they set one.
     """
-    return CalibratorConfig.from_options({**_no_limit(parent, child), **options})
+    of_streams = _no_limit(parent, child) | _measures(parent, child)
+    return CalibratorConfig.from_options(of_streams | dict(options))
 
 
 def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajectory) -> Snapshot:
@@ -125,3 +134,8 @@ def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajecto
 def _no_limit(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
     """Options under which all poses of both trajectories are used."""
     return {"max_pairs": max(len(parent), len(child), 10)}
+
+
+def _measures(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
+    """Options that say what the streams measure, as they themselves do."""
+    return {"parent_measures": parent.measures, "child_measures": child.measures}

@@ -13,13 +13,17 @@ from hand_eye_calib.checks.findings import answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import RawPoses
+from hand_eye_calib.engine.rotations import estimate_rotation
 from hand_eye_calib.engine.scatter import quick_cross_check
-from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
 STREAMS = ("parent", "child")
+
+# A time offset that is closer than this to the one that the poses were paired with stays (s).
+_NEGLIGIBLE_S = 0.005
 
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
@@ -126,11 +130,29 @@ class Snapshot:
     def _estimate(self) -> Calibration:
         if len(self._pose_pairs) < self.config.min_pairs:
             raise NotEnoughDataError(self._what_is_missing(len(self._pose_pairs)))
+        if self.config.measured != "poses":
+            return self._named(self._estimate_part())
         result = estimate_extrinsic(self._pose_pairs, self.config, self.time_offset)
         checked = quick_cross_check(result, self.config, self._pose_pairs)
+        return self._named(replace(result, cross_check=checked.to_dict()))
+
+    def _estimate_part(self) -> Calibration:
+        """The part of the extrinsic that streams without rotations or positions show."""
+        if self.config.measured == "positions":
+            raise ConfigError("positions alone are read, but not calibrated with yet")
+        result = estimate_rotation(self._pose_pairs, self.config)
+        found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)
+        if len(self.kept) or abs(found_s - given_s) < _NEGLIGIBLE_S:
+            return result
+        # Interpolated where the other stream has its poses, rather than moved along its velocity.
+        config = replace(self.config, time_offset=found_s)
+        moved = replace(self, config=config)._pose_pairs
+        return estimate_rotation(moved, config) if len(moved) >= self.config.min_pairs else result
+
+    def _named(self, result: Calibration) -> Calibration:
+        """With the frames, and what there is to say of them."""
         return replace(
             result,
-            cross_check=checked.to_dict(),
             parent_frame=self.parent_frame,
             child_frame=self.child_frame,
             warnings=self.warnings + result.warnings,

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.config import MEASURES
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.rates import integrated
 
 # A quaternion further from unit length than this is wrong and not just rounded (tf2 has the same
 # bound).
@@ -36,6 +38,9 @@ class Trajectory:
         Name of the moving frame; empty if unknown.
     world_frame : str
         Name of the fixed frame; empty if unknown.
+    measures : {"poses", "positions", "rotations", "rates"}
+        What the sensor measures of its poses. The orientations of positions and the positions of
+        rotations mean nothing; rates are rotations that were integrated, with a bias.
 
     Raises
     ------
@@ -47,6 +52,7 @@ class Trajectory:
     poses: FloatArray
     sensor_frame: str = ""
     world_frame: str = ""
+    measures: str = "poses"
 
     def __post_init__(self) -> None:
         stamps_ns = np.ascontiguousarray(self.stamps_ns)
@@ -60,6 +66,10 @@ class Trajectory:
             raise InputError(
                 f"poses must have shape ({len(stamps_ns)}, 4, 4), one per stamp; "
                 f"found {poses.shape}"
+            )
+        if self.measures not in MEASURES:
+            raise InputError(
+                f"measures must be one of {', '.join(MEASURES)}; got {self.measures!r}"
             )
         stamps_ns = stamps_ns.astype(np.int64, copy=False)
         backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
@@ -109,6 +119,44 @@ class Trajectory:
         poses = se3.from_quat_xyzw(translations, quats_xyzw)
         return cls(stamps_ns, poses, sensor_frame, world_frame)
 
+    @classmethod
+    def from_positions(
+        cls,
+        stamps_ns: IntArray,
+        positions: ArrayLike,
+        sensor_frame: str = "",
+        world_frame: str = "",
+    ) -> Self:
+        """Build from positions (N, 3), m, of a sensor that has no orientation: the antenna of a
+        GNSS receiver, the prism of a total station.
+        """
+        positions = np.asarray(positions, dtype=float).reshape(-1, 3)
+        poses = se3.from_rotation_translation(
+            np.broadcast_to(np.eye(3), (len(positions), 3, 3)), positions
+        )
+        return cls(stamps_ns, poses, sensor_frame, world_frame, "positions")
+
+    @classmethod
+    def from_rates(cls, stamps_ns: IntArray, rates: ArrayLike, sensor_frame: str = "") -> Self:
+        """Build from angular rates (N, 3), rad/s, about the sensor's own axes, as a gyroscope
+        measures them.
+
+        Raises
+        ------
+        InputError
+            If a rate is not finite or the stamps do not increase.
+        """
+        rates = np.asarray(rates, dtype=float).reshape(-1, 3)
+        finite = np.isfinite(rates).all(axis=1)
+        if not finite.all():
+            raise InputError(
+                f"rate {int(np.argmin(finite))} has a value that is not finite; remove it or "
+                "repair its source"
+            )
+        rotations = integrated(np.asarray(stamps_ns), rates)
+        poses = se3.from_rotation_translation(rotations, np.zeros_like(rates))
+        return cls(stamps_ns, poses, sensor_frame, "", "rates")
+
     def __repr__(self) -> str:
         frames = [
             f", {name}={frame!r}"
@@ -118,7 +166,8 @@ class Trajectory:
             )
             if frame
         ]
-        return f"Trajectory({len(self)} poses over {self.duration_s:.3f} s{''.join(frames)})"
+        of = f"{len(self)} {self.measures} over {self.duration_s:.3f} s"
+        return f"Trajectory({of}{''.join(frames)})"
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -131,7 +180,11 @@ class Trajectory:
                 "single poses are trajectory.poses[i]"
             )
         return type(self)(
-            self.stamps_ns[index], self.poses[index], self.sensor_frame, self.world_frame
+            self.stamps_ns[index],
+            self.poses[index],
+            self.sensor_frame,
+            self.world_frame,
+            self.measures,
         )
 
     @property

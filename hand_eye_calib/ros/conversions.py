@@ -1,13 +1,14 @@
 """Between ROS messages and the poses of the engine."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
     Point,
+    PointStamped,
     PoseStamped,
     PoseWithCovarianceStamped,
     Quaternion,
@@ -15,11 +16,14 @@ from geometry_msgs.msg import (
     Vector3,
 )
 from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.errors import printable
+from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.rates import RateIntegrator
+from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
 
 _Triple = TypeVar("_Triple", Point, Vector3)
 
@@ -78,6 +82,78 @@ POSE_TYPES = {
         TransformStamped, lambda message: _transform(message.transform), _child_frame
     ),
 }
+
+
+# Messages of a part of a pose, and how each is read as what it measures; a new reading for every
+# stream, for some remember what came before.
+PART_TYPES: dict[tuple[str, str], Callable[[], PoseType]] = {
+    ("sensor_msgs/msg/Imu", "rates"): lambda: PoseType(Imu, _integrated(), _own_frame),
+    ("sensor_msgs/msg/Imu", "rotations"): lambda: PoseType(Imu, _orientation, _own_frame),
+    ("sensor_msgs/msg/NavSatFix", "positions"): lambda: PoseType(NavSatFix, _local(), _own_frame),
+    ("geometry_msgs/msg/PointStamped", "positions"): lambda: PoseType(
+        PointStamped, lambda message: (message.point, Quaternion())
+    ),
+}
+
+
+def reading(type_name: str, measures: str) -> PoseType:
+    """How to read messages of a type as what they measure, see
+    :func:`~hand_eye_calib.io.bags.parts.measured_as`.
+    """
+    if type_name not in POSE_TYPES:
+        return PART_TYPES[type_name, measures]()
+    whole = POSE_TYPES[type_name]
+    parts: dict[str, Callable[[Any], tuple[Any, Any]]] = {
+        "poses": whole.pose,
+        "positions": lambda message: (whole.pose(message)[0], Quaternion()),
+        "rotations": lambda message: (Point(), whole.pose(message)[1]),
+    }
+    return replace(whole, pose=parts[measures])
+
+
+def _own_frame(message: Any) -> str:
+    """The frame of a message that is one of the sensor's own."""
+    return printable(message.header.frame_id)
+
+
+def _orientation(message: Imu) -> tuple[Point, Quaternion]:
+    if message.orientation_covariance[0] == -1.0:
+        raise InputError("the message says that it has no orientation")
+    return Point(), message.orientation
+
+
+def _integrated() -> Callable[[Imu], tuple[Point, Quaternion]]:
+    """Orientations from the rates of messages, one after the other."""
+    integrator = RateIntegrator()
+
+    def pose(message: Imu) -> tuple[Point, Quaternion]:
+        if message.angular_velocity_covariance[0] == -1.0:
+            raise InputError("the message says that it has no angular rates")
+        rate = message.angular_velocity
+        rates = np.array([[rate.x, rate.y, rate.z]])
+        if not np.isfinite(rates).all():
+            raise InputError("an angular rate is not finite")
+        x, y, z, w = integrator.quats_xyzw(np.array([to_ns(message.header.stamp)]), rates)[0]
+        return Point(), Quaternion(x=float(x), y=float(y), z=float(z), w=float(w))
+
+    return pose
+
+
+def _local() -> Callable[[NavSatFix], tuple[Point, Quaternion]]:
+    """Metres east, north and up of the first fix."""
+    origin = LocalOrigin()
+
+    def pose(message: NavSatFix) -> tuple[Point, Quaternion]:
+        if message.status.status < 0:
+            raise InputError("the receiver has no fix")
+        lat, lon = np.radians([[message.latitude], [message.longitude]])
+        height = np.array([message.altitude])
+        if not np.isfinite([lat, lon, height]).all():
+            raise InputError("a coordinate is not finite")
+        x, y, z = origin.local(lat, lon, height)[0]
+        return Point(x=float(x), y=float(y), z=float(z)), Quaternion()
+
+    return pose
 
 
 def to_ns(stamp: Time) -> int:

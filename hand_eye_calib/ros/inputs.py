@@ -12,7 +12,8 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.engine.pose_buffer import StreamStatistics
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.ros.conversions import POSE_TYPES, PoseType, to_ns
+from hand_eye_calib.io.bags.parts import measured_as
+from hand_eye_calib.ros.conversions import PART_TYPES, POSE_TYPES, PoseType, reading, to_ns
 from hand_eye_calib.ros.input_monitor import InputMonitor
 from hand_eye_calib.ros.live_session import LiveSession
 from hand_eye_calib.ros.log import NodeLog
@@ -25,6 +26,9 @@ _QOS = QoSProfile(
     depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
 )
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+
+# What a topic may have, the likeliest first.
+_TYPES = tuple(dict.fromkeys([*POSE_TYPES, *(name for name, _ in PART_TYPES)]))
 
 # Messages taken in one callback beyond the first; services and timers have their turn then.
 _MOST_AT_ONCE = 50
@@ -80,6 +84,8 @@ class PoseInput:
         self._on_jump_back = on_jump_back
         self._sensor_frame = ""
         self._max_gap_ns = 0.0
+        self._wanted: str = "auto"
+        self._is_watching = False
 
     @property
     def statistics(self) -> StreamStatistics:
@@ -89,6 +95,8 @@ class PoseInput:
     def configure(self, options: Parameters) -> None:
         """Follow the parameters."""
         self._max_gap_ns = options.calibrator.max_gap * 1e9
+        self._wanted = getattr(options.calibrator, f"{self.name}_measures")
+        self._is_watching = options.node.monitor
 
     def restart(self, because_of: "PoseInput | None") -> None:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
@@ -218,10 +226,10 @@ class TopicInput(PoseInput):
         """The type of the publishers; None if there is none that can be used."""
         if self._type_name in offered:
             return self._type_name
-        usable = [name for name in offered if name in POSE_TYPES]
+        usable = [name for name in _TYPES if name in offered]
         if offered and not usable:
             self._log.warning(
-                f"{self.topic} has type {', '.join(offered)}; expected {', '.join(POSE_TYPES)}: "
+                f"{self.topic} has type {', '.join(offered)}; expected {', '.join(_TYPES)}: "
                 f"remap {self.relative_topic} to a topic with poses",
                 ("type", self.name),
             )
@@ -231,7 +239,11 @@ class TopicInput(PoseInput):
         if self._subscription is not None:
             self._log.warning(f"{self.topic} has changed its type from {self._type_name}")
             self._node.destroy_subscription(self._subscription)
-        pose_type = POSE_TYPES[type_name]
+        measures = measured_as(type_name, self._wanted, self.topic)
+        if self._is_watching and measures != "poses":
+            raise ConfigError(f"monitor watches poses; {self.topic} has {measures}")
+        pose_type = reading(type_name, measures)
+        self._session.set_measures(self.name, measures)
 
         def on_message(message: Any, info: dict[str, Any]) -> None:
             self.receive(pose_type, message, info)

@@ -1,6 +1,7 @@
 """The session of the node: the engine, the number of the session, and its journal on disk."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ class LiveSession:
         self.topics: dict[str, str] = {}
         self.has_new_poses = False
         self._log = log
+        self._measures: dict[str, Any] = {}
         self._journal: SessionJournal | None = None
         self._lock: DirectoryLock | None = None
 
@@ -76,9 +78,16 @@ class LiveSession:
         if self._journal is not None:
             self._journal.set_frame(stream, sensor_frame)
 
+    def set_measures(self, stream: str, measures: str) -> None:
+        """Take what a stream measures, as its message type says, one of config.MEASURES."""
+        name = f"{stream}_measures"
+        if self._measures.get(name, "poses") != measures:
+            self._measures[name] = measures
+            self.reconfigure(self.calibrator.config)
+
     def reconfigure(self, config: CalibratorConfig) -> None:
         """Put other options in force; the poses stay, and are to be solved again."""
-        self.calibrator.reconfigure(config)
+        self.calibrator.reconfigure(replace(config, **self._measures))
         if self._journal is not None:
             self._journal.describe(self._about())
         received = sum(self.calibrator.statistics(stream).received for stream in STREAMS)

@@ -146,7 +146,7 @@ class Goal:
         Progress
         """
         wanted = _SHARE * self._targets
-        exempt = _settled_by_prior(calibration)
+        exempt = _settled_by_prior(calibration) | _out_of_reach(calibration)
         ratios = np.where(exempt, 0.0, (calibration.sigmas / wanted) ** 2)
         worst = int(np.argmax(ratios))
         motion_s = seen.motion_s
@@ -235,6 +235,11 @@ def _settled_by_prior(calibration: Calibration) -> BoolArray:
     return np.array([dof.verdict is DofVerdict.PRIOR for dof in calibration.observability])
 
 
+def _out_of_reach(calibration: Calibration) -> BoolArray:
+    """Axes that streams of this kind never show."""
+    return np.isin(AXES, calibration.out_of_reach)
+
+
 def _least_motion_s(calibration: Calibration) -> float:
     """Seconds of motion below which a standard deviation is not believed."""
     lasting = (calibration.noise or {}).get("lasting", ())
@@ -282,10 +287,12 @@ def _called(axis: str) -> str:
 
 def _precision(calibration: Calibration) -> str:
     metres, radians = calibration.sigmas[:3].max(), calibration.sigmas[3:].max()
-    return (
-        f"translation known to {_length(metres)}, rotation to {np.degrees(radians):.2g} deg "
-        "(one sigma)"
-    )
+    told = [f"translation known to {_length(metres)}", f"rotation to {np.degrees(radians):.2g} deg"]
+    if calibration.measured == "rotations" and calibration.out_of_reach:
+        told = [f"rotation known to {np.degrees(radians):.2g} deg"]
+    elif calibration.out_of_reach:
+        told = told[:1]
+    return f"{', '.join(told)} (one sigma)"
 
 
 def _floor(calibration: Calibration, goal: Goal) -> str:

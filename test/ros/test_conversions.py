@@ -35,7 +35,8 @@ def calibration(covariance, T_parent_child=T_PARENT_CHILD):
 
 
 def test_every_pose_type_of_the_options_can_be_read():
-    assert set(conversions.POSE_TYPES) | {"auto"} == set(config.POSE_TYPES)
+    parts = {name for name, _ in conversions.PART_TYPES}
+    assert set(conversions.POSE_TYPES) | parts | {"auto"} == set(config.POSE_TYPES)
 
 
 def test_control_characters_in_names_of_frames_are_escaped():

@@ -60,6 +60,7 @@ ALLOWED = ENGINE | {
 ROS_LIBRARIES = (
     "rclpy",
     "nav_msgs",
+    "sensor_msgs",
     "geometry_msgs",
     "std_srvs",
     "std_msgs",

@@ -48,6 +48,7 @@ DECLARED_AS = {
     "launch": (None, "launch"),
     "launch_ros": (None, "launch_ros"),
     "nav_msgs": ("ros-jazzy-common-interfaces", "nav_msgs"),
+    "sensor_msgs": ("ros-jazzy-common-interfaces", "sensor_msgs"),
     "rcl_interfaces": ("ros-jazzy-rclpy", "rcl_interfaces"),
     "rclpy": ("ros-jazzy-rclpy", "rclpy"),
     "std_msgs": ("ros-jazzy-common-interfaces", "std_msgs"),

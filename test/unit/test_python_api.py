@@ -71,6 +71,8 @@ class TestOptionsOfCalibrate:
             max_gap=3.0,
             time_offset="estimate",
             scale=2.0,
+            parent_measures="rates",
+            child_measures="rotations",
             target_translation=0.5,
             target_rotation=0.25,
             parent_frame="lidar",

@@ -64,7 +64,9 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
         replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
     snapshot = replayed.calibrator.snapshot()
     calibration, snapshot = checked(replayed.calibration, snapshot, task.options)
-    calibration, evidence = with_cross_check(calibration, snapshot)
+    evidence = None
+    if calibration.measured == "poses":
+        calibration, evidence = with_cross_check(calibration, snapshot)
     inputs = replayed.inputs | {"options": snapshot.config.to_options()}
     found: Outcome = {
         "calibration": calibration.to_dict(),
@@ -73,7 +75,7 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
     }
     if calibration.status.failure:
         found["error"] = calibration.status.failure
-    if task.with_report:
+    if task.with_report and evidence is not None:
         found["page"] = rendered(calibration, evidence, snapshot.config, inputs)
     return found
 

@@ -6,6 +6,7 @@ a whole message and needs no type definitions. Messages that differ only in thei
 unpacked together.
 """
 
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -131,6 +132,22 @@ class _Cursor:
         if not self.packing.is_aligned:
             self.length()  # sequence number
         return self.stamp_ns(), self.name()
+
+    def doubles(self, count: int) -> list[float]:
+        """Read numbers."""
+        self._align(8)
+        format_ = f"{self.packing.order}{count}d"
+        values = struct.unpack_from(format_, self.data, self.position)
+        self.position += 8 * count
+        return list(values)
+
+    def fix_status(self) -> int:
+        """Read a NavSatStatus; negative without a fix."""
+        (status,) = struct.unpack_from("b", self.data, self.position)
+        self.position += 1
+        self._align(2)
+        self.position += 2
+        return int(status)
 
     def pose(self) -> tuple[list[float], list[float]]:
         """Read position and quaternion."""
@@ -323,3 +340,59 @@ def unpack_transforms(data: Buffer, is_ros1: bool) -> Iterator[PoseFields]:
         stamp_ns, world_frame = cursor.header()
         frames = world_frame.lstrip("/"), cursor.name().lstrip("/")
         yield PoseFields(stamp_ns, *frames, *cursor.pose())
+
+
+class PartFields(NamedTuple):
+    """The unpacked part of a message that is no pose: stamp, frame and values."""
+
+    stamp_ns: int
+    frame: str
+    values: list[float]
+
+
+def unpack_imu(data: Buffer, is_ros1: bool) -> PartFields:
+    """Orientation, quaternion with the scalar last, and angular rates (rad/s) of a sensor_msgs/Imu:
+    NaN for what its covariance says it does not have, 0 for the other.
+
+    Raises
+    ------
+    struct.error, ValueError
+        If the bytes are not such a message.
+    """
+    cursor = _Cursor(data, is_ros1)
+    stamp_ns, frame = cursor.header()
+    values = cursor.doubles(4 + 9 + 3 + 9)
+    orientation, rates = values[:4], values[13:16]
+    if values[4] == -1.0:
+        orientation = [math.nan] * 4
+    if values[16] == -1.0:
+        rates = [math.nan] * 3
+    return PartFields(stamp_ns, frame, orientation + rates)
+
+
+def unpack_fix(data: Buffer, is_ros1: bool) -> PartFields:
+    """Latitude, longitude (deg) and height (m) of a sensor_msgs/NavSatFix: NaN without a fix.
+
+    Raises
+    ------
+    struct.error, ValueError
+        If the bytes are not such a message.
+    """
+    cursor = _Cursor(data, is_ros1)
+    stamp_ns, frame = cursor.header()
+    has_fix = cursor.fix_status() >= 0
+    values = cursor.doubles(3)
+    return PartFields(stamp_ns, frame, values if has_fix else [math.nan] * 3)
+
+
+def unpack_point(data: Buffer, is_ros1: bool) -> PartFields:
+    """Position (m) of a geometry_msgs/PointStamped.
+
+    Raises
+    ------
+    struct.error, ValueError
+        If the bytes are not such a message.
+    """
+    cursor = _Cursor(data, is_ros1)
+    stamp_ns, frame = cursor.header()
+    return PartFields(stamp_ns, frame, cursor.doubles(3))

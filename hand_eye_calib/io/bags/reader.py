@@ -1,7 +1,8 @@
 """Reading the poses of two streams from bags."""
 
 import heapq
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Self
@@ -36,6 +37,7 @@ from hand_eye_calib.io.bags.messages import (
     unpack_poses,
     unpack_transforms,
 )
+from hand_eye_calib.io.bags.parts import PART_TYPES, PartReader, measured_as
 from hand_eye_calib.io.bags.storage import Storage
 from hand_eye_calib.io.bags.topics import (
     Source,
@@ -71,6 +73,7 @@ class PoseBag:
         self.paths = [Path(path) for path in paths]
         self._files = BagFiles()
         self._watches: dict[str, PoseWatch] = {}
+        self._readers: dict[str, PartReader] = {}
         self._gaps: list[str] = []
         try:
             for path in self.paths:
@@ -101,12 +104,21 @@ class PoseBag:
             for loss in storage.losses.texts()
         ]
         watched = [text for name, watch in self._watches.items() for text in watch.warnings(name)]
-        return [*self._files.notes, *self._gaps, *losses, *watched]
+        without = [
+            f"{name}: {reader.n_left_out} messages without a fix, or without what they were read "
+            "for, were left out"
+            for name, reader in self._readers.items()
+            if reader.n_left_out
+        ]
+        return [*self._files.notes, *self._gaps, *losses, *watched, *without]
 
     @property
     def n_left_out(self) -> int:
-        """Messages left out because their stamps cannot be right; complete after reading."""
-        return sum(watch.n_stamps for watch in self._watches.values())
+        """Messages left out because their stamps cannot be right, or without a fix; complete after
+        reading.
+        """
+        of_stamps = sum(watch.n_stamps for watch in self._watches.values())
+        return of_stamps + sum(reader.n_left_out for reader in self._readers.values())
 
     @property
     def start_ns(self) -> int | None:
@@ -205,10 +217,23 @@ class PoseBag:
         for source in sources:
             if not isinstance(source, str) or source not in topics:
                 return None
-            if topics[source].type not in POSE_TYPES:
+            if topics[source].type not in (*POSE_TYPES, *PART_TYPES):
                 return None
             count += topics[source].count
         return count
+
+    def measured(self, source: Source, wanted: str = "auto") -> str:
+        """What a source measures, one of config.MEASURES: what is wanted of it, or what messages of
+        its type are for.
+
+        Raises
+        ------
+        ConfigError
+            If its messages do not have what is wanted.
+        """
+        topics = self._topics()
+        message_type = topics[source].type if isinstance(source, str) and source in topics else ""
+        return measured_as(message_type, wanted, source)
 
     # ---- poses
 
@@ -220,7 +245,11 @@ class PoseBag:
             yield from block.rows()
 
     def blocks(
-        self, parent: Source, child: Source | None, max_gap_s: float = CalibratorConfig.max_gap
+        self,
+        parent: Source,
+        child: Source | None,
+        max_gap_s: float = CalibratorConfig.max_gap,
+        measures: Mapping[str, str] | None = None,
     ) -> Iterator[PoseBlock]:
         """Iterate over the poses of both streams in the order of the bag's time, many at once.
 
@@ -234,6 +263,9 @@ class PoseBag:
             A topic, or a pair of frames.
         max_gap_s : float
             Longest time that is interpolated between two transforms of a chain.
+        measures : mapping, optional
+            "parent" and "child" to what their topics are read as, if that is not what their types
+            are for; see :meth:`measured`.
 
         Yields
         ------
@@ -247,12 +279,16 @@ class PoseBag:
         sources = {"parent": parent, "child": child}
         types = {topic.name: topic.type for topic in self.topics()}
         self._watches = {str(source): PoseWatch() for source in sources.values()}
+        self._readers = {}
         direct, paths, transforms = {}, {}, {}
         for stream, source in sources.items():
             if isinstance(source, TfSource):
                 transforms[stream] = source
-            elif source is not None and types.get(source) in POSE_TYPES:
+            elif source is not None and types.get(source) in (*POSE_TYPES, *PART_TYPES):
                 direct[source] = stream
+                measured = self.measured(source, (measures or {}).get(stream, "auto"))
+                if measured != "poses":
+                    self._readers[source] = PartReader(types[source], measured)
             elif source is not None and types.get(source) == PATH_TYPE:
                 paths[stream] = source
         streams: list[Iterator[PoseBlock]] = [self._direct_blocks(direct)] if direct else []
@@ -287,14 +323,21 @@ class PoseBag:
     ) -> tuple[PoseBlock, BoolArray]:
         """PoseBlock of messages, and which of them to keep."""
         try:
-            columns = unpack_poses([message[2] for message in messages], kind.type, kind.is_ros1)
+            columns = self._columns(kind, [message[2] for message in messages])
         except MalformedMessage as error:
             raise unreadable(kind, first_number + error.index, error) from error
         message_numbers = first_number + np.arange(len(messages))
         bag_ns = np.array([message[1] for message in messages], dtype=np.int64)
         keep = self._watches[kind.topic].believable(first_number, columns.stamps_ns, bag_ns)
+        keep &= ~np.isnan(columns.poses).any(axis=1) | (kind.topic not in self._readers)
         self._watch(kind.topic, message_numbers, columns, keep)
         return PoseBlock.of_columns(stream, message_numbers, columns, bag_ns), keep
+
+    def _columns(self, kind: MessageKind, messages: list[bytes]) -> PoseColumns:
+        reader = self._readers.get(kind.topic)
+        if reader is not None:
+            return reader.columns(messages, kind.is_ros1)
+        return unpack_poses(messages, kind.type, kind.is_ros1)
 
     def _watch(
         self, name: str, message_numbers: IntArray, columns: PoseColumns, keep: BoolArray
@@ -435,7 +478,7 @@ class PoseBag:
 
 
 def read_bag_trajectory(
-    path: str | Path, topic: str | None = None, tf: str | None = None
+    path: str | Path, topic: str | None = None, tf: str | None = None, measures: str = "auto"
 ) -> tuple[Trajectory, list[str]]:
     """Read one trajectory of a bag.
 
@@ -445,6 +488,8 @@ def read_bag_trajectory(
     topic : str, optional
     tf : str, optional
         ``world:sensor``, instead of a topic.
+    measures : str
+        What to read of the poses, see :meth:`PoseBag.measured`.
 
     Returns
     -------
@@ -461,7 +506,8 @@ def read_bag_trajectory(
     source: Source = TfSource.parse(tf) if tf else topic or ""
     with PoseBag(path) as bag:
         bag.check(source)
-        blocks = list(bag.blocks(source, None))
+        kind = bag.measured(source, measures)
+        blocks = list(bag.blocks(source, None, measures={"parent": measures}))
         notes = bag.warnings
     if not blocks:
         raise InputError(f"no poses on {source} of {path}")
@@ -482,7 +528,7 @@ def read_bag_trajectory(
         sensor_frame=poses.sensor_frames[0] or "",
         world_frame=poses.world_frames[0],
     )
-    return trajectory, notes
+    return replace(trajectory, measures=kind) if kind != "poses" else trajectory, notes
 
 
 def _first_seen(

@@ -18,6 +18,7 @@ from hand_eye_calib.io.bags.messages import (
     unpack_poses,
     unpack_transforms,
 )
+from hand_eye_calib.io.bags.parts import PART_TYPES
 from hand_eye_calib.io.transforms import TfSource
 
 # A topic with fewer poses is not one of the two sensors: goals and initial poses are published
@@ -125,7 +126,7 @@ class TopicScan:
 
     def describe(self, info: TopicInfo, bag_duration_s: float) -> TopicDescription:
         """Sum up what was seen."""
-        is_usable = info.type in POSE_TYPES or info.type == PATH_TYPE
+        is_usable = info.type in (*POSE_TYPES, PATH_TYPE, *PART_TYPES)
         duration_s = bag_duration_s
         if is_usable and self._first_ns is not None and self._last_ns is not None:
             duration_s = (self._last_ns - self._first_ns) * 1e-9
@@ -169,13 +170,13 @@ def check_source(source: Source, topics: Mapping[str, TopicInfo], bag: str) -> N
     if source not in topics:
         raise InputError(f"no topic {source} in {bag}. {listing(topics, bag)}")
     found = topics[source].type
-    if found not in (*POSE_TYPES, PATH_TYPE):
+    if found not in (*POSE_TYPES, PATH_TYPE, *PART_TYPES):
         frames = (
             "; name two of its frames with --parent-tf and --child-tf" if found in TF_TYPES else ""
         )
         raise InputError(
             f"topic {source} of {bag} is of type {found or 'several types'}; accepted are "
-            f"{', '.join([*POSE_TYPES, PATH_TYPE])}{frames}. {listing(topics, bag)}"
+            f"{', '.join([*POSE_TYPES, PATH_TYPE, *PART_TYPES])}{frames}. {listing(topics, bag)}"
         )
 
 

@@ -18,9 +18,12 @@ ORIENTATIONS = (
     ("roll", "pitch", "yaw"),
     ("roll", "pitch", "heading"),
 )
+RATES = ("wx", "wy", "wz")
 # Of a machine on a plane.
 _PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
 _PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
+_ALL_POSITIONS = (*POSITIONS, *_PLANAR_POSITIONS)
+_ALL_ORIENTATIONS = (*ORIENTATIONS, *_PLANAR_ORIENTATIONS)
 
 # Last parts of column names, lower case, words joined by underscores; exports of bags have whole
 # paths such as .pose.pose.position.x.
@@ -42,6 +45,13 @@ _ALIASES = {
         *("nsecs", "nanosec"),
     ),
 }
+_RATE_NAMES = (
+    *("w", "w_", "omega_", "gyro_", "gyr_", "angvel_", "ang_vel_", "angular_velocity_"),
+    *("angular_rate_", "rate_", "w_rs_s_"),
+)
+_ALIASES |= {f"w{axis}": tuple(name + axis for name in _RATE_NAMES) for axis in "xyz"}
+# Names that stand for a part of an orientation, even if it is not known which.
+_ORIENTED = re.compile(r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude", re.IGNORECASE)
 _QUATERNION_NAMES = (
     "q",
     "q_",
@@ -62,6 +72,7 @@ _UNITS = "|".join([*_LENGTHS, *_ANGLES])
 _STAMP_UNIT = re.compile(
     r"[\[(]\s*(s|ms|us|ns)\s*[\])]\s*$|^\W*(?:t|time|timestamp|stamp)_(s|ms|us|ns)$"
 )
+_RATE_UNIT = re.compile(r"(?:\b|_)(?:(rad|deg|°)(?:_?ps|\s*/\s*s|[ _]s(?:\^?-1)?)|(dps))[\])\s]*$")
 _UNIT = re.compile(rf"[\[(]\s*({_UNITS})\s*[\])]\s*$|_({_UNITS})$")
 
 
@@ -86,8 +97,11 @@ class Columns(NamedTuple):
     units: dict[str, str]
 
 
-def choose_columns(path: object, names: Sequence[str], has_stamps: bool = True) -> Columns:
-    """Find the columns of stamp, unless stamps come from elsewhere, of position and orientation.
+def choose_columns(
+    path: object, names: Sequence[str], has_stamps: bool = True, measures: str = "auto"
+) -> Columns:
+    """Find the columns of stamp, unless stamps come from elsewhere, and of what is measured:
+    position and orientation, or what there is of them, or angular rates.
 
     Raises
     ------
@@ -99,10 +113,8 @@ def choose_columns(path: object, names: Sequence[str], has_stamps: bool = True) 
     stamp: tuple[str, ...] = ()
     if has_stamps:
         stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",)
-    orientation = _first_complete((*ORIENTATIONS, *_PLANAR_ORIENTATIONS), found)
-    is_planar = orientation in _PLANAR_ORIENTATIONS
-    position = _first_complete((*POSITIONS, *(_PLANAR_POSITIONS if is_planar else ())), found)
-    wanted = (*stamp, *position, *orientation)
+    measured = _quantities(found, names, measures)
+    wanted = (*stamp, *measured)
     missing = [name for name in wanted if name not in found]
     if missing:
         raise InputError(
@@ -115,7 +127,7 @@ def choose_columns(path: object, names: Sequence[str], has_stamps: bool = True) 
                 f"{path}: columns {listed([names[index] for index in found[name]])} could all be "
                 f"{name}; name them with `columns`"
             )
-    quantities = {name: found[name][0] for name in (*position, *orientation)}
+    quantities = {name: found[name][0] for name in measured}
     return Columns(
         stamp=[found[name][0] for name in stamp],
         quantities=quantities,
@@ -124,10 +136,53 @@ def choose_columns(path: object, names: Sequence[str], has_stamps: bool = True) 
     )
 
 
+def _quantities(
+    found: dict[str, list[int]], names: Sequence[str], measures: str
+) -> tuple[str, ...]:
+    """The quantities to read: of poses, or of the part of them that is measured or is there."""
+    orientation = _first_complete(_ALL_ORIENTATIONS, found)
+    is_planar = orientation in _PLANAR_ORIENTATIONS
+    position = _first_complete(_ALL_POSITIONS if is_planar else POSITIONS, found)
+    if measures == "auto":
+        measures = _what_is_there(found, names)
+    if measures == "positions":
+        return _first_complete(_ALL_POSITIONS, found)
+    parts = {"rates": RATES, "rotations": orientation}
+    return parts.get(measures, (*position, *orientation))
+
+
+def _what_is_there(found: dict[str, list[int]], names: Sequence[str]) -> str:
+    """What the columns measure; poses in doubt, so that what is missing is named."""
+    has_position, has_orientation, has_rates = (
+        any(set(group) <= found.keys() for group in groups)
+        for groups in (_ALL_POSITIONS, ORIENTATIONS, (RATES,))
+    )
+    if has_position:
+        is_oriented = _has_any(_ALL_ORIENTATIONS, found) or any(map(_ORIENTED.search, names))
+        return "poses" if is_oriented else "positions"
+    if _has_any(POSITIONS, found):
+        return "poses"
+    if has_rates:
+        return "rates"
+    return "rotations" if has_orientation else "poses"
+
+
+def _has_any(groups: Sequence[tuple[str, ...]], found: dict[str, list[int]]) -> bool:
+    return any(name in found for group in groups for name in group)
+
+
+def measured_by(quantities: Sequence[str]) -> str:
+    """What quantities of :func:`choose_columns` measure, one of config.MEASURES."""
+    if not {"x", "lat", "m11"} & {*quantities}:
+        return "rates" if RATES[0] in quantities else "rotations"
+    last = quantities[-1]
+    return "positions" if any(last == group[-1] for group in _ALL_POSITIONS) else "poses"
+
+
 def are_columns(names: Sequence[str]) -> bool:
     """Whether these are names of columns, or some other text."""
     found = _matches(names)
-    return any(set(group) <= found.keys() for group in (*POSITIONS, *_PLANAR_POSITIONS))
+    return any(set(group) <= found.keys() for group in (*_ALL_POSITIONS, RATES))
 
 
 def _matches(names: Sequence[str]) -> dict[str, list[int]]:
@@ -162,6 +217,7 @@ def listed(names: Sequence[str]) -> str:
 def _plain(name: str) -> str:
     """A column's name without its unit: ``.pose.position.x [m]`` to ``pose_position_x``."""
     name = re.sub(r"\[.*?\]|\(.*?\)", "", name).strip().lower()
+    name = _RATE_UNIT.sub("", name)
     name = re.sub(r"[^a-z0-9°]+", "_", name).strip("_")
     if name.startswith(("t_", "time", "stamp")):
         return re.sub(r"_(s|ms|us|ns)$", "", name)
@@ -175,7 +231,9 @@ def _stamp_unit(name: str) -> str:
 
 
 def _unit(name: str) -> str:
-    """Unit of a length or an angle in a column's name, empty if it has none."""
+    """Unit of a length, an angle or a rate in a column's name, empty if it has none."""
+    if rate := _RATE_UNIT.search(name.strip().lower()):
+        return "deg/s" if rate[1] != "rad" else "rad/s"
     found = _UNIT.search(name.strip().lower())
     unit = (found[1] or found[2]) if found else ""
     return _ANGLES.get(unit, unit)

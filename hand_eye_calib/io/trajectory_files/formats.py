@@ -110,7 +110,11 @@ def read_kitti(path: _Path, lines: Sequence[Line], times: _Path | None) -> Table
 
 
 def read_csv(
-    path: _Path, lines: Sequence[Line], columns: str | None, may_guess: bool = False
+    path: _Path,
+    lines: Sequence[Line],
+    columns: str | None,
+    may_guess: bool = False,
+    measures: str = "auto",
 ) -> Table:
     """Columns by the names in the header, or by those given.
 
@@ -123,6 +127,8 @@ def read_csv(
     may_guess : bool
         Whether eight columns without names are a stamp, a position and a quaternion, whose order
         is to be found.
+    measures : str
+        What to read of the columns, one of config.MEASURES, or "auto" for what there is.
 
     Raises
     ------
@@ -137,7 +143,7 @@ def read_csv(
         return _read_unnamed(path, rows, may_guess)
     if len(names) > MOST_COLUMNS:
         raise InputError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are read")
-    chosen = choose_columns(path, names)
+    chosen = choose_columns(path, names, measures=measures)
     table = Table(
         path,
         f"{len(names)} columns: {listed(names)}",

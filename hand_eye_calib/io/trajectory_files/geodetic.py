@@ -37,18 +37,36 @@ def local_positions(
     MissingDependencyError
         If pymap3d is not installed.
     """
-    try:
-        with np.errstate():  # importing it makes NumPy raise where it warns, for good
-            from pymap3d import geodetic2enu
-    except ModuleNotFoundError:
-        raise MissingDependencyError(
-            "latitude and longitude need the package pymap3d, which is not installed: "
-            "pip install 'hand_eye_calib[gnss]'"
-        ) from None
-    origin = (lat_rad[0], lon_rad[0], height_m[0])
-    east_north_up = geodetic2enu(lat_rad, lon_rad, height_m, *origin, deg=False)
+    positions = LocalOrigin().local(lat_rad, lon_rad, height_m)
     axes = _axes(lat_rad, lon_rad)
-    return LocalPositions(np.stack(east_north_up, axis=1), axes[0].T @ axes)
+    return LocalPositions(positions, axes[0].T @ axes)
+
+
+class LocalOrigin:
+    """The first position of a stream, from which the others count."""
+
+    def __init__(self) -> None:
+        self._origin: tuple[float, float, float] | None = None
+
+    def local(self, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
+        """Metres (N, 3) east, north and up of the first position of all that were asked for.
+
+        Raises
+        ------
+        MissingDependencyError
+            If pymap3d is not installed.
+        """
+        try:
+            with np.errstate():  # importing it makes NumPy raise where it warns, for good
+                from pymap3d import geodetic2enu
+        except ModuleNotFoundError:
+            raise MissingDependencyError(
+                "latitude and longitude need the package pymap3d, which is not installed: "
+                "pip install 'hand_eye_calib[gnss]'"
+            ) from None
+        self._origin = self._origin or (lat_rad[0], lon_rad[0], height_m[0])
+        east_north_up = geodetic2enu(lat_rad, lon_rad, height_m, *self._origin, deg=False)
+        return np.stack(east_north_up, axis=1)
 
 
 def _axes(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:

@@ -18,6 +18,9 @@ from hand_eye_calib.io.trajectory_files.table import Table
 
 _METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0}
 _RADIANS = {"deg": np.pi / 180, "rad": 1.0}
+_RADIANS_PER_S = {"deg/s": np.pi / 180, "rad/s": 1.0}
+# No gyroscope measures more (rad/s): 2,000 deg/s.
+_FASTEST = 35.0
 # Angles in radians are no larger than a turn, with room for rounding.
 _LARGEST_RAD = 2 * np.pi + 0.01
 # A first orientation so close to the identity is where an odometry starts.
@@ -59,6 +62,35 @@ def poses_of(table: Table) -> Poses:
     return (_in_local_frame if "lat" in columns else _in_metres)(table, columns)
 
 
+def rates_of(table: Table) -> FloatArray:
+    """The angular rates (N, 3), rad/s, of a table of rates; a unit that had to be guessed is added
+    to its ``guesses``.
+
+    Raises
+    ------
+    InputError
+        For values that cannot be; the message names the line.
+    """
+    values = np.array(table.values)
+    table.refuse(
+        ~np.isfinite(values).all(axis=1),
+        lambda _: "found a value that is not finite; remove the line or repair its source",
+    )
+    units = {_checked_unit(table, name, _RADIANS_PER_S) for name in table.quantities}
+    if len(units) > 1:
+        raise InputError(f"{table.path}: the columns of the rates have different units")
+    unit = units.pop()
+    if not unit:
+        largest = float(np.abs(values).max())
+        unit = "deg/s" if largest > _FASTEST else "rad/s"
+        _guess(
+            table,
+            f"angular rates read in {unit}, the largest is {largest:.4g}; to change that, name "
+            "their unit in the header, such as wx_deg_s",
+        )
+    return values * _RADIANS_PER_S[unit]
+
+
 def _guess(table: Table, text: str) -> None:
     table.guesses.append(f"{table.path}: {text}")
 
@@ -77,6 +109,9 @@ def _checked(table: Table, positions: FloatArray) -> FloatArray:
 
 
 def _in_metres(table: Table, columns: _Columns) -> Poses:
+    if "x" not in columns:
+        positions = np.zeros((len(table.values), 3))
+        return Poses(positions, _orientations(table, columns, positions))
     names = ("x", "y", "height" if "height" in columns else "z")
     positions = np.stack([_lengths(table, columns, name) for name in names], axis=1)
     _checked(table, positions)
@@ -126,6 +161,8 @@ def _orientations(table: Table, columns: _Columns, positions: FloatArray) -> Flo
         quats_xyzw = np.stack([columns[name] for name in QUATERNION], axis=1)
         _check_quaternions(table, quats_xyzw)
         return quats_xyzw
+    if not {"yaw", "heading"} & columns.keys():
+        return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
     return _from_angles(table, columns, positions)
 
 

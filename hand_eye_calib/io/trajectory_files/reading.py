@@ -1,6 +1,7 @@
 """Reading a trajectory from a text file in any format."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files.columns import measured_by
 from hand_eye_calib.io.trajectory_files.formats import (
     lines_of,
     read_csv,
@@ -19,9 +21,9 @@ from hand_eye_calib.io.trajectory_files.formats import (
 )
 from hand_eye_calib.io.trajectory_files.layout import Layout, layout_of
 from hand_eye_calib.io.trajectory_files.objects import PoseObject, trajectory_from_object
-from hand_eye_calib.io.trajectory_files.poses import poses_of
+from hand_eye_calib.io.trajectory_files.poses import poses_of, rates_of
 from hand_eye_calib.io.trajectory_files.stamps import in_order, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import Line, Table
+from hand_eye_calib.io.trajectory_files.table import Line, Table, cells_of, data_lines
 
 _Path = str | Path
 
@@ -31,6 +33,8 @@ _USUAL = "tum"
 # Of eight numbers in files so called, the scalar is the last.
 _SUFFIXES_OF_TUM = ("", ".txt", ".tum")
 _TIMES = "times.txt"
+# What four columns without names are.
+_OF_FOUR = {"positions": "t,x,y,z", "rates": "t,wx,wy,wz"}
 
 
 class FileReading(NamedTuple):
@@ -60,6 +64,7 @@ def read_trajectory(
     times: str | Path | ArrayLike | None = None,
     stamp_unit: str | None = None,
     repair: bool = False,
+    measures: str = "auto",
 ) -> Trajectory:
     """Read a trajectory from a text file, from a bag if ``topic`` or ``tf`` is given, or from an
     object of another library.
@@ -87,6 +92,9 @@ def read_trajectory(
     stamp_unit : str, optional
         "s", "ms", "us" or "ns"; if left out, recognised from the stamps' size or taken from the
         header (``timestamp [ns]``).
+    measures : str
+        What to read: "poses", or only "positions", "rotations" or angular "rates"; "auto" for what
+        the columns are, and of a bag for what the messages are.
     repair : bool
         Sort poses that are out of order and drop those with a stamp that is there already, with a
         ``UserWarning`` that says how many; otherwise they are an error.
@@ -116,17 +124,17 @@ def read_trajectory(
             )
         from hand_eye_calib.io.bags import read_bag_trajectory
 
-        trajectory, notes = read_bag_trajectory(source, topic, tf)
+        trajectory, notes = read_bag_trajectory(source, topic, tf, measures)
     elif isinstance(source, _Path):
         if not isinstance(times, _Path | None):
             raise ConfigError("stamps in memory are for poses in memory; of a kitti file name one")
         trajectory, repairs, guesses = read_trajectory_file(
-            source, format, columns, times, stamp_unit, repair
+            source, format, columns, times, stamp_unit, repair, measures
         )
         notes = [*guesses, *repairs]
     else:
-        if format != _USUAL or isinstance(times, _Path):
-            raise ConfigError("format and a file of times are for text files")
+        if format != _USUAL or isinstance(times, _Path) or measures != AUTO:
+            raise ConfigError("format, measures and a file of times are for text files")
         trajectory, notes = trajectory_from_object(source, times, columns, stamp_unit, repair)
     for text in notes:
         warnings.warn(text, UserWarning, stacklevel=2)
@@ -140,17 +148,29 @@ def read_trajectory_file(
     times: _Path | None = None,
     stamp_unit: str | None = None,
     repair: bool = False,
+    measures: str = AUTO,
 ) -> FileReading:
     """Read a text file as :func:`read_trajectory`, without warnings."""
     _check_options(format, columns, times, stamp_unit)
     lines = lines_of(path, "a trajectory")
-    table = _table(path, lines, format, columns, times)
+    table = _table(path, lines, format, columns, times, measures)
     if not table.stamps:
         raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
     stamps_ns = stamps_in_ns(table, stamp_unit)
+    found = measured_by(table.quantities)
+    if found == "rates":
+        rates = rates_of(table)
+        keep, repairs = in_order(table, stamps_ns, repair)
+        trajectory = Trajectory.from_rates(stamps_ns[keep], rates[keep])
+        return FileReading(trajectory, repairs, table.guesses)
     positions, quats_xyzw = poses_of(table)
     keep, repairs = in_order(table, stamps_ns, repair)
     trajectory = Trajectory.from_quat_xyzw(stamps_ns[keep], positions[keep], quats_xyzw[keep])
+    if found != "poses":
+        table.guesses.append(f"{path}: {found} alone, as its columns have it")
+    kind = found if measures == AUTO else measures
+    if kind != "poses":
+        trajectory = replace(trajectory, measures=kind)
     return FileReading(trajectory, repairs, table.guesses)
 
 
@@ -163,6 +183,12 @@ def layout_of_file(path: _Path) -> Layout:
         If it cannot be read.
     """
     return layout_of(lines_of(path, "a trajectory"))
+
+
+def _n_columns(lines: list[Line]) -> int:
+    """Number of cells in the first line with data."""
+    first = next((text for _, text in data_lines(lines)), "")
+    return len(cells_of(first))
 
 
 def _check_options(
@@ -183,22 +209,36 @@ def _check_options(
 
 
 def _table(
-    path: _Path, lines: list[Line], format: str, columns: str | None, times: _Path | None
+    path: _Path,
+    lines: list[Line],
+    format: str,
+    columns: str | None,
+    times: _Path | None,
+    measures: str,
 ) -> Table:
     if format == AUTO:
-        return _recognised(path, lines, columns, times)
+        return _recognised(path, lines, columns, times, measures)
     if format == "csv":
-        return read_csv(path, lines, columns)
+        return read_csv(path, lines, columns, measures=measures)
     if format == "kitti":
         return read_kitti(path, lines, times)
     return read_tum(path, lines) if format == _USUAL else read_euroc(path, lines)
 
 
-def _recognised(path: _Path, lines: list[Line], columns: str | None, times: _Path | None) -> Table:
+def _recognised(
+    path: _Path, lines: list[Line], columns: str | None, times: _Path | None, measures: str
+) -> Table:
     """The table of a file in the format that it looks like."""
     found, is_named = layout_of(lines)
+    if columns is None and times is None and not is_named and _n_columns(lines) == 4:
+        if measures not in _OF_FOUR:
+            raise InputError(
+                f"{path}: four columns without names; name them with `columns`: t,x,y,z for "
+                "positions, t,wx,wy,wz for angular rates"
+            )
+        columns = _OF_FOUR[measures]
     if columns is not None:
-        return read_csv(path, lines, columns)
+        return read_csv(path, lines, columns, measures=measures)
     if times is not None:
         return read_kitti(path, lines, times)
     if found == _USUAL:
@@ -212,7 +252,7 @@ def _recognised(path: _Path, lines: list[Line], columns: str | None, times: _Pat
             guesses.append(f"stamps read from {beside}; to change that, give `times`")
         table = read_kitti(path, lines, beside if beside.is_file() else None)
     elif found == "csv":
-        table = read_csv(path, lines, None, may_guess=True)
+        table = read_csv(path, lines, None, may_guess=True, measures=measures)
     else:
         table = read_euroc(path, lines)
     table.guesses[:0] = guesses

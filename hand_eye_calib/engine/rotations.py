@@ -1,0 +1,137 @@
+"""From streams of which at least one gives only rotations, or angular rates, to a calibration: the
+rotation between the sensors, the bias of a gyroscope and the time offset.
+
+The adaptive estimator sees trajectories that never leave their origins: their increments have no
+translation, and what it finds for the rotation does not depend on the rest.
+"""
+
+import numpy as np
+
+from hand_eye_calib.adaptive import estimator as adaptive_estimator
+from hand_eye_calib.adaptive.increments import SYSTEMATIC_OF_RATES, SYSTEMATIC_OF_ROTATIONS
+from hand_eye_calib.adaptive.solution import AdaptiveSolution
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.covariance import assess_rotation
+from hand_eye_calib.assessment.prior import fuse
+from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
+from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+# Two streams of which more than this share of the rotation stays unexplained are not of one body.
+_UNRELATED = 0.5
+
+# Poses between the ends of the motions that tell this.
+_SPAN = 10
+
+
+def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
+    """Solve and assess synchronised rotations.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        On one clock. Positions are not looked at.
+    config : CalibratorConfig
+        With a time offset in seconds, which the poses already have.
+
+    Returns
+    -------
+    Calibration
+        Without frame names. Its translation is zero and unknown.
+    """
+    Ts_pw_p, Ts_cw_c = (_without_positions(Ts) for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c))
+    has_rates = "rates" in (config.parent_measures, config.child_measures)
+    systematic = SYSTEMATIC_OF_RATES if has_rates else SYSTEMATIC_OF_ROTATIONS
+    solution = adaptive_estimator.solve(pose_pairs.stamps_ns, Ts_pw_p, Ts_cw_c, systematic)
+    fused = fuse(solution.T_parent_child, assess_rotation(solution), config.prior())
+    verdicts = fused.assessment.observability[3:]
+    is_known = all(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in verdicts)
+    status = SolveStatus.OK if is_known else SolveStatus.UNOBSERVABLE
+    if fused.contradictions:
+        status = SolveStatus.CONTRADICTED
+    pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
+    residuals = _residuals(pairs, solution, pose_pairs)
+    return Calibration(
+        T_parent_child=fused.T_parent_child,
+        covariance=fused.assessment.cov_parent_child_in_child,
+        status=status if solution.converged else SolveStatus.NOT_CONVERGED,
+        observability=fused.assessment.observability,
+        measured="rotations",
+        T_method=solution.T_parent_child,
+        objective=solution.objective,
+        method="adaptive",
+        reference="increments",
+        backend="fast",
+        n_poses=len(pose_pairs),
+        n_pairs=len(residuals),
+        n_inliers=int(residuals.is_inlier.sum()),
+        time_offset_s=float(config.time_offset) + solution.time_offset_s,
+        time_offset_sigma_s=solution.time_offset_sigma_s,
+        rate_bias=_rate_bias(solution, config) if has_rates else None,
+        noise=solution.describe(pose_pairs.stamps_ns),
+        findings=tuple(_unrelated(Ts_pw_p, Ts_cw_c, solution)),
+        contradictions=fused.contradictions,
+        target_translation=config.target_translation,
+        target_rotation=config.target_rotation,
+        stamp_ns=int(pose_pairs.stamps_ns[-1]),
+        motion_residuals=residuals,
+    )
+
+
+def _without_positions(Ts: FloatArray) -> FloatArray:
+    return se3.from_rotation_translation(Ts[:, :3, :3], np.zeros((len(Ts), 3)))
+
+
+def _rate_bias(solution: AdaptiveSolution, config: CalibratorConfig) -> dict[str, object]:
+    """The bias of the rates in plain values, in the axes of the sensor that has it.
+
+    Of two gyroscopes only the difference of the biases shows, the child's less the parent's.
+    """
+    bias, sigmas = solution.rate_bias
+    if config.child_measures == "rates":
+        of = "child" if config.parent_measures != "rates" else "child less parent, child's axes"
+        return {"of": of, "rad_per_s": bias.tolist(), "sigma": sigmas.tolist()}
+    rotation = solution.T_parent_child[:3, :3]
+    variances = np.diag(rotation @ np.diag(sigmas**2) @ rotation.T)
+    return {
+        "of": "parent",
+        "rad_per_s": (-rotation @ bias).tolist(),
+        "sigma": np.sqrt(variances).tolist(),
+    }
+
+
+def _residuals(pairs: MotionPairs, solution: AdaptiveSolution, pose_pairs: PosePairs) -> Residuals:
+    translation, rotation = pairs.residuals(solution.T_parent_child)
+    return Residuals(
+        translation=translation,
+        rotation=rotation,
+        weights=(~solution.jumps).astype(float),
+        start_ns=pose_pairs.stamps_ns[pairs.i],
+        end_ns=pose_pairs.stamps_ns[pairs.j],
+    )
+
+
+def _unrelated(
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, solution: AdaptiveSolution
+) -> list[dict[str, object]]:
+    """A finding if the rotations of one stream do not explain those of the other."""
+    span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
+    pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
+    left = np.linalg.norm(pairs.residuals(solution.T_parent_child)[1], axis=1)
+    turned = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
+    share = float(np.median(left) / max(float(np.median(turned)), 1e-12))
+    if share < _UNRELATED:
+        return []
+    found = Finding(
+        code="unrelated",
+        stream="both",
+        severity=Severity.ERROR,
+        confidence=Confidence.LIKELY,
+        what=f"{share:.0%} of the rotation of one sensor is not that of the other",
+        advice="check that both are on one rigid body, the unit of the rates, and the clocks "
+        "(time_offset estimate)",
+    )
+    return [found.to_dict()]

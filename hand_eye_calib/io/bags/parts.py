@@ -1,0 +1,131 @@
+"""Messages that carry a part of a pose: positions of GNSS receivers and prisms, orientations and
+angular rates of IMUs; and messages of poses of which only a part counts.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.geometry.rates import RateIntegrator
+from hand_eye_calib.io.bags.messages import (
+    MALFORMED,
+    POSE_TYPES,
+    Buffer,
+    MalformedMessage,
+    PoseColumns,
+    unpack_fix,
+    unpack_imu,
+    unpack_point,
+    unpack_poses,
+)
+from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
+
+_IMU, _FIX, _POINT = (
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/NavSatFix",
+    "geometry_msgs/msg/PointStamped",
+)
+#: What each type can be read as, the usual first.
+PART_TYPES = {_IMU: ("rates", "rotations"), _FIX: ("positions",), _POINT: ("positions",)}
+_OF_POSES = ("poses", "positions", "rotations")
+
+_LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def measured_as(message_type: str, wanted: str, source: object) -> str:
+    """What messages of a type are read as: what is wanted, or the usual for "auto".
+
+    Raises
+    ------
+    ConfigError
+        If they cannot be read as that.
+    """
+    possible = PART_TYPES.get(message_type, _OF_POSES)
+    if wanted == "auto":
+        return possible[0]
+    if wanted not in possible:
+        raise ConfigError(
+            f"{source} has messages of type {message_type or 'tf2_msgs/msg/TFMessage'}, which "
+            f"measure {' or '.join(possible)}; asked for are {wanted}"
+        )
+    return wanted
+
+
+class PartReader:
+    """Unpacks the messages of one topic, in their order, as rows of poses whose other part means
+    nothing: level positions, rotations at the origin.
+
+    Parameters
+    ----------
+    message_type, measures : str
+        As of :func:`measured_as`.
+
+    Attributes
+    ----------
+    n_left_out : int
+        Messages without a fix or an orientation.
+    """
+
+    def __init__(self, message_type: str, measures: str) -> None:
+        self._type, self._measures = message_type, measures
+        self._integrator, self._origin = RateIntegrator(), LocalOrigin()
+        self.n_left_out = 0
+
+    def columns(self, messages: Sequence[Buffer], is_ros1: bool) -> PoseColumns:
+        """The next messages; a row without a fix or an orientation is not finite.
+
+        Raises
+        ------
+        MalformedMessage
+            At the first that cannot be unpacked.
+        """
+        if self._type in POSE_TYPES:
+            columns = unpack_poses(messages, self._type, is_ros1)
+            poses = columns.poses.copy()
+            if self._measures == "positions":
+                poses[:, 3:] = _LEVEL
+            elif self._measures == "rotations":
+                poses[:, :3] = 0.0
+            return columns._replace(poses=poses)
+        unpack = {_IMU: unpack_imu, _FIX: unpack_fix, _POINT: unpack_point}[self._type]
+        rows = []
+        for index, data in enumerate(messages):
+            try:
+                rows.append(unpack(data, is_ros1))
+            except MALFORMED as error:
+                raise MalformedMessage(index, error) from error
+        stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
+        poses = np.zeros((len(rows), 7))
+        poses[:, 3:] = _LEVEL
+        values = np.array([row.values for row in rows], dtype=float)
+        if self._type == _IMU:
+            values = values[:, 4:] if self._measures == "rates" else values[:, :4]
+        is_usable = np.isfinite(values).all(axis=1)
+        self.n_left_out += int((~is_usable).sum())
+        if is_usable.any():
+            self._fill(poses, stamps_ns, values, is_usable)
+        poses[~is_usable] = np.nan
+        names = [row.frame for row in rows]
+        is_fixed = self._type == _POINT
+        return PoseColumns(
+            stamps_ns,
+            names if is_fixed else [""] * len(rows),
+            [None] * len(rows) if is_fixed else names,
+            poses,
+        )
+
+    def _fill(
+        self, poses: FloatArray, stamps_ns: IntArray, values: FloatArray, rows: BoolArray
+    ) -> None:
+        """Write what was measured into some rows of poses (N, 7)."""
+        if self._type == _FIX:
+            lat, lon = np.radians(values[rows, :2]).T
+            poses[rows, :3] = self._origin.local(lat, lon, values[rows, 2])
+        elif self._type == _POINT:
+            poses[rows, :3] = values[rows]
+        elif self._measures == "rates":
+            poses[rows, 3:] = self._integrator.quats_xyzw(stamps_ns[rows], values[rows])
+        else:
+            poses[rows, 3:] = values[rows]

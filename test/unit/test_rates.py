@@ -1,0 +1,259 @@
+"""Streams without positions: rotations, and the angular rates of a gyroscope."""
+
+import json
+
+import numpy as np
+import pytest
+from motions import T_PARENT_CHILD, child_of, wandering_poses
+from rosbags.typesys import Stores, get_typestore
+
+import hand_eye_calib as hec
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.rates import RateIntegrator, integrated
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags.messages import unpack_fix, unpack_imu
+from hand_eye_calib.io.bags.parts import PartReader, measured_as
+from hand_eye_calib.io.trajectory_files import read_trajectory_file
+
+BIAS = np.array([0.02, -0.01, 0.03])
+OFFSET_S = 0.02
+STEP_NS = 50_000_000
+START_NS = 1_700_000_000_000_000_000
+TYPES = get_typestore(Stores.ROS2_HUMBLE).types
+
+
+def smooth_streams(n_poses=500, noise_rad=2e-4, seed=1):
+    """Poses of the parent every 50 ms, and rates of the child five times as often, late and with a
+    bias."""
+    random = np.random.default_rng(seed)
+    stamps_ns = START_NS + STEP_NS * np.arange(n_poses)
+    parent = Trajectory(stamps_ns, wandering_poses(n_poses, seed))
+    child = Trajectory(stamps_ns, child_of(parent.poses))
+    fine_ns = START_NS + STEP_NS // 5 * np.arange(5 * (n_poses - 1))
+    fine = child.at(fine_ns)
+    steps = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
+    rates = se3.rotation_log(steps) / (STEP_NS / 5 * 1e-9) + BIAS
+    middle_ns = fine_ns[:-1] + STEP_NS // 10 - round(OFFSET_S * 1e9)
+    noise = noise_rad * random.normal(size=(n_poses, 3))
+    noisy = parent.poses @ se3.exp(np.c_[np.zeros((n_poses, 3)), noise])
+    return Trajectory(stamps_ns, noisy, "lidar"), middle_ns, rates
+
+
+@pytest.fixture(scope="module")
+def streams():
+    parent, stamps_ns, rates = smooth_streams()
+    return parent, Trajectory.from_rates(stamps_ns, rates, "imu")
+
+
+@pytest.fixture(scope="module")
+def result(streams):
+    return hec.calibrate(*streams)
+
+
+def angle_to(rotation, result):
+    return float(se3.rotation_angle(rotation.T @ result.T_parent_child[:3, :3]))
+
+
+class TestRates:
+    def test_rotation_bias_and_offset_are_found(self, result):
+        assert angle_to(T_PARENT_CHILD[:3, :3], result) < np.radians(0.1)
+        assert result.rate_bias["of"] == "child"
+        assert result.rate_bias["rad_per_s"] == pytest.approx(BIAS, abs=1e-3)
+        assert result.time_offset_s == pytest.approx(OFFSET_S, abs=1e-3)
+        assert 0 < result.time_offset_sigma_s < 1e-3
+
+    def test_the_translation_is_out_of_reach_and_no_number(self, result):
+        assert result.measured == "rotations"
+        assert result.out_of_reach == ("x", "y", "z")
+        assert np.isinf(result.sigmas[:3]).all()
+        assert result.covariance[0, 0] > 1.0
+        assert result.usable_numbers()["x"] == "MEASURE_X_BY_HAND"
+        assert result.verdict is hec.Verdict.USE
+        assert "out of reach" in result.headline
+
+    def test_the_other_way_round_it_is_the_inverse(self, streams, result):
+        parent, child = streams
+        inverse = hec.calibrate(child, parent)
+        product = inverse.T_parent_child[:3, :3] @ result.T_parent_child[:3, :3]
+        assert float(se3.rotation_angle(product)) < np.radians(0.05)
+        assert inverse.rate_bias["of"] == "parent"
+        assert inverse.rate_bias["rad_per_s"] == pytest.approx(BIAS, abs=1e-3)
+        assert inverse.time_offset_s == pytest.approx(-OFFSET_S, abs=1e-3)
+
+    def test_a_prior_gives_the_translation(self, streams):
+        prior = {axis: (value, 0.01) for axis, value in zip("xyz", (0.4, -0.2, 0.7), strict=True)}
+        known = hec.calibrate(*streams, prior=prior)
+        assert known.out_of_reach == ()
+        assert known.T_parent_child[:3, 3] == pytest.approx([0.4, -0.2, 0.7], abs=1e-3)
+
+    def test_rotations_alone_need_no_bias(self, streams):
+        parent, _ = streams
+        child = Trajectory(parent.stamps_ns, child_of(parent.poses), measures="rotations")
+        found = hec.calibrate(parent, child)
+        assert found.rate_bias is None
+        assert angle_to(T_PARENT_CHILD[:3, :3], found) < np.radians(0.1)
+
+    def test_rates_of_another_body_are_not_to_be_used(self, streams):
+        parent, _ = streams
+        _, stamps_ns, rates = smooth_streams(seed=9)
+        found = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, rates))
+        assert found.verdict is hec.Verdict.DO_NOT_USE
+        assert [finding["code"] for finding in found.findings] == ["unrelated"]
+
+    def test_it_survives_a_file(self, result, tmp_path):
+        again = hec.load(hec.save(result, tmp_path))
+        assert (again.measured, again.rate_bias) == (result.measured, result.rate_bias)
+        assert again.out_of_reach == ("x", "y", "z")
+        assert "MEASURE_X_BY_HAND" in (tmp_path / "extrinsic.urdf.xacro").read_text()
+
+    def test_positions_and_rates_show_nothing_together(self, streams):
+        parent, child = streams
+        with pytest.raises(ConfigError, match="beside poses"):
+            hec.calibrate(
+                Trajectory.from_positions(parent.stamps_ns, parent.poses[:, :3, 3]), child
+            )
+
+
+class TestIntegration:
+    def test_a_constant_rate_turns_evenly(self):
+        rotations = integrated(np.arange(101) * 10_000_000, np.tile([0.0, 0.0, 0.5], (101, 1)))
+        assert se3.rotation_log(rotations[-1]) == pytest.approx([0, 0, 0.5])
+
+    def test_parts_give_the_same_as_the_whole(self):
+        _, stamps_ns, rates = smooth_streams(n_poses=50)
+        whole = RateIntegrator().quats_xyzw(stamps_ns, rates)
+        integrator = RateIntegrator()
+        parts = [
+            integrator.quats_xyzw(stamps_ns[part], rates[part])
+            for part in (slice(0, 1), slice(1, 90), slice(90, None))
+        ]
+        assert np.abs(np.concatenate(parts) - whole).max() < 1e-12
+
+    def test_a_rate_that_is_not_finite_is_refused(self):
+        with pytest.raises(InputError, match="rate 1"):
+            Trajectory.from_rates(np.arange(2), [[0, 0, 0], [np.nan, 0, 0]])
+
+
+class TestFiles:
+    @pytest.mark.parametrize(
+        ("text", "measures", "largest"),
+        [
+            (
+                "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1]",
+                "auto",
+                1,
+            ),
+            ("t,gyro_x_dps,gyro_y_dps,gyro_z_dps", "auto", np.pi / 180),
+            ("t wx wy wz", "auto", 1),
+        ],
+    )
+    def test_columns_of_rates(self, tmp_path, text, measures, largest):
+        separator = "," if "," in text else " "
+        rows = [separator.join(map(str, (1_700_000_000 + k, 0.0, 0.0, 1.0))) for k in range(3)]
+        path = tmp_path / "imu.csv"
+        path.write_text("\n".join([text, *rows]))
+        found = read_trajectory_file(path, "auto", stamp_unit="s", measures=measures).trajectory
+        assert found.measures == "rates"
+        assert np.abs(se3.rotation_log(found.poses[1, :3, :3])).max() == pytest.approx(largest)
+
+    def test_large_rates_without_a_unit_are_degrees_and_that_is_said(self, tmp_path):
+        path = tmp_path / "imu.csv"
+        path.write_text("t,wx,wy,wz\n1,90,0,0\n2,90,0,0\n")
+        reading = read_trajectory_file(path, "auto")
+        assert se3.rotation_log(reading.trajectory.poses[1, :3, :3])[0] == pytest.approx(np.pi / 2)
+        assert any("deg/s" in text for text in reading.guesses)
+
+    def test_four_columns_without_names_need_to_be_told(self, tmp_path):
+        path = tmp_path / "data.txt"
+        path.write_text("1 0 0 1\n2 0 0 1\n")
+        with pytest.raises(InputError, match="four columns"):
+            read_trajectory_file(path, "auto")
+        assert read_trajectory_file(path, "auto", measures="rates").trajectory.measures == "rates"
+        found = read_trajectory_file(path, "auto", measures="positions").trajectory
+        assert found.measures == "positions"
+
+    def test_the_command(self, streams, tmp_path, capsys):
+        parent, stamps_ns, rates = smooth_streams(n_poses=200)
+        hec.write_trajectory(tmp_path / "lidar.tum", parent)
+        rows = [
+            f"{stamp},{x:.9f},{y:.9f},{z:.9f}"
+            for stamp, (x, y, z) in zip(stamps_ns.tolist(), rates, strict=True)
+        ]
+        (tmp_path / "imu.csv").write_text("\n".join(["t_ns,wx,wy,wz", *rows]))
+        files = [str(tmp_path / name) for name in ("lidar.tum", "imu.csv")]
+        assert main(["calibrate", *files]) == 0
+        assert "x, y and z are not estimated" in capsys.readouterr().out
+        assert main(["calibrate", *files, "--json"]) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert document["rate_bias"]["rad_per_s"] == pytest.approx(BIAS, abs=3e-3)
+        assert document["observability"][0]["sigma"] is None
+
+
+def message(kind, **fields):
+    header = TYPES["std_msgs/msg/Header"](
+        stamp=TYPES["builtin_interfaces/msg/Time"](sec=12, nanosec=5), frame_id="imu_link"
+    )
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    return bytes(store.serialize_cdr(TYPES[kind](header=header, **fields), kind))
+
+
+def imu(rates, first_covariance=0.0):
+    covariance = np.zeros(9)
+    of_rates = np.zeros(9)
+    of_rates[0] = first_covariance
+    vector = TYPES["geometry_msgs/msg/Vector3"]
+    return message(
+        "sensor_msgs/msg/Imu",
+        orientation=TYPES["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.6, w=0.8),
+        orientation_covariance=covariance,
+        angular_velocity=vector(*rates),
+        angular_velocity_covariance=of_rates,
+        linear_acceleration=vector(0.0, 0.0, 9.81),
+        linear_acceleration_covariance=covariance,
+    )
+
+
+def fix(status, latitude=60.0):
+    return message(
+        "sensor_msgs/msg/NavSatFix",
+        status=TYPES["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
+        latitude=latitude,
+        longitude=25.0,
+        altitude=30.0,
+        position_covariance=np.zeros(9),
+        position_covariance_type=0,
+    )
+
+
+class TestMessages:
+    def test_an_imu(self):
+        found = unpack_imu(imu((0.1, 0.2, 0.3)), is_ros1=False)
+        assert (found.stamp_ns, found.frame) == (12_000_000_005, "imu_link")
+        assert found.values == [0.0, 0.0, 0.6, 0.8, 0.1, 0.2, 0.3]
+        assert np.isnan(unpack_imu(imu((0, 0, 0), -1.0), is_ros1=False).values[4:]).all()
+
+    def test_a_fix(self):
+        assert unpack_fix(fix(2), is_ros1=False).values == [60.0, 25.0, 30.0]
+        assert np.isnan(unpack_fix(fix(-1), is_ros1=False).values).all()
+
+    def test_without_a_fix_a_message_is_left_out(self):
+        reader = PartReader("sensor_msgs/msg/NavSatFix", "positions")
+        messages = [fix(0), fix(-1), fix(2, latitude=60.001)]
+        columns = reader.columns(messages, is_ros1=False)
+        assert reader.n_left_out == 1
+        assert np.isnan(columns.poses[1]).all()
+        assert columns.poses[0, :3] == pytest.approx([0, 0, 0])
+        assert columns.poses[2, 1] == pytest.approx(111.4, abs=0.3)
+        assert columns.sensor_frames[0] == "imu_link"
+
+    def test_an_imu_can_be_read_as_rotations(self):
+        reader = PartReader("sensor_msgs/msg/Imu", "rotations")
+        assert reader.columns([imu((1, 1, 1))], False).poses[0, 3:].tolist() == [0, 0, 0.6, 0.8]
+
+    def test_what_a_type_does_not_have_is_refused(self):
+        assert measured_as("sensor_msgs/msg/Imu", "auto", "/imu") == "rates"
+        assert measured_as("nav_msgs/msg/Odometry", "positions", "/odom") == "positions"
+        with pytest.raises(ConfigError, match="/fix has messages of type"):
+            measured_as("sensor_msgs/msg/NavSatFix", "rates", "/fix")
