@@ -108,6 +108,11 @@ def type_is_used(start_node, peer, tmp_path, stream):
     peer.wait_matched(peer.publisher(PoseStamped, f"{stream}_odom"))
 
 
+def measures_is_used(start_node, peer, tmp_path, stream):
+    start_node(*QUIET, f"-p {stream}_measures:=rotations")
+    assert peer.solve(peer.publishers(), *drive())[1].transform.translation.x == 0.0
+
+
 def solve_period_is_used(start_node, peer, tmp_path):
     start_node(*QUIET)
     heard = peer.listen(TransformStamped, "extrinsic")
@@ -216,6 +221,8 @@ EFFECTS = {
     "child_type": lambda *fixtures: type_is_used(*fixtures, "child"),
     "parent_tf": lambda *fixtures: tf_is_used(*fixtures, "parent"),
     "child_tf": lambda *fixtures: tf_is_used(*fixtures, "child"),
+    "parent_measures": lambda *fixtures: measures_is_used(*fixtures, "parent"),
+    "child_measures": lambda *fixtures: measures_is_used(*fixtures, "child"),
     "solve_period": solve_period_is_used,
     "output_directory": output_directory_is_used,
     "journal": journal_is_used,
