@@ -7,7 +7,9 @@ over all of them; the largest tells. It is measured by what the scores really sc
 
 What was there before a shift, the installed extrinsic is off by: by its own uncertainty, and by the
 common-mode error of both odometries (:mod:`hand_eye_calib.assessment.floor`). That is learned from
-all motion before. Standing still adds nothing. docs/session.md has what the monitor can see.
+all motion before. A scale that drifts, as that of visual odometry, looks like a lever arm in
+curves: in each second the scale is a parameter, as free as it is seen to drift. Standing still adds
+nothing. docs/session.md has what the monitor can see.
 """
 
 from __future__ import annotations
@@ -64,6 +66,10 @@ _WINDOWS, _FEWEST_WINDOWS = (10, 30, 90, 240), 4
 _ASSUMED, _ASSUMED_WINDOWS = 10.0, 4.0
 _LONG_RUN_EVERY = 10
 _MOST_OF_TYPICAL = 20.0
+# The drift of the scale is followed over stretches of so many seconds of motion. What is assumed of
+# it beforehand (standard deviation over a stretch) counts as much as so many stretches.
+_STRETCH_S, _ASSUMED_SCALE, _ASSUMED_STRETCHES = 60, 0.003, 2.0
+_LEAST_VARIANCE = 1e-12
 # Student's t weights of the motions, as in the kernel.
 _T_DOF = 4.0
 
@@ -148,6 +154,40 @@ class _Seconds:
         return _shift_shown(*self.newest(self._count))
 
 
+class _Scale:
+    """The error of the child's scale (its logarithm), as white noise that adds up to the same over
+    a stretch: a scale that drifts for many seconds is unknown in each of them.
+    """
+
+    def __init__(self) -> None:
+        self._variance = _STRETCH_S * _ASSUMED_SCALE**2
+        self._stretches = self._seconds = 0
+        self._information = self._score = 0.0
+
+    def take_out(
+        self, H: FloatArray, S: FloatArray, long_run: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """H (6, 6) and S (6,) of a shift whatever the scale, from those (7, 7) of both."""
+        share = H[:6, 6] / (H[6, 6] + long_run / max(self._variance, _LEAST_VARIANCE))
+        return H[:6, :6] - np.outer(share, H[6, :6]), S[:6] - share * S[6]
+
+    def add(self, information: float, score: float, long_run: float) -> None:
+        """Follow the error with the information and the score of the scale in a second."""
+        self._seconds += 1
+        self._information += information
+        self._score += score
+        if self._seconds == _STRETCH_S:
+            self._end_stretch(long_run)
+
+    def _end_stretch(self, long_run: float) -> None:
+        squared = (self._score / self._information) ** 2 - long_run / self._information
+        most = _NOISE_MEMORY_S / _STRETCH_S
+        share = 1.0 / (min(self._stretches, most) + _ASSUMED_STRETCHES)
+        self._variance += share * (_STRETCH_S * squared - self._variance)
+        self._stretches += 1
+        self._seconds, self._information, self._score = 0, 0.0, 0.0
+
+
 def _shift_shown(H: FloatArray, S: FloatArray) -> FloatArray:
     prior = np.linalg.inv(shift_covariance())
     return np.asarray(np.linalg.solve(H + 1e-3 * prior, S))
@@ -184,6 +224,7 @@ class MountMonitor:
         self._learning: list[tuple[int, MotionPairs]] = []
         self._tail = PosePairs.empty()
         self._memory = _Seconds()
+        self._scale = _Scale()
         self._centre = np.zeros(6)
         self._last_s = -1
         self._since_alarm = 0
@@ -279,7 +320,12 @@ class MountMonitor:
         """Add the information of a second, and follow the noise."""
         assert self._noise is not None
         residuals, jacobians = residuals_and_jacobians(motions, self._installed)
-        H, S, scatter = _information(residuals, jacobians, self._noise, self._memory_answer())
+        jacobians = np.concatenate([jacobians, _by_scale(motions)], axis=2)
+        shift = np.append(self._memory_answer(), 0.0)
+        both_H, both_S, scatter = _information(residuals, jacobians, self._noise, shift)
+        score = float(both_S[6] - both_H[6] @ shift)
+        self._scale.add(float(both_H[6, 6]), score, self.long_run)
+        H, S = self._scale.take_out(both_H, both_S, self.long_run)
         if len(self._memory) == MEMORY_S and self.alarm is None:
             kept = 1.0 - 1.0 / _OLD_MEMORY_S
             H_oldest, S_oldest = self._memory.oldest()
@@ -417,13 +463,22 @@ def _is_motion(motions: MotionPairs, noise: FloatArray | None) -> bool:
     return rotation > least or distance > _LEAST_MOTION
 
 
+def _by_scale(motions: MotionPairs) -> FloatArray:
+    """Negative derivatives (K, 6, 1) of the residuals by the logarithm of the child's scale."""
+    column = np.zeros((len(motions), 6, 1))
+    column[:, :3, 0] = -se3.inverse(motions.Ts_childi_childj)[:, :3, 3]
+    return column
+
+
 def _information(
     residuals: FloatArray,
     jacobians: FloatArray,
     noise: FloatArray,
     shift: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """H (6, 6), S (6,) of motions, and their weighted scatter (6, 6) about a shift."""
+    """H (p, p), S (p,) of motions for p parameters, and their weighted scatter (6, 6) about given
+    ones.
+    """
     precision = np.linalg.inv(noise)
     centred = residuals if shift is None else residuals + jacobians @ shift
     squared = np.einsum("ki,ki->k", centred @ precision, centred)
