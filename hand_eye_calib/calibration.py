@@ -73,6 +73,7 @@ _PLAIN_LATER = (
     "contradictions",
     "target_translation",
     "target_rotation",
+    "target_axes",
     "comparison",
     "goal",
     "measured",
@@ -85,7 +86,7 @@ _KINDS: dict[str, Any] = (
     | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
     | dict.fromkeys(("method_reason", "reference_reason", "proved_global", "measured"), str)
     | dict.fromkeys(("noise", "cross_check", "comparison", "goal", "rate_bias"), (dict, type(None)))
-    | {"contradictions": dict}
+    | {"contradictions": dict, "target_axes": dict}
 )
 
 # Motion pairs with more weight than this count as inliers.
@@ -203,6 +204,8 @@ class Calibration:
         Axis to the distance, in joint standard deviations, of a prior that contradicts the motion.
     target_translation, target_rotation : float
         Standard deviations (m, rad) that are good enough for the use that is made of the result.
+    target_axes : dict
+        Axis to a target of its own, m or rad.
     comparison : dict or None
         Comparison with what is installed, in plain values
         (:meth:`~hand_eye_calib.session.compare.Comparison.to_dict`); None without one.
@@ -253,6 +256,7 @@ class Calibration:
     contradictions: dict[str, float] = field(default_factory=dict)
     target_translation: float = CalibratorConfig.target_translation
     target_rotation: float = CalibratorConfig.target_rotation
+    target_axes: dict[str, float] = field(default_factory=dict)
     comparison: dict[str, Any] | None = None
     goal: dict[str, Any] | None = None
     base_frame: str = ""

@@ -343,6 +343,42 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
     return tuple(_quantity(name, word, unit) for word, unit in values)
 
 
+def parse_targets(name: str, text: str) -> dict[str, float]:
+    """Targets of single axes: ``z=10cm yaw=0.5deg``, metres and radians without a unit.
+
+    Parameters
+    ----------
+    name : str
+        Of the option.
+    text : str
+        Empty for none.
+
+    Returns
+    -------
+    dict
+        Axis name to standard deviation, in m or rad.
+
+    Raises
+    ------
+    ConfigError
+        If the text has another form, an axis comes twice or a target is not above 0.
+    """
+    targets: dict[str, float] = {}
+    for word in text.replace(",", " ").split():
+        axis, _, value = word.partition("=")
+        if axis not in AXIS_UNITS or axis in targets:
+            raise ConfigError(
+                f"{name} takes AXIS=TARGET of {', '.join(AXIS_UNITS)}, once each, such as z=10cm "
+                f"yaw=0.5deg; got {_shown(word)}"
+            )
+        targets[axis] = _quantity(f"{name}: {axis}", value, AXIS_UNITS[axis])
+        if not targets[axis] > 0:
+            raise ConfigError(f"{name} needs targets above 0; got {_shown(word)}")
+        if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
+            raise ConfigError(f"{name} is in rad without a unit; write {axis}={value}deg")
+    return targets
+
+
 def _quantity(name: str, text: str, unit: str) -> float:
     match = _QUANTITY.fullmatch(text)
     if not match or (match[2] or unit) not in _IN_SI[unit]:
@@ -496,6 +532,13 @@ class CalibratorConfig(OptionSet):
         maximum=math.pi,
         name="target.rotation",
     )
+    target_axes: str = option(
+        "",
+        "Targets of single axes in place of target.translation and target.rotation, such as z=10cm "
+        "yaw=0.5deg. Empty for none.",
+        name="target.axes",
+        parse=parse_targets,
+    )
     parent_frame: str = option(
         "", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True
     )
@@ -525,9 +568,11 @@ class CalibratorConfig(OptionSet):
         return "positions"
 
     @property
-    def targets(self) -> tuple[float, float]:
-        """Targets of translation (m) and rotation (rad)."""
-        return self.target_translation, self.target_rotation
+    def targets(self) -> tuple[float, ...]:
+        """Targets of x, y, z (m), roll, pitch and yaw (rad)."""
+        single = parse_targets("target.axes", self.target_axes)
+        of_unit = {"m": self.target_translation, "rad": self.target_rotation}
+        return tuple(single.get(axis, of_unit[unit]) for axis, unit in AXIS_UNITS.items())
 
     def prior(self) -> dict[str, tuple[float, float]]:
         """The prior: axis name to (value, standard deviation), in m and rad; an option of a single

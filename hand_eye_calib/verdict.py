@@ -100,6 +100,8 @@ class Judged(Protocol):
     def target_translation(self) -> float: ...
     @property
     def target_rotation(self) -> float: ...
+    @property
+    def target_axes(self) -> Mapping[str, float]: ...
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,8 @@ def headline(result: Judged, found: Sequence[Reason]) -> str:
 
 def target_of(axis: str, result: Judged) -> float:
     """The standard deviation (m or rad) that is good enough for an axis."""
-    return result.target_rotation if axis in ROTATIONS else result.target_translation
+    of_kind = result.target_rotation if axis in ROTATIONS else result.target_translation
+    return float(result.target_axes.get(axis, of_kind))
 
 
 # ---------------------------------------------------------------- the rules
@@ -427,7 +430,7 @@ RULES = (
     Rule(
         "target",
         _CARE,
-        "the standard deviation of an axis is above target.translation or target.rotation",
+        "the standard deviation of an axis is above its target",
         _worse_than_target,
     ),
     Rule(

@@ -37,6 +37,7 @@ def calibrate(
     prior: Prior | None = None,
     target_translation: float | None = None,
     target_rotation: float | None = None,
+    target_axes: str | None = None,
     parent_frame: str | None = None,
     child_frame: str | None = None,
     progress: Progress | None = None,

@@ -90,11 +90,18 @@ def render(
             streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
             reasons=[_reason(reason) for reason in shown(calibration.reasons)],
             unknown=_by_hand(calibration),
-            target=listing([amount(axis, target_of(axis, calibration)) for axis in ("x", "yaw")]),
+            target=_targets(calibration),
             provenance=_provenance(inputs),
             options={name: value for name, value in config.to_options().items() if value != ""},
         )
     )
+
+
+def _targets(calibration: Calibration) -> str:
+    """Target of x, y and z, of the rotations, and of the axes that have their own."""
+    single = [f"{axis} {amount(axis, value)}" for axis, value in calibration.target_axes.items()]
+    common = amount("x", calibration.target_translation), amount("yaw", calibration.target_rotation)
+    return listing([*common, *single])
 
 
 def _result(calibration: Calibration) -> dict[str, Any]:
@@ -108,6 +115,7 @@ def _result(calibration: Calibration) -> dict[str, Any]:
         **verdict_of(calibration),
         "directions": [_direction(document[key]) for key in ("T_parent_child", "T_child_parent")],
         "axes": _axes(calibration),
+        "differences": _differences(calibration),
     }
 
 
@@ -211,6 +219,26 @@ def _axes(calibration: Calibration) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _differences(calibration: Calibration) -> list[dict[str, str]]:
+    """Rows of the comparison with what is installed; none without one."""
+    if not calibration.comparison:
+        return []
+    (difference,) = calibration.comparison["differences"]
+    return [
+        {
+            "title": _AXIS_NAMES.get(axis, f"along {axis}"),
+            "difference": _known(axis, row["difference"]) + f" ± {_known(axis, row['sigma'])}",
+            "visible": _known(axis, row["visible"]),
+            "verdict": row["verdict"],
+        }
+        for axis, row in difference["axes"].items()
+    ]
+
+
+def _known(axis: str, value: float | None) -> str:
+    return "unknown" if value is None else amount(axis, value)
 
 
 def _bar(ratio: float) -> float:

@@ -92,7 +92,7 @@ class CalibratorNode(Node):
             self._answered.trigger,
             self._robot.complete,
             self._publish_result,
-            Goal(*self._options.calibrator.targets),
+            Goal(self._options.calibrator.targets),
         )
         self._parts = NodeParts(
             self.get_fully_qualified_name(), self._options, self._session, self._inputs,
@@ -280,7 +280,7 @@ class CalibratorNode(Node):
         if options.calibrator != self._session.calibrator.config:
             self._session.reconfigure(options.calibrator)
             self._checks.hasten()
-            self._cycle.aim(*options.calibrator.targets)
+            self._cycle.aim(options.calibrator.targets)
         for each in self._inputs:
             each.configure(options)
         self._session.follow_journal(options.node)

@@ -80,7 +80,7 @@ class MountWatch:
         monitor = self._monitor
         if monitor is None:
             return Report(WARN, self._robot.problem or "no poses yet", {"alarms": 0})
-        targets = np.repeat(self._session.calibrator.config.targets, 3)
+        targets = np.array(self._session.calibrator.config.targets)
         visible = monitor.visible(_LONG_S)
         values: dict[str, object] = {
             "seconds of motion": monitor.seconds,

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from rclpy.task import Future
@@ -95,9 +95,9 @@ class SolveCycle:
         self.failure: Failure | None = None
         self.goal.restart()
 
-    def aim(self, translation: float, rotation: float) -> None:
-        """Start over with a goal of these targets (m, rad): options have changed."""
-        self.goal = Goal(translation, rotation)
+    def aim(self, targets: Sequence[float]) -> None:
+        """Start over with a goal of these targets (6; m, rad): options have changed."""
+        self.goal = Goal(targets)
 
     @property
     def has_valid_result(self) -> bool:

@@ -26,6 +26,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.status import amount, listing
+from hand_eye_calib.verdict import target_of
 
 # Factor on stated variances.
 _CAUTION = 2.0
@@ -173,7 +174,7 @@ def compare(
     results: Sequence[Calibration | Extrinsic],
     installed: Calibration | Extrinsic | None = None,
     names: Sequence[str] | None = None,
-    targets: tuple[float, float] | None = None,
+    targets: Sequence[float] | None = None,
 ) -> Comparison:
     """Compare results with what is installed, or with each other.
 
@@ -185,7 +186,7 @@ def compare(
         compared: which one has moved?
     names : sequence of str, optional
         What to call the results; numbered by default.
-    targets : (float, float), optional
+    targets : (6,) sequence of float, optional
         Accuracy that matters along (m) and about (rad) each axis; by default that of the results.
 
     Returns
@@ -259,17 +260,17 @@ def _require_same_frames(results: Sequence[Calibration | Extrinsic]) -> None:
 
 
 def _limits(
-    results: Sequence[Calibration | Extrinsic], targets: tuple[float, float] | None
+    results: Sequence[Calibration | Extrinsic], targets: Sequence[float] | None
 ) -> FloatArray:
     """Changes (6,) that have to be seen before an axis is called the same."""
     if targets is None:
         stated = [
-            (result.target_translation, result.target_rotation)
+            [target_of(axis, result) for axis in AXES]
             for result in results
             if isinstance(result, Calibration)
         ]
         targets = stated[0] if stated else CalibratorConfig().targets
-    return _TARGETS * np.repeat(targets, 3)
+    return _TARGETS * np.array(targets)
 
 
 def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Difference:

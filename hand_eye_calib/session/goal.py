@@ -97,17 +97,17 @@ class _Point:
 class Goal:
     """Judges the results of a session, one after the other.
 
-    Once the goal is reached, it stays reached. Of the results that reach it, the newest is kept, but
-    not one that is clearly worse than the best.
+    Once the goal is reached, it stays reached. Of the results that reach it, the newest is kept,
+    but not one that is clearly worse than the best.
 
     Parameters
     ----------
-    translation, rotation : float
-        Targets, m and rad: standard deviation wanted of each axis, times 1 / 0.7.
+    targets : (6,) array-like
+        Of x, y, z (m), roll, pitch and yaw (rad): standard deviation wanted, times 1 / 0.7.
     """
 
-    def __init__(self, translation: float, rotation: float) -> None:
-        self._targets = np.repeat([translation, rotation], 3)
+    def __init__(self, targets: Sequence[float] | FloatArray) -> None:
+        self._targets = np.asarray(targets, dtype=float)
         self.restart()
 
     def restart(self) -> None:

@@ -61,7 +61,7 @@ def solve(recordings: Iterable[Recorded], path: Path, method: str) -> list[Kept]
 
 def stopped(kept: Kept, factor: float) -> Stop:
     """Let the goal judge the results of a recording in turn."""
-    goal = Goal(*(factor * TARGET[[0, 3]]))
+    goal = Goal(factor * TARGET)
     stuck_s = np.nan
     for step in kept.steps:
         progress = goal.add(step.calibration, step.seen)

@@ -35,6 +35,7 @@ GIVEN = {
     "scale": ("0.5", 0.5),
     "target.translation": ("0.1", 0.1),
     "target.rotation": ("0.01", 0.01),
+    "target.axes": ("z=10cm yaw=0.5deg", "z=10cm yaw=0.5deg"),
     "prior.x": ("1+/-0.1", "1+/-0.1"),
     "prior.y": ("2+/-0.1", "2+/-0.1"),
     "prior.z": ("185cm+/-2cm", "185cm+/-2cm"),

@@ -36,6 +36,7 @@ CHANGES = {
     "scale": (1.5, {}),
     "target.translation": (1e-5, {}),
     "target.rotation": (1e-5, {}),
+    "target.axes": ("yaw=1e-5", {}),
     "prior.x": ("1+/-0.001", {}),
     "prior.y": ("1+/-0.001", {}),
     "prior.z": ("1+/-0.001", {}),

@@ -1,5 +1,6 @@
 """Results against what is installed, and recordings against each other."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -62,6 +63,14 @@ def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recordin
     assert compare([first, second]).verdict is Change.MOVED
     known = Extrinsic(X, "earlier result", first.covariance, is_calibration=True)
     assert compare([second], known).differences[0].axes(Change.MOVED) == ["yaw"]
+
+
+def test_an_axis_is_the_same_by_its_own_target():
+    rough, drawing = result(), Extrinsic(X, "drawing")
+    assert compare([rough], drawing).verdict is Change.SAME
+    strict = dataclasses.replace(rough, target_axes={"y": 0.001})
+    assert compare([strict], drawing).differences[0].axes(Change.CANNOT_TELL) == ["y"]
+    assert compare([rough], drawing, targets=[1e-3] * 6).verdict is Change.CANNOT_TELL
 
 
 class TestWhichOneMoved:

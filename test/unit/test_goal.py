@@ -12,11 +12,13 @@ from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.cli.present import as_text
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.session.goal import Goal, helpful_motion
 
-TARGETS = 0.02, 0.005
+TARGETS = (0.02,) * 3 + (0.005,) * 3
 
 
 def result(sigmas_m=0.005, sigmas_rad=0.001, verdicts=(), **fields):
@@ -40,7 +42,7 @@ def lasting(tau_s):
 
 
 def test_two_good_results_in_a_row_end_the_session_and_one_does_not():
-    goal = Goal(*TARGETS)
+    goal = Goal(TARGETS)
     assert not goal.add(result(), seen(40.0)).is_done
     assert not goal.add(result(sigmas_m=0.015), seen(42.0)).is_done  # below the target, not 0.7
     assert not goal.add(result(), seen(44.0)).is_done
@@ -49,11 +51,40 @@ def test_two_good_results_in_a_row_end_the_session_and_one_does_not():
     assert done.sentence.startswith("Done: translation known to 5 mm, rotation to 0.057 deg")
 
 
+def test_every_axis_has_its_own_target():
+    config = CalibratorConfig(target_axes="z=10cm, yaw=0.5deg")
+    assert config.targets == pytest.approx((0.02, 0.02, 0.1, 0.00524, 0.00524, np.radians(0.5)))
+    goal = Goal(config.targets)
+    rough_height = result(sigmas_m=(0.004, 0.004, 0.06))
+    for motion_s in (40.0, 42.0):
+        progress = goal.add(rough_height, seen(motion_s))
+    assert progress.is_done
+    assert progress.to_dict()["axes"]["z"]["target"] == pytest.approx(0.1)
+    strict = Goal(CalibratorConfig(target_axes="x=1mm").targets)
+    assert strict.add(result(), seen(40.0)).limiting_axis == "x"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("height=10cm", "takes AXIS=TARGET of x, y, z, roll, pitch, yaw.*got 'height=10cm'"),
+        ("z", "z must be numbers in m or cm or mm"),
+        ("z=1 z=2", "once each.*got 'z=2'"),
+        ("z=0", "above 0"),
+        ("yaw=1cm", "numbers in rad or deg"),
+        ("yaw=5", "write yaw=5deg"),
+    ],
+)
+def test_targets_that_say_something_else_are_refused(text, message):
+    with pytest.raises(ConfigError, match=message):
+        CalibratorConfig(target_axes=text)
+
+
 @pytest.mark.parametrize(
     ("noise", "motion_s"), [(None, 29.0), (lasting(5.0), 49.0), (lasting(20.0), 199.0)]
 )
 def test_small_sigmas_are_not_believed_in_a_short_recording(noise, motion_s):
-    goal = Goal(*TARGETS)
+    goal = Goal(TARGETS)
     for moved_s in (motion_s - 1.0, motion_s):
         early = goal.add(result(noise=noise), seen(moved_s))
         assert not early.is_done
@@ -63,7 +94,7 @@ def test_small_sigmas_are_not_believed_in_a_short_recording(noise, motion_s):
 
 
 def test_time_left_follows_from_the_variance_that_falls_with_time():
-    progress = Goal(*TARGETS).add(result(sigmas_m=(0.004, 0.028, 0.004)), seen(40.0))
+    progress = Goal(TARGETS).add(result(sigmas_m=(0.004, 0.028, 0.004)), seen(40.0))
     assert progress.limiting_axis == "y"
     np.testing.assert_allclose(progress.seconds_left, [0, 120, 0, 0, 0, 0])
     assert progress.sentence == (
@@ -72,7 +103,7 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
 
 
 def test_faults_of_the_streams_and_failed_solves_are_no_success():
-    goal = Goal(*TARGETS)
+    goal = Goal(TARGETS)
     for motion_s in (40.0, 42.0):
         assert not goal.add(result(), seen(motion_s), ["the clocks differ"]).is_done
     assert goal.progress.sentence == "Stop: the streams are faulty: the clocks differ."
@@ -83,14 +114,14 @@ def test_faults_of_the_streams_and_failed_solves_are_no_success():
 
 
 def test_what_was_measured_by_hand_need_not_be_shown_by_motion():
-    goal = Goal(*TARGETS)
+    goal = Goal(TARGETS)
     by_hand = result(sigmas_m=(0.004, 0.004, 0.05), verdicts={"z": DofVerdict.PRIOR})
     goal.add(by_hand, seen(40.0))
     assert goal.add(by_hand, seen(42.0)).is_done
 
 
 def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_worse():
-    goal = Goal(*TARGETS)
+    goal = Goal(TARGETS)
     goal.add(result(), seen(40.0))
     goal.add(result(), seen(42.0))
     best = result(sigmas_m=0.004)
@@ -104,7 +135,7 @@ def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_
 
 
 def test_the_newest_of_equally_good_results_is_kept():
-    goal = Goal(*TARGETS)
+    goal = Goal(TARGETS)
     for motion_s in (40.0, 42.0):
         goal.add(result(sigmas_m=0.004), seen(motion_s))
     for motion_s, sigma_m in ((44.0, 0.0045), (46.0, 0.0049)):
@@ -116,7 +147,7 @@ def test_the_newest_of_equally_good_results_is_kept():
 
 
 def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
-    progress = Goal(*TARGETS).add(result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0))
+    progress = Goal(TARGETS).add(result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0))
     hec.save(dataclasses.replace(made(), goal=progress.to_dict()), tmp_path)
     found = hec.load(tmp_path).goal
     assert found == progress.to_dict()
@@ -129,7 +160,7 @@ class TestNotGettingThere:
     FLAT = (0.5, 1.0, 90.0)
 
     def test_an_axis_that_stays_unobservable(self):
-        goal = Goal(*TARGETS)
+        goal = Goal(TARGETS)
         hidden = result(sigmas_m=(0.004, 0.004, np.inf), status=SolveStatus.UNOBSERVABLE)
         assert not goal.add(hidden, seen(20.0, self.FLAT)).will_not_get_there
         stuck = goal.add(hidden, seen(40.0, self.FLAT))
@@ -140,7 +171,7 @@ class TestNotGettingThere:
         )
 
     def test_information_that_stops_growing(self):
-        goal = Goal(*TARGETS)
+        goal = Goal(TARGETS)
         for motion_s in np.arange(10.0, 100.0, 5.0):
             sigma = 0.04 * np.sqrt(100.0 / motion_s)
             assert not goal.add(result(sigmas_m=sigma), seen(motion_s)).will_not_get_there
@@ -151,7 +182,7 @@ class TestNotGettingThere:
         assert stuck
 
     def test_a_faint_hope_is_none(self):
-        assert Goal(*TARGETS).add(result(sigmas_m=0.5), seen(40.0)).will_not_get_there
+        assert Goal(TARGETS).add(result(sigmas_m=0.5), seen(40.0)).will_not_get_there
 
 
 @pytest.mark.parametrize(

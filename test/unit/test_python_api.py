@@ -75,6 +75,7 @@ class TestOptionsOfCalibrate:
             child_measures="rotations",
             target_translation=0.5,
             target_rotation=0.25,
+            target_axes="z=0.1",
             parent_frame="lidar",
             child_frame="camera",
         )

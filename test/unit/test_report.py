@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
@@ -24,13 +25,16 @@ from hand_eye_calib.cli.reporting import with_cross_check, write_report
 from hand_eye_calib.engine import answers, evidence
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.report.report import render
 from hand_eye_calib.report.words import with_sigma
+from hand_eye_calib.session.compare import with_comparison
 from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.status import amount
 
 FIGURES = ("trajectories", "residuals", "convergence", "excitation", "methods", "halves", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
@@ -406,6 +410,40 @@ def test_warnings_are_part_of_the_verdict(hilly):
     for reason in warned.reasons:
         assert reason.sentence in verdict
         assert reason.what_to_do in verdict
+
+
+def test_what_is_installed_is_compared_axis_by_axis(planar, tmp_path):
+    snapshot, calibration, *_ = planar
+    to_parent = se3.from_rotation_translation(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    installed = Extrinsic(to_parent @ calibration.T_parent_child, "robot.urdf <b>")
+    compared = with_comparison(calibration, installed)
+    text, page = page_of(snapshot, compared)
+    assert "installed" in [attributes["aria-labelledby"] for attributes in page.all("section")]
+    shown = page.text[page.text.index("axis of lidar difference") : page.text.index("Evidence")]
+    (difference,) = hec.compare([calibration], installed).differences
+    assert compared.comparison["sentence"] in page.text
+    sigma, visible = (amount("x", size[0]) for size in (difference.sigmas, difference.visible))
+    assert f"along x -50 cm ± {sigma} {visible} moved along y" in shown
+    assert "along z 0 mm ± unknown unknown cannot tell about x" in shown
+    assert shown.count("deg same") == 3
+    assert "robot.urdf <b>" in page.text
+    hec.save(compared, tmp_path)
+    (file,) = tmp_path.glob("*.yaml")
+    stated = yaml.safe_load(file.read_text())["comparison"]
+    assert stated["installed"] == "robot.urdf <b>"
+    assert stated["values"]["x"] == pytest.approx(installed.values[0])
+    assert stated["differences"][0]["axes"]["x"]["difference"] == pytest.approx(-0.5)
+    assert stated["differences"][0]["axes"]["z"]["sigma"] is None
+
+
+def test_targets_of_single_axes_are_marked_and_move_their_bars():
+    snapshot, calibration = simulated()
+    _, before = page_of(snapshot, calibration)
+    _, after = page_of(snapshot, dataclasses.replace(calibration, target_axes={"z": 0.2}))
+    assert "mark: the target, 2.0 cm and 0.30 deg" in before.text
+    assert "mark: the target, 2.0 cm, 0.30 deg and z 20 cm" in after.text
+    widths = [[a["style"] for a in page.all("i")] for page in (before, after)]
+    assert [a == b for a, b in zip(*widths, strict=True)] == [True, True, False, True, True, True]
 
 
 @pytest.mark.parametrize(

@@ -140,6 +140,7 @@ def test_nothing_against_it_is_use():
         dict(
             observability=observed(x=0.04, yaw=0.02), target_translation=0.05, target_rotation=0.1
         ),
+        dict(observability=observed(z=0.09), target_axes={"z": 0.1}),
         dict(n_pairs=100, n_inliers=70),
     ],
 )
