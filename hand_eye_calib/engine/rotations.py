@@ -15,7 +15,7 @@ from hand_eye_calib.assessment.covariance import assess_rotation
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.config import CalibratorConfig, parse_targets
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -76,6 +76,7 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         contradictions=fused.contradictions,
         target_translation=config.target_translation,
         target_rotation=config.target_rotation,
+        target_axes=parse_targets("target.axes", config.target_axes),
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
         motion_residuals=residuals,
     )
