@@ -44,7 +44,13 @@ from hand_eye_calib.adaptive.outliers import (
 from hand_eye_calib.adaptive.relinearise import corrected, restored
 from hand_eye_calib.adaptive.resampling import answers_without, part_products
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
-from hand_eye_calib.adaptive.state_space import NormalEquations, Posterior, StateSpace, selected
+from hand_eye_calib.adaptive.state_space import (
+    WHITE,
+    NormalEquations,
+    Posterior,
+    StateSpace,
+    selected,
+)
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -549,10 +555,13 @@ def _at_freed_poses(state: _State) -> _State:
 
 def _freed(state: _State, states: FloatArray) -> _State:
     """With poses freed of the errors that latent states (N, d) make."""
-    error = state.model.lasting(states, state.poses, state.T)
-    white = state.model.sensor_white(state.levels, state.poses, state.T)
-    given = bridged(state.streams, state.T, state.outliers.spikes)
-    return dataclasses.replace(state, poses=corrected(given, error, state.T, white), error=error)
+    model, T, spikes = state.model, state.T, state.outliers.spikes
+    white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
+    error = states[:, :WHITE] + model.lasting(states, state.poses, T)
+    white = model.sensor_white(state.levels, state.poses, T)
+    given = bridged(state.streams, T, spikes)
+    poses = corrected(given, white_error, error - white_error, T, white)
+    return dataclasses.replace(state, poses=poses, error=error)
 
 
 def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveSolution:

@@ -341,9 +341,9 @@ class NoiseModel:
     def lasting(
         self, states: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
-        """The error c (N, 6) that states (N, d) make, in the child's frame."""
+        """The lasting part (N, 6) of the error c that states (N, d) make, in the child's frame."""
         to_child = se3.adjoint(se3.inverse(T_parent_child))
-        error = states[:, :WHITE].copy()
+        error = np.zeros((len(states), 6))
         for process, group in zip(self.slow, self._groups(), strict=True):
             if process.kind != "scale":
                 directions = slow_directions(process, streams, to_child)

@@ -2,13 +2,16 @@
 
 Everything else is of first order in the errors. Where noise is not small beside the motion from
 pose to pose, the derivatives themselves are noise, and draw the answer (errors in variables). So
-the errors c are smoothed and split between the sensors,
+the errors c are smoothed and split between the sensors. White errors are split by
 
     Ad(X^-1) a = S' (S' + S)^-1 c,     b = -S (S' + S)^-1 c
 
-with the white covariances S' of the parent and S of the child, in the child's frame. The poses are
-corrected by ``Exp(-a)`` and ``Exp(-b)``, derivatives are taken there, and what was taken out of the
-residuals is put back.
+with the white covariances S' of the parent and S of the child, in the child's frame: with a lever
+arm, a translation says which of the sensors rotated. This holds for errors of these covariances
+only. A lasting error of some centimetres beside white noise of a millimetre would be taken for
+large and opposite rotations, so other errors are split in halves. The poses are corrected by
+``Exp(-a)`` and ``Exp(-b)``, derivatives are taken there, and what was taken out of the residuals is
+put back.
 """
 
 from __future__ import annotations
@@ -32,12 +35,20 @@ class SensorWhite:
 
 
 def corrected(
-    streams: Streams, error: FloatArray, T_parent_child: FloatArray, white: SensorWhite
+    streams: Streams,
+    white_error: FloatArray,
+    other_error: FloatArray,
+    T_parent_child: FloatArray,
+    white: SensorWhite,
 ) -> Streams:
-    """Streams without the error c (N, 6), split by the white errors of both sensors."""
+    """Streams without the errors c (N, 6): the white ones split by the white covariances of both
+    sensors, the others in halves.
+    """
     both = white.of_parent + white.of_child
-    by_parent = (white.of_parent @ np.linalg.solve(both, error[:, :, None]))[:, :, 0]
-    by_child = by_parent - error
+    by_parent = (white.of_parent @ np.linalg.solve(both, white_error[:, :, None]))[:, :, 0]
+    by_child = by_parent - white_error
+    by_parent = by_parent + 0.5 * other_error
+    by_child = by_child - 0.5 * other_error
     at_parent = by_parent @ se3.adjoint(T_parent_child).T
     return Streams(
         streams.stamps_s,
