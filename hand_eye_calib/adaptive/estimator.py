@@ -36,6 +36,7 @@ from hand_eye_calib.adaptive.outliers import (
     bridged,
     first_outliers,
     judged,
+    spikes_beyond_tails,
     student_weights,
     surprises,
     tails_are_heavy,
@@ -78,6 +79,9 @@ _OUTLIER_ROUNDS, _TAIL_ROUNDS = 4, 3
 # No more than this share of the poses are wrong by themselves.
 _MOST_SPIKES = 0.2
 
+# If more than this share are, and the tails are heavy without them, most of them belong to these.
+_MOST_SPIKES_IN_TAILS = 0.1
+
 # Changes of this share of the evidence leave the noise levels as they are.
 _NEGLIGIBLE = 0.005
 
@@ -95,10 +99,10 @@ _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
 _LONGER_SIZES = np.array([0.0, 0.25, 1.0])
 
 # Systematic errors larger than this (of the length, m/m, s, rad/s) are none: a wrong unit, a clock
-# that was not aligned, or noise. Nor is one assumed that can hardly be told from X: on flat ground
+# that was not aligned, or noise. Nor is one assumed that can hardly be told from X: on a road
 # a child that slips sideways looks like one that is mounted askew.
 _LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5, 1.0, 1.0, 1.0])
-_MOST_GROWTH = 5.0
+_MOST_GROWTH = 3.0
 
 # Each parameter of a systematic error must lower the weighted squared residual by so much: one that
 # is not there is chosen once in forty to five hundred recordings. Schwarz's criterion would ask for
@@ -108,6 +112,10 @@ _PENALTY = 5.0
 # Blocks of the jackknife of systematic errors, and what chi-square with nine degrees of freedom,
 # per degree, exceeds once in ten times.
 _BLOCKS, _CHANCE = 10, 1.63
+
+# What the largest ratio of variances over ten blocks to those of a model that is right hardly
+# exceeds: of six, once in ten times; of three, once in a hundred.
+_HARDLY_BY_CHANCE = 3.3
 
 # X is followed until it moves by less than this share of its sigma, at least one round.
 _MAX_ROUNDS = 6
@@ -376,16 +384,35 @@ def _without_outliers(state: _State, quick: bool) -> _State:
     if found.outliers.differs_by(state.outliers) > _NEGLIGIBLE:
         found = _fitted(found, walk)
         found, of_white = _outliers_found(found, 1)
-    if np.mean(found.outliers.spikes) > _MOST_SPIKES:
+    share = np.mean(found.outliers.spikes)
+    if share > _MOST_SPIKES:
         # Whole stretches are noisy, not single poses wrong: they count less, and none is left out.
         outliers = Outliers(found.outliers.jumps, np.zeros_like(found.outliers.spikes))
         found = dataclasses.replace(found, outliers=outliers, poses=found.streams)
     elif quick or not tails_are_heavy(found.outliers, of_white):
         return found
+    elif share > _MOST_SPIKES_IN_TAILS:
+        found = _without_mild_spikes(found)
     state = dataclasses.replace(found, heavy=True)
     for _ in range(2):
         state = _fitted(_weighed_tails(state), walk)
     return _outliers_found(state, 2)[0]
+
+
+def _without_mild_spikes(state: _State) -> _State:
+    """With those poses back that count as wrong by themselves, but would by no more than tails that
+    are heavy anyway make probable. As part of these tails they count less.
+    """
+    left_out = state.outliers.spikes
+    errors = np.zeros_like(state.error)
+    errors[left_out] = se3.log(
+        se3.inverse(state.poses.Ts_cw_c[left_out]) @ state.streams.Ts_cw_c[left_out]
+    )
+    gross = spikes_beyond_tails(state.posterior(), left_out, errors)
+    outliers = Outliers(state.outliers.jumps, gross)
+    poses = bridged(state.streams, state.T, gross)
+    error = np.zeros_like(state.error)
+    return dataclasses.replace(state, outliers=outliers, poses=poses, error=error)
 
 
 def _weighed_tails(state: _State) -> _State:
@@ -470,7 +497,7 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
         return [*range(6), *(6 + tried.index(column) for column in parameters_of(name))]
 
     def criterion(name: str, cost: float) -> float:
-        return cost + _PENALTY * len(parameters_of(name))
+        return cost + penalties[name]
 
     def at_its_own(name: str) -> _State:
         return dataclasses.replace(state, systematic=name, columns=parameters_of(name)).moved(
@@ -485,7 +512,13 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     credible = [
         name for name, fit in fits.items() if name == plainest or _is_credible(fit, name, known)
     ]
+    penalties = {name: _PENALTY * len(parameters_of(name)) for name in systematic}
     best = min(credible, key=lambda name: criterion(name, fits[name].cost))
+    if best != plainest:
+        parts = part_products(posterior)
+        for name in systematic:
+            penalties[name] = _PENALTY * _n_misjudged(parts, columns_of(name), fits[name])
+        best = min(credible, key=lambda name: criterion(name, fits[name].cost))
     if "bias" in best:
         # A scale is not of first order if it is large, and then a bias along the direction of
         # travel seems to be nearer: both are judged at their own parameters.
@@ -501,6 +534,21 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     chosen = dataclasses.replace(at_its_own(best), other_sigmas=sigmas)
     states = posterior.states_after(fits[best].step, columns_of(best))
     return _freed(chosen, states)
+
+
+def _n_misjudged(parts: FloatArray, columns: list[int], fit: NormalEquations) -> float:
+    """The number of parameters of systematic errors, each times the factor by which its variance
+    over ten blocks exceeds that of the model beyond chance. By as much a parameter that is not
+    there lowers the weighted squared residual more than the model expects (Takeuchi's criterion).
+    """
+    n_parameters = len(columns) - 6
+    if n_parameters == 0 or len(parts) < _BLOCKS:
+        return n_parameters
+    rows = [*columns, parts.shape[1] - 1]
+    answers = answers_without(parts[np.ix_(range(len(parts)), rows, rows)], _BLOCKS)[:, 6:]
+    spread = np.atleast_2d(np.cov(answers.T, bias=True)) * (_BLOCKS - 1)
+    ratios = np.linalg.eigvals(np.linalg.pinv(fit.covariance[6:, 6:], hermitian=True) @ spread)
+    return float(np.maximum(ratios.real / _HARDLY_BY_CHANCE, 1.0).sum())
 
 
 def _is_credible(fit: NormalEquations, name: str, known: FloatArray) -> bool:

@@ -39,6 +39,9 @@ _MOST_SPIKES = 0.3
 # factor (4/3 for normal ones).
 _HEAVY_KURTOSIS = 1.7
 
+# If tails are heavy, a spike exceeds the level of false alarms by this factor.
+_BEYOND_TAILS = 3.0
+
 # Degrees of freedom of Student's t distribution for heavy tails, plus 6.
 _STUDENT = 4.0
 
@@ -132,6 +135,26 @@ def _of_walk(posterior: Posterior, states: FloatArray, part: slice) -> FloatArra
     prior = space.walk_covariance(posterior.levels) * space.relative[part, None, None]
     known = walk_covariance(posterior, part) + _squared(walk[:, :, 1:])
     return _chi_squares(walk[:, :, 0], prior, known, space.cut[part])
+
+
+def spikes_beyond_tails(posterior: Posterior, spikes: BoolArray, errors: FloatArray) -> BoolArray:
+    """Spikes (N,) that stand out of heavy tails, too.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    spikes : (N,) bool array
+        Poses that are left out, and bridged.
+    errors : (N, 6) array
+        What bridging took away from them, in the child's frame.
+    """
+    states = posterior.restricted()[:, :WHITE]
+    states[:, :, 0] -= errors
+    gross = spikes.copy()
+    limit = _BEYOND_TAILS * chi_square_quantile(_FALSE_ALARMS / len(spikes))
+    for part in chunks(len(spikes)):
+        gross[part] &= _of_white(posterior, states, spikes, part) > limit
+    return gross
 
 
 def _of_white(

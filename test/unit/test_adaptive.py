@@ -23,6 +23,7 @@ from hand_eye_calib.adaptive.noise_model import (
     NoiseModel,
 )
 from hand_eye_calib.adaptive.outliers import chi_square_quantile
+from hand_eye_calib.adaptive.relinearise import SensorWhite, corrected
 from hand_eye_calib.adaptive.state_space import Covariance
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.calibration import DofVerdict
@@ -414,6 +415,48 @@ def test_heavy_tails_leave_the_answer_near():
         xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
         errors.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
     assert np.median(errors) < 10.0
+
+
+def test_poses_that_heavy_tails_make_probable_are_not_left_out():
+    random, shares, errors = np.random.default_rng(6), [], []
+    for seed in range(4):
+        parent = wandering_poses(200, seed)
+        tails = np.sqrt(1.3 / random.chisquare(1.3, (2, 200, 1)))
+        noise = se3.exp(random.normal(size=(2, 200, 6)) * tails * np.repeat([0.003, 0.004], 3))
+        solution = estimator.solve(stamps(200), parent @ noise[0], child_of(parent) @ noise[1])
+        xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
+        shares.append(np.mean(solution.spikes))
+        errors.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
+    assert np.mean(shares) < 0.1, shares
+    assert np.median(errors) < 12.0, errors
+
+
+def test_lasting_errors_are_no_rotations():
+    parent = wandering_poses(5, 1)
+    streams = streams_of(parent, child_of(parent))
+    to_child = se3.adjoint(se3.inverse(T_PARENT_CHILD))
+    of_child = np.diag(np.repeat([1e-6, 1e-4], 3))
+    white = SensorWhite((to_child @ of_child @ to_child.T)[None], of_child[None])
+    error = np.tile([0.05, -0.02, 0.03, 0.0, 0.0, 0.0], (5, 1))
+    none = np.zeros((5, 6))
+    freed = corrected(streams, none, error, T_PARENT_CHILD, white)
+    as_white = corrected(streams, error, none, T_PARENT_CHILD, white)
+    for given, lasting, split in zip(
+        (streams.Ts_pw_p, streams.Ts_cw_c),
+        (freed.Ts_pw_p, freed.Ts_cw_c),
+        (as_white.Ts_pw_p, as_white.Ts_cw_c),
+        strict=True,
+    ):
+        np.testing.assert_allclose(given[:, :3, :3], lasting[:, :3, :3], atol=1e-12)
+        assert np.linalg.norm(given[:, :3, 3] - lasting[:, :3, 3], axis=1).max() < 0.04
+        assert (
+            se3.rotation_angle(np.swapaxes(given, 1, 2)[:, :3, :3] @ split[:, :3, :3]).min() > 0.002
+        )
+    for each in (freed, as_white):
+        moved = se3.inverse(each.Ts_pw_p) @ streams.Ts_pw_p
+        by_child = se3.inverse(each.Ts_cw_c) @ streams.Ts_cw_c
+        removed = se3.log(moved) @ to_child.T - se3.log(by_child)
+        np.testing.assert_allclose(removed, error, atol=1e-12)
 
 
 @pytest.mark.parametrize("centre", CENTRES[1:])
