@@ -19,10 +19,12 @@ _HOMES = {
     "HandEyeCalibError": "errors",
     "Reason": "verdict",
     "Residuals": "calibration",
+    "RigCalibration": "rig.result",
     "SolveStatus": "status",
     "Trajectory": "geometry.trajectory",
     "Verdict": "verdict",
     "calibrate": "engine.offline",
+    "calibrate_rig": "rig.calibrate",
     "compare": "session.compare",
     "compare_methods": "engine.compare_methods",
     "cross_check": "engine.cross_check",
@@ -42,10 +44,12 @@ __all__ = [
     "HandEyeCalibError",
     "Reason",
     "Residuals",
+    "RigCalibration",
     "SolveStatus",
     "Trajectory",
     "Verdict",
     "calibrate",
+    "calibrate_rig",
     "compare",
     "compare_methods",
     "cross_check",
@@ -71,6 +75,8 @@ if TYPE_CHECKING:
     from hand_eye_calib.io.trajectory_files.reading import read_trajectory
     from hand_eye_calib.io.trajectory_files.writing import write_trajectory
     from hand_eye_calib.report.plot import plot
+    from hand_eye_calib.rig.calibrate import calibrate_rig
+    from hand_eye_calib.rig.result import RigCalibration
     from hand_eye_calib.session.compare import compare
     from hand_eye_calib.status import SolveStatus
     from hand_eye_calib.verdict import Reason, Verdict

@@ -333,8 +333,10 @@ def _rough_levels(residuals: FloatArray, left_out: np.ndarray) -> tuple[FloatArr
     return np.log(white), np.log(walk)
 
 
-def _sample(n_poses: int, most: int) -> IntArray | None:
-    """Evenly spread bursts of poses, ever farther apart within each; None for all of them."""
+def sample(n_poses: int, most: int) -> IntArray | None:
+    """Poses to fit noise levels with: evenly spread bursts, ever farther apart within each; None
+    for all of them.
+    """
     if n_poses <= most:
         return None
     offsets = _BURST[2 * len(_BURST) * n_poses // most > _BURST]
@@ -344,7 +346,7 @@ def _sample(n_poses: int, most: int) -> IntArray | None:
 
 def _fitted(state: _State, walks: tuple[str, ...] = ("time", "distance")) -> _State:
     """Noise levels of white noise, walk and drifting scale, and one step of X."""
-    kept = _sample(len(state.streams), _MOST_POSES)
+    kept = sample(len(state.streams), _MOST_POSES)
     fits = []
     levels = state.levels
     if walks != (state.model.walk_by,) and not state.course.is_uneven:
@@ -447,7 +449,7 @@ def _is_noisy(state: _State) -> bool:
 
 def _with_lasting_errors(plain: _State) -> _State:
     """The same with errors that last, if the data ask for them."""
-    kept = _sample(len(plain.streams), _MOST_POSES_LASTING)
+    kept = sample(len(plain.streams), _MOST_POSES_LASTING)
     scores = []
     for tau_s in plain.model.taus_s():
         model, faint = plain.model.with_faint_lasting(plain.levels, tau_s)

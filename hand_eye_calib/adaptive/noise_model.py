@@ -16,7 +16,7 @@ import numpy as np
 from hand_eye_calib.adaptive.increments import Linearisation, Streams
 from hand_eye_calib.adaptive.relinearise import SensorWhite
 from hand_eye_calib.adaptive.reml import Fit, Prior
-from hand_eye_calib.adaptive.state_space import WHITE, Group, StateSpace
+from hand_eye_calib.adaptive.state_space import WHITE, Group, Posterior, StateSpace
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 
@@ -324,7 +324,7 @@ class NoiseModel:
         start = np.concatenate([levels[:N_FAST], starts, levels[N_FAST:]])
         return tuple(chosen), start, total
 
-    def reduced(self, fit: Fit) -> tuple[NoiseModel, FloatArray]:
+    def reduced(self, fit: Fit[Posterior]) -> tuple[NoiseModel, FloatArray]:
         """The model and log levels without the slow processes that make no difference."""
         keep = [
             bool(fit.information[group.variance, group.variance] > _LEAST_INFORMATION)

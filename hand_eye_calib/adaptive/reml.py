@@ -7,7 +7,9 @@ curvature is the average of observed and expected information (Gilmour, Thompson
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -43,12 +45,25 @@ class Prior:
         return self.precision * (levels - self.mean)
 
 
+class HasLoss(Protocol):
+    """What :func:`minimised` needs of a likelihood."""
+
+    levels: FloatArray
+
+    @property
+    def loss(self) -> float:
+        """Negative restricted log likelihood."""
+
+
+L = TypeVar("L", bound=HasLoss)
+
+
 @dataclass(frozen=True)
-class Fit:
+class Fit(Generic[L]):
     """Log levels, the posterior at them, and the average information (m, m)."""
 
     levels: FloatArray
-    posterior: Posterior
+    posterior: L
     information: FloatArray
     n_evaluations: int
 
@@ -58,10 +73,30 @@ class Fit:
         return self.posterior.loss
 
 
-def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Fit:
-    """Levels of the least loss near a start, by Newton steps within a radius."""
+def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Fit[Posterior]:
+    """Levels of the least loss of a state space near a start."""
+    return minimised(lambda levels: Posterior(space, levels), derivatives, start, prior)
+
+
+def minimised(
+    at: Callable[[FloatArray], L],
+    derivatives: Callable[[L], tuple[FloatArray, FloatArray]],
+    start: FloatArray,
+    prior: Prior,
+) -> Fit[L]:
+    """Levels of the least loss near a start, by Newton steps within a radius.
+
+    Parameters
+    ----------
+    at : callable
+        The likelihood at log levels (m,).
+    derivatives : callable
+        Gradient (m,) and average information (m, m) of a likelihood.
+    start : (m,) array
+    prior : Prior
+    """
     levels = np.clip(start, prior.lower, prior.upper)
-    posterior, radius, n_evaluations = Posterior(space, levels), _FIRST_RADIUS, 1
+    posterior, radius, n_evaluations = at(levels), _FIRST_RADIUS, 1
     loss = posterior.loss + prior.loss(levels)
     for _ in range(_MAX_STEPS):
         gradient, information = derivatives(posterior)
@@ -73,7 +108,7 @@ def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Fit:
             promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
             if np.abs(step).max() < _SETTLED_STEP or (is_newton and promised < _SETTLED_LOSS):
                 break
-            rival = _posterior(space, levels + step)
+            rival = _at_or_none(at, levels + step)
             n_evaluations += 1
             gain = loss - _total(rival, prior)
             if rival is not None and gain > 0.0:
@@ -91,14 +126,14 @@ def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Fit:
     return Fit(levels, posterior, information, n_evaluations)
 
 
-def _posterior(space: StateSpace, levels: FloatArray) -> Posterior | None:
+def _at_or_none(at: Callable[[FloatArray], L], levels: FloatArray) -> L | None:
     try:
-        return Posterior(space, levels)
+        return at(levels)
     except np.linalg.LinAlgError:
         return None
 
 
-def _total(posterior: Posterior | None, prior: Prior) -> float:
+def _total(posterior: HasLoss | None, prior: Prior) -> float:
     if posterior is None or not np.isfinite(posterior.loss):
         return np.inf
     return posterior.loss + prior.loss(posterior.levels)

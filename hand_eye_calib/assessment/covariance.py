@@ -105,7 +105,7 @@ def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) 
     """
     model, unknown = model_covariance(pairs, solution)
     resampled = jackknife_covariance(len(pairs), solution.T_parent_child, solve_without)
-    return _combine(solution.T_parent_child, model, resampled, unknown)
+    return combined(solution.T_parent_child, model, resampled, unknown)
 
 
 def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assessment:
@@ -126,8 +126,14 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         steps = answers_without(solution.part_products, _BLOCKS)[:, :6]
         covariance = beyond_chance(covariance, _spread_of_blocks(steps))
         covariance = widened_by_halves(covariance, solution.part_products, solution.misfit)
-    unseen = [*solution.unseen.T, *_noise_driven_baselines(pose_pairs.Ts_pw_p, solution)]
-    return _combine(solution.T_parent_child, covariance, None, _basis(unseen))
+    hidden = noise_driven(
+        pose_pairs.Ts_pw_p,
+        solution.T_parent_child,
+        solution.jumps,
+        solution.noise.rotation_variance,
+    )
+    unseen = basis([*solution.unseen.T, *hidden])
+    return combined(solution.T_parent_child, covariance, None, unseen)
 
 
 def assess_rotation(solution: AdaptiveSolution) -> Assessment:
@@ -153,41 +159,65 @@ def assess_rotation(solution: AdaptiveSolution) -> Assessment:
     whole[rotation, rotation] = covariance
     hidden = unseen[:, np.linalg.norm(unseen, axis=0) > _SHARE_OF_ROTATION]
     unknown = [*np.eye(6)[:3], *(np.r_[np.zeros(3), direction] for direction in hidden.T)]
-    return _combine(solution.T_parent_child, whole, None, _basis(unknown))
+    return combined(solution.T_parent_child, whole, None, basis(unknown))
 
 
-def _noise_driven_baselines(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> list[FloatArray]:
+def noise_driven(
+    Ts_pw_p: FloatArray,
+    T_parent_child: FloatArray,
+    jumps: BoolArray,
+    rotation_variance: Callable[[int], FloatArray],
+) -> list[FloatArray]:
     """Directions (6,) of translation that the rotations do not reveal over any baseline.
 
     Each increment alone may be smaller than its noise; sums of increments decide: long ones if the
     noise is white, short ones if it drifts.
+
+    Parameters
+    ----------
+    Ts_pw_p : (N, 4, 4) array
+    T_parent_child : (4, 4) array
+    jumps : (N - 1,) bool array
+        Increments that are no evidence.
+    rotation_variance : callable
+        Variance (rad^2) per axis of the rotation noise over so many increments.
     """
     longest = max(len(Ts_pw_p) // _BLOCKS, 1)
     baselines = sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True)
-    found = [_noise_driven_over(baseline, Ts_pw_p[:, :3, :3], solution) for baseline in baselines]
+    axes = T_parent_child[:3, :3]
+    found = [
+        _noise_driven_over(baseline, Ts_pw_p[:, :3, :3], axes, jumps, rotation_variance(baseline))
+        for baseline in baselines
+    ]
     return min(found, key=len)
 
 
 def _noise_driven_over(
-    baseline: int, rotation: FloatArray, solution: AdaptiveSolution
+    baseline: int,
+    rotation: FloatArray,
+    axes: FloatArray,
+    jumps: BoolArray,
+    variance: FloatArray,
 ) -> list[FloatArray]:
     motions = np.swapaxes(rotation[:-baseline], 1, 2) @ rotation[baseline:]
     # No baseline may run across a jump, unless all of them do.
-    jumps_before = np.concatenate([[0], np.cumsum(solution.jumps)])
+    jumps_before = np.concatenate([[0], np.cumsum(jumps)])
     weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
     if not weights.any():
         weights[:] = 1.0
-    variance = solution.noise.rotation_variance(baseline)
-    chords = (motions - np.eye(3)) @ solution.T_parent_child[:3, :3]
+    chords = (motions - np.eye(3)) @ axes
     return _hidden_translations(LeverArms.of(chords, weights), variance * np.eye(3))
 
 
-def _combine(
+def combined(
     T_parent_child: FloatArray,
     model: FloatArray,
     resampled: FloatArray | None,
     unknown: FloatArray,
 ) -> Assessment:
+    """Covariance and verdicts from a model's covariance (6, 6) in the child's frame, that of
+    resampling if there is one, and directions (6, U) that the motion does not reveal.
+    """
     known = np.eye(6) - unknown @ unknown.T
     covariance = known @ larger_by_direction(model, resampled) @ known + _unknown_variance(unknown)
     return Assessment(covariance, _verdicts(T_parent_child[:3, :3], covariance, unknown))
@@ -231,7 +261,7 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     covariance = inverse @ (variance_t * information_t + 4 * variance_r * information_r) @ inverse
 
     hidden = _hidden_translations(LeverArms.of(moved @ rotation, weights), cov_r)
-    return covariance, _basis([*hidden, *vectors[:, ~seen].T])
+    return covariance, basis([*hidden, *vectors[:, ~seen].T])
 
 
 def _hidden_translations(lever_arms: LeverArms, cov_rotation: FloatArray) -> list[FloatArray]:
@@ -241,7 +271,7 @@ def _hidden_translations(lever_arms: LeverArms, cov_rotation: FloatArray) -> lis
     ]
 
 
-def _basis(directions: list[FloatArray]) -> FloatArray:
+def basis(directions: list[FloatArray]) -> FloatArray:
     """Orthonormal basis (6, U) of directions (6,), which may be linearly dependent."""
     if not directions:
         return np.zeros((6, 0))

@@ -1,8 +1,8 @@
-"""``calibrate PARENT CHILD``: two trajectory files."""
+"""``calibrate PARENT CHILD``: two trajectory files, or those of all sensors of a rig."""
 
 import argparse
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ from hand_eye_calib.cli.options import add_config_arguments, add_output_argument
 from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.cli.robot import add_robot_arguments
 from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
+from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
     from hand_eye_calib.geometry.trajectory import Trajectory
@@ -21,14 +22,16 @@ EXAMPLES = """\
 examples:
   hand_eye_calib calibrate lidar.txt camera.txt --out result
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate
-  hand_eye_calib calibrate lidar.txt mono.txt --scale estimate --prior z=1.85+/-0.02"""
+  hand_eye_calib calibrate lidar.txt mono.txt --scale estimate --prior z=1.85+/-0.02
+  hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig"""
 
 _FORMATS = (
     "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; csv: columns "
     "by the names in the header, or with --columns: positions as x y z or lat lon height, "
     "orientations as quaternion, roll pitch yaw or heading. Default: what the file looks like"
 )
-_FILE_OPTIONS: dict[str, dict[str, Any]] = {
+# By name, what argparse needs.
+FILE_OPTIONS: dict[str, dict[str, Any]] = {
     "format": {"choices": TRAJECTORY_FORMATS, "help": _FORMATS},
     "columns": {
         "metavar": "NAMES",
@@ -57,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EXAMPLES
     parser.add_argument("parent", metavar="PARENT", help="trajectory of the parent sensor")
     parser.add_argument("child", metavar="CHILD", help="trajectory of the child sensor")
+    parser.add_argument(
+        "others",
+        metavar="OTHER",
+        nargs="*",
+        help="trajectories of more sensors: all are solved together, in the frame of the parent",
+    )
     add_file_arguments(parser)
     add_config_arguments(parser)
     add_output_arguments(parser)
@@ -68,7 +77,7 @@ def add_file_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "trajectory files", "each also as --parent-... and --child-... for one of the two files"
     )
-    for name, settings in _FILE_OPTIONS.items():
+    for name, settings in FILE_OPTIONS.items():
         group.add_argument(f"--{name.replace('_', '-')}", dest=name, **settings)
         for stream in STREAMS:
             of_one = settings | {"help": f"the same for {stream.upper()} only"}
@@ -129,7 +138,7 @@ def _settings_of(arguments: argparse.Namespace, stream: str) -> dict[str, Any]:
     Of those for both, columns are meant for the files that do not name their own, and times for
     those of format kitti.
     """
-    given = {name: _given(arguments, stream, name) for name in _FILE_OPTIONS if name != "format"}
+    given = {name: _given(arguments, stream, name) for name in FILE_OPTIONS if name != "format"}
     for name in _OF_SOME_FILES:
         of_both = getattr(arguments, name) and not getattr(arguments, f"{stream}_{name}")
         if of_both and not _is_meant(arguments, stream, name):
@@ -152,6 +161,11 @@ def _is_meant(arguments: argparse.Namespace, stream: str, name: str) -> bool:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate from files; returns the exit code."""
+    if arguments.others:
+        from hand_eye_calib.cli.rig import calibrate_and_deliver
+
+        files = [arguments.parent, arguments.child, *arguments.others]
+        return calibrate_and_deliver(_read_rig(files, arguments), arguments, {"files": files})
     from hand_eye_calib.cli.memory import keep_freed_memory
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.engine.checked import checked
@@ -176,6 +190,40 @@ def run(arguments: argparse.Namespace) -> int:
 
         inputs["files"] = fingerprints(_files(arguments))
     return deliver(calibration, arguments, inputs, snapshot)
+
+
+def _read_rig(files: Sequence[str], arguments: argparse.Namespace) -> dict[str, "Trajectory"]:
+    """The trajectories by the names of their frames: as the files name them, or as the files are
+    named.
+    """
+    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_file
+
+    of_one = [
+        f"--{stream}-{name.replace('_', '-')}"
+        for stream in STREAMS
+        for name in FILE_OPTIONS
+        if getattr(arguments, f"{stream}_{name}")
+    ]
+    if of_one:
+        raise ConfigError(f"{of_one[0]} is of two files; give the option for all of a rig's files")
+    settings = {name: getattr(arguments, name) for name in FILE_OPTIONS}
+    format = settings.pop("format") or AUTO
+    found: dict[str, Trajectory] = {}
+    for file in files:
+        with waiting_for(f"reading {file}"):
+            trajectory, repairs, guesses = read_trajectory_file(
+                file, format, repair=True, **settings
+            )
+        for text in (*guesses, *repairs):
+            note(text)
+        name = trajectory.sensor_frame or Path(file).stem
+        if name in found:
+            raise ConfigError(
+                f"two files of the rig are of one sensor, {name!r}: sensors have the names of "
+                "their files, which must differ"
+            )
+        found[name] = trajectory
+    return found
 
 
 def _files(arguments: argparse.Namespace) -> list[Path]:

@@ -127,16 +127,16 @@ def as_text(calibration: Calibration, steps: Iterable[str] = ()) -> str:
         *_warning_lines(calibration),
         "",
         f"{child} in {parent}: maps coordinates of {child} into {parent}",
-        *_transform_lines(document["T_parent_child"], calibration.out_of_reach),
+        *transform_lines(document["T_parent_child"], calibration.out_of_reach),
         "",
         f"{parent} in {child}: maps coordinates of {parent} into {child}",
-        *_transform_lines(document["T_child_parent"], calibration.out_of_reach),
+        *transform_lines(document["T_child_parent"], calibration.out_of_reach),
         "",
         *_base_lines(calibration),
         *(["Next", *(f"  {step}" for step in steps), ""] if steps else []),
         *_publishing_lines(calibration),
         "Details",
-        *(line for detail in _details(calibration) for line in _wrapped(detail, "  ", "    ")),
+        *(line for detail in _details(calibration) for line in wrapped(detail, "  ", "    ")),
     ]
     return "\n".join(printable(line) for line in lines)
 
@@ -146,7 +146,7 @@ def _base_lines(calibration: Calibration) -> Iterator[str]:
     if calibration.T_base_child is not None:
         yield f"{calibration.child_frame} in {calibration.base_frame}"
         document = calibration.to_dict()["T_base_child"]
-        yield from _transform_lines(document, calibration.out_of_reach)
+        yield from transform_lines(document, calibration.out_of_reach)
         yield ""
 
 
@@ -161,13 +161,13 @@ def _details(calibration: Calibration) -> Iterator[str]:
 def _reason_lines(calibration: Calibration) -> Iterator[str]:
     for reason in shown(calibration.reasons):
         if not calibration.headline.endswith(reason.sentence):
-            yield from _wrapped(reason.sentence, "- ", "  ")
-        yield from _wrapped(_what_to_do(reason), "  -> ", "     ")
+            yield from wrapped(reason.sentence, "- ", "  ")
+        yield from wrapped(_what_to_do(reason), "  -> ", "     ")
 
 
 def _warning_lines(calibration: Calibration) -> Iterator[str]:
     for warning in calibration.warnings:
-        yield from _wrapped(f"Note: {warning}", "", "  ")
+        yield from wrapped(f"Note: {warning}", "", "  ")
 
 
 def _what_to_do(reason: Reason) -> str:
@@ -175,7 +175,8 @@ def _what_to_do(reason: Reason) -> str:
     return f"{reason.what_to_do}: {options}" if options else reason.what_to_do
 
 
-def _wrapped(text: str, first: str, others: str) -> list[str]:
+def wrapped(text: str, first: str, others: str) -> list[str]:
+    """Lines of a text, with what the first and what the others begin with."""
     return textwrap.wrap(
         printable(as_typed(text)),
         _WIDTH,
@@ -239,7 +240,7 @@ def _values(names: tuple[str, ...] | str, values: list[float], decimals: int) ->
     )
 
 
-def _transform_lines(
+def transform_lines(
     transform: Mapping[str, Any], out_of_reach: tuple[str, ...] = ()
 ) -> Iterator[str]:
     """A row for each number that is printed, with one standard deviation."""

@@ -5,7 +5,7 @@ as launch file.
 import hashlib
 import platform
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -55,14 +55,14 @@ def save_result(
     InputError
         If they cannot be written.
     """
-    document = calibration.to_dict() | {"provenance": _provenance(inputs or {})}
+    document = calibration.to_dict() | {"provenance": provenance(inputs or {})}
     texts = {
         FILE_NAME: yaml.safe_dump(
             document, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
         ),
     }
     if calibration.verdict is not Verdict.DO_NOT_USE:
-        ready = {XACRO_NAME: _xacro_text(calibration), LAUNCH_NAME: _launch_text(calibration)}
+        ready = {XACRO_NAME: _xacro_text(calibration), LAUNCH_NAME: launch_text([calibration])}
         texts = ready | texts
     directory = Path(directory)
     try:
@@ -78,7 +78,7 @@ def save_result(
     return directory / FILE_NAME
 
 
-def _provenance(inputs: Mapping[str, Any]) -> dict[str, Any]:
+def provenance(inputs: Mapping[str, Any]) -> dict[str, Any]:
     """Where a result came from, in plain values."""
     return {
         "package": "hand_eye_calib",
@@ -181,20 +181,12 @@ def _xacro_text(calibration: Calibration) -> str:
 """
 
 
-def _launch_text(calibration: Calibration) -> str:
-    """A launch file that publishes the extrinsic as a static transform."""
-    mounted_on = calibration.mounting[0]
-    arguments = [
-        (f"--{name}", value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}")
-        for name, value in calibration.usable_numbers().items()
-    ]
-    arguments += [
-        ("--frame-id", printable(mounted_on)),
-        ("--child-frame-id", printable(calibration.child_frame)),
-    ]
-    lines = "\n".join(f"                    {option!r}, {value!r}," for option, value in arguments)
-    remarks = _remarks(calibration)
-    comment = "\n".join(f"# {line}" for line in remarks)
+def launch_text(calibrations: Sequence[Calibration]) -> str:
+    """A launch file that publishes extrinsics as static transforms."""
+    comment = "\n".join(f"# {line}" for each in calibrations for line in _remarks(each))
+    headlines = [_remarks(each)[0] for each in calibrations]
+    logged = "\n".join(f"            LogInfo(msg={headline!r})," for headline in headlines)
+    nodes = "\n".join(_node_text(each) for each in calibrations)
     return f"""\
 # Publishes the extrinsic on /tf_static. Only if no robot description has this edge: a frame has one
 # parent and one publisher.
@@ -207,17 +199,32 @@ from launch_ros.actions import Node
 def generate_launch_description():
     return LaunchDescription(
         [
-            LogInfo(msg={remarks[0]!r}),
+{logged}
+{nodes}
+        ]
+    )
+"""
+
+
+def _node_text(calibration: Calibration) -> str:
+    """The node that publishes an extrinsic."""
+    arguments = [
+        (f"--{name}", value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}")
+        for name, value in calibration.usable_numbers().items()
+    ]
+    arguments += [
+        ("--frame-id", printable(calibration.mounting[0])),
+        ("--child-frame-id", printable(calibration.child_frame)),
+    ]
+    lines = "\n".join(f"                    {option!r}, {value!r}," for option, value in arguments)
+    return f"""\
             Node(
                 package='tf2_ros',
                 executable='static_transform_publisher',
                 arguments=[
 {lines}
                 ],
-            )
-        ]
-    )
-"""
+            ),"""
 
 
 def _remarks(calibration: Calibration) -> list[str]:

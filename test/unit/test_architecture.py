@@ -43,13 +43,14 @@ ENGINE["checks"] = ENGINE["alignment"] | {
     "alignment",
 }
 ENGINE["engine"] = set(ENGINE)
+ENGINE["rig"] = set(ENGINE)
 ENGINE["session"] = set(ENGINE)
 ALLOWED = ENGINE | {
     "io": GROUND | {"geometry", "calibration", "status", "verdict"},
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
     "root": GROUND
-    | {"geometry", "calibration", "status", "verdict", "engine", "session", "io", "report"},
+    | {"geometry", "calibration", "status", "verdict", "engine", "rig", "session", "io", "report"},
     "watch": {"errors"},
     "ros": {"io", "watch", *ENGINE},
     "cli": {"io", "report", "simulation", "watch", "ros", *ENGINE},

@@ -47,6 +47,8 @@ hec.calibrate(parent, child, progress=lambda share, step: print(f"{share:.0%} {s
 hec.calibrate(parent, child, progress="done")  # wrong
 hec.compare_methods(parent, child, references=["B5"], progress=None)
 hec.compare_methods(parent, child, reference="B5")  # wrong
+rig: hec.RigCalibration = hec.calibrate_rig({"a": parent, "b": child}, time_offset="estimate")
+hec.calibrate_rig([parent, child])  # wrong
 moved: hec.Trajectory = result.child_as_parent(child)
 hec.write_trajectory("moved.tum", moved)
 hec.plot(result).savefig("result.png")

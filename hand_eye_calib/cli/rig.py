@@ -1,0 +1,84 @@
+"""A rig of three sensors or more: calibrated, printed and saved."""
+
+import argparse
+import json
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from hand_eye_calib.cli.console import fail, note, waiting_for
+from hand_eye_calib.cli.options import options_from
+from hand_eye_calib.cli.present import exit_code, transform_lines, wrapped
+from hand_eye_calib.errors import ConfigError, printable
+
+if TYPE_CHECKING:
+    from hand_eye_calib.geometry.trajectory import Trajectory
+    from hand_eye_calib.rig.result import RigCalibration
+
+
+def calibrate_and_deliver(
+    trajectories: Mapping[str, "Trajectory"], arguments: argparse.Namespace, inputs: dict[str, Any]
+) -> int:
+    """Calibrate a rig, print it and save it if ``--out`` asks for that; returns the exit code.
+
+    Parameters
+    ----------
+    trajectories : mapping of str to Trajectory
+        By the sensors' frames.
+    arguments : argparse.Namespace
+        With the calibration options, ``json`` and ``out``.
+    inputs : dict
+        Where the data came from, in plain values.
+    """
+    from hand_eye_calib.cli.memory import keep_freed_memory
+    from hand_eye_calib.rig.calibrate import solve_rig
+
+    keep_freed_memory()
+    _refuse_robot(arguments)
+    options = options_from(arguments)
+    with waiting_for(f"solving for {len(trajectories)} sensors"):
+        rig = solve_rig(trajectories, options)
+    inputs = {**inputs, "options": dict(options)}
+    if arguments.out:
+        from hand_eye_calib.io.rig_files import save_rig
+
+        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
+    print(
+        json.dumps(rig.to_dict() | {"inputs": inputs}, indent=2, allow_nan=False)
+        if arguments.json
+        else "\n".join(printable(line) for line in as_lines(rig))
+    )
+    codes = [exit_code(each) for each in rig.calibrations]
+    failed = [each for each in rig.calibrations if each.status.failure]
+    for each in failed:
+        fail(f"{each.child_frame}: {each.headline}", max(codes))
+    return 1 if failed else max(codes)
+
+
+def as_lines(rig: "RigCalibration") -> list[str]:
+    """What a person needs to see of a rig: tree, extrinsics, closure, noise."""
+    lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors in one solve", "", *rig.tree(), ""]
+    for each in rig.calibrations:
+        lines += [f"{each.child_frame} in {each.parent_frame}: {each.headline}"]
+        lines += [
+            line
+            for reason in each.reasons
+            for line in wrapped(f"{reason.sentence}: {reason.what_to_do}", "- ", "  ")
+            if not each.headline.endswith(reason.sentence)
+        ]
+        lines += [line for text in each.warnings for line in wrapped(f"Note: {text}", "", "  ")]
+        lines += [*transform_lines(each.to_dict()["T_parent_child"]), ""]
+    lines.append("Answers for two sensors at a time")
+    lines += _indented(closure.sentence for closure in rig.closures)
+    lines += ["", "Noise of every sensor", *_indented(rig.noise_in_words())]
+    return lines
+
+
+def _indented(texts: Iterable[str]) -> list[str]:
+    return [line for text in texts for line in wrapped(text, "  ", "    ")]
+
+
+def _refuse_robot(arguments: argparse.Namespace) -> None:
+    """Options that compare or write one extrinsic."""
+    for name in ("installed", "urdf", "write", "base_frame"):
+        if getattr(arguments, name, None):
+            raise ConfigError(f"--{name.replace('_', '-')} is of two sensors, not of a rig")

@@ -1,0 +1,1 @@
+"""Several sensors on one body, calibrated in one solve with the noise of every sensor."""
