@@ -503,7 +503,7 @@ def parsed(options):
         (["replay", "bag", "--method", "dnlp"], "got 'dnlp'; did you mean dnl"),
         (["replay", "bag", "--scale", "non"], "did you mean none?"),
         (["calibrate", "--methd", "dnl", "a", "b"], "unknown option --methd; did you mean"),
-        (["check", "a", "b", "c"], "unexpected argument 'c'"),
+        (["info", "a", "b"], "unexpected argument 'b'"),
         (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
     ],
