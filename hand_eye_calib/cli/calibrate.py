@@ -196,6 +196,7 @@ def _read_rig(files: Sequence[str], arguments: argparse.Namespace) -> dict[str, 
     """The trajectories by the names of their frames: as the files name them, or as the files are
     named.
     """
+    from hand_eye_calib.cli.rig import add_sensor
     from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_file
 
     of_one = [
@@ -216,13 +217,7 @@ def _read_rig(files: Sequence[str], arguments: argparse.Namespace) -> dict[str, 
             )
         for text in (*guesses, *repairs):
             note(text)
-        name = trajectory.sensor_frame or Path(file).stem
-        if name in found:
-            raise ConfigError(
-                f"two files of the rig are of one sensor, {name!r}: sensors have the names of "
-                "their files, which must differ"
-            )
-        found[name] = trajectory
+        add_sensor(found, trajectory.sensor_frame or Path(file).stem, trajectory)
     return found
 
 

@@ -25,6 +25,7 @@ EXAMPLES = """\
 examples:
   hand_eye_calib replay my_bag --list
   hand_eye_calib replay my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
+  hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay my_bag --parent-tf odom:lidar --child-topic /vio --out result
   hand_eye_calib replay live/journal --out result
   hand_eye_calib replay monday_1.mcap monday_2.mcap --time-offset estimate --every 5s"""
@@ -81,6 +82,14 @@ def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
             type=_tf_source,
             help="the same from /tf and /tf_static: fixed frame and the sensor's, as odom:lidar",
         )
+    several = group.add_argument(
+        "--topics",
+        metavar="TOPIC",
+        nargs="+",
+        help="poses of three sensors or more, or frames as odom:lidar: all are solved together, in "
+        "the frame of the first",
+    )
+    offer(several, lambda typed: topics_of(typed.bags))
 
 
 def _add_batch_arguments(parser: argparse.ArgumentParser) -> None:
@@ -117,6 +126,11 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.cli.listing import list_bag
 
         return list_bag(arguments.bags, arguments.json)
+
+    if arguments.topics:
+        from hand_eye_calib.cli.rig import calibrate_bag
+
+        return calibrate_bag(arguments)
 
     from hand_eye_calib.cli.memory import keep_freed_memory
     from hand_eye_calib.cli.options import options_from
@@ -160,6 +174,11 @@ def _check_usage(arguments: argparse.Namespace) -> None:
         )
     if not arguments.batch and (arguments.jobs or arguments.dask):
         raise ConfigError("--jobs and --dask are for --batch")
+    if arguments.topics:
+        named = [f"{each}_{kind}" for each in ("parent", "child") for kind in ("topic", "tf")]
+        others = [name for name in (*named, "batch", "list", "every") if getattr(arguments, name)]
+        if others:
+            raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
     if not arguments.batch and not arguments.bags:
         raise ConfigError("the following arguments are required: BAG, or --batch FILE")
 

@@ -15,6 +15,30 @@ if TYPE_CHECKING:
     from hand_eye_calib.rig.result import RigCalibration
 
 
+def calibrate_bag(arguments: argparse.Namespace) -> int:
+    """Calibrate a rig from the topics of a bag; returns the exit code."""
+    from hand_eye_calib.cli.replaying import fingerprints
+    from hand_eye_calib.io.bags import PoseBag, trajectory_of
+    from hand_eye_calib.io.transforms import TfSource
+
+    found: dict[str, Trajectory] = {}
+    with PoseBag(*arguments.bags) as bag:
+        for topic in arguments.topics:
+            source = TfSource.parse(topic) if ":" in topic else topic
+            with waiting_for(f"reading {topic}"):
+                trajectory, notes = trajectory_of(bag, source)
+            for text in notes:
+                note(text)
+            add_sensor(found, trajectory.sensor_frame or topic, trajectory)
+        for text in bag.warnings:
+            note(text)
+        inputs: dict[str, Any] = {"bag": str(bag), "topics": arguments.topics}
+        files = bag.files()
+    if arguments.out:
+        inputs["files"] = fingerprints(files)
+    return calibrate_and_deliver(found, arguments, inputs)
+
+
 def calibrate_and_deliver(
     trajectories: Mapping[str, "Trajectory"], arguments: argparse.Namespace, inputs: dict[str, Any]
 ) -> int:
@@ -52,6 +76,22 @@ def calibrate_and_deliver(
     for each in failed:
         fail(f"{each.child_frame}: {each.headline}", max(codes))
     return 1 if failed else max(codes)
+
+
+def add_sensor(found: dict[str, "Trajectory"], name: str, trajectory: "Trajectory") -> None:
+    """Add the trajectory of a sensor by its name, which no other one has.
+
+    Raises
+    ------
+    ConfigError
+        If another one has it.
+    """
+    if name in found:
+        raise ConfigError(
+            f"two trajectories of the rig are of one sensor, {name!r}: sensors have the names of "
+            "their frames or files, which must differ"
+        )
+    found[name] = trajectory
 
 
 def as_lines(rig: "RigCalibration") -> list[str]:

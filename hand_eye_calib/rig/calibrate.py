@@ -24,8 +24,8 @@ from hand_eye_calib.rig.result import RigCalibration, closures
 from hand_eye_calib.rig.solution import RigSolution, SensorNoise
 from hand_eye_calib.rig.table import Table, synchronised
 
-# Options that are of one pair of sensors.
-_OF_ONE_PAIR = ("parent_frame", "child_frame", "base_frame")
+# Options that are of one pair of sensors, by their beginnings.
+_OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
 
 
 def calibrate_rig(
@@ -121,11 +121,17 @@ def solve_rig(
 def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) -> None:
     if len(trajectories) < 3:
         raise InputError(
-            f"a rig has at least three sensors; found {len(trajectories)}: two are calibrated with "
-            "hec.calibrate(parent, child)"
+            f"a rig has at least three sensors; found {len(trajectories)}: two are calibrated as "
+            "parent and child"
         )
+    for name, trajectory in trajectories.items():
+        if trajectory.measures != "poses":
+            raise InputError(
+                f"{name} measures {trajectory.measures} only: a rig takes sensors with poses; "
+                "calibrate this one with one of the others"
+            )
     for name, value in options.items():
-        if name in _OF_ONE_PAIR or name.startswith("prior"):
+        if name.startswith(_OF_ONE_PAIR):
             raise ConfigError(f"{name} is of two sensors; it cannot be given for a rig")
         if name in ("time_offset", "scale") and not isinstance(value, str):
             raise ConfigError(

@@ -11,6 +11,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.cli.rig import as_lines
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.rig import solution as joint
 from hand_eye_calib.rig.calibrate import solve_rig
 from hand_eye_calib.rig.increments import Aligned, linearised
@@ -146,6 +147,9 @@ def test_what_is_of_two_sensors_is_refused(rig):
     for options in ({"prior.z": "1.0 +/- 0.1"}, {"time_offset": 0.1}, {"parent_frame": "a"}):
         with pytest.raises(ConfigError, match=next(iter(options))):
             solve_rig(trajectories, options)
+    trajectories["rear"] = dataclasses.replace(trajectories["rear"], measures="positions")
+    with pytest.raises(InputError, match="rear measures positions only"):
+        hec.calibrate_rig(trajectories)
     with pytest.raises(NotEnoughDataError, match="30 are needed"):
         joint.solve(rig.table.at(np.arange(20)), rig.Xs)
 
@@ -178,6 +182,26 @@ def test_a_person_sees_the_tree_and_whether_pairs_close(found):
     assert lines[0] == "USE: 3 sensors in one solve"
     assert lines[4].startswith("`- rear: x")
     assert any(line.startswith("  lidar - front - rear closes: off by") for line in lines)
+
+
+def test_topics_of_a_bag(rig, tmp_path, capsys):
+    streams = {
+        f"/{name}/odometry": (
+            dataclasses.replace(trajectory, sensor_frame=f"{name}_link", world_frame="odom"),
+            "nav_msgs/msg/Odometry",
+        )
+        for name, trajectory in trajectories_of(rig).items()
+    }
+    bag = str(tmp_path / "bag")
+    write_bag(bag, streams)
+    assert main(["replay", bag, "--json", "--topics", *streams]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["sensors"] == ["lidar_link", "front_link", "rear_link"]
+    assert document["inputs"]["topics"] == list(streams)
+    assert main(["replay", bag, "--every", "5s", "--topics", *streams]) == 2
+    assert "--topics and --every do not go together" in capsys.readouterr().err
+    assert main(["replay", bag, "--topics", "/lidar/odometry", "/lidar/odometry", "/x"]) == 2
+    assert "of one sensor, 'lidar_link'" in capsys.readouterr().err
 
 
 def test_the_command_refuses_options_of_two_files(files, capsys):

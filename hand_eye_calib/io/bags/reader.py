@@ -503,14 +503,23 @@ def read_bag_trajectory(
     InputError
         If the bag or a pose cannot be read.
     """
-    source: Source = TfSource.parse(tf) if tf else topic or ""
     with PoseBag(path) as bag:
-        bag.check(source)
-        kind = bag.measured(source, measures)
-        blocks = list(bag.blocks(source, None, measures={"parent": measures}))
-        notes = bag.warnings
+        trajectory, notes = trajectory_of(bag, TfSource.parse(tf) if tf else topic or "", measures)
+        return trajectory, [*bag.warnings, *notes]
+
+
+def trajectory_of(
+    bag: PoseBag, source: Source, measures: str = "auto"
+) -> tuple[Trajectory, list[str]]:
+    """The trajectory of one source of an open bag, as :func:`read_bag_trajectory` gives it, and
+    what a person should know of it.
+    """
+    bag.check(source)
+    kind = bag.measured(source, measures)
+    notes: list[str] = []
+    blocks = list(bag.blocks(source, None, measures={"parent": measures}))
     if not blocks:
-        raise InputError(f"no poses on {source} of {path}")
+        raise InputError(f"no poses on {source} of {bag}")
     poses = PoseBlock.concatenate(blocks)
     stamps_ns, first = np.unique(poses.stamps_ns, return_index=True)
     if len(first) < len(poses):
