@@ -18,6 +18,7 @@ from hand_eye_calib.adaptive import noise_model, reml
 from hand_eye_calib.adaptive.increments import (
     N_SYSTEMATIC,
     SYSTEMATIC,
+    TIME,
     Course,
     Streams,
     course_of,
@@ -42,6 +43,7 @@ from hand_eye_calib.adaptive.outliers import (
     tails_are_heavy,
     with_jumps_across_spikes,
 )
+from hand_eye_calib.adaptive.part_delays import PartDelay, part_delays, with_delay_columns
 from hand_eye_calib.adaptive.relinearise import corrected, restored
 from hand_eye_calib.adaptive.resampling import answers_without, part_products
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
@@ -131,6 +133,8 @@ def solve(
     Ts_cw_c: FloatArray,
     systematic: Sequence[str] = SYSTEMATIC,
     quick: bool = False,
+    is_clock_free: bool = False,
+    with_delays: bool = False,
 ) -> AdaptiveSolution:
     """Estimate T_parent_child, the noise of the trajectories, and their covariance.
 
@@ -143,6 +147,11 @@ def solve(
         Systematic errors to choose from, the plainest first; the choice if there is only one.
     quick : bool
         Stop at white noise, drift and outliers: neither errors that last nor heavy tails.
+    is_clock_free : bool
+        The clock offset was estimated from these poses, so that X is as uncertain as that makes it:
+        the model has a time offset, unless the motion hardly tells it from X.
+    with_delays : bool
+        Estimate the delays of positions against orientations, too.
 
     Returns
     -------
@@ -150,14 +159,26 @@ def solve(
     """
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     streams = Streams(stamps_s, Ts_pw_p, Ts_cw_c)
-    start = _start(streams, _while_fitting(systematic))
+    start = dataclasses.replace(
+        _start(streams, _while_fitting(systematic)),
+        is_clock_free=is_clock_free,
+        with_delays=with_delays,
+    )
     plain = _fitted(start)
     if _is_noisy(plain):
         plain = _fitted_at_freed_poses(start, plain)
     plain = _without_outliers(plain, quick)
     kept = _strided(plain)
     if len(kept) < len(streams):
-        fewer = solve(stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept], systematic, quick)
+        fewer = solve(
+            stamps_ns[kept],
+            Ts_pw_p[kept],
+            Ts_cw_c[kept],
+            systematic,
+            quick,
+            is_clock_free,
+            with_delays,
+        )
         return _at_all_poses(fewer, kept, plain.outliers.spikes)
     found = plain if quick else _with_lasting_errors(plain)
     solution = _polished(_with_systematic_errors(found, systematic))
@@ -218,6 +239,10 @@ class _State:
         Standard deviations of parameters that are not in the model.
     mean_variances : (6,) array
         Of X, by errors that last too long to be found.
+    is_clock_free : bool
+        Whether a time offset is in the model if the motion tells it from X.
+    with_delays : bool
+        Whether the solution has delays of positions.
     weights : (N,) array
         Of white errors; other than 1 where tails are heavy.
     """
@@ -238,23 +263,36 @@ class _State:
     other_sigmas: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
     mean_variances: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(6))
     n_evaluations: int = 0
+    is_clock_free: bool = False
+    with_delays: bool = False
 
-    def space(self, kept: IntArray | None = None, model: NoiseModel | None = None) -> StateSpace:
-        """State space of all or some of the poses."""
+    def space(
+        self,
+        kept: IntArray | None = None,
+        model: NoiseModel | None = None,
+        with_delays: bool = False,
+    ) -> StateSpace:
+        """State space of all or some of the poses; with the columns of a clock offset and of the
+        delays of positions if asked for.
+        """
         poses, course, error, weights = self.poses, self.course, self.error, self.weights
-        outliers = self.outliers
+        outliers, columns = self.outliers, self.columns
         if kept is not None:
             poses, course, error, weights = poses[kept], course[kept], error[kept], weights[kept]
             outliers = outliers.across(kept)
         linearisation = linearise(poses, course, self.T, self.parameters)
         if error.any():
             linearisation = restored(linearisation, error)
+        if with_delays:
+            at_poses = course_of(poses, self.T)
+            linearisation = with_delay_columns(linearisation, at_poses, self.T)
+            columns = [*dict.fromkeys((*columns, TIME)), N_SYSTEMATIC, N_SYSTEMATIC + 1]
         return (model or self.model).state_space(
             poses,
             linearisation,
             course.twists,
             self.T,
-            self.columns,
+            columns,
             np.where(outliers.spikes, 0.0, weights),
             outliers.jumps,
         )
@@ -490,7 +528,8 @@ def _mean_variances(found: _State, kept: IntArray | None) -> FloatArray:
 
 def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     """The model of systematic errors that the data ask for, one step from where the search stands,
-    at poses freed of their errors. All models are judged under the same noise.
+    at poses freed of their errors. All models are judged under the same noise. If the clock is
+    free, those with a time offset come first.
     """
     tried = sorted({column for name in systematic for column in parameters_of(name)})
     posterior = dataclasses.replace(state, columns=tried).posterior()
@@ -514,6 +553,8 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     credible = [
         name for name, fit in fits.items() if name == plainest or _is_credible(fit, name, known)
     ]
+    if state.is_clock_free:
+        credible = [name for name in credible if TIME in parameters_of(name)] or credible
     penalties = {name: _PENALTY * len(parameters_of(name)) for name in systematic}
     best = min(credible, key=lambda name: criterion(name, fits[name].cost))
     if best != plainest:
@@ -640,10 +681,16 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
         misfit=misfit,
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
         part_products=parts,
+        delays=_delays(state, misfit) if state.with_delays else None,
         objective=0.5 * (posterior.log_determinant + normal.cost),
         converged=converged,
         iterations=state.n_evaluations,
     )
+
+
+def _delays(state: _State, misfit: float) -> tuple[PartDelay, PartDelay]:
+    posterior = Posterior(state.space(with_delays=True), state.levels)
+    return part_delays(posterior, misfit)
 
 
 def _sigmas(state: _State, covariance: FloatArray, parts: FloatArray) -> FloatArray:

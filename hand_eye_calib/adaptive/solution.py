@@ -18,6 +18,7 @@ from hand_eye_calib.adaptive.noise_model import (
     WALK_TRANSLATION,
     NoiseModel,
 )
+from hand_eye_calib.adaptive.part_delays import PartDelay
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 
 _TURNING = {
@@ -156,6 +157,9 @@ class AdaptiveSolution:
         Path of the parent from pose to pose.
     part_products : (K, p + 1, p + 1) array
         What each part of the recording adds, see :mod:`~hand_eye_calib.adaptive.resampling`.
+    delays : (PartDelay, PartDelay) or None
+        Of the child's and of the parent's positions against their orientations, if they were
+        estimated.
     objective : float
         Negative log likelihood.
     converged : bool
@@ -182,6 +186,7 @@ class AdaptiveSolution:
     converged: bool
     iterations: int
     is_drowned: bool = False
+    delays: tuple[PartDelay, PartDelay] | None = None
 
     @cached_property
     def noise(self) -> NoiseLevels:

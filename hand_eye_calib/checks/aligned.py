@@ -3,9 +3,13 @@ little of the motion unexplained and yet spoil the extrinsic.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from hand_eye_calib.adaptive import estimator
+from hand_eye_calib.adaptive.part_delays import PartDelay
+from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.mount_change import find_change, information
 from hand_eye_calib.checks import findings as wording
@@ -31,10 +35,16 @@ _NEARLY_M, _NEARLY_WITHIN = 0.012, 4.0
 # Gains of rotations, less 1, from which on there is a warning, an error.
 _GAIN_WARNING, _GAIN_ERROR = 0.003, 0.03
 
-# Delays of positions against orientations (s, squared intervals of the poses), and smoothing (s^2,
-# squared intervals), from which on they count.
-_DELAY_S, _DELAY_INTERVALS2 = 0.015, 2.0
+# Delays of positions against orientations (s, standard deviations), and smoothing (s^2, squared
+# intervals of the poses), from which on they count.
+_DELAY_S, _DELAY_SIGMAS = 0.003, 4.5
 _SMOOTHING_S2, _SMOOTHING_INTERVALS2 = {"position": 0.004, "rotation": 0.002}, 0.1
+
+# Poses that the estimator solves for a check: at most, at least.
+_MOST_POSES, _FEWEST_POSES = 400, 60
+
+# Speeds are over about this time (s), so that noise is no speed.
+_SPEED_SPAN_S = 0.4
 
 # Shifts (m) by a delay or by smoothing from which on they count, and from which on a result is
 # unusable.
@@ -66,6 +76,45 @@ class Aligned:
     T_parent_child: FloatArray
     covariance: FloatArray
 
+    @cached_property
+    def solution(self) -> AdaptiveSolution | None:
+        """Answer of the adaptive estimator from some of the poses, with a free clock; None if they
+        are too few or it does not settle.
+        """
+        poses = self.pose_pairs[:: -(-len(self.pose_pairs) // _MOST_POSES)]
+        if len(poses) < _FEWEST_POSES:
+            return None
+        found = estimator.solve(
+            poses.stamps_ns,
+            poses.Ts_pw_p,
+            poses.Ts_cw_c,
+            is_clock_free=True,
+            with_delays=True,
+        )
+        return found if found.converged else None
+
+    @property
+    def best_known(self) -> tuple[FloatArray, FloatArray]:
+        """X and its standard deviations (6,), by the estimator if that is surer of it."""
+        by_fit = self.T_parent_child, np.sqrt(np.diag(self.covariance))
+        if self.solution is None or self.solution.unseen.size:
+            return by_fit
+        sigmas = np.sqrt(np.diag(self.solution.cov_parent_child_in_child))
+        return min(
+            by_fit, (self.solution.T_parent_child, sigmas), key=lambda known: known[1][:3].max()
+        )
+
+    @cached_property
+    def rms_speed(self) -> float:
+        """Root mean square speed of the parent, m/s: without jumps."""
+        stamps_s = self.pose_pairs.stamps_ns * 1e-9
+        n = round(_SPEED_SPAN_S / float(np.median(np.diff(stamps_s))))
+        n = min(max(n, 1), len(stamps_s) - 1)
+        positions = self.pose_pairs.Ts_pw_p[:, :3, 3]
+        steps = np.linalg.norm(positions[n:] - positions[:-n], axis=1)
+        speeds = steps / (stamps_s[n:] - stamps_s[:-n])
+        return float(np.sqrt(np.mean(np.minimum(speeds, 3 * np.median(speeds)) ** 2)))
+
 
 def check_aligned(aligned: Aligned) -> list[Finding]:
     """Findings about two streams that agree."""
@@ -75,15 +124,14 @@ def check_aligned(aligned: Aligned) -> list[Finding]:
     found = response(aligned.pose_pairs, aligned.T_parent_child, gains)
     return [
         *gain_findings,
-        *(_check_response(found) if found else []),
+        *(_check_delays(aligned) or (_check_smoothing(found, aligned.rms_speed) if found else [])),
         *_check_mount(aligned),
     ]
 
 
 def _check_same(aligned: Aligned) -> list[Finding]:
     """Finding about an extrinsic, or a translation, of zero."""
-    T, covariance = aligned.T_parent_child, aligned.covariance
-    sigmas = np.sqrt(np.diag(covariance))
+    T, sigmas = aligned.best_known
     if sigmas[:3].max() > _MAX_SIGMA_M or sigmas[3:].max() > _MAX_SIGMA_RAD:
         return []
     distance_m = float(np.linalg.norm(T[:3, 3]))
@@ -113,14 +161,23 @@ def _check_gains(aligned: Aligned) -> tuple[FloatArray, list[Finding]]:
     return matrix, findings
 
 
-def _check_response(found: Response) -> list[Finding]:
-    """Findings about delays and smoothing of one part of the poses."""
-    late = found.position_delay
-    shift_m = abs(late.value) * found.rms_speed
-    least_s = max(_DELAY_S, _DELAY_INTERVALS2 * found.interval_s**2, _SIGMAS * late.sigma)
-    is_sure = late.is_clear and abs(late.value) > max(least_s, _BIASES * late.bias)
-    if is_sure and shift_m > _SHIFT_M:
-        return [wording.position_clock(late, shift_m, _severity(shift_m))]
+def _check_delays(aligned: Aligned) -> list[Finding]:
+    """Finding about positions that are late, or early, against orientations of their stream."""
+    if aligned.solution is None or aligned.solution.delays is None:
+        return []
+    delays: dict[str, PartDelay] = dict(
+        zip(("child", "parent"), aligned.solution.delays, strict=True)
+    )
+    stream = max(delays, key=lambda name: delays[name].sigmas)
+    delay = delays[stream]
+    shift_m = abs(delay.seconds) * aligned.rms_speed
+    if delay.sigmas < _DELAY_SIGMAS or abs(delay.seconds) < _DELAY_S or shift_m < _SHIFT_M:
+        return []
+    return [wording.position_clock(stream, delay, shift_m, _severity(shift_m))]
+
+
+def _check_smoothing(found: Response, rms_speed: float) -> list[Finding]:
+    """Findings about smoothing of one part of the poses."""
     for part, least_s2 in _SMOOTHING_S2.items():
         least = least_s2 + _SMOOTHING_INTERVALS2 * found.interval_s**2
         smoothing = getattr(found, f"{part}_smoothing")
@@ -128,7 +185,7 @@ def _check_response(found: Response) -> list[Finding]:
             quantity = getattr(smoothing, stream)
             if not quantity.exceeds(least + _BIASES * quantity.bias, _SMOOTHING_SIGMAS):
                 continue
-            shift_m = float(np.sqrt(quantity.value)) * found.rms_speed
+            shift_m = float(np.sqrt(quantity.value)) * rms_speed
             if shift_m < _SHIFT_M:
                 continue
             name = {"position": "positions", "rotation": "orientations"}[part]

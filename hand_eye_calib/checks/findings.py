@@ -12,6 +12,7 @@ import numpy as np
 from hand_eye_calib.methods import METHODS
 
 if TYPE_CHECKING:
+    from hand_eye_calib.adaptive.part_delays import PartDelay
     from hand_eye_calib.alignment.angular_rates import Correlation
     from hand_eye_calib.alignment.scale import Scale
     from hand_eye_calib.alignment.time_offset import TimeOffset
@@ -540,22 +541,21 @@ def rotation_gain(gain: Quantity, axis: FloatArray, severity: Severity) -> Findi
     )
 
 
-def position_clock(delay: Quantity, shift_m: float, severity: Severity) -> Finding:
-    """Positions and orientations have different delays."""
-    later, earlier = ("child", "parent") if delay.value > 0 else ("parent", "child")
+def position_clock(stream: str, delay: PartDelay, shift_m: float, severity: Severity) -> Finding:
+    """Positions and orientations of a stream have different delays."""
+    late = "late" if delay.seconds > 0 else "early"
     return Finding(
         code="position_clock",
-        stream="both",
+        stream=stream,
         severity=severity,
         confidence=Confidence.LIKELY,
-        what=f"with orientations aligned, the {later}'s positions are {abs(delay.value):.3f} +/- "
-        f"{delay.sigma:.3f} s late, or the {earlier}'s early: at this speed a shift of "
-        f"{shift_m:.2g} m",
+        what=f"the {stream}'s positions are {abs(delay.seconds):.3f} +/- {delay.sigma_s:.3f} s "
+        f"{late} against its orientations: at this speed a shift of {shift_m:.2g} m",
         cause="positions and orientations of one stream come from different sources or filters",
         advice="use the poses before that filter, or correct the delay of the positions",
         evidence=(
-            ("delay_s", delay.value),
-            ("sigma_s", delay.sigma),
+            ("delay_s", delay.seconds),
+            ("sigma_s", delay.sigma_s),
             ("shift_m", shift_m),
         ),
     )

@@ -2,18 +2,23 @@
 nobody gave.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import HandEyeCalibError
 
 # Options that a check can be certain of.
 _MENDED = ("time_offset", "scale")
+
+# A model's own time offset moves poses along their velocities. From this one (s) on, poses are
+# paired anew instead.
+_MOST_MOVED_S = 0.003
 
 
 def checked(
@@ -43,7 +48,10 @@ def checked(
         return calibration, snapshot  # the checks are of poses; the solve has its own findings
     findings = snapshot.check(calibration).findings
     found = _with(calibration, findings)
-    options = {} if given is None or len(snapshot.kept) else _certain(findings, given)
+    if given is None or len(snapshot.kept):
+        return found, snapshot
+    certain = _certain(findings, given)
+    options = _offset_of_model(calibration, snapshot, given) | certain
     if not options:
         return found, snapshot
     mended = replace(snapshot, config=replace(snapshot.config, **options), time_offset=None)
@@ -52,17 +60,24 @@ def checked(
         again = _with(again, mended.check(again).findings)
     except HandEyeCalibError:
         return found, snapshot
-    if _serious(again) >= _serious(found):
+    if _serious(again) > _serious(found) - bool(certain):
         return found, snapshot
-    told = [
+    told = _told(findings, options) or (
+        f"the child's clock is {again.time_offset_s:.4f} s off: solved with time_offset estimate",
+    )
+    warnings = dict.fromkeys((*told, *calibration.warnings, *again.warnings))
+    return replace(again, warnings=tuple(warnings)), mended
+
+
+def _told(findings: Collection[Finding], options: Mapping[str, Any]) -> tuple[str, ...]:
+    """Warnings about findings that these options mend."""
+    return tuple(
         f"{finding.what}: solved with {name} {options[name]}; to take the stream as it is, give "
         f"{name} {getattr(CalibratorConfig, name)}"
         for finding in findings
         for name, _ in finding.options
         if name in options
-    ]
-    warnings = dict.fromkeys((*told, *calibration.warnings, *again.warnings))
-    return replace(again, warnings=tuple(warnings)), mended
+    )
 
 
 def _with(calibration: Calibration, findings: Collection[Finding]) -> Calibration:
@@ -82,6 +97,18 @@ def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str,
         for name, value in finding.options
         if name in _MENDED and name not in given and _is_grave(finding, name)
     }
+
+
+def _offset_of_model(
+    calibration: Calibration, snapshot: Snapshot, given: Collection[str]
+) -> dict[str, Any]:
+    """The option that pairs the poses anew if the model found a large time offset by itself."""
+    moved_s = calibration.time_offset_s - fixed_time_offset(snapshot.resolved().config)
+    return (
+        {}
+        if "time_offset" in given or abs(moved_s) < _MOST_MOVED_S
+        else {"time_offset": "estimate"}
+    )
 
 
 def _is_grave(finding: Finding, option: str) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from hand_eye_calib.adaptive import estimator as adaptive_estimator
 from hand_eye_calib.adaptive.estimator import AdaptiveSolution
 from hand_eye_calib.adaptive.increments import Streams, course_of
+from hand_eye_calib.adaptive.part_delays import PartDelay, spread_by_delays
 from hand_eye_calib.alignment.scale import Scale, child_scaled, estimate_scale
 from hand_eye_calib.alignment.similarity import MAX_UNEXPLAINED_TRANSLATION
 from hand_eye_calib.alignment.time_offset import TimeOffset
@@ -66,6 +67,7 @@ class _Evaluation:
     time_sigma_s: float = 0.0
     warnings: tuple[str, ...] = ()
     other_answer: tuple[FloatArray, FloatArray] | None = None
+    delays: tuple[PartDelay, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,10 +107,15 @@ def estimate_extrinsic(
     """
     scale = _settle_scale(pose_pairs, config)
     METHODS[config.method].require_backend(config.backend)
-    solve = _SOLVE.get(config.method, _solve_pairs)
-    evaluation = solve(child_scaled(pose_pairs, scale.value), config)
+    solve = _SOLVE.get(config.method, _solve_only_pairs)
+    scaled = child_scaled(pose_pairs, scale.value)
+    evaluation = solve(scaled, config, is_clock_free=time_offset is not None)
     T_method = evaluation.solution.T_parent_child
-    spread = _spread_by_alignment(scale.estimate, time_offset)
+    # A model with a time offset knows how uncertain that is.
+    spread = _spread_by_alignment(
+        scale.estimate, None if evaluation.time_correction_s else time_offset
+    )
+    spread += spread_by_delays(evaluation.delays, time_offset.seconds if time_offset else 0.0)
     assessment = widened(evaluation.assessment, T_method[:3, :3], spread)
     fused = fuse(T_method, assessment, config.prior())
     result = _calibration(evaluation, fused, pose_pairs.stamps_ns, config)
@@ -187,7 +194,9 @@ def fixed_time_offset(config: CalibratorConfig) -> float:
     return config.time_offset
 
 
-def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
+def _solve_auto(
+    pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
+) -> _Evaluation:
     """The adaptive estimator if its noise model fits, as judged with DNLO's answer, otherwise DNLO;
     and DNLO if a reference is given, which only the paper's methods have.
 
@@ -198,10 +207,10 @@ def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
         dnlo = _solve_pairs(pose_pairs, with_dnlo)
         return replace(dnlo, method_reason=f"auto: dnlo, for reference {config.reference} is given")
     if len(pose_pairs) < MIN_POSES:
-        evaluation = _solve_adaptive(pose_pairs, config)
+        evaluation = _solve_adaptive(pose_pairs, config, is_clock_free)
         reason = f"auto: fewer than {MIN_POSES} poses, too few to compare with dnlo"
         return replace(evaluation, method_reason=reason)
-    solution = _adaptive_solution(pose_pairs)
+    solution = _adaptive_solution(pose_pairs, is_clock_free)
     dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
     by_model = _evaluated(pose_pairs, solution)
     floor = common_mode_floor(*by_model.spans, solution.T_parent_child)
@@ -214,7 +223,8 @@ def _solve_auto(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
     compared = f"dnlo on reference {dnlo.reference}"
     if misfit:
         reason = f"auto: {compared} stands, because the noise model does not fit: {misfit}"
-        return replace(dnlo, method_reason=reason, other_answer=_beside(by_model))
+        beside = _beside(by_model)
+        return replace(dnlo, method_reason=reason, other_answer=beside, delays=by_model.delays)
     reason = f"auto: the noise model fits, and its answer agrees with that of {compared}"
     return replace(by_model, method_reason=reason, other_answer=_beside(dnlo))
 
@@ -289,9 +299,18 @@ def _named(assessment: Assessment, verdict: DofVerdict) -> list[str]:
     return [dof.name for dof in assessment.observability if dof.verdict is verdict]
 
 
-def _solve_adaptive(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluation:
+def _solve_only_pairs(
+    pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
+) -> _Evaluation:
+    """A method of the paper, which takes the clock as it is."""
+    return _solve_pairs(pose_pairs, config)
+
+
+def _solve_adaptive(
+    pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
+) -> _Evaluation:
     """The adaptive estimator, which uses no reference."""
-    evaluation = _evaluated(pose_pairs, _adaptive_solution(pose_pairs))
+    evaluation = _evaluated(pose_pairs, _adaptive_solution(pose_pairs, is_clock_free))
     jumps = 1.0 - float(np.mean(evaluation.weights))
     warning = (
         f"{jumps:.0%} of the increments are jumps: the errors do not fit the adaptive noise "
@@ -300,8 +319,14 @@ def _solve_adaptive(pose_pairs: PosePairs, config: CalibratorConfig) -> _Evaluat
     return replace(evaluation, warnings=(warning,) if jumps > MAX_JUMPS else ())
 
 
-def _adaptive_solution(pose_pairs: PosePairs) -> AdaptiveSolution:
-    return adaptive_estimator.solve(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
+def _adaptive_solution(pose_pairs: PosePairs, is_clock_free: bool) -> AdaptiveSolution:
+    return adaptive_estimator.solve(
+        pose_pairs.stamps_ns,
+        pose_pairs.Ts_pw_p,
+        pose_pairs.Ts_cw_c,
+        is_clock_free=is_clock_free,
+        with_delays=True,
+    )
 
 
 def _corrected(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
@@ -340,6 +365,7 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         scale_sigma=solution.scale_sigma,
         time_correction_s=solution.time_offset_s,
         time_sigma_s=solution.time_offset_sigma_s,
+        delays=solution.delays or (),
     )
 
 

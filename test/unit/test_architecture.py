@@ -36,6 +36,7 @@ ENGINE["adaptive"] = ENGINE["solvers"] | {"solvers"}
 ENGINE["assessment"] = ENGINE["adaptive"] | {"calibration", "status", "verdict", "adaptive"}
 ENGINE["alignment"] = ENGINE["solvers"] | {"solvers"}
 ENGINE["checks"] = ENGINE["alignment"] | {
+    "adaptive",
     "calibration",
     "status",
     "verdict",

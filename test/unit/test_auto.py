@@ -19,6 +19,7 @@ from hand_eye_calib.assessment import model_fit
 from hand_eye_calib.assessment.covariance import Assessment
 from hand_eye_calib.assessment.reference_selection import ReferenceChoice
 from hand_eye_calib.engine import estimation
+from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -58,8 +59,8 @@ class TestWhichAnswerStands:
         """Of a model that is wrong: its answer is half a metre off."""
         solve = estimator.solve
 
-        def wrong(*poses):
-            found = solve(*poses)
+        def wrong(*poses, **options):
+            found = solve(*poses, **options)
             return dataclasses.replace(found, T_parent_child=shifted(0.5))
 
         streams = noisy_streams()
@@ -85,9 +86,12 @@ class TestWhichAnswerStands:
         solves = []
         solve = estimator.solve
         monkeypatch.setattr(
-            estimator, "solve", lambda *poses: solves.append(len(poses[0])) or solve(*poses)
+            estimator,
+            "solve",
+            lambda *poses, **options: solves.append(len(poses[0])) or solve(*poses, **options),
         )
-        hec.calibrate(*noisy_streams(), method="auto")
+        streams = noisy_streams()
+        whole_snapshot(offline_config(*streams, {"method": "auto"}), *streams).estimate()
         assert solves == [150]
 
     def test_a_time_offset_that_dnlo_does_not_know_of_is_no_misfit(self):

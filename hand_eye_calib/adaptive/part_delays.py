@@ -1,0 +1,135 @@
+"""Delay of the positions of a stream against its own orientations.
+
+Positions and orientations of one pose may come from different filters. Poses whose positions are
+late by d are ``T Exp(-d (v, 0))``, with the velocity v of that sensor in its own frame. At a
+constant v that is a shift of the sensor, which no motion tells from a part of X; where v changes,
+it is a column of the linear model like that of a clock offset, ``(v, w)``. Both are estimated
+together, under the noise that the estimator found: a clock offset alone moves positions and
+orientations alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.adaptive.increments import Course, Linearisation, turned
+from hand_eye_calib.adaptive.resampling import answers_without, part_products
+from hand_eye_calib.adaptive.state_space import NormalEquations, Posterior, selected
+from hand_eye_calib.arrays import FloatArray
+
+# Blocks of the jackknife.
+_BLOCKS = 10
+
+# Delays from so many standard deviations on are likely.
+_LIKELY = 2.0
+
+# A direction without evidence that has this much of a delay in it leaves the delay open.
+_UNSEEN = 1e-6
+
+
+@dataclass(frozen=True)
+class PartDelay:
+    """A delay of positions against orientations.
+
+    Attributes
+    ----------
+    seconds : float
+        Positive if the positions are late.
+    sigma_s : float
+        Standard deviation: the larger of that of the model and that of the jackknife. Infinite if
+        the motion shows nothing of it.
+    sensitivity : (6,) array
+        By how much xi in ``X Exp(xi)`` is off for each second of it that is not in the model.
+    """
+
+    seconds: float
+    sigma_s: float
+    sensitivity: FloatArray
+
+    @property
+    def sigmas(self) -> float:
+        """Its size in standard deviations."""
+        return abs(self.seconds) / max(self.sigma_s, 1e-12)
+
+
+def spread_by_delays(delays: tuple[PartDelay, ...], clock_offset_s: float) -> FloatArray:
+    """Covariance (6, 6) of xi by delays that the model does not have: of the stream that matters
+    more.
+
+    A delay that is likely counts with its size. If the clocks were found to be apart, one of the
+    streams may have a latency rather than another clock, and its positions and orientations need
+    not have the same: then a delay counts that the motion does not exclude, up to that offset.
+
+    Parameters
+    ----------
+    delays : sequence of PartDelay
+    clock_offset_s : float
+        As estimated; zero if it was given.
+    """
+    spreads = [np.zeros((6, 6))]
+    for delay in delays:
+        variance = min(delay.sigma_s, abs(clock_offset_s)) ** 2
+        if delay.sigmas > _LIKELY:
+            variance += delay.seconds**2
+        spreads.append(variance * np.outer(delay.sensitivity, delay.sensitivity))
+    return max(spreads, key=lambda spread: float(np.trace(spread[:3, :3])))
+
+
+def with_delay_columns(
+    linearisation: Linearisation, course: Course, T_parent_child: FloatArray
+) -> Linearisation:
+    """A linearisation with two more columns: of a delay of the child's positions, and of the
+    parent's.
+    """
+    rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
+    velocities, rates = course.twists[:, :3], course.twists[:, 3:]
+    of_parent = velocities - np.cross(rates, translation @ rotation)
+    columns = [
+        sign * _column(linearisation, of_sensor)
+        for sign, of_sensor in ((1.0, velocities), (-1.0, of_parent))
+    ]
+    jacobian = np.concatenate([linearisation.jacobian, *columns], axis=2)
+    return dataclasses.replace(linearisation, jacobian=jacobian)
+
+
+def _column(linearisation: Linearisation, velocities: FloatArray) -> FloatArray:
+    twists = np.concatenate([velocities, np.zeros_like(velocities)], axis=1)
+    return (turned(linearisation.adjoints, twists[:-1]) - twists[1:])[:, :, None]
+
+
+def part_delays(posterior: Posterior, misfit: float) -> tuple[PartDelay, PartDelay]:
+    """Delays of the child's and of the parent's positions, each without the other.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of a state space whose last two columns, before the residuals, are those of
+        :func:`with_delay_columns`.
+    misfit : float
+        Factor of the covariance.
+    """
+    parts = part_products(posterior)
+    n_columns = parts.shape[1] - 1
+    child, parent = (
+        _delay([*range(n_columns - 2), column], posterior.products, parts, misfit)
+        for column in (n_columns - 2, n_columns - 1)
+    )
+    return child, parent
+
+
+def _delay(columns: list[int], products: FloatArray, parts: FloatArray, misfit: float) -> PartDelay:
+    others, column = columns[:-1], columns[-1]
+    without = NormalEquations(selected(products, others))
+    sensitivity = (without.covariance @ products[others, column])[:6]
+    normal = NormalEquations(selected(products, columns))
+    if np.abs(normal.unseen[-1]).max(initial=0.0) > _UNSEEN:
+        return PartDelay(0.0, np.inf, sensitivity)
+    variance = max(misfit, 1.0) * float(normal.covariance[-1, -1])
+    if len(parts) >= _BLOCKS:
+        chosen = np.array([selected(part, columns) for part in parts])
+        spread = answers_without(chosen, _BLOCKS)[:, -1].var()
+        variance = max(variance, (_BLOCKS - 1) * float(spread))
+    return PartDelay(float(normal.step[-1]), float(np.sqrt(variance)), sensitivity)
