@@ -223,8 +223,7 @@ def _solve_auto(
     compared = f"dnlo on reference {dnlo.reference}"
     if misfit:
         reason = f"auto: {compared} stands, because the noise model does not fit: {misfit}"
-        beside = _beside(by_model)
-        return replace(dnlo, method_reason=reason, other_answer=beside, delays=by_model.delays)
+        return replace(dnlo, method_reason=reason, other_answer=_beside(by_model))
     reason = f"auto: the noise model fits, and its answer agrees with that of {compared}"
     return replace(by_model, method_reason=reason, other_answer=_beside(dnlo))
 
