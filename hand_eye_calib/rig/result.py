@@ -18,6 +18,9 @@ _FORMAT, _VERSION = "hand_eye_calib/rig", 1
 # What chi-square with so many degrees of freedom exceeds once in a hundred times.
 _ONCE_IN_A_HUNDRED = {1: 6.63, 2: 9.21, 3: 11.34, 4: 13.28, 5: 15.09, 6: 16.81}
 
+# Variances (m^2, rad^2) of directions that are unknown are larger.
+_UNKNOWN = 1.0
+
 _GRAVITY = (Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE, Verdict.USE)
 
 
@@ -29,12 +32,13 @@ class Closure:
     ----------
     sensors : (str, str, str)
     translation_m, rotation_rad : float
-        Size of ``T_ab T_bc T_ca``, which is the identity without errors.
+        Size of ``T_ab T_bc T_ca``, which is the identity without errors, along directions that all
+        three answers know.
     chi2 : float
         The same in standard deviations, squared: with the covariances of the three answers as if
         they were independent. They share sensors, so that it is rather smaller than by chance.
     dof : int
-        Directions that all three answers know.
+        Number of these directions.
     """
 
     sensors: tuple[str, str, str]
@@ -165,14 +169,16 @@ def closure(
     ):
         adjoint = se3.adjoint(T)
         covariance += adjoint @ each.covariance @ adjoint.T
-    miss = se3.log(error)
-    unknown = max(len(each.unobservable()) for each in (to_second, on, to_third))
+    variances, axes = np.linalg.eigh(covariance)
+    known = axes[:, variances < _UNKNOWN]
+    along = known.T @ se3.log(error)
+    miss = known @ along
     return Closure(
         sensors=sensors,
-        translation_m=float(np.linalg.norm(error[:3, 3])),
+        translation_m=float(np.linalg.norm(miss[:3])),
         rotation_rad=float(np.linalg.norm(miss[3:])),
-        chi2=float(miss @ np.linalg.solve(covariance, miss)),
-        dof=6 - unknown,
+        chi2=float((along**2 / variances[variances < _UNKNOWN]).sum()),
+        dof=known.shape[1],
     )
 
 

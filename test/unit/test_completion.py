@@ -56,7 +56,7 @@ def test_commands_options_values_and_topics(tmp_path):
     )
     assert offered == [
         {"check"},
-        {"--parent-topic", "--parent-tf", "--parent-frame"},
+        {"--parent-topic", "--parent-tf", "--parent-frame", "--parent-measures"},
         {"dnlo", "dnl"},
         {"/lidar", "/camera"},
         {"--child-format", "--child-frame"},
