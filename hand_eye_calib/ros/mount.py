@@ -53,8 +53,9 @@ class MountWatch:
         began_s = time.perf_counter()
         pairs = self._session.calibrator.take_pairs()
         pairs = pairs[pairs.stamps_ns > self._last_ns]
-        monitor = self._started()
-        if monitor is None or not len(pairs):
+        # Before the first poses, the frames are not known.
+        monitor = self._started() if len(pairs) else None
+        if monitor is None:
             return
         self._last_ns = int(pairs.stamps_ns[-1])
         alarm = monitor.add(pairs)

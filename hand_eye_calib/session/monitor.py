@@ -130,6 +130,10 @@ class _Seconds:
             sums[: self._count + 1] = sums[start : self._end + 1] - sums[start]
         self._end = self._count
 
+    def forget_all_but(self, newest: int) -> None:
+        """Keep so many of the newest seconds."""
+        self._count = newest
+
     def newest(self, lags: IntArray | int) -> tuple[FloatArray, FloatArray]:
         """H (..., 6, 6) and S (..., 6) of so many of the newest seconds."""
         start = self._end - lags
@@ -349,9 +353,9 @@ class MountMonitor:
         if len(self._memory) < _LAGS[0]:
             return None
         self._since_alarm += 1
-        if self.alarm is not None and self._is_over():
+        if self.alarm is not None and (put_back_s := self._put_back_s()):
             self.alarm = None
-            self._memory = _Seconds()
+            self._memory.forget_all_but(put_back_s)
             return None
         lags, H, S, before = self._sums()
         ratios = log_ratio(H, S, 1.0, _KNOCKS[:, None]).max(axis=0)
@@ -393,15 +397,17 @@ class MountMonitor:
         lags = np.append(lags, len(self._memory))
         return lags, reduced @ H, (reduced @ off[..., None])[..., 0], before
 
-    def _is_over(self) -> bool:
-        """Whether, over some lag since the alarm, no shift is far more likely than the alarm's."""
+    def _put_back_s(self) -> int:
+        """The shortest lag since the alarm over which no shift is far more likely than the alarm's;
+        0 if there is none.
+        """
         assert self.alarm is not None
         lags = _LAGS[: np.searchsorted(_LAGS, min(self._since_alarm, len(self._memory)))]
         H, S = (part / self.long_run for part in self._memory.newest(lags))
         shift = self._to_parent.T @ self.alarm.shift
         off = S - (H @ self._before_alarm)
         for_shift = off @ shift - 0.5 * np.einsum("i,lij,j->l", shift, H, shift)
-        return bool((for_shift < -THRESHOLD).any())
+        return next(iter(lags[for_shift < -THRESHOLD].tolist()), 0)
 
     def _sigmas(self, covariance: FloatArray) -> FloatArray:
         in_parent = self._to_parent @ covariance @ self._to_parent.T

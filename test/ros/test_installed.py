@@ -73,19 +73,23 @@ def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_mov
         *RELIABLE_INPUTS,
     )  # fmt: skip
     publishers = peer.publishers()
-    stamps_ns, Ts_pw_p, Ts_cw_c = noisy(*drive(2400))
+    stamps_ns, Ts_pw_p, Ts_cw_c = noisy(*drive(3000))
     peer.feed(publishers, stamps_ns[:1800], Ts_pw_p[:1800], Ts_cw_c[:1800])
     quiet, values = status("mount", lambda each: "has not moved" in each.message)
     assert quiet.level == DiagnosticStatus.OK
     assert values["alarms"] == "0"
     assert all(float(values[f"visible_10min.{axis}"]) < 0.01 for axis in ("x", "y", "z", "yaw"))
     knocked = se3.exp(np.array([0, 0, 0, 0, 0, np.radians(1.0)]))
-    peer.feed(publishers, stamps_ns[1800:], Ts_pw_p[1800:], Ts_cw_c[1800:] @ knocked)
+    peer.feed(publishers, stamps_ns[1800:2400], Ts_pw_p[1800:2400], Ts_cw_c[1800:2400] @ knocked)
     alarm, values = status("mount", lambda each: each.level == DiagnosticStatus.ERROR)
     assert alarm.message.startswith("the mount has moved: ")
     since_s = (int(values["since_ns"]) - stamps_ns[1800]) * 1e-9
     assert abs(since_s) < 10.0
     node.wait_for_log("the mount has moved: ")
+    peer.feed(publishers, stamps_ns[2400:], Ts_pw_p[2400:], Ts_cw_c[2400:])
+    back, values = status("mount", lambda each: "has not moved" in each.message)
+    assert (back.level, values["alarms"]) == (DiagnosticStatus.OK, "1")
+    node.wait_for_log("the mount is where it was installed again")
     assert "extrinsic" not in node.log
     assert not (tmp_path / "journal").exists()
 
@@ -98,6 +102,8 @@ def test_a_monitor_without_what_is_installed_does_not_start(start_node):
 
 def test_what_cannot_be_read_is_said(start_node, peer, status, tmp_path):
     start_node("-p monitor:=true", f"-p installed:={tmp_path / 'robot.urdf'}", *RELIABLE_INPUTS)
+    early, _ = status("mount", lambda each: True)
+    assert early.message == "no poses yet"
     peer.feed(peer.publishers(), *drive(100))
     mount, _ = status("mount", lambda each: "what is installed is not known" in each.message)
     assert mount.level == DiagnosticStatus.WARN

@@ -1,0 +1,165 @@
+"""The script of the page of ``watch``: it finds what it looks for, and does what it should."""
+
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from hand_eye_calib.watch import web
+from hand_eye_calib.watch.board import Board
+from hand_eye_calib.watch.html import fragment
+
+FOLDER = Path(web.__file__).parent / "page"
+SCRIPT = (FOLDER / "page.js").read_text(encoding="utf-8")
+PAGE = (FOLDER / "page.html").read_text(encoding="utf-8")
+
+# A browser as far as the script needs one: it stands still until it is told what happens.
+BROWSER = """
+let now = 0, tick = null; const log = {posts: [], opened: [], shaken: 0};
+Date.now = () => now;
+const element = (more) => ({
+  dataset: {}, hidden: false, disabled: false, textContent: "", heard: {}, classes: new Set(),
+  classList: {toggle(name, on) { on ? part.connection.classes.add(name)
+                                    : part.connection.classes.delete(name); }},
+  addEventListener(name, run) { this.heard[name] = run; }, ...more});
+const part = {connection: element(), footer: element(), view: element({
+  innerHTML: "",
+  querySelector(what) {
+    if (what === "progress") return this.innerHTML.includes("<progress") ? {} : null;
+    return {textContent: this.innerHTML.match(/<h1>(.*?)<.h1>/)[1].replace(/<[^>]*>/g, "")};
+  }})};
+const keys = ["solve", "save", "reset"].map((request) => element(
+  {dataset: request === "reset" ? {request, sure: "Forget all poses?"} : {request}}));
+globalThis.document = {title: "", getElementById: (id) => part[id],
+  querySelector: () => part.footer, querySelectorAll: () => keys};
+globalThis.location = {search: "?key=word"};
+globalThis.history = {replaceState(a, b, address) { log.address = address; }};
+Object.defineProperty(globalThis, "navigator", {value: {vibrate() { log.shaken += 1; }}});
+let sure = false, answer = {ok: true};
+globalThis.confirm = () => sure;
+globalThis.fetch = (address, {method}) => {
+  log.posts.push(`${method} ${address}`); return Promise.resolve(answer); };
+globalThis.setInterval = (run) => { tick = run; };
+globalThis.EventSource = class {
+  static CLOSED = 2;
+  constructor(address) { this.readyState = 1; log.opened.push(address); events = this; }
+  close() { this.readyState = 2; }
+};
+let events = null;
+const state = () => ({...log, posts: [...log.posts],
+  opened: log.opened.length, last: log.opened.at(-1),
+  title: document.title, said: part.connection.textContent,
+  lost: part.connection.classes.has("lost"), footer: part.footer.hidden,
+  disabled: keys.every((button) => button.disabled)});
+"""
+
+
+class Found(HTMLParser):
+    """Ids, tags and data attributes of a piece of HTML."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.ids, self.tags, self.data = set(), [], {}
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.add(value)
+            if name.startswith("data-"):
+                self.data.setdefault(name, []).append(value)
+
+
+def shown(*names):
+    board = Board()
+    for name in names:
+        board.take(name, [], 0.0)
+    return Found(fragment(board.view("", 0.0)))
+
+
+def test_the_script_finds_what_it_looks_for():
+    page = Found(PAGE)
+    assert set(re.findall(r'getElementById\("(\w+)"\)', SCRIPT)) <= page.ids
+    assert set(re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)) <= set(page.tags)
+    assert tuple(page.data["data-request"]) == web.REQUESTS
+    assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
+    assert page.data["data-sure"] == ["Forget all poses?"]
+
+
+@pytest.mark.parametrize("names", [(), ("/a",), ("/a", "/b")])
+def test_every_view_has_one_word_for_the_title(names):
+    assert shown(*names).tags.count("h1") == 1
+
+
+def test_a_node_is_chosen_by_what_the_script_reads():
+    assert shown("/a", "/b").data["data-node"] == ["/a", "/b"]
+    assert '"a[data-node]"' in SCRIPT
+
+
+def played(steps):
+    """States of the page after each step, given in JavaScript."""
+    run = "\n".join(f"{step}\nawait null; await null; states.push(state());" for step in steps)
+    text = f"{BROWSER}{SCRIPT.replace('use strict', '')}"
+    text += f"(async () => {{ const states = []; {run}\nconsole.log(JSON.stringify(states)); }})();"
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("the script runs in Node.js, which is not installed")
+    done = subprocess.run([node, "-"], input=text, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_page_shows_what_comes_and_says_when_nothing_comes():
+    go_on = "'<h1><span>▶</span> GO ON</h1><progress></progress>'"
+    states = played(
+        [
+            "",
+            f"now = 100; events.onmessage({{data: {go_on}}});",
+            "now = 200; events.onmessage({data: '<h1>MOUNT MOVED</h1>'});",
+            "now = 3000; events.onmessage({data: ''}); tick();",
+            "now = 7500; tick();",
+            "now = 9500; tick();",
+            f"now = 9800; events.onmessage({{data: {go_on}}});",
+            "events.onerror(); now = 10800; tick();",
+        ]
+    )
+    opened, title, said = ([each[key] for each in states] for key in ("opened", "title", "said"))
+    assert opened == [1, 1, 1, 1, 2, 2, 2, 3]
+    assert states[0]["last"] == "events?key=word"
+    assert title[1:4] == ["▶ GO ON", "MOUNT MOVED", "MOUNT MOVED"]
+    assert [each["shaken"] for each in states] == [0, 1, 2, 2, 2, 2, 3, 3]
+    assert [each["footer"] for each in states][1:3] == [False, True]
+    assert [each["disabled"] for each in states] == [False] * 4 + [True, True, False, True]
+    assert said[3:6] == [
+        "✓ connected",
+        "✗ NO CONNECTION for 0 s, trying again ...",
+        "✗ NO CONNECTION for 0 s, trying again ...",
+    ]
+    assert [each["lost"] for each in states][3:7] == [False, True, True, False]
+
+
+def test_buttons_and_nodes_are_asked_for_by_their_addresses():
+    def click(index):
+        return f"keys[{index}].heard.click();"
+
+    link = "{closest: () => ({dataset: {node: '/b'}})}"
+    states = played(
+        [
+            click(0) + click(1),
+            click(2),
+            "sure = true;" + click(2),
+            f"part.view.heard.click({{target: {link}, preventDefault() {{}}}});",
+            "answer = {ok: false};" + click(1),
+        ]
+    )
+    asked = [f"POST {name}?key=word" for name in ("solve", "save", "reset")]
+    assert [each["posts"] for each in states[:3]] == [asked[:2], asked[:2], asked]
+    assert states[3]["address"] == "?key=word&node=%2Fb"
+    assert states[3]["last"] == "events?key=word&node=%2Fb"
+    assert states[4]["posts"][-1] == "POST save?key=word&node=%2Fb"
+    assert states[4]["lost"]
