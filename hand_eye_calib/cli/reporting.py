@@ -101,6 +101,28 @@ def write_check(directory: Path, *arguments: Any) -> None:
         note(f"wrote {path}")
 
 
+def write_rig_report(directory: Path, *arguments: Any) -> None:
+    """Write the report of a rig into a directory; if a library for it is missing, say so and go on.
+
+    Parameters
+    ----------
+    directory : path-like
+    *arguments
+        Those of :func:`~hand_eye_calib.report.rig_page.render_rig`.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    if can_draw(REPORT):
+        from hand_eye_calib.report.rig_page import render_rig
+
+        with waiting_for("writing the report"):
+            path = save_page(Path(directory) / REPORT, render_rig(*arguments))
+        note(f"wrote {path}")
+
+
 def can_draw(file_name: str) -> bool:
     """Whether the libraries for pages are installed; prints which one is missing."""
     try:

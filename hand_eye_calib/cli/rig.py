@@ -63,9 +63,11 @@ def calibrate_and_deliver(
         rig = solve_rig(trajectories, options)
     inputs = {**inputs, "options": dict(options)}
     if arguments.out:
+        from hand_eye_calib.cli.reporting import write_rig_report
         from hand_eye_calib.io.rig_files import save_rig
 
         note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
+        write_rig_report(arguments.out, rig, inputs.get("topics") or inputs["files"])
     print(
         json.dumps(rig.to_dict() | {"inputs": inputs}, indent=2, allow_nan=False)
         if arguments.json

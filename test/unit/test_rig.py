@@ -167,6 +167,9 @@ def test_the_command_prints_and_saves_a_tree(files, capsys, tmp_path):
     document = json.loads(capsys.readouterr().out)
     assert document["sensors"] == ["lidar", "front", "rear"]
     assert document["inputs"]["files"] == files
+    page = (tmp_path / "rig/report.html").read_text(encoding="utf-8")
+    assert "3 sensors in <code>lidar</code>" in page
+    assert "lidar - front - rear closes: off by" in page
     launch = (tmp_path / "rig/static_transform.launch.py").read_text(encoding="utf-8")
     compile(launch, "launch", "exec")
     assert launch.count("'--frame-id', 'lidar'") == 2
