@@ -1,5 +1,5 @@
-"""``python -m reproduction.partial rates``: what streams of rates alone give, against the truth and
-against whole poses.
+"""``python -m reproduction.partial rates`` and ``positions``: what streams of rates or positions
+alone give, against the truth and against whole poses.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.cli.main import exit_code_of
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from reproduction import positions
 from reproduction.coverage import motions
 from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, draw, sigmas
 from reproduction.recordings import recorded_sets
@@ -152,9 +153,17 @@ _TANGO_HEADER = (
 
 def run(arguments: argparse.Namespace) -> int:
     """Make the tables; returns the exit code."""
-    tables = {"rates": markdown_table(_RATE_HEADER, rate_rows(arguments.seeds))}
-    if arguments.data_folder:
-        tables["tango"] = markdown_table(_TANGO_HEADER, tango_rows(arguments.data_folder))
+    seeds, data_folder = arguments.seeds, arguments.data_folder
+    if arguments.what == "rates":
+        tables = {"rates": markdown_table(_RATE_HEADER, rate_rows(seeds))}
+        if data_folder:
+            tables["tango"] = markdown_table(_TANGO_HEADER, tango_rows(data_folder))
+    else:
+        rows = positions.simulated_rows(seeds)
+        tables = {"receivers": markdown_table(positions.SIMULATED_HEADER, rows)}
+        if data_folder:
+            rows = positions.recorded_rows(data_folder)
+            tables["recorded"] = markdown_table(positions.RECORDED_HEADER, rows)
     for name, table in tables.items():
         print(f"{table}\n")
         if arguments.page:
@@ -165,7 +174,7 @@ def run(arguments: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m reproduction.partial", description=__doc__)
-    parser.add_argument("what", choices=("rates",))
+    parser.add_argument("what", choices=("rates", "positions"))
     parser.add_argument(
         "--seeds", type=int, default=40, help="recordings of each kind. Default: 40"
     )

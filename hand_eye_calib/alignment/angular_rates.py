@@ -6,6 +6,7 @@ extrinsic, no common world, no common scale and no particular quaternion order: 
 inverted quaternions have the same angles.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,7 +123,10 @@ class AngularRates:
 
 
 def correlate_rates(
-    parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
+    parent: Trajectory,
+    child: Trajectory,
+    max_gap_s: float = CalibratorConfig.max_gap,
+    of: "Callable[[Trajectory, float, float, float], AngularRates] | None" = None,
 ) -> Correlation:
     """Find the clock offset at which the angular rates of two streams agree best.
 
@@ -132,6 +136,8 @@ def correlate_rates(
         Their time ranges need not overlap.
     max_gap_s : float
         Windows that touch a longer gap between poses are left out, in seconds.
+    of : callable, optional
+        What is correlated; by default :func:`angular_rates`, otherwise :func:`speeds`.
 
     Returns
     -------
@@ -150,8 +156,9 @@ def correlate_rates(
     step_s = float(np.clip(max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S))
     step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES)
     window_s = max(_WINDOW_STEPS * step_s, _MIN_WINDOW_S)
-    of_parent = angular_rates(parent, window_s, step_s, max_gap_s)
-    of_child = angular_rates(child, window_s, step_s, max_gap_s)
+    sampled = of or angular_rates
+    of_parent = sampled(parent, window_s, step_s, max_gap_s)
+    of_child = sampled(child, window_s, step_s, max_gap_s)
     if min(of_parent.covered_s, of_child.covered_s) < _MIN_OVERLAP_S:
         return NO_CORRELATION
     return _best_correlation(of_parent, of_child, window_s)
@@ -186,12 +193,36 @@ def angular_rates(
     trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float
 ) -> AngularRates:
     """Angular rates over windows of ``window_s`` seconds that start every ``step_s`` seconds."""
+
+    def turned(before: FloatArray, after: FloatArray) -> FloatArray:
+        return se3.rotation_angle(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+
+    return _sampled(trajectory, window_s, step_s, max_gap_s, turned)
+
+
+def speeds(
+    trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float
+) -> AngularRates:
+    """The same of the speed (m/s), for sensors without an orientation."""
+
+    def moved(before: FloatArray, after: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1))
+
+    return _sampled(trajectory, window_s, step_s, max_gap_s, moved)
+
+
+def _sampled(
+    trajectory: Trajectory,
+    window_s: float,
+    step_s: float,
+    max_gap_s: float,
+    distance: Callable[[FloatArray, FloatArray], FloatArray],
+) -> AngularRates:
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
     starts_ns = stamps_ns[0] + np.round(np.arange(n_windows) * step_s * 1e9).astype(np.int64)
     ends_ns = starts_ns + round(window_s * 1e9)
-    rotations = [trajectory.at(at_ns)[:, :3, :3] for at_ns in (starts_ns, ends_ns)]
-    rates = se3.rotation_angle(np.swapaxes(rotations[0], 1, 2) @ rotations[1]) / window_s
+    rates = distance(trajectory.at(starts_ns), trajectory.at(ends_ns)) / window_s
     gaps_before = np.r_[0, np.cumsum(np.diff(stamps_ns) > (max_gap_s + window_s) * 1e9)]
     first = np.searchsorted(stamps_ns, starts_ns, side="right") - 1
     last = np.minimum(np.searchsorted(stamps_ns, ends_ns), len(stamps_ns) - 1)

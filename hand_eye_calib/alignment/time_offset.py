@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
+from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates, speeds
 from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
@@ -87,6 +87,28 @@ def estimate_time_offset(
             "drive more varied turns, or give time_offset in seconds"
         )
     return refine_time_offset(parent, child, correlation, max_gap_s)
+
+
+def time_offset_of_speeds(
+    parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
+) -> TimeOffset:
+    """Estimate the offset of the child's clock, coarsely, from the speeds of both sensors: one of
+    them has no orientation.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If the evidence is weak; the message says why.
+    """
+    correlation = correlate_rates(parent, child, max_gap_s, of=speeds)
+    if not correlation.is_clear:
+        raise NotEnoughDataError(
+            "the time offset cannot be estimated from the speeds of both sensors: "
+            f"{correlation.doubt().replace('angular rates', 'speeds')}; drive with more changes of "
+            "speed, or give time_offset in seconds"
+        )
+    sigma_s = max(parent.interval_s, child.interval_s) / 5
+    return TimeOffset(correlation.offset_s, sigma_s, correlation, None)
 
 
 def refine_time_offset(

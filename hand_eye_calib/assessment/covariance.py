@@ -15,6 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from hand_eye_calib.adaptive.lever_arm import LeverArmSolution
 from hand_eye_calib.adaptive.resampling import answers_without
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.adaptive.state_space import NormalEquations
@@ -150,16 +151,40 @@ def assess_rotation(solution: AdaptiveSolution) -> Assessment:
     """
     rotation, unseen = slice(3, 6), solution.unseen[3:]
     covariance = solution.cov_parent_child_in_child[rotation, rotation]
-    if len(solution.jumps) >= _BLOCKS * _MIN_PAIRS_PER_BLOCK:
-        steps = answers_without(solution.part_products, _BLOCKS)[:, rotation]
-        covariance = beyond_chance(covariance, _spread_of_blocks(steps))
-        products, misfit = solution.part_products, solution.misfit
-        covariance = widened_by_halves(covariance, products, misfit, rotation)
+    covariance = _widened_part(covariance, solution, rotation)
     whole = np.zeros((6, 6))
     whole[rotation, rotation] = covariance
     hidden = unseen[:, np.linalg.norm(unseen, axis=0) > _SHARE_OF_ROTATION]
     unknown = [*np.eye(6)[:3], *(np.r_[np.zeros(3), direction] for direction in hidden.T)]
     return combined(solution.T_parent_child, whole, None, basis(unknown))
+
+
+def assess_lever_arm(solution: LeverArmSolution) -> Assessment:
+    """Covariance and observability of a lever arm.
+
+    Parameters
+    ----------
+    solution : LeverArmSolution
+
+    Returns
+    -------
+    Assessment
+        Of a transform with no rotation, which is unknown.
+    """
+    whole = np.zeros((6, 6))
+    whole[:3, :3] = _widened_part(solution.covariance, solution, slice(0, 3))
+    return combined(np.eye(4), whole, None, np.eye(6)[:, 3:])
+
+
+def _widened_part(
+    covariance: FloatArray, solution: AdaptiveSolution | LeverArmSolution, part: slice
+) -> FloatArray:
+    """The model's covariance (3, 3) of a part of xi, widened by blocks and halves."""
+    if len(solution.jumps) < _BLOCKS * _MIN_PAIRS_PER_BLOCK:
+        return covariance
+    steps = answers_without(solution.part_products, _BLOCKS)[:, part]
+    covariance = beyond_chance(covariance, _spread_of_blocks(steps))
+    return widened_by_halves(covariance, solution.part_products, solution.misfit, part)
 
 
 def noise_driven(

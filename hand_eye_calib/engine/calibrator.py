@@ -14,7 +14,11 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import Correlation
 from hand_eye_calib.alignment.similarity import SimilarityFit
-from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
+from hand_eye_calib.alignment.time_offset import (
+    TimeOffset,
+    estimate_time_offset,
+    time_offset_of_speeds,
+)
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
@@ -393,7 +397,10 @@ class Calibrator:
         if self._time_offset is None:
             parent, child = self._buffers["parent"].poses(), self._buffers["child"].poses()
             try:
-                self._time_offset = self._proposed_offset or estimate_time_offset(
+                estimate = estimate_time_offset
+                if self._config.measured == "positions":
+                    estimate = time_offset_of_speeds
+                self._time_offset = self._proposed_offset or estimate(
                     parent.trajectory, child.trajectory, self._config.max_gap
                 )
             except NotEnoughDataError:

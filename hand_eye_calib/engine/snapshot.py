@@ -6,21 +6,29 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
+from hand_eye_calib.alignment.time_offset import (
+    TimeOffset,
+    estimate_time_offset,
+    time_offset_of_speeds,
+)
 from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.checks.check import CheckResult, check_streams
 from hand_eye_calib.checks.findings import answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
+from hand_eye_calib.engine.lever_arms import estimate_lever_arm
 from hand_eye_calib.engine.pose_buffer import RawPoses
 from hand_eye_calib.engine.rotations import estimate_rotation
 from hand_eye_calib.engine.scatter import quick_cross_check
-from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
 STREAMS = ("parent", "child")
+
+# What estimates a part of the extrinsic, by what the streams measure.
+_OF_PARTS = {"rotations": estimate_rotation, "positions": estimate_lever_arm}
 
 # A time offset that is closer than this to the one that the poses were paired with stays (s).
 _NEGLIGIBLE_S = 0.005
@@ -85,9 +93,10 @@ class Snapshot:
     def _resolved(self) -> "Snapshot":
         if not isinstance(self.config.time_offset, str):
             return self
-        found = self.time_offset or estimate_time_offset(
-            self.parent, self.child, self.config.max_gap
-        )
+        estimate = estimate_time_offset
+        if self.config.measured == "positions":
+            estimate = time_offset_of_speeds
+        found = self.time_offset or estimate(self.parent, self.child, self.config.max_gap)
         config = replace(self.config, time_offset=found.seconds)
         return replace(self, config=config, time_offset=found)
 
@@ -138,16 +147,15 @@ class Snapshot:
 
     def _estimate_part(self) -> Calibration:
         """The part of the extrinsic that streams without rotations or positions show."""
-        if self.config.measured == "positions":
-            raise ConfigError("positions alone are read, but not calibrated with yet")
-        result = estimate_rotation(self._pose_pairs, self.config)
+        estimate = _OF_PARTS[self.config.measured]
+        result = estimate(self._pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)
         if len(self.kept) or abs(found_s - given_s) < _NEGLIGIBLE_S:
             return result
         # Interpolated where the other stream has its poses, rather than moved along its velocity.
         config = replace(self.config, time_offset=found_s)
         moved = replace(self, config=config)._pose_pairs
-        return estimate_rotation(moved, config) if len(moved) >= self.config.min_pairs else result
+        return estimate(moved, config) if len(moved) >= self.config.min_pairs else result
 
     def _named(self, result: Calibration) -> Calibration:
         """With the frames, and what there is to say of them."""

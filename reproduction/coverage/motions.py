@@ -142,6 +142,22 @@ def flat_agv(rng: np.random.Generator, duration_s: float) -> Motion:
     return agv(rng, duration_s, ramps=False)
 
 
+def excavator(rng: np.random.Generator, duration_s: float) -> Motion:
+    """The cab of an excavator: it slews to and fro, rocks, and now and then drives a little."""
+    times = _grid(duration_s)
+    slewing = _smooth_steps(rng, times, 4.0, lambda size: rng.normal(0.0, 0.5, size), 0.5)
+    tilt = np.radians(2.0) * _waves(rng, times, 2, (0.1, 0.6))
+    tilt += np.radians(4.0) * _waves(rng, times, 2, (0.01, 0.05), 3)
+    speeds = [0.0, 0.0, 0.0, 0.6, -0.6]
+    speed = _smooth_steps(rng, times, 6.0, lambda size: rng.choice(speeds, size), 0.6)
+    steering = _smooth_steps(rng, times, 6.0, lambda size: rng.normal(0.0, 0.8, size), 0.5)
+    heading = np.cumsum(0.15 * (speed != 0) * steering) / _RATE
+    velocity = np.stack([speed * np.cos(heading), speed * np.sin(heading), 0.02 * speed], axis=-1)
+    positions = np.cumsum(velocity, axis=0) / _RATE + 0.01 * _waves(rng, times, 3, (0.3, 1.0))
+    yaw = heading + np.cumsum(slewing) / _RATE
+    return Motion(_from_euler(np.column_stack([yaw, tilt]), positions))
+
+
 def drone(rng: np.random.Generator, duration_s: float) -> Motion:
     """A multicopter: its tilt makes its acceleration, its yaw follows slowly."""
     times = _grid(duration_s)

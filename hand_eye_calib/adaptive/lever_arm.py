@@ -1,0 +1,458 @@
+"""The lever arm of a sensor that measures only positions: a GNSS antenna, the prism of a total
+station.
+
+The sensor's orientation is that of the other one, as that is known from its own odometry, in the
+world of the positions: a latent rotation of each pose that may be anything, but changes from pose
+to pose as the odometry says, up to its drift. So this is the state space of the adaptive estimator
+(:mod:`~hand_eye_calib.adaptive.state_space`) with a white rotation error without bounds; the
+rotations are updated from what the positions say of them, until they stay. The sensor's frame has
+the axes of the other one by convention: ``X = (I, l)``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.adaptive import noise_model, reml
+from hand_eye_calib.adaptive.estimator import rough_levels, sample
+from hand_eye_calib.adaptive.increments import (
+    N_SYSTEMATIC,
+    SCALE,
+    TIME,
+    Course,
+    Streams,
+    course_of,
+    linearise,
+)
+from hand_eye_calib.adaptive.noise_model import SCALE_DRIFT, Extent, NoiseModel, Slow
+from hand_eye_calib.adaptive.outliers import Outliers, judged, surprises
+from hand_eye_calib.adaptive.resampling import part_products
+from hand_eye_calib.adaptive.state_space import Posterior, StateSpace, multiplied
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.geometry import se3
+
+# Log variance (rad^2) of orientations that may be anything, and bounds of their walk.
+_ANY_ROTATION = float(np.log(100.0))
+_LEAST_WALK, _MOST_WALK = np.log(1e-12), np.log(0.1)
+_FIRST_WALK = np.log(1e-6)
+_LEAST_WHITE_SHARE, _LEAST_WALK_SHARE = -14.0, -12.0
+
+# Poses of the windows that are aligned by themselves: for the first lever arm, and for the first
+# orientations. The first lever arm is drawn to zero by so much where the motion does not show it.
+_START_WINDOW, _ALIGNED_WINDOW = 60, 100
+_START_STEPS, _SETTLED_START, _DRAWN = 50, 1e-6, 1e-6
+
+# Rounds of updating the orientations; those after which noise levels are fitted, errors that last
+# are looked for, and outliers; X moves by less than this share of its sigma in the last.
+_ROUNDS = 10
+_FITS, _LASTING, _OUTLIERS, _QUALITY = (1, 2, 4, 6), 2, (3, 5), (2, 4, 5)
+_SETTLED = 0.1
+
+# An error that lasts is part of the model if the loss is so much lower with it; it starts at this
+# share of the rest.
+_LEAST_GAIN, _FIRST_SHARE = 4.0, np.exp(-1.0)
+
+# Noise levels need no more poses than this.
+_MOST_POSES = 300
+
+# A jump is a step of the walk with this many times the variance that it needs.
+_JUMP_FACTOR = 10.0
+
+# The quality of a solution is that of so many positions around; those whose squared errors exceed
+# the median by this factor count less.
+_NEIGHBOURS, _WORSE, _STUDENT = 11, 16.0, 4.0
+
+# Errors of odometry that are the same all the time: of the direction of travel (rad) and of the
+# scale, as in the common-mode floor.
+_PARENT_BIAS = [4, 5, 6]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeverArmSolution:
+    """A lever arm and what it rests on.
+
+    Attributes
+    ----------
+    lever_arm : (3,) array
+        m, in the axes of the sensor with poses.
+    covariance : (3, 3) array
+        Under the model, misfit accounted for.
+    by_scale, by_direction : (3,) and (3, 3) arrays
+        Derivatives of the lever arm by the scale of the odometry, and by a sideways error of it
+        per metre travelled.
+    time_offset_s, time_offset_sigma_s, scale, scale_sigma : float
+        As of an AdaptiveSolution.
+    model, levels
+        Noise model and its log levels.
+    weights : (N,) array
+        Of the positions: below 1 where their quality is worse.
+    jumps : (n,) bool array
+    spikes : (N,) bool array
+    part_products : (K, p + 1, p + 1) array
+    misfit, objective : float
+    converged : bool
+    """
+
+    lever_arm: FloatArray
+    covariance: FloatArray
+    by_scale: FloatArray
+    by_direction: FloatArray
+    time_offset_s: float
+    time_offset_sigma_s: float
+    scale: float
+    scale_sigma: float
+    model: NoiseModel
+    levels: FloatArray
+    weights: FloatArray
+    jumps: BoolArray
+    spikes: BoolArray
+    part_products: FloatArray
+    misfit: float
+    objective: float
+    converged: bool
+
+    def describe(self, stamps_ns: IntArray) -> dict[str, object]:
+        """The noise in plain values and in words, as of an AdaptiveSolution."""
+        sigmas = np.exp(0.5 * self.levels)
+        white, walk = float(sigmas[noise_model.TRANSLATION]), float(sigmas[noise_model.N_FAST - 2])
+        turned = float(np.degrees(sigmas[noise_model.N_FAST - 1]))
+        worse = float(np.mean(self.weights < 1.0))
+        said = [
+            f"each position is off by {100 * white:.2g} cm per axis, and the odometry drifts by "
+            f"{100 * walk:.2g} cm and {turned:.2g} deg from one to the next"
+        ]
+        if worse:
+            said.append(f"{worse:.0%} of the positions are far less precise, and count less")
+        for what, found in (("jumps", self.jumps), ("positions wrong by themselves", self.spikes)):
+            if found.any():
+                said.append(f"{int(found.sum())} {what}")
+        return {
+            "translation_white_m": white,
+            "translation_drift_m_per_pose": walk,
+            "rotation_drift_rad_per_pose": float(np.radians(turned)),
+            "lasting": [],
+            "share_of_worse_positions": worse,
+            "jumps_before_stamp_ns": stamps_ns[1:][self.jumps].tolist(),
+            "spikes_at_stamp_ns": stamps_ns[self.spikes].tolist(),
+            "misfit": self.misfit,
+            "in_words": said,
+        }
+
+
+def solve(
+    stamps_ns: IntArray, Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool = False
+) -> LeverArmSolution:
+    """Estimate the lever arm of a sensor that measures positions.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    Ts_pw_p : (N, 4, 4) array
+        Poses of the other sensor in its world.
+    positions : (N, 3) array
+        At the same stamps, in a world of their own.
+    with_scale : bool
+        Whether to estimate the scale between both worlds.
+    """
+    stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
+    lever_arm = _first_lever_arm(Ts_pw_p, positions)
+    state = _State.first(stamps_s, Ts_pw_p, positions, lever_arm, with_scale)
+    for number in range(_ROUNDS):
+        state = state.fitted() if number in _FITS else state
+        state = state.with_lasting_error() if number == _LASTING else state
+        posterior = state.posterior()
+        if number in _OUTLIERS:
+            state = state.with_outliers(posterior)
+        if number in _QUALITY:
+            state = state.with_quality(posterior)
+        step = posterior.normal.step
+        is_small = np.abs(step[:3]) < _SETTLED * np.sqrt(np.diag(posterior.normal.covariance)[:3])
+        converged = number > max(_FITS) and bool(is_small.all())
+        if converged:
+            break
+        state = state.moved(posterior)
+    return _solution(state, posterior, converged)
+
+
+def _first_lever_arm(Ts_pw_p: FloatArray, positions: FloatArray) -> FloatArray:
+    """The lever arm (3,) that fits windows best, each aligned by itself; bad ones count less."""
+    size = min(_START_WINDOW, len(positions))
+    count = len(positions) // size
+    axes, path, measured = (
+        _centred(values[: count * size].reshape(count, size, *values.shape[1:]))
+        for values in (Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions)
+    )
+    information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
+    lever_arm = np.zeros(3)
+    for _ in range(_START_STEPS):
+        rotations = _rotations(measured, axes @ lever_arm + path)
+        residuals = measured @ rotations - path
+        errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
+        weights = 1.0 / (1.0 + (errors / (np.median(errors) + 1e-12)) ** 2)
+        pulled = np.einsum("n,nkij,nki->j", weights, axes, residuals)
+        before = lever_arm
+        lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), pulled)
+        if np.abs(lever_arm - before).max() < _SETTLED_START:
+            break
+    return lever_arm
+
+
+def _centred(windows: FloatArray) -> FloatArray:
+    return windows - windows.mean(axis=1, keepdims=True)
+
+
+def _rotations(measured: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of windows, centred."""
+    left, _, right = np.linalg.svd(np.einsum("nki,nkj->nij", measured, predicted))
+    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+    return np.asarray(left @ right)
+
+
+def _aligned(Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) of the positions, with the other sensor's orientations turned into their
+    world, window by window.
+    """
+    predicted = Ts_pw_p[:, :3, :3] @ lever_arm + Ts_pw_p[:, :3, 3]
+    n_poses = len(positions)
+    size = min(_ALIGNED_WINDOW, n_poses)
+    rotations = np.empty((n_poses, 3, 3))
+    for start in range(0, n_poses, size):
+        first = max(min(start, n_poses - size), 0)  # the last window is as long as the others
+        window = slice(first, first + size)
+        turn = _rotations(_centred(positions[None, window]), _centred(predicted[None, window]))[0]
+        rotations[start : start + size] = turn @ Ts_pw_p[start : start + size, :3, :3]
+    return se3.from_rotation_translation(rotations, positions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _State:
+    """Where the search stands.
+
+    Attributes
+    ----------
+    streams : Streams
+        The child's poses are its positions with the orientations known so far.
+    columns : list of int
+        Parameters of systematic errors in the model, of ``parameters`` (11,).
+    boost : (n,) array
+        Factors of the walk's variance: above 1 at jumps.
+    """
+
+    streams: Streams
+    lever_arm: FloatArray
+    columns: list[int]
+    parameters: FloatArray
+    model: NoiseModel
+    levels: FloatArray
+    outliers: Outliers
+    boost: FloatArray
+    weights: FloatArray
+
+    @classmethod
+    def first(
+        cls,
+        stamps_s: FloatArray,
+        Ts_pw_p: FloatArray,
+        positions: FloatArray,
+        lever_arm: FloatArray,
+        with_scale: bool,
+    ) -> _State:
+        """Where it begins."""
+        streams = Streams(stamps_s, Ts_pw_p, _aligned(Ts_pw_p, positions, lever_arm))
+        steps = np.linalg.norm(np.diff(Ts_pw_p[:, :3, 3], axis=0), axis=1)
+        interval_s = float(np.median(np.diff(stamps_s)))
+        extent = Extent(interval_s, max(float(np.median(steps)), 1e-9), float(stamps_s[-1]))
+        n = len(steps)
+        state = cls(
+            streams=streams,
+            lever_arm=lever_arm,
+            columns=[SCALE, TIME] if with_scale else [TIME],
+            parameters=np.zeros(N_SYSTEMATIC),
+            model=NoiseModel((SCALE_DRIFT,), "time", "sensors", extent),
+            levels=np.zeros(0),
+            outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
+            boost=np.ones(n),
+            weights=np.ones(n + 1),
+        )
+        residuals = linearise(streams, state.course, state.X, state.parameters).residuals
+        white, walk = rough_levels(residuals, np.zeros(n, dtype=bool))
+        white[1], walk[1] = _ANY_ROTATION, _FIRST_WALK
+        return dataclasses.replace(state, levels=state.model.first_levels(white, walk))
+
+    @property
+    def X(self) -> FloatArray:
+        """The lever arm as a transform (4, 4)."""
+        return se3.from_rotation_translation(np.eye(3), self.lever_arm)
+
+    @property
+    def course(self) -> Course:
+        """Of the sensor with poses, at the lever arm: free of the noise of the positions."""
+        streams = self.streams
+        moved = Streams(streams.stamps_s, streams.Ts_pw_p, streams.Ts_pw_p @ self.X)
+        return course_of(moved, self.X)
+
+    def space(
+        self, model: NoiseModel | None = None, columns: list[int] | None = None
+    ) -> StateSpace:
+        """State space of all poses."""
+        model, X = model or self.model, self.X
+        course = self.course
+        space = model.state_space(
+            self.streams,
+            linearise(self.streams, course, X, self.parameters),
+            course.twists,
+            X,
+            self.columns if columns is None else columns,
+            np.where(self.outliers.spikes, 0.0, self.weights),
+            np.zeros(len(self.boost), dtype=bool),
+        )
+        return _of_positions(space, X, self.boost)
+
+    def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
+        """State space of as many poses as noise levels need."""
+        kept = sample(len(self.streams), _MOST_POSES)
+        if kept is None:
+            return self.space(model)
+        jumps = self.outliers.across(kept).jumps
+        return dataclasses.replace(
+            self,
+            streams=self.streams[kept],
+            outliers=Outliers(jumps, self.outliers.spikes[kept]),
+            boost=np.where(jumps, self.boost.max(), 1.0),
+            weights=self.weights[kept],
+        ).space(model)
+
+    def posterior(self) -> Posterior:
+        """Of all poses."""
+        return Posterior(self.space(), self.levels)
+
+    def fitted(self) -> _State:
+        """With noise levels fitted."""
+        fit = reml.fit(self.sampled_space(), self.levels, _prior(self.model, self.levels))
+        return dataclasses.replace(self, levels=fit.levels)
+
+    def with_lasting_error(self) -> _State:
+        """With an error of the positions that lasts, if the data ask for it."""
+        extent, levels = self.model.extent, self.levels
+        start = np.logaddexp(levels[noise_model.TRANSLATION], levels[noise_model.WALK_TRANSLATION])
+        fits = []
+        for kind in ("body", "world"):
+            for tau_s in self.model.taus_s():
+                model = self.model.richer((Slow(kind, "translation"), *self.model.slow))
+                more = [start + np.log(_FIRST_SHARE), np.log(max(tau_s, 2 * extent.interval_s))]
+                richer = np.concatenate(
+                    [levels[: noise_model.N_FAST], more, levels[noise_model.N_FAST :]]
+                )
+                fits.append(
+                    (model, reml.fit(self.sampled_space(model), richer, _prior(model, richer)))
+                )
+        model, best = min(fits, key=lambda each: each[1].loss)
+        before = Posterior(self.sampled_space(), levels).loss
+        if before - best.loss < _LEAST_GAIN:
+            return self
+        return dataclasses.replace(self, model=model, levels=best.levels)
+
+    def with_outliers(self, posterior: Posterior) -> _State:
+        """With jumps, which are large steps of the walk, and positions wrong by themselves."""
+        of_walk, of_white = surprises(posterior, self.outliers.spikes)
+        found = judged(self.outliers, of_walk, of_white, with_spikes=True)
+        boost = np.where(found.jumps, np.maximum(_JUMP_FACTOR * of_walk, self.boost), 1.0)
+        return dataclasses.replace(self, outliers=found, boost=boost)
+
+    def with_quality(self, posterior: Posterior) -> _State:
+        """With weights below 1 where the positions around one are clearly worse than the rest."""
+        states = posterior.states_after(posterior.normal.step)[:, :3]
+        spread = posterior.selected_inverse[0][:, range(3), range(3)]
+        squares = (states**2 + spread).sum(axis=1) / np.exp(self.levels[noise_model.TRANSLATION])
+        window = min(_NEIGHBOURS, len(squares))
+        around = np.convolve(squares, np.ones(window), mode="same")
+        counts = np.convolve(np.ones(len(squares)), np.ones(window), mode="same")
+        expected = 3.0 * counts
+        is_worse = around / counts > _WORSE * float(np.median(around / counts))
+        weights = np.where(is_worse, (_STUDENT + expected) / (_STUDENT + around), 1.0)
+        return dataclasses.replace(self, weights=np.minimum(weights, 1.0))
+
+    def moved(self, posterior: Posterior) -> _State:
+        """After a step, with the orientations that the positions ask for."""
+        states = posterior.states_after(posterior.normal.step)
+        turns = self.model.lasting(states, self.streams, self.X)[:, 3:]
+        Ts_cw_c = self.streams.Ts_cw_c.copy()
+        Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
+        parameters = self.parameters.copy()
+        parameters[self.columns] += posterior.normal.step[3:]
+        return dataclasses.replace(
+            self,
+            streams=dataclasses.replace(self.streams, Ts_cw_c=Ts_cw_c),
+            lever_arm=self.lever_arm + posterior.normal.step[:3],
+            parameters=parameters,
+        )
+
+
+def _of_positions(space: StateSpace, X: FloatArray, boost: FloatArray) -> StateSpace:
+    """A state space without a rotation to estimate, with orientations that may be anything, and
+    with a walk that is the odometry's.
+    """
+    to_child = se3.adjoint(se3.inverse(X))
+    translation, rotation = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
+    return dataclasses.replace(
+        space,
+        relative=space.relative * boost,
+        columns=np.delete(space.columns, [3, 4, 5], axis=2),
+        white=(translation[None], rotation[None]),
+        walk=(translation, to_child @ rotation @ to_child.T),
+    )
+
+
+def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
+    """What is known of log levels beforehand, for a search from these."""
+    prior = model.prior(levels)
+    lower, upper = prior.lower.copy(), prior.upper.copy()
+    white, walk = noise_model.TRANSLATION, noise_model.WALK_TRANSLATION
+    total = np.logaddexp(levels[walk], levels[white] + np.log(2.0))
+    least = np.log(noise_model.LOWEST_VARIANCE)
+    lower[white] = max(least, total + _LEAST_WHITE_SHARE)
+    lower[walk] = max(least, total + _LEAST_WALK_SHARE)
+    lower[noise_model.ROTATION] = upper[noise_model.ROTATION] = _ANY_ROTATION
+    lower[noise_model.WALK_ROTATION] = _LEAST_WALK
+    upper[noise_model.WALK_ROTATION] = _MOST_WALK
+    return dataclasses.replace(prior, lower=lower, upper=upper)
+
+
+def _solution(state: _State, posterior: Posterior, converged: bool) -> LeverArmSolution:
+    normal = posterior.normal
+    n_evidence = len(state.boost) - int(state.outliers.spikes.sum())
+    misfit = normal.cost / max(3 * n_evidence - 3 - len(state.columns), 1)
+    covariance = max(misfit, 1.0) * normal.covariance
+    sigmas = np.zeros(N_SYSTEMATIC)
+    sigmas[state.columns] = np.sqrt(np.diag(covariance)[3:])
+    return LeverArmSolution(
+        lever_arm=state.lever_arm + normal.step[:3],
+        covariance=covariance[:3, :3],
+        **_by_common_errors(state),
+        time_offset_s=-float(state.parameters[TIME]),
+        time_offset_sigma_s=float(sigmas[TIME]),
+        scale=1.0 + float(state.parameters[SCALE]),
+        scale_sigma=float(sigmas[SCALE]),
+        model=state.model,
+        levels=state.levels,
+        weights=state.weights,
+        jumps=state.outliers.jumps,
+        spikes=state.outliers.spikes,
+        part_products=part_products(posterior),
+        misfit=misfit,
+        objective=0.5 * (posterior.log_determinant + normal.cost),
+        converged=converged,
+    )
+
+
+def _by_common_errors(state: _State) -> dict[str, FloatArray]:
+    """Derivatives of the lever arm by errors of the odometry that are the same all the time."""
+    space = state.space(columns=[SCALE, *_PARENT_BIAS])
+    posterior = Posterior(space, state.levels)
+    products = multiplied(space.columns, posterior.weighed(space.columns))
+    products -= multiplied(posterior.whitened, posterior.whitened)
+    by = -np.linalg.lstsq(products[:3, :3], products[:3, 3:-1], rcond=None)[0]
+    return {"by_scale": by[:, 0], "by_direction": by[:, 1:]}

@@ -1,0 +1,163 @@
+"""From a stream of positions beside one of poses to a calibration: the lever arm, and the time
+offset. The rotation is out of reach; by convention the sensor that measures positions has the axes
+of the other one.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hand_eye_calib.adaptive import lever_arm
+from hand_eye_calib.adaptive.lever_arm import LeverArmSolution
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
+from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
+from hand_eye_calib.assessment.prior import fuse
+from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
+from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.pairing.synchronise import PosePairs
+
+# Two streams of which more than this share of the path stays unexplained are not of one body, over
+# motions of so many poses.
+_UNRELATED, _SPAN = 0.5, 10
+
+
+def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
+    """Solve and assess synchronised poses and positions.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        On one clock. Of the sensor that measures positions, orientations are not looked at.
+    config : CalibratorConfig
+        With a time offset in seconds, which the poses already have.
+
+    Returns
+    -------
+    Calibration
+        Without frame names. Its rotation is the identity, and unknown.
+    """
+    is_child = config.child_measures == "positions"
+    poses, measured = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
+    if not is_child:
+        poses, measured = measured, poses
+    if not isinstance(config.scale, str):
+        measured = _scaled(measured, config.scale if is_child else 1.0)
+        poses = _scaled(poses, 1.0 if is_child else config.scale)
+    positions = measured[:, :3, 3]
+    with_scale = config.scale in ("auto", "estimate")
+    solution = lever_arm.solve(pose_pairs.stamps_ns, poses, positions, with_scale)
+    sign = 1.0 if is_child else -1.0
+    T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
+    fused = fuse(T, assess_lever_arm(solution), config.prior())
+    result = _calibration(solution, fused.assessment, pose_pairs, config)
+    status = SolveStatus.CONTRADICTED if fused.contradictions else result.status
+    given = config.scale if not isinstance(config.scale, str) else 1.0
+    scale = solution.scale if is_child else 1.0 / solution.scale
+    return replace(
+        result,
+        T_parent_child=fused.T_parent_child,
+        T_method=T,
+        status=status,
+        contradictions=fused.contradictions,
+        time_offset_s=float(config.time_offset) + sign * solution.time_offset_s,
+        scale=given * scale,
+        scale_sigma=solution.scale_sigma * scale**2,
+        motion_residuals=_residuals(solution, poses, positions, pose_pairs),
+        findings=tuple(_unrelated(solution, poses, positions)),
+    )
+
+
+def _scaled(Ts: FloatArray, scale: float) -> FloatArray:
+    scaled = Ts.copy()
+    scaled[:, :3, 3] *= scale
+    return scaled
+
+
+def _calibration(
+    solution: LeverArmSolution,
+    assessment: Assessment,
+    pose_pairs: PosePairs,
+    config: CalibratorConfig,
+) -> Calibration:
+    """What does not depend on which of the sensors has positions."""
+    is_known = all(
+        dof.verdict is not DofVerdict.UNOBSERVABLE for dof in assessment.observability[:3]
+    )
+    status = SolveStatus.OK if is_known else SolveStatus.UNOBSERVABLE
+    return Calibration(
+        T_parent_child=np.eye(4),
+        covariance=assessment.cov_parent_child_in_child,
+        status=status if solution.converged else SolveStatus.NOT_CONVERGED,
+        observability=assessment.observability,
+        measured="positions",
+        floor=_floor(solution),
+        objective=solution.objective,
+        method="adaptive",
+        reference="increments",
+        backend="fast",
+        n_poses=len(pose_pairs),
+        n_pairs=len(pose_pairs) - 1,
+        n_inliers=len(pose_pairs) - 1 - int((solution.jumps | solution.spikes[1:]).sum()),
+        time_offset_sigma_s=solution.time_offset_sigma_s,
+        noise=solution.describe(pose_pairs.stamps_ns),
+        target_translation=config.target_translation,
+        target_rotation=config.target_rotation,
+        stamp_ns=int(pose_pairs.stamps_ns[-1]),
+    )
+
+
+def _floor(solution: LeverArmSolution) -> FloatArray:
+    """Covariance (6, 6) of errors of the odometry that are the same all the time."""
+    floor = np.zeros((6, 6))
+    by_scale, by_direction = solution.by_scale, solution.by_direction
+    floor[:3, :3] = FLOOR_SCALE**2 * np.outer(by_scale, by_scale)
+    floor[:3, :3] += FLOOR_ROTATION**2 * by_direction @ by_direction.T
+    return floor
+
+
+def _residuals(
+    solution: LeverArmSolution,
+    poses: FloatArray,
+    positions: FloatArray,
+    pose_pairs: PosePairs,
+) -> Residuals:
+    """Of the steps from each position to the next, along the axes of the sensor with poses."""
+    steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
+    axes = np.swapaxes(poses[:-1, :3, :3], 1, 2)
+    excess = np.linalg.norm(steps, axis=1) - np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    along = steps / np.maximum(np.linalg.norm(steps, axis=1), 1e-12)[:, None]
+    return Residuals(
+        translation=(axes @ (excess[:, None] * along)[:, :, None])[:, :, 0],
+        rotation=np.zeros((len(steps), 3)),
+        weights=(~(solution.jumps | solution.spikes[1:])).astype(float),
+        start_ns=pose_pairs.stamps_ns[:-1],
+        end_ns=pose_pairs.stamps_ns[1:],
+    )
+
+
+def _unrelated(
+    solution: LeverArmSolution, poses: FloatArray, positions: FloatArray
+) -> list[dict[str, object]]:
+    """A finding if the distances of the positions are not those that the other sensor moves it."""
+    span = min(_SPAN, max(len(poses) // 10, 1))
+    predicted = poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3]
+    far, expected = (
+        np.linalg.norm(path[span:] - path[:-span], axis=1)
+        for path in (solution.scale * positions, predicted)
+    )
+    share = float(np.median(np.abs(far - expected)) / max(float(np.median(far)), 1e-12))
+    if share < _UNRELATED:
+        return []
+    found = Finding(
+        code="unrelated",
+        stream="both",
+        severity=Severity.ERROR,
+        confidence=Confidence.LIKELY,
+        what=f"the distances between positions differ by {share:.0%} from those of the odometry",
+        advice="check that both are on one rigid body, the units, the scale, and the clocks "
+        "(time_offset estimate)",
+    )
+    return [found.to_dict()]
