@@ -69,8 +69,8 @@ def simulated_positions(name: str, seed: int) -> tuple[Trajectory, Trajectory, F
     times_s: FloatArray = np.arange(round(machine.duration_s * 10.0)) / 10.0
     true_poses, twists = motion.at(times_s), motion.twists(times_s)
     poses = draw(machine.odometry, true_poses, twists, 0.1, odometry_rng).poses
-    fixes_s: FloatArray = np.arange(round((machine.duration_s - 1.0) * receiver.rate_hz)) + 0.25
-    fixes_s = fixes_s / receiver.rate_hz
+    n_fixes = round((machine.duration_s - 1.0) * receiver.rate_hz)
+    fixes_s: FloatArray = (np.arange(n_fixes, dtype=np.float64) + 0.25) / receiver.rate_hz
     Ts = motion.at(fixes_s)
     yaw = mount_rng.uniform(-np.pi, np.pi)
     positions = (Ts[:, :3, :3] @ lever_arm + Ts[:, :3, 3]) @ se3.rotation_exp(np.r_[0, 0, yaw])

@@ -324,7 +324,7 @@ def _start(streams: Streams, columns: list[int]) -> _State:
         outliers = with_jumps_across_spikes(outliers, linearisation.residuals, bridging)
     model = NoiseModel((SCALE_DRIFT,), "time", _centre(streams, T, linearisation.residuals), extent)
     beside = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
-    levels = model.first_levels(*_rough_levels(linearisation.residuals, beside))
+    levels = model.first_levels(*rough_levels(linearisation.residuals, beside))
     return _State(
         streams=streams,
         poses=poses,
@@ -351,7 +351,7 @@ def _centre(streams: Streams, T: FloatArray, residuals: FloatArray) -> str:
     return best if sizes[best] < _DECISIVE * sizes["sensors"] else "sensors"
 
 
-def _rough_levels(residuals: FloatArray, left_out: np.ndarray) -> tuple[FloatArray, FloatArray]:
+def rough_levels(residuals: FloatArray, left_out: np.ndarray) -> tuple[FloatArray, FloatArray]:
     """Log variances of white noise (2,) and of the walk (2,), from scatter and correlation.
 
     Differences of white noise have variance 2 s^2 and a covariance of -s^2 with their neighbours;

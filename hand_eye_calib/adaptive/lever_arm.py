@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,6 +35,9 @@ from hand_eye_calib.adaptive.state_space import Posterior, StateSpace, multiplie
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 
+# Of the latent states.
+_WHITE_ROTATION = slice(3, 6)
+
 # Log variance (rad^2) of orientations that may be anything, and bounds of their walk.
 _ANY_ROTATION = float(np.log(100.0))
 _LEAST_WALK, _MOST_WALK = np.log(1e-12), np.log(0.1)
@@ -50,6 +54,12 @@ _START_STEPS, _SETTLED_START, _DRAWN = 50, 1e-6, 1e-6
 _ROUNDS = 10
 _FITS, _LASTING, _OUTLIERS, _QUALITY = (1, 2, 4, 6), 2, (3, 5), (2, 4, 5)
 _SETTLED = 0.1
+
+# Standard deviation (m) of lever arms before anything is known.
+_LONG_M = 10.0
+
+# An axis that is not known to this (m) need not settle: noise moves it on and on.
+_UNKNOWN_M = 0.2
 
 # An error that lasts is part of the model if the loss is so much lower with it; it starts at this
 # share of the rest.
@@ -114,11 +124,21 @@ class LeverArmSolution:
     objective: float
     converged: bool
 
+    def noise_over(self, n_poses: int) -> float:
+        """Standard deviation (m) of the error of the motion over so many poses."""
+        white, walk = np.exp(
+            self.levels[[noise_model.TRANSLATION, noise_model.WALK_TRANSLATION]]
+        ).tolist()
+        return float(np.sqrt(3.0 * (2.0 * white + n_poses * walk)))
+
     def describe(self, stamps_ns: IntArray) -> dict[str, object]:
         """The noise in plain values and in words, as of an AdaptiveSolution."""
         sigmas = np.exp(0.5 * self.levels)
-        white, walk = float(sigmas[noise_model.TRANSLATION]), float(sigmas[noise_model.N_FAST - 2])
-        turned = float(np.degrees(sigmas[noise_model.N_FAST - 1]))
+        white, walk = (
+            float(sigmas[level])
+            for level in (noise_model.TRANSLATION, noise_model.WALK_TRANSLATION)
+        )
+        turned = float(np.degrees(sigmas[noise_model.WALK_ROTATION]))
         worse = float(np.mean(self.weights < 1.0))
         said = [
             f"each position is off by {100 * white:.2g} cm per axis, and the odometry drifts by "
@@ -158,8 +178,8 @@ def solve(
         Whether to estimate the scale between both worlds.
     """
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
-    lever_arm = _first_lever_arm(Ts_pw_p, positions)
-    state = _State.first(stamps_s, Ts_pw_p, positions, lever_arm, with_scale)
+    lever_arm, scale = _first_answer(Ts_pw_p, positions, with_scale)
+    state = _State.first(stamps_s, Ts_pw_p, scale * positions, lever_arm, with_scale)
     for number in range(_ROUNDS):
         state = state.fitted() if number in _FITS else state
         state = state.with_lasting_error() if number == _LASTING else state
@@ -169,16 +189,21 @@ def solve(
         if number in _QUALITY:
             state = state.with_quality(posterior)
         step = posterior.normal.step
-        is_small = np.abs(step[:3]) < _SETTLED * np.sqrt(np.diag(posterior.normal.covariance)[:3])
-        converged = number > max(_FITS) and bool(is_small.all())
+        sigmas = np.sqrt(np.diag(posterior.normal.covariance)[:3])
+        is_settled = (np.abs(step[:3]) < _SETTLED * sigmas) | (sigmas > _UNKNOWN_M)
+        converged = number > max(_FITS) and bool(is_settled.all())
         if converged:
             break
         state = state.moved(posterior)
-    return _solution(state, posterior, converged)
+    return _solution(state, posterior, converged, scale)
 
 
-def _first_lever_arm(Ts_pw_p: FloatArray, positions: FloatArray) -> FloatArray:
-    """The lever arm (3,) that fits windows best, each aligned by itself; bad ones count less."""
+def _first_answer(
+    Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool
+) -> tuple[FloatArray, float]:
+    """The lever arm (3,) and the scale, if it is asked for, that fit windows best, each aligned by
+    itself; bad ones count less.
+    """
     size = min(_START_WINDOW, len(positions))
     count = len(positions) // size
     axes, path, measured = (
@@ -186,10 +211,14 @@ def _first_lever_arm(Ts_pw_p: FloatArray, positions: FloatArray) -> FloatArray:
         for values in (Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions)
     )
     information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
-    lever_arm = np.zeros(3)
+    lever_arm, scale = np.zeros(3), 1.0
     for _ in range(_START_STEPS):
-        rotations = _rotations(measured, axes @ lever_arm + path)
-        residuals = measured @ rotations - path
+        predicted = axes @ lever_arm + path
+        aligned = measured @ _rotations(measured, predicted)
+        if with_scale:
+            shares = (aligned * predicted).sum(axis=(1, 2)) / (aligned**2).sum(axis=(1, 2))
+            scale = float(np.median(shares))
+        residuals = scale * aligned - path
         errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
         weights = 1.0 / (1.0 + (errors / (np.median(errors) + 1e-12)) ** 2)
         pulled = np.einsum("n,nkij,nki->j", weights, axes, residuals)
@@ -197,7 +226,7 @@ def _first_lever_arm(Ts_pw_p: FloatArray, positions: FloatArray) -> FloatArray:
         lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), pulled)
         if np.abs(lever_arm - before).max() < _SETTLED_START:
             break
-    return lever_arm
+    return lever_arm, scale
 
 
 def _centred(windows: FloatArray) -> FloatArray:
@@ -325,9 +354,9 @@ class _State:
             weights=self.weights[kept],
         ).space(model)
 
-    def posterior(self) -> Posterior:
+    def posterior(self) -> _Posterior:
         """Of all poses."""
-        return Posterior(self.space(), self.levels)
+        return _Posterior(self.space(), self.levels, self.lever_arm)
 
     def fitted(self) -> _State:
         """With noise levels fitted."""
@@ -355,14 +384,14 @@ class _State:
             return self
         return dataclasses.replace(self, model=model, levels=best.levels)
 
-    def with_outliers(self, posterior: Posterior) -> _State:
+    def with_outliers(self, posterior: _Posterior) -> _State:
         """With jumps, which are large steps of the walk, and positions wrong by themselves."""
         of_walk, of_white = surprises(posterior, self.outliers.spikes)
         found = judged(self.outliers, of_walk, of_white, with_spikes=True)
         boost = np.where(found.jumps, np.maximum(_JUMP_FACTOR * of_walk, self.boost), 1.0)
         return dataclasses.replace(self, outliers=found, boost=boost)
 
-    def with_quality(self, posterior: Posterior) -> _State:
+    def with_quality(self, posterior: _Posterior) -> _State:
         """With weights below 1 where the positions around one are clearly worse than the rest."""
         states = posterior.states_after(posterior.normal.step)[:, :3]
         spread = posterior.selected_inverse[0][:, range(3), range(3)]
@@ -375,10 +404,9 @@ class _State:
         weights = np.where(is_worse, (_STUDENT + expected) / (_STUDENT + around), 1.0)
         return dataclasses.replace(self, weights=np.minimum(weights, 1.0))
 
-    def moved(self, posterior: Posterior) -> _State:
+    def moved(self, posterior: _Posterior) -> _State:
         """After a step, with the orientations that the positions ask for."""
-        states = posterior.states_after(posterior.normal.step)
-        turns = self.model.lasting(states, self.streams, self.X)[:, 3:]
+        turns = posterior.states_after(posterior.normal.step)[:, _WHITE_ROTATION]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
         parameters = self.parameters.copy()
@@ -389,6 +417,28 @@ class _State:
             lever_arm=self.lever_arm + posterior.normal.step[:3],
             parameters=parameters,
         )
+
+
+class _Posterior(Posterior):
+    """A posterior that knows that no lever arm is kilometres long."""
+
+    def __init__(self, space: StateSpace, levels: FloatArray, lever_arm: FloatArray) -> None:
+        super().__init__(space, levels)
+        self._lever_arm = lever_arm
+
+    @cached_property
+    def products(self) -> FloatArray:
+        """Products of J and, last, e, weighed with V^-1, the prior among them."""
+        return super().products + self.of_prior
+
+    @property
+    def of_prior(self) -> FloatArray:
+        """What the prior adds to the products."""
+        added = np.zeros(2 * (self.space.columns.shape[2],))
+        added[:3, :3] = np.eye(3) / _LONG_M**2
+        added[:3, -1] = self._lever_arm / _LONG_M**2
+        added[-1, :3], added[-1, -1] = added[:3, -1], self._lever_arm @ added[:3, -1]
+        return added
 
 
 def _of_positions(space: StateSpace, X: FloatArray, boost: FloatArray) -> StateSpace:
@@ -421,27 +471,30 @@ def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
     return dataclasses.replace(prior, lower=lower, upper=upper)
 
 
-def _solution(state: _State, posterior: Posterior, converged: bool) -> LeverArmSolution:
+def _solution(
+    state: _State, posterior: _Posterior, converged: bool, first_scale: float
+) -> LeverArmSolution:
     normal = posterior.normal
     n_evidence = len(state.boost) - int(state.outliers.spikes.sum())
     misfit = normal.cost / max(3 * n_evidence - 3 - len(state.columns), 1)
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[state.columns] = np.sqrt(np.diag(covariance)[3:])
+    parts = part_products(posterior)
     return LeverArmSolution(
         lever_arm=state.lever_arm + normal.step[:3],
         covariance=covariance[:3, :3],
         **_by_common_errors(state),
         time_offset_s=-float(state.parameters[TIME]),
         time_offset_sigma_s=float(sigmas[TIME]),
-        scale=1.0 + float(state.parameters[SCALE]),
-        scale_sigma=float(sigmas[SCALE]),
+        scale=first_scale * (1.0 + float(state.parameters[SCALE])),
+        scale_sigma=first_scale * float(sigmas[SCALE]),
         model=state.model,
         levels=state.levels,
         weights=state.weights,
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
-        part_products=part_products(posterior),
+        part_products=parts + posterior.of_prior / len(parts),
         misfit=misfit,
         objective=0.5 * (posterior.log_determinant + normal.cost),
         converged=converged,
@@ -454,5 +507,5 @@ def _by_common_errors(state: _State) -> dict[str, FloatArray]:
     posterior = Posterior(space, state.levels)
     products = multiplied(space.columns, posterior.weighed(space.columns))
     products -= multiplied(posterior.whitened, posterior.whitened)
-    by = -np.linalg.lstsq(products[:3, :3], products[:3, 3:-1], rcond=None)[0]
+    by: FloatArray = -np.linalg.pinv(products[:3, :3], hermitian=True) @ products[:3, 3:-1]
     return {"by_scale": by[:, 0], "by_direction": by[:, 1:]}

@@ -14,17 +14,20 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import Correlation
 from hand_eye_calib.alignment.similarity import SimilarityFit
-from hand_eye_calib.alignment.time_offset import (
-    TimeOffset,
-    estimate_time_offset,
-    time_offset_of_speeds,
-)
+from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import BufferLimits, PoseBuffer, StreamStatistics
-from hand_eye_calib.engine.snapshot import STREAMS, Snapshot, downsample, name_frames, pair_poses
+from hand_eye_calib.engine.snapshot import (
+    STREAMS,
+    Snapshot,
+    downsample,
+    estimated_time_offset,
+    name_frames,
+    pair_poses,
+)
 from hand_eye_calib.engine.state import check_state
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
@@ -397,11 +400,8 @@ class Calibrator:
         if self._time_offset is None:
             parent, child = self._buffers["parent"].poses(), self._buffers["child"].poses()
             try:
-                estimate = estimate_time_offset
-                if self._config.measured == "positions":
-                    estimate = time_offset_of_speeds
-                self._time_offset = self._proposed_offset or estimate(
-                    parent.trajectory, child.trajectory, self._config.max_gap
+                self._time_offset = self._proposed_offset or estimated_time_offset(
+                    self._config, parent.trajectory, child.trajectory
                 )
             except NotEnoughDataError:
                 return None

@@ -141,14 +141,10 @@ def _residuals(
 def _unrelated(
     solution: LeverArmSolution, poses: FloatArray, positions: FloatArray
 ) -> list[dict[str, object]]:
-    """A finding if the distances of the positions are not those that the other sensor moves it."""
+    """A finding if the noise that was found is as large as the motion."""
     span = min(_SPAN, max(len(poses) // 10, 1))
-    predicted = poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3]
-    far, expected = (
-        np.linalg.norm(path[span:] - path[:-span], axis=1)
-        for path in (solution.scale * positions, predicted)
-    )
-    share = float(np.median(np.abs(far - expected)) / max(float(np.median(far)), 1e-12))
+    motion_m = solution.scale * np.linalg.norm(positions[span:] - positions[:-span], axis=1)
+    share = solution.noise_over(span) / max(float(np.sqrt(np.mean(motion_m**2))), 1e-12)
     if share < _UNRELATED:
         return []
     found = Finding(
@@ -156,7 +152,7 @@ def _unrelated(
         stream="both",
         severity=Severity.ERROR,
         confidence=Confidence.LIKELY,
-        what=f"the distances between positions differ by {share:.0%} from those of the odometry",
+        what=f"{share:.0%} of the motion of the positions is not that of the odometry",
         advice="check that both are on one rigid body, the units, the scale, and the clocks "
         "(time_offset estimate)",
     )

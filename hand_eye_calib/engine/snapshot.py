@@ -93,10 +93,7 @@ class Snapshot:
     def _resolved(self) -> "Snapshot":
         if not isinstance(self.config.time_offset, str):
             return self
-        estimate = estimate_time_offset
-        if self.config.measured == "positions":
-            estimate = time_offset_of_speeds
-        found = self.time_offset or estimate(self.parent, self.child, self.config.max_gap)
+        found = self.time_offset or estimated_time_offset(self.config, self.parent, self.child)
         config = replace(self.config, time_offset=found.seconds)
         return replace(self, config=config, time_offset=found)
 
@@ -269,6 +266,22 @@ def name_frames(
         names.append(name)
     parent, child = names
     return parent, child, tuple(warnings)
+
+
+def estimated_time_offset(
+    config: CalibratorConfig, parent: Trajectory, child: Trajectory
+) -> TimeOffset:
+    """The time offset of two streams: from their angular rates or, if one of them has only
+    positions, from their speeds.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If the evidence is weak; the message says why.
+    """
+    if config.measured == "positions":
+        return time_offset_of_speeds(parent, child, config.max_gap)
+    return estimate_time_offset(parent, child, config.max_gap)
 
 
 def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:

@@ -1,0 +1,141 @@
+"""Streams of positions alone: GNSS antennas and prisms beside the poses of another sensor."""
+
+import numpy as np
+import pytest
+from motions import planar_poses, wandering_poses
+
+import hand_eye_calib as hec
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+
+LEVER_ARM = np.array([0.8, -0.5, 1.2])
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 100_000_000
+WORLD = se3.exp(np.array([50.0, -20.0, 3.0, 0.1, -0.2, 2.0]))
+
+
+def antenna_of(poses, noise_m, seed=5):
+    """Positions of the antenna in another world."""
+    positions = (WORLD @ poses)[:, :3, :3] @ LEVER_ARM + (WORLD @ poses)[:, :3, 3]
+    return positions + noise_m * np.random.default_rng(seed).standard_normal(positions.shape)
+
+
+def recorded(n_poses=400, noise_m=0.005, drift_rad=2e-4, seed=2, poses=None):
+    """Odometry that drifts, and positions beside it."""
+    poses = wandering_poses(n_poses, seed) if poses is None else poses
+    random = np.random.default_rng(seed)
+    drift = np.c_[np.zeros((len(poses), 3)), drift_rad * random.normal(size=(len(poses), 3))]
+    motions = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift[1:])
+    odometry = [np.eye(4)]
+    for motion in motions:
+        odometry.append(odometry[-1] @ motion)
+    stamps_ns = START_NS + STEP_NS * np.arange(len(poses))
+    child = Trajectory.from_positions(stamps_ns, antenna_of(poses, noise_m), "antenna", "map")
+    return Trajectory(stamps_ns, np.array(odometry), "lidar", "odom"), child
+
+
+@pytest.fixture(scope="module")
+def streams():
+    return recorded()
+
+
+@pytest.fixture(scope="module")
+def result(streams):
+    return hec.calibrate(*streams)
+
+
+def distances(result, sign=1.0):
+    """Errors over their standard deviations."""
+    return (sign * result.T_parent_child[:3, 3] - LEVER_ARM) / result.sigmas[:3]
+
+
+class TestLeverArm:
+    def test_it_is_found_within_its_sigma(self, result):
+        assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
+        assert np.abs(distances(result)).max() < 4.0
+        assert result.sigmas[:3].max() < 0.005
+        assert abs(result.time_offset_s) < 0.005
+
+    def test_the_rotation_is_out_of_reach_and_no_number(self, result):
+        assert result.measured == "positions"
+        assert result.out_of_reach == ("roll", "pitch", "yaw")
+        assert result.T_parent_child[:3, :3].tolist() == np.eye(3).tolist()
+        assert np.isinf(result.sigmas[3:]).all()
+        assert result.covariance[3, 3] > 1.0
+        assert result.usable_numbers()["yaw"] == "MEASURE_YAW_BY_HAND"
+        assert result.status is hec.SolveStatus.OK
+
+    def test_positions_of_the_parent_give_the_opposite(self, streams, result):
+        inverse = hec.calibrate(*streams[::-1])
+        assert inverse.T_parent_child[:3, 3] == pytest.approx(-result.T_parent_child[:3, 3])
+        assert inverse.time_offset_s == pytest.approx(-result.time_offset_s)
+
+    def test_poses_declared_as_positions_give_the_same(self, streams, result):
+        parent, child = streams
+        turned = child.poses @ se3.exp(np.r_[0, 0, 0, 0.5, 1.0, -0.3])
+        whole = Trajectory(child.stamps_ns, turned, "antenna")
+        found = hec.calibrate(parent, whole, child_measures="positions")
+        assert found.T_parent_child[:3, 3] == pytest.approx(result.T_parent_child[:3, 3], abs=1e-9)
+
+    def test_another_clock_is_found_from_the_speeds(self):
+        parent, child = recorded(poses=wandering_poses(600, seed=4, step_rad=0.02))
+        found = hec.calibrate(parent, child.shifted(-7.31), time_offset="estimate")
+        assert found.time_offset_s == pytest.approx(7.31, abs=0.01)
+        assert np.abs(distances(found)).max() < 4.0
+
+    def test_a_scale_is_found_if_asked_for(self, streams):
+        parent, child = streams
+        small = Trajectory(parent.stamps_ns, parent.scaled(0.5).poses, "camera")
+        found = hec.calibrate(small, child, scale="estimate")
+        assert found.scale == pytest.approx(0.5, rel=0.01)
+        assert found.T_parent_child[:3, 3] == pytest.approx(0.5 * LEVER_ARM, abs=0.02)
+
+    def test_float_solutions_outages_and_a_jump_do_little(self, streams):
+        parent, child = streams
+        random = np.random.default_rng(1)
+        positions = child.poses[:, :3, 3].copy()
+        positions[100:160] += 0.3 + 0.05 * random.standard_normal((60, 3))
+        positions[250:] += [0.4, -0.3, 0.2]
+        kept = (np.arange(len(child)) % 50) > 8
+        worse = Trajectory.from_positions(child.stamps_ns[kept], positions[kept], "antenna")
+        found = hec.calibrate(parent, worse)
+        assert found.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.03)
+        assert np.abs(distances(found)).max() < 4.0
+
+    def test_on_flat_ground_height_is_unobservable(self):
+        parent, child = recorded(drift_rad=0.0, poses=planar_poses(400, seed=3))
+        found = hec.calibrate(parent, child)
+        assert found.unobservable() == ["z", "roll", "pitch", "yaw"]
+        assert found.status is hec.SolveStatus.UNOBSERVABLE
+        assert "the motion does not show z" in found.reasons[0].sentence
+        assert np.abs(distances(found)[:2]).max() < 4.0
+        known = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)})
+        assert known.status is hec.SolveStatus.OK
+
+    def test_positions_of_another_body_are_not_to_be_used(self, streams):
+        found = hec.calibrate(streams[0], recorded(seed=8)[1])
+        assert found.verdict is hec.Verdict.DO_NOT_USE
+
+    def test_it_survives_a_file(self, result, tmp_path):
+        again = hec.load(hec.save(result, tmp_path))
+        assert again.out_of_reach == ("roll", "pitch", "yaw")
+        assert "MEASURE_ROLL_BY_HAND" in (tmp_path / "extrinsic.urdf.xacro").read_text()
+
+
+def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, capsys):
+    pymap3d = pytest.importorskip("pymap3d")
+    parent, child = streams
+    east, north, up = child.poses[:, :3, 3].T
+    lat, lon, height = pymap3d.enu2geodetic(east, north, up, 60.0, 25.0, 40.0)
+    rows = [
+        f"{stamp},{a:.11f},{b:.11f},{c:.5f}"
+        for stamp, a, b, c in zip(child.stamps_ns.tolist(), lat, lon, height, strict=True)
+    ]
+    hec.write_trajectory(tmp_path / "lidar.tum", parent)
+    (tmp_path / "gnss.csv").write_text("\n".join(["t_ns,latitude,longitude,altitude", *rows]))
+    code = main(["calibrate", str(tmp_path / "lidar.tum"), str(tmp_path / "gnss.csv")])
+    printed = capsys.readouterr()
+    assert code == 0
+    assert "roll, pitch and yaw are not estimated" in printed.out
+    assert "became metres east and north" in printed.err
