@@ -529,7 +529,7 @@ def _mean_variances(found: _State, kept: IntArray | None) -> FloatArray:
 def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     """The model of systematic errors that the data ask for, one step from where the search stands,
     at poses freed of their errors. All models are judged under the same noise. If the clock is
-    free, those with a time offset come first.
+    free, those with a time offset come first, unless it differs from part to part.
     """
     tried = sorted({column for name in systematic for column in parameters_of(name)})
     posterior = dataclasses.replace(state, columns=tried).posterior()
@@ -553,14 +553,14 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     credible = [
         name for name, fit in fits.items() if name == plainest or _is_credible(fit, name, known)
     ]
-    if state.is_clock_free:
-        credible = [name for name in credible if TIME in parameters_of(name)] or credible
     penalties = {name: _PENALTY * len(parameters_of(name)) for name in systematic}
     best = min(credible, key=lambda name: criterion(name, fits[name].cost))
-    if best != plainest:
+    if state.is_clock_free or best != plainest:
         parts = part_products(posterior)
-        for name in systematic:
-            penalties[name] = _PENALTY * _n_misjudged(parts, columns_of(name), fits[name])
+        counts = {name: _n_misjudged(parts, columns_of(name), fits[name]) for name in systematic}
+        penalties = {name: _PENALTY * count for name, count in counts.items()}
+        if state.is_clock_free and counts.get("time", np.inf) <= 1.0:
+            credible = [name for name in credible if TIME in parameters_of(name)] or credible
         best = min(credible, key=lambda name: criterion(name, fits[name].cost))
     if "bias" in best:
         # A scale is not of first order if it is large, and then a bias along the direction of

@@ -20,7 +20,13 @@ from hand_eye_calib.adaptive.resampling import answers_without
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.adaptive.state_space import NormalEquations
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.assessment.lever_arm import HIDDEN_SHARE, ROUNDING_ANGLE, LeverArms
+from hand_eye_calib.assessment.lever_arm import (
+    HIDDEN_SHARE,
+    MIN_SHARE,
+    MIN_SHARE_WITH_TILT,
+    ROUNDING_ANGLE,
+    LeverArms,
+)
 from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
@@ -132,6 +138,8 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         solution.T_parent_child,
         solution.jumps,
         solution.noise.rotation_variance,
+        # Noise that drowns the rotation between poses is not told from small rotations.
+        MIN_SHARE if solution.is_drowned else MIN_SHARE_WITH_TILT,
     )
     unseen = basis([*solution.unseen.T, *hidden])
     return combined(solution.T_parent_child, covariance, None, unseen)
@@ -192,6 +200,7 @@ def noise_driven(
     T_parent_child: FloatArray,
     jumps: BoolArray,
     rotation_variance: Callable[[int], FloatArray],
+    least_share: float = MIN_SHARE,
 ) -> list[FloatArray]:
     """Directions (6,) of translation that the rotations do not reveal over any baseline.
 
@@ -206,32 +215,33 @@ def noise_driven(
         Increments that are no evidence.
     rotation_variance : callable
         Variance (rad^2) per axis of the rotation noise over so many increments.
+    least_share : float
+        See :meth:`~hand_eye_calib.assessment.lever_arm.LeverArms.is_hidden`.
     """
     longest = max(len(Ts_pw_p) // _BLOCKS, 1)
     baselines = sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True)
-    axes = T_parent_child[:3, :3]
+    rotations = (Ts_pw_p[:, :3, :3], T_parent_child[:3, :3])
     found = [
-        _noise_driven_over(baseline, Ts_pw_p[:, :3, :3], axes, jumps, rotation_variance(baseline))
+        _hidden_translations(
+            _lever_arms_over(baseline, *rotations, jumps),
+            rotation_variance(baseline) * np.eye(3),
+            least_share,
+        )
         for baseline in baselines
     ]
     return min(found, key=len)
 
 
-def _noise_driven_over(
-    baseline: int,
-    rotation: FloatArray,
-    axes: FloatArray,
-    jumps: BoolArray,
-    variance: FloatArray,
-) -> list[FloatArray]:
+def _lever_arms_over(
+    baseline: int, rotation: FloatArray, axes: FloatArray, jumps: BoolArray
+) -> LeverArms:
     motions = np.swapaxes(rotation[:-baseline], 1, 2) @ rotation[baseline:]
     # No baseline may run across a jump, unless all of them do.
     jumps_before = np.concatenate([[0], np.cumsum(jumps)])
     weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
     if not weights.any():
         weights[:] = 1.0
-    chords = (motions - np.eye(3)) @ axes
-    return _hidden_translations(LeverArms.of(chords, weights), variance * np.eye(3))
+    return LeverArms.of((motions - np.eye(3)) @ axes, weights)
 
 
 def combined(
@@ -289,11 +299,12 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     return covariance, basis([*hidden, *vectors[:, ~seen].T])
 
 
-def _hidden_translations(lever_arms: LeverArms, cov_rotation: FloatArray) -> list[FloatArray]:
+def _hidden_translations(
+    lever_arms: LeverArms, cov_rotation: FloatArray, least_share: float = MIN_SHARE
+) -> list[FloatArray]:
     """Directions (6,) of translation that the rotations do not reveal."""
-    return [
-        np.r_[direction, np.zeros(3)] for direction in lever_arms.hidden_directions(cov_rotation).T
-    ]
+    hidden = lever_arms.hidden_directions(cov_rotation, least_share)
+    return [np.r_[direction, np.zeros(3)] for direction in hidden.T]
 
 
 def basis(directions: list[FloatArray]) -> FloatArray:

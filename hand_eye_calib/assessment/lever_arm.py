@@ -19,7 +19,11 @@ _MIN_SIGNAL_TO_NOISE = 3.0
 # Nor is it revealed if it moves less than this share of the direction that moves most: all rotation
 # is then about that direction to within 2.3 deg. Odometry errors of a per cent or two of the
 # rotation are common. They are systematic, so that the residuals do not show them.
-_MIN_SHARE = 0.04
+MIN_SHARE = 0.04
+
+# A noise model tells small rotations from its own errors, and the tilt of the axis is stated: half
+# as much is enough then (1.1 deg).
+MIN_SHARE_WITH_TILT = 0.02
 
 # Rotation errors are never taken to be smaller than this (rad): rounding, not motion.
 ROUNDING_ANGLE = 1e-6
@@ -65,7 +69,9 @@ class LeverArms:
         powers, directions = np.linalg.eigh(information)
         return cls(powers, directions, information)
 
-    def is_hidden(self, cov_rotation: FloatArray | None = None) -> BoolArray:
+    def is_hidden(
+        self, cov_rotation: FloatArray | None = None, least_share: float = MIN_SHARE
+    ) -> BoolArray:
         """Whether the rotations do not reveal each of the directions, (3,).
 
         Parameters
@@ -73,16 +79,20 @@ class LeverArms:
         cov_rotation : (3, 3) array, optional
             Covariance C of the rotation errors, rad^2, in the frame of the lever arms. An error e
             moves a lever arm d by ``e x d``, with the mean square ``d' (tr(C) I - C) d``.
+        least_share : float
+            Least displacement, as a share of that along the direction that moves most.
         """
         cov_rotation = np.zeros((3, 3)) if cov_rotation is None else cov_rotation
         noise = np.trace(cov_rotation) * np.eye(3) - cov_rotation + ROUNDING_ANGLE**2 * np.eye(3)
         noise_powers = np.array([d @ noise @ d for d in self.directions.T])
-        least = np.maximum(_MIN_SIGNAL_TO_NOISE * noise_powers, _MIN_SHARE**2 * self.powers[-1])
+        least = np.maximum(_MIN_SIGNAL_TO_NOISE * noise_powers, least_share**2 * self.powers[-1])
         return self.powers < least
 
-    def hidden_directions(self, cov_rotation: FloatArray | None = None) -> FloatArray:
+    def hidden_directions(
+        self, cov_rotation: FloatArray | None = None, least_share: float = MIN_SHARE
+    ) -> FloatArray:
         """The directions (3, U) that the rotations do not reveal; see :meth:`is_hidden`."""
-        return self.directions[:, self.is_hidden(cov_rotation)]
+        return self.directions[:, self.is_hidden(cov_rotation, least_share)]
 
     def hidden_axes(self, cov_rotation: FloatArray | None = None) -> tuple[str, ...]:
         """Names of the axes x, y, z that lie too far in the hidden directions to be known."""

@@ -283,7 +283,7 @@ def _observability(calibration: Calibration) -> str:
 def _floor_lines(calibration: Calibration) -> Iterator[str]:
     """Errors that nothing in the recording shows."""
     if calibration.floor is not None:
-        from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
+        from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE, FLOOR_TILT
 
         told = [
             f"{dof.name} {amount(dof.name, sigma)}"
@@ -294,8 +294,8 @@ def _floor_lines(calibration: Calibration) -> Iterator[str]:
         ]
         yield (
             "not in these standard deviations, because it is the same all the time: odometry that "
-            f"is off by {FLOOR_SCALE:.0%} in scale and {np.degrees(FLOOR_ROTATION):.2g} deg: "
-            f"{', '.join(told)}"
+            f"is off by {FLOOR_SCALE:.0%} in scale and {np.degrees(FLOOR_ROTATION):.2g} deg, with "
+            f"an axis of rotation tilted by {np.degrees(FLOOR_TILT):.2g} deg: {', '.join(told)}"
         )
 
 

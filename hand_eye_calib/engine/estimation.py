@@ -144,7 +144,7 @@ def _calibration(
         status=_status(solution.converged, fused),
         observability=fused.assessment.observability,
         T_method=solution.T_parent_child,
-        floor=common_mode_floor(*evaluation.spans, fused.T_parent_child),
+        floor=common_mode_floor(*evaluation.spans, fused.T_parent_child, _known_by_motion(fused)),
         objective=solution.objective,
         proved_global=evaluation.proved_global,
         method=evaluation.method,
@@ -165,6 +165,12 @@ def _calibration(
         motion_residuals=residuals,
         other_answer=evaluation.other_answer,
     )
+
+
+def _known_by_motion(fused: Fused) -> BoolArray:
+    """Whether the motion, not a prior alone, reveals x, y and z of the parent, (3,)."""
+    unknown = (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
+    return np.array([dof.verdict not in unknown for dof in fused.assessment.observability[:3]])
 
 
 def _residuals(

@@ -6,9 +6,14 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import widened_by_halves
-from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE, common_mode_floor
+from hand_eye_calib.assessment.floor import (
+    FLOOR_ROTATION,
+    FLOOR_SCALE,
+    FLOOR_TILT,
+    common_mode_floor,
+)
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers.registry import Method
 
 
@@ -32,6 +37,29 @@ class TestFloor:
         expected = np.outer(shift, shift)
         np.testing.assert_allclose(floor[:3, :3], expected, atol=0.1 * np.trace(expected))
         np.testing.assert_allclose(floor[3:, 3:], np.eye(3) * FLOOR_ROTATION**2)
+
+    def test_a_tilted_axis_of_rotation_draws_the_height_to_zero(self):
+        rng = np.random.default_rng(3)
+        vectors = rng.normal(size=(4000, 3)) * [0.02, 0.02, 0.5]
+        tilts = rng.normal(size=(4000, 2)) * FLOOR_TILT
+        height, shown = 0.8, np.zeros((4000, 3))
+        tilted = vectors.copy()
+        tilted[:, :2] += tilts * vectors[:, 2:]
+        lever = np.array([0.0, 0.0, height])
+        shown[:] = np.cross(vectors, lever)
+        arms = np.cross(tilted, [0.0, 0.0, 1.0])
+        lost = 1.0 - (arms * shown).sum() / (height * (arms**2).sum())
+        T = se3.from_rotation_translation(np.eye(3), lever)
+        motions = se3.exp(np.c_[np.zeros((4000, 3)), tilted])
+        pairs = MotionPairs(motions, motions, np.arange(4000), np.arange(4000) + 1)
+        known = np.array([True, True, True])
+        sigmas = [
+            np.sqrt(np.diag(common_mode_floor(pairs, np.ones(4000), T, axes)))
+            for axes in (None, known, ~known)
+        ]
+        np.testing.assert_allclose(sigmas[1][2], height * lost / (1.0 - lost), rtol=0.2)
+        assert sigmas[1][2] > 0.04 > 0.01 > sigmas[1][:2].max()
+        np.testing.assert_array_equal(sigmas[0], sigmas[2])
 
     @pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "park"])
     def test_every_result_has_it_beside_the_covariance(self, method):
