@@ -119,6 +119,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of processes; the numbers do not depend on it. Default: all cores",
     )
+    parser.add_argument(
+        "--clean", action="store_true", help="with faults: only the recordings without a fault"
+    )
     add_json_argument(parser)
 
 
@@ -127,6 +130,8 @@ def run(arguments: argparse.Namespace) -> int:
     from reproduction.catalogue import Experiment
 
     jobs = _cores() if arguments.jobs is None else arguments.jobs
+    if arguments.clean and arguments.id != "faults":
+        raise ConfigError(f"--clean is for faults; got {arguments.id}")
     if arguments.id == "faults":
         return _run_faults(arguments, jobs)
     source, theirs = _sources(arguments)
@@ -158,8 +163,9 @@ def _run_faults(arguments: argparse.Namespace, jobs: int) -> int:
 
     folder = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
     folder = Path(folder) if folder else None
-    with _progress(len(faults.cases(folder))) as advance:
-        print(faults.run(folder, arguments.out, arguments.page, jobs, advance))
+    todo = faults.clean_cases(folder) if arguments.clean else faults.cases(folder)
+    with _progress(len(todo)) as advance:
+        print(faults.run(todo, folder, arguments.out, arguments.page, jobs, advance))
     return 0
 
 

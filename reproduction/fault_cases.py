@@ -342,7 +342,7 @@ FAULTS = (
     Fault(
         "S12",
         "both scalar first",
-        (0.0, 0.0, 0.0),
+        (0.0,),
         scalar_first,
         "",
         frozenset({"quaternion_order"}),

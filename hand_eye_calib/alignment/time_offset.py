@@ -20,9 +20,11 @@ from hand_eye_calib.pairing.synchronise import synchronise
 _LAGS_S = (1.0, 0.3, 3.0)
 _MIN_PAIRS = 20
 
-# Time on either side of a stamp (s) over which the child's velocity is taken. One interval of the
-# child's stream if that is longer.
-_VELOCITY_SPAN_S = 0.05
+# Time on either side of a stamp (s) over which the child's velocity is taken: at least; at most; in
+# intervals of the child's stream, so that no pose is in the velocity and in the motion; and in
+# standard deviations of rotations by the angular rate, so that noise is little of the velocity.
+# Noise in both, or much of it, draws the offset, and its standard deviation is too small.
+_LEAST_SPAN_S, _MOST_SPAN_S, _SPAN_INTERVALS, _SPAN_OF_NOISE = 0.05, 0.3, 2.0, 1.4
 
 _MAX_ROUNDS, _SETTLED_S = 4, 2e-5
 
@@ -155,7 +157,7 @@ def _fine_offset(
     fit: SimilarityFit | None,
 ) -> tuple[float, SimilarityFit | None]:
     """Offset and fit over motions of ``lag_s``; no fit if there are too few."""
-    span_s = max(_VELOCITY_SPAN_S, child.interval_s)
+    span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     for _ in range(_MAX_ROUNDS):
         shifted = child.shifted(offset_s)
         pose_pairs = synchronise(parent, shifted, max_gap_s)
@@ -165,6 +167,9 @@ def _fine_offset(
         used, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
         twists = _twists(shifted, pose_pairs.stamps_ns[used], span_s)[where]
         fit = fit_similarity(pairs, twists[: len(pairs)], twists[len(pairs) :], start=fit)
+        rate = float(np.sqrt(np.mean((twists[:, 3:] ** 2).sum(axis=1))))
+        of_noise_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(rate, 1e-9)
+        span_s = max(span_s, min(of_noise_s, _MOST_SPAN_S))
         offset_s += fit.offset_s
         if abs(fit.offset_s) < _SETTLED_S:
             break

@@ -2,7 +2,7 @@
 little of the motion unexplained and yet spoil the extrinsic.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.adaptive.part_delays import PartDelay
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
+from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.mount_change import find_change, information
 from hand_eye_calib.checks import findings as wording
@@ -42,6 +43,9 @@ _SMOOTHING_S2, _SMOOTHING_INTERVALS2 = {"position": 0.004, "rotation": 0.002}, 0
 
 # Poses that the estimator solves for a check: at most, at least.
 _MOST_POSES, _FEWEST_POSES = 400, 60
+
+# What the estimator adds to a time offset that was estimated before, from which on it counts (s).
+_SETTLED_S = 0.002
 
 # Speeds are over about this time (s), so that noise is no speed.
 _SPEED_SPAN_S = 0.4
@@ -92,6 +96,16 @@ class Aligned:
             with_delays=True,
         )
         return found if found.converged else None
+
+    def refined(self, offset: TimeOffset) -> TimeOffset:
+        """The time offset that aligned the streams, with what the estimator adds to it: under its
+        noise model, the standard deviation is right even if noise is large.
+        """
+        found = self.solution
+        if found is None or abs(found.time_offset_s) < _SETTLED_S:
+            return offset
+        seconds = offset.seconds + found.time_offset_s
+        return replace(offset, seconds=seconds, sigma_s=found.time_offset_sigma_s)
 
     @property
     def best_known(self) -> tuple[FloatArray, FloatArray]:

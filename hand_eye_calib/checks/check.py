@@ -168,15 +168,15 @@ def _check_agreeing(
     except NotEnoughDataError:
         scale = None  # too few poses to tell
     rotations = _motions(pose_pairs).Ts_parenti_parentj[:, :3, :3]
+    fit = scale.fit if scale else explanation.fit
+    aligned = _aligned(streams, offset.seconds, fit) if is_sound else None
     findings = [
         *findings,
-        *_check_offset(offset, known_offset_s),
+        *_check_offset(aligned.refined(offset) if aligned else offset, known_offset_s),
         *(_check_scale(scale, known_scale) if scale else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
+        *(check_aligned(aligned) if aligned else []),
     ]
-    if is_sound:
-        fit = scale.fit if scale else explanation.fit
-        findings += _check_aligned(streams, offset.seconds, fit)
     rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
     return CheckResult(
         gravest_first(findings),
@@ -186,17 +186,16 @@ def _check_agreeing(
     )
 
 
-def _check_aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit) -> list[Finding]:
-    """What is wrong with streams that agree without any mistake undone."""
+def _aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit) -> Aligned:
+    """Streams that agree without any mistake undone, on one clock and in one unit of length."""
     child = streams.child.shifted(offset_s).scaled(fit.scale)
     pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
-    aligned = Aligned(
+    return Aligned(
         pose_pairs=pose_pairs,
         motions=_motions(pose_pairs),
         T_parent_child=fit.T_parent_child,
         covariance=fit.covariance[:6, :6],
     )
-    return check_aligned(aligned)
 
 
 def can_check(parent: Trajectory, child: Trajectory) -> bool:

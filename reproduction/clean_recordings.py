@@ -1,0 +1,114 @@
+"""Clean recordings, in which a stream check should find nothing: simulated ones of many kinds, and
+real ones with the options that they need.
+
+The limits of the checks were set with the first seeds of each kind. The seeds here are others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
+from reproduction.coverage.classes import CLASSES, make
+from reproduction.coverage.real_sets import Rig, real_rigs
+
+SEEDS = range(50, 55)
+
+# Noise (m; twice as many radians) of simulated hilly drives.
+_HILLY = {"hilly": 0.003, "hilly_noisy": 0.02}
+
+# What is really there besides what the options of a recording say.
+_KNOWN = {
+    "hand_mixture_30s": frozenset({"jumps"}),
+    "primesense": frozenset({"jumps", "time_offset"}),
+    "robot_arm": frozenset({"time_offset"}),
+    "kitti_long": frozenset({"scale"}),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clean:
+    """A clean recording.
+
+    Attributes
+    ----------
+    name : str
+        Its kind, and which one of it it is.
+    parent, child : Trajectory
+    T_parent_child : (4, 4) array or None
+        The truth, if it is known.
+    options : dict
+        Options of the calibration.
+    is_real : bool
+    """
+
+    name: str
+    parent: Trajectory
+    child: Trajectory
+    T_parent_child: FloatArray | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    is_real: bool = False
+
+
+def names(folder: Path | None) -> list[str]:
+    """Names of all clean recordings."""
+    simulated = [f"{kind} {seed}" for kind in (*CLASSES, *_HILLY) for seed in SEEDS]
+    return simulated + list(_real(folder))
+
+
+def kind_of(name: str) -> str:
+    """Kind of the recording of this name."""
+    return name.rpartition(" ")[0]
+
+
+def known_in(name: str, folder: Path | None) -> frozenset[str]:
+    """Codes of the findings that are right in this recording."""
+    kind = kind_of(name)
+    options = _real(folder)[name].options if name in _real(folder) else {}
+    return _KNOWN.get(kind, frozenset()) | options.keys()
+
+
+def recording(name: str, folder: Path | None) -> Clean:
+    """The recording of this name."""
+    kind, seed = kind_of(name), name.rpartition(" ")[2]
+    if kind in _HILLY:
+        drive = simulate_drive(int(seed), HILLY_DRIVE, NoiseConfig(gaussian=_HILLY[kind]))
+        return Clean(
+            name=name,
+            parent=drive.parent,
+            child=drive.child,
+            T_parent_child=drive.T_parent_child,
+        )
+    if kind in CLASSES:
+        made = make(kind, int(seed))
+        return Clean(
+            name=name,
+            parent=made.parent,
+            child=made.child,
+            T_parent_child=made.T_parent_child,
+        )
+    return _real(folder)[name]
+
+
+@cache
+def _real(folder: Path | None) -> dict[str, Clean]:
+    rigs = real_rigs(folder)[0] if folder else ()
+    return {clean.name: clean for rig in rigs for clean in _of_rig(rig)}
+
+
+def _of_rig(rig: Rig) -> Iterator[Clean]:
+    for which, recording in rig.recordings.items():
+        yield Clean(
+            name=f"{rig.name} {which}",
+            parent=recording.parent,
+            child=recording.child,
+            options=dict(rig.options),
+            is_real=True,
+        )
