@@ -328,8 +328,8 @@ def _floor(result: Judged) -> Iterator[_Found]:
     if rough:
         told = listing([f"{axis} by {amount(axis, floor)}" for axis, floor in rough.items()])
         text = (
-            "an odometry that is off by 1% in scale and 0.15 deg all the time, or tilts the axis of "
-            f"rotation, which no recording shows, moves {told}: more than the target"
+            "an odometry that is off by 1% in scale and 0.15 deg all the time, or tilts the axis "
+            f"of rotation, which no recording shows, moves {told}: more than the target"
         )
         yield text, "check the scale of both odometries on a known distance", tuple(rough), ()
 
