@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, fdtrc
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.metrics import deviation
@@ -111,7 +111,7 @@ def agreement_of(Ts_parent_child: FloatArray, covariances: FloatArray) -> Agreem
     weights = np.array([_information(*one) for one in zip(Ts, covariances, strict=True)])
     nothing = np.zeros(len(Ts), dtype=bool)
     whole = _fit(Ts, weights, ~nothing)
-    p_value = float(stats.chi2.sf(whole.chi2, whole.dof)) if whole.dof else 1.0
+    p_value = float(chdtrc(whole.dof, whole.chi2)) if whole.dof else 1.0
     kind, apart = _explanation(Ts, weights, whole, p_value < _LEVEL)
     kept = _fit(Ts, weights, ~apart)
     scatter = math.sqrt(kept.chi2 / kept.dof) if kept.dof else 1.0
@@ -175,8 +175,8 @@ def _p_of_split(errors: FloatArray, weights: FloatArray, whole: _Fit, apart: Boo
     if spent <= 0:
         return 1.0
     if chi2 <= dof or dof == 0:
-        return float(stats.chi2.sf(gained, spent))
-    return float(stats.f.sf(gained / spent / (chi2 / dof), spent, dof))
+        return float(chdtrc(spent, gained))
+    return float(fdtrc(spent, dof, gained / spent / (chi2 / dof)))
 
 
 def _information(T: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -16,7 +16,6 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2, norm
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import AXES
@@ -31,14 +30,13 @@ from hand_eye_calib.verdict import target_of
 # Factor on stated variances.
 _CAUTION = 2.0
 
-# Probabilities with which chance makes a change of an axis, and of all axes together.
-_CHANCE_OF_AXES, _CHANCE_OF_ALL = 0.005, 0.001
-_SIGMAS = float(norm.isf(_CHANCE_OF_AXES / 2 / len(AXES)))
-_CHI2 = float(chi2.isf(_CHANCE_OF_ALL, len(AXES)))
+# Chance makes a change of so many standard deviations on any of six axes with probability 0.005,
+# and one of this chi-square on all of them together with probability 0.001. (In numbers, because
+# scipy.stats takes longer to import than a comparison.)
+SIGMAS, CHI2 = 3.341479, 22.457744
 
-# With this probability a change of the stated size is seen.
-_POWER = 0.9
-_SEEN_SIGMAS = _SIGMAS + float(norm.isf(1.0 - _POWER))
+# A change of so many more standard deviations is seen with probability 0.9.
+MORE_SIGMAS = 1.281552
 
 # An axis is the same if changes of so many targets would have been seen.
 _TARGETS = 5.0
@@ -281,13 +279,13 @@ def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Differen
         covariance = covariance + first.floor + second.floor
     covariance = covariance + 1e-18 * np.eye(6)
     sigmas = np.sqrt(np.diag(covariance))
-    visible = _SEEN_SIGMAS * sigmas
+    visible = (SIGMAS + MORE_SIGMAS) * sigmas
     distance = float(values @ np.linalg.solve(covariance, values))
     verdicts = tuple(
         _axis_verdict(abs(value) / sigma, seen <= limit)
         for value, sigma, seen, limit in zip(values, sigmas, visible, limits, strict=True)
     )
-    if Change.MOVED in verdicts or distance > _CHI2:
+    if Change.MOVED in verdicts or distance > CHI2:
         verdict = Change.MOVED
     else:
         verdict = Change.CANNOT_TELL if Change.CANNOT_TELL in verdicts else Change.SAME
@@ -305,7 +303,7 @@ def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Differen
 
 
 def _axis_verdict(ratio: float, would_be_seen: bool) -> Change:
-    if ratio > _SIGMAS:
+    if ratio > SIGMAS:
         return Change.MOVED
     return Change.SAME if would_be_seen else Change.CANNOT_TELL
 

@@ -8,6 +8,7 @@ import json
 import pytest
 from published_data import FALSE_MINIMA_OF_DNL, data_folder
 
+from reproduction import paper_figures
 from reproduction.command import main
 from reproduction.published import METHODS
 from reproduction.tables import PRINTED
@@ -69,8 +70,23 @@ def test_variant_tables_hold_every_method_on_both_drives(tmp_path, capsys):
         assert len(read(tmp_path / f"tableS{number}_comparison.csv")) == 24
 
 
+@pytest.fixture
+def one_error_figure(monkeypatch):
+    """Draw the first of the eight figures of errors only: they take as long as all the solves."""
+    drawn, draw = [], paper_figures.draw_errors
+
+    def draw_first(*arguments):
+        if not drawn:
+            drawn.extend(draw(*arguments))
+            return list(drawn)
+        return []
+
+    monkeypatch.setattr(paper_figures, "draw_errors", draw_first)
+    return drawn
+
+
 @pytest.mark.slow
-def test_everything_from_one_command(tmp_path, capsys):
+def test_everything_from_one_command(tmp_path, capsys, one_error_figure):
     document = run(capsys, "all", "--out", str(tmp_path))
     agreement = {item["method"]: item for item in document["agreement"]}
     four = [agreement[method] for method in ("park", "taylor", "zhuang", "dnl")]
@@ -105,6 +121,7 @@ def test_everything_from_one_command(tmp_path, capsys):
         points = [line["agrees"] == "True" for line in read(tmp_path / f"{figure}_comparison.csv")]
         assert len(points) == 19 * 6 * 4
         assert sum(points) >= exact * len(points), figure
+    assert [path.suffix for path in one_error_figure] == [".png", ".svg"]
     verdicts = [line["verdict"] for line in read(tmp_path / "conclusions.csv")]
     assert len(verdicts) == 21
     assert "Does not hold" not in verdicts

@@ -77,3 +77,10 @@ def test_the_help_names_every_experiment():
 
     # The study of faults has recordings of its own, and none of the cells of the others.
     assert [name for name in EXPERIMENTS if name != "faults"] == list(catalogue.EXPERIMENTS)
+
+
+def test_the_node_loads_no_scipy():
+    code = "import sys, hand_eye_calib.ros.calibrator_node; print(*sys.modules, file=sys.stderr)"
+    loaded = loaded_by(code)
+    assert {name for name in loaded if name.startswith("scipy")} <= {"scipy.linalg._flapack"}
+    assert not {name.partition(".")[0] for name in loaded} & {"casadi", "matplotlib", "rosbags"}
