@@ -30,3 +30,11 @@ def _ros_stays_here(tmp_path_factory):
     patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
     yield
     patch.undo()
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Reports of this process have no figures, as if there were too little data: drawing them takes
+    several times as long as the solve.
+    """
+    monkeypatch.setattr("hand_eye_calib.report.report.draw_all", lambda *_: {})

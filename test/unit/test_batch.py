@@ -29,6 +29,8 @@ from hand_eye_calib.io import remote
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 ODOMETRY = "nav_msgs/msg/Odometry"
 STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]
 

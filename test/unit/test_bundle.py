@@ -14,6 +14,8 @@ from hand_eye_calib.cli.replaying import replay
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.io.results import save_result
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 PARENT, CHILD = "secret/run_01/T_S1_W1.txt", "secret/run_01/T_S2_W2.txt"
 
 

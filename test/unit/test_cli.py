@@ -32,6 +32,8 @@ from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.io.trajectory_files import write_trajectory
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 ROOT = Path(__file__).resolve().parents[2]
 ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 PARENT_TOPIC, CHILD_TOPIC = "/lidar/odom", "/camera/odom"

@@ -13,6 +13,8 @@ from hand_eye_calib.calibration import SolveStatus
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 NUMBERS = " ".join(f"{value:.6f}" for value in (*X[:3, 3], *se3.rotation_to_rpy(X[:3, :3])))
 
 

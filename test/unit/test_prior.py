@@ -15,6 +15,8 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.io.trajectory_files import write_trajectory
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 # A sensor on a mast, looking back.
 MOUNT = se3.from_rotation_translation(
     se3.rotation_exp(np.array([0.0, 0.0, np.pi - 0.2])), [0.6, -0.3, 1.85]
