@@ -75,13 +75,20 @@ def message(kind, stamp_ns, T_world_sensor, sensor_frame):
     made = kind()
     made.header.stamp = conversions.to_time(stamp_ns)
     made.header.frame_id = "world"
-    pose_type = conversions.POSE_TYPES[f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"]
-    place, turn = pose_type.pose(made)
+    place, turn = parts_of(made)
     place.x, place.y, place.z = T_world_sensor[:3, 3].tolist()
     turn.x, turn.y, turn.z, turn.w = se3.to_quat_xyzw(T_world_sensor).tolist()
-    if pose_type.sensor_frame is not None:
+    if hasattr(made, "child_frame_id"):
         made.child_frame_id = sensor_frame
     return made
+
+
+def parts_of(message):
+    """Position and orientation of a pose message of any type, still messages."""
+    if hasattr(message, "transform"):
+        return message.transform.translation, message.transform.rotation
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    return pose.position, pose.orientation
 
 
 def matrix(transform):

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from rclpy.exceptions import ParameterException
@@ -12,8 +13,9 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.engine.pose_buffer import StreamStatistics
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.bags.parts import measured_as
-from hand_eye_calib.ros.conversions import PART_TYPES, POSE_TYPES, PoseType, reading, to_ns
+from hand_eye_calib.io.bags.messages import MALFORMED, PoseFields, unpack_stamp_ns
+from hand_eye_calib.io.bags.parts import MessageReader, measured_as
+from hand_eye_calib.ros.conversions import MESSAGES
 from hand_eye_calib.ros.input_monitor import InputMonitor
 from hand_eye_calib.ros.live_session import LiveSession
 from hand_eye_calib.ros.log import NodeLog
@@ -26,9 +28,6 @@ _QOS = QoSProfile(
     depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
 )
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
-
-# What a topic may have, the likeliest first.
-_TYPES = tuple(dict.fromkeys([*POSE_TYPES, *(name for name, _ in PART_TYPES)]))
 
 # Messages taken in one callback beyond the first; services and timers have their turn then.
 _MOST_AT_ONCE = 50
@@ -125,8 +124,8 @@ class PoseInput:
 
     # -------------------------------------------------------------- messages
 
-    def accept(self, pose_type: PoseType, stamp_ns: int, message: Any) -> None:
-        """Take a message with a pose."""
+    def accept(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
+        """Take a message; it is read when its stamp is believed."""
         if not self.is_enabled:
             self.monitor.ignored += 1
             return
@@ -134,7 +133,7 @@ class PoseInput:
         clock_ns = self._node.get_clock().now().nanoseconds
         self.monitor.note(stamp_ns, clock_ns, steady_s, self._max_gap_ns)
         last_ns = self.guard.last_ns
-        judgement = self.guard.check(stamp_ns, (pose_type, message), steady_s)
+        judgement = self.guard.check(stamp_ns, read, steady_s)
         if judgement.verdict is Verdict.JUMPED_BACK:
             self._say_jump_back(judgement.taken[0][0], last_ns)
             self._on_jump_back(self)
@@ -152,19 +151,18 @@ class PoseInput:
         for stamp_ns in judgement.dropped:
             text = "its stamp does not fit those before and after it"
             self._refuse(stamp_ns, "corrupt stamp", text)
-        for stamp_ns, (pose_type, message) in judgement.taken:
-            self._take(pose_type, stamp_ns, message)
+        for stamp_ns, read in judgement.taken:
+            self._take(stamp_ns, read)
         if is_first and judgement.taken:
             first_s = judgement.taken[0][0] * 1e-9
             self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
 
-    def _take(self, pose_type: PoseType, stamp_ns: int, message: Any) -> None:
+    def _take(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
         try:
-            if pose_type.sensor_frame is not None:
-                self._set_frame(pose_type.sensor_frame(message))
-            self._session.add_pose(
-                self.name, stamp_ns, pose_type.position(message), pose_type.quat_xyzw(message)
-            )
+            pose = read()
+            if pose.sensor_frame is not None:
+                self._set_frame(pose.sensor_frame)
+            self._session.add_pose(self.name, stamp_ns, pose.position, pose.quat_xyzw)
         except InputError as error:
             self._refuse(stamp_ns, "unusable", str(error))
 
@@ -226,10 +224,10 @@ class TopicInput(PoseInput):
         """The type of the publishers; None if there is none that can be used."""
         if self._type_name in offered:
             return self._type_name
-        usable = [name for name in _TYPES if name in offered]
+        usable = [name for name in MESSAGES if name in offered]
         if offered and not usable:
             self._log.warning(
-                f"{self.topic} has type {', '.join(offered)}; expected {', '.join(_TYPES)}: "
+                f"{self.topic} has type {', '.join(offered)}; expected {', '.join(MESSAGES)}: "
                 f"remap {self.relative_topic} to a topic with poses",
                 ("type", self.name),
             )
@@ -242,23 +240,26 @@ class TopicInput(PoseInput):
         measures = measured_as(type_name, self._wanted, self.topic)
         if self._is_watching and measures != "poses":
             raise ConfigError(f"monitor watches poses; {self.topic} has {measures}")
-        pose_type = reading(type_name, measures)
+        read = MessageReader(type_name, measures)
         self._session.set_measures(self.name, measures)
 
-        def on_message(message: Any, info: dict[str, Any]) -> None:
-            self.receive(pose_type, message, info)
+        def on_message(data: Any, info: dict[str, Any]) -> None:
+            self.receive(read, data, info)
             for queued in waiting_messages(self._subscription):
-                self.receive(pose_type, *queued)
+                self.receive(read, *queued)
 
         # rclpy looks at the signature: with two arguments it passes the info as well, which its
         # annotations do not know.
         callback: Any = on_message
         try:
             self._subscription = self._node.create_subscription(
-                pose_type.message,
+                MESSAGES[type_name],
                 self.relative_topic,
                 callback,
                 _QOS,
+                # As bytes: making the objects of a message takes ten times as long as reading what
+                # is needed of it.
+                raw=True,
                 qos_overriding_options=QoSOverridingOptions(_QOS_OVERRIDES),
             )
         except _BAD_QOS as error:
@@ -268,11 +269,16 @@ class TopicInput(PoseInput):
         self._type_name = type_name
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
-    def receive(self, pose_type: PoseType, message: Any, info: dict[str, Any]) -> None:
+    def receive(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
         """Take a message: the callback of the subscription."""
         waited_ns = time.time_ns() - info["received_timestamp"]
         self.monitor.delivery.note(info["publication_sequence_number"], waited_ns * 1e-9)
-        self.accept(pose_type, to_ns(message.header.stamp), message)
+        try:
+            stamp_ns = unpack_stamp_ns(data)
+        except MALFORMED as error:
+            self._refuse(0, "malformed", str(error))
+            return
+        self.accept(stamp_ns, partial(read, data))
 
 
 def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, dict[str, Any]]]:
@@ -285,7 +291,7 @@ def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, d
         return
     with subscription.handle:
         for _ in range(_MOST_AT_ONCE):
-            taken = subscription.handle.take_message(subscription.msg_type, False)
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 return
             yield taken

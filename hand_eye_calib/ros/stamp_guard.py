@@ -7,13 +7,13 @@ or have corrupt stamps. A corrupt stamp is restored if the messages around it le
 place for it; otherwise the message is dropped.
 """
 
+import statistics
 from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from itertools import pairwise
 from typing import Any
-
-import numpy as np
 
 # A real change this far back is a jump of the clock, and a new session.
 BACKWARD_JUMP_NS = 1_000_000_000
@@ -191,10 +191,10 @@ class StampGuard:
     def _set_period(self) -> None:
         if len(self._intervals) < WITNESSES - 1:
             return
-        intervals = np.array(self._intervals, dtype=float)
-        self._period_ns = float(np.median(intervals))
-        off = np.abs(intervals - np.round(intervals / self._period_ns) * self._period_ns)
-        jitter_ns = float(np.percentile(off, 80))
+        period_ns = self._period_ns = statistics.median(self._intervals)
+        # Not NumPy: for so few numbers it takes several times as long.
+        off = sorted(abs(each - round(each / period_ns) * period_ns) for each in self._intervals)
+        jitter_ns = off[round(0.8 * (len(off) - 1))]
         least_ns = max(_LEAST_TOLERANCE_NS, _LEAST_TOLERANCE * self._period_ns)
         self._tolerance_ns = max(_JITTERS * jitter_ns, least_ns)
 
@@ -259,7 +259,7 @@ class StampGuard:
         # The rate may be another one.
         self._intervals.clear()
         newest = [stamp_ns for stamp_ns, _ in self._recent[-2 * WITNESSES :]]
-        self._intervals.extend(np.diff(newest).tolist())
+        self._intervals.extend(later - earlier for earlier, later in pairwise(newest))
         self._set_period()
         verdict = Verdict.JUMPED_BACK if jumped and not followed else Verdict.TAKE
         return Judgement(verdict, [(each.stamp_ns, each.message) for each in members])

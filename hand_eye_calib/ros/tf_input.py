@@ -11,8 +11,9 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import InputError, printable
+from hand_eye_calib.io.bags.messages import PoseFields
 from hand_eye_calib.io.transforms import TfSource
-from hand_eye_calib.ros.conversions import POSE_TYPES, to_ns, to_time
+from hand_eye_calib.ros.conversions import to_ns
 from hand_eye_calib.ros.inputs import PoseInput, waiting_messages
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
@@ -25,8 +26,6 @@ _STATIC_QOS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 _DYNAMIC_QOS = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-_POSE_TYPE = POSE_TYPES["geometry_msgs/msg/TransformStamped"]
 
 
 class TfInput(PoseInput):
@@ -79,18 +78,13 @@ class TfInput(PoseInput):
             transform = _stamped(each)
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):
-                    self.accept(_POSE_TYPE, pose.stamp_ns, self._message(pose))
+                    self.accept(pose.stamp_ns, partial(self._fields, pose))
             except InputError as error:
                 self._refuse(transform.stamp_ns, "unusable", str(error))
 
-    def _message(self, pose: StampedPose) -> TransformStamped:
-        message = TransformStamped(child_frame_id=self._source.sensor_frame)
-        message.header.stamp = to_time(pose.stamp_ns)
-        message.header.frame_id = self._source.world_frame
-        place, rotation = message.transform.translation, message.transform.rotation
-        place.x, place.y, place.z = pose.position
-        rotation.x, rotation.y, rotation.z, rotation.w = pose.quat_xyzw
-        return message
+    def _fields(self, pose: StampedPose) -> PoseFields:
+        frames = self._source.world_frame, self._source.sensor_frame
+        return PoseFields(pose.stamp_ns, *frames, list(pose.position), list(pose.quat_xyzw))
 
 
 def tf_source(options: NodeConfig, name: str) -> TfSource | None:

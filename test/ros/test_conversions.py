@@ -5,12 +5,16 @@ import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
+from ros_harness import parts_of
 from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib import config
 from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags.messages import POSE_TYPES
+from hand_eye_calib.io.bags.parts import PART_TYPES, MessageReader
 from hand_eye_calib.ros import conversions
 from hand_eye_calib.ros.log import NodeLog
 
@@ -37,16 +41,14 @@ def calibration(covariance, T_parent_child=T_PARENT_CHILD):
 
 
 def test_every_pose_type_of_the_options_can_be_read():
-    parts = {name for name, _ in conversions.PART_TYPES}
-    assert set(conversions.POSE_TYPES) | parts | {"auto"} == set(config.POSE_TYPES)
+    assert {*conversions.MESSAGES, "auto"} == set(config.POSE_TYPES)
+    assert set(conversions.MESSAGES) == {*POSE_TYPES, *PART_TYPES}
 
 
 def test_control_characters_in_names_of_frames_are_escaped():
-    message = Odometry()
-    message.child_frame_id = "li\x1b[2J\ndar"
-    assert conversions.POSE_TYPES["nav_msgs/msg/Odometry"].sensor_frame(message) == (
-        "li\\x1b[2J\\ndar"
-    )
+    read = MessageReader("nav_msgs/msg/Odometry", "poses")
+    data = serialize_message(Odometry(child_frame_id="li\x1b[2J\ndar"))
+    assert read(data).sensor_frame == "li\\x1b[2J\\ndar"
 
 
 def test_control_characters_do_not_reach_the_log():
@@ -66,23 +68,43 @@ def test_control_characters_do_not_reach_the_log():
 )
 def test_pose_and_frame_are_read_from_each_type(kind):
     message = kind()
-    if kind is TransformStamped:
-        place, turn = message.transform.translation, message.transform.rotation
-    else:
-        pose = message.pose if kind is PoseStamped else message.pose.pose
-        place, turn = pose.position, pose.orientation
+    place, turn = parts_of(message)
     place.x, place.y, place.z = 1.0, 2.0, 3.0
     turn.x, turn.y, turn.z, turn.w = 0.1, 0.2, 0.3, 0.9
     message.header.frame_id = "world"
-    pose_type = conversions.POSE_TYPES[f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"]
-    assert pose_type.message is kind
-    assert pose_type.position(message) == (1.0, 2.0, 3.0)
-    assert pose_type.quat_xyzw(message) == (0.1, 0.2, 0.3, 0.9)
-    if kind in (Odometry, TransformStamped):
+    type_name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
+    assert conversions.MESSAGES[type_name] is kind
+    has_frame = kind in (Odometry, TransformStamped)
+    if has_frame:
         message.child_frame_id = "lidar"
-        assert pose_type.sensor_frame(message) == "lidar"
+    pose = MessageReader(type_name, "poses")(serialize_message(message))
+    assert (pose.position, pose.quat_xyzw) == ([1.0, 2.0, 3.0], [0.1, 0.2, 0.3, 0.9])
+    assert (pose.world_frame, pose.sensor_frame) == ("world", "lidar" if has_frame else None)
+
+
+def test_bytes_that_are_no_message_are_refused():
+    data = serialize_message(Odometry())
+    with pytest.raises(InputError, match="not a message of type nav_msgs/msg/Odometry"):
+        MessageReader("nav_msgs/msg/Odometry", "poses")(data[:40])
+
+
+@pytest.mark.parametrize(
+    ("kind", "measures", "lacks"),
+    [
+        (Imu, "rates", "angular rates"),
+        (Imu, "rotations", "orientation"),
+        (NavSatFix, "positions", "fix"),
+    ],
+)
+def test_a_message_without_what_is_measured_is_refused(kind, measures, lacks):
+    message = kind()
+    if kind is Imu:
+        message.orientation_covariance[0] = message.angular_velocity_covariance[0] = -1.0
     else:
-        assert pose_type.sensor_frame is None
+        message.status.status = -1
+    read = MessageReader(f"sensor_msgs/msg/{kind.__name__}", measures)
+    with pytest.raises(InputError, match=f"the message has no {lacks}"):
+        read(serialize_message(message))
 
 
 @pytest.mark.parametrize(

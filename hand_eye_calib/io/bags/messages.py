@@ -174,6 +174,17 @@ def _unpack_pose(cursor: _Cursor, message_type: str) -> PoseFields:
     return PoseFields(stamp_ns, world_frame, sensor_frame, *cursor.pose())
 
 
+def unpack_stamp_ns(data: Buffer) -> int:
+    """Unpack the stamp of a message in CDR that begins with a header.
+
+    Raises
+    ------
+    struct.error, ValueError
+        If the bytes are not such a message.
+    """
+    return _Cursor(data, is_ros1=False).stamp_ns()
+
+
 class PoseColumns(NamedTuple):
     """The unpacked part of N messages in columns.
 

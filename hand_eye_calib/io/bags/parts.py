@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.rates import RateIntegrator
 from hand_eye_calib.io.bags.messages import (
     MALFORMED,
@@ -15,9 +15,11 @@ from hand_eye_calib.io.bags.messages import (
     Buffer,
     MalformedMessage,
     PoseColumns,
+    PoseFields,
     unpack_fix,
     unpack_imu,
     unpack_point,
+    unpack_pose,
     unpack_poses,
 )
 from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
@@ -32,6 +34,9 @@ PART_TYPES = {_IMU: ("rates", "rotations"), _FIX: ("positions",), _POINT: ("posi
 _OF_POSES = ("poses", "positions", "rotations")
 
 _LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+# What a row that is not finite lacks.
+_LACKS = {"positions": "fix", "rotations": "orientation", "rates": "angular rates"}
 
 
 def measured_as(message_type: str, wanted: str, source: object) -> str:
@@ -129,3 +134,33 @@ class PartReader:
             poses[rows, 3:] = self._integrator.quats_xyzw(stamps_ns[rows], values[rows])
         else:
             poses[rows, 3:] = values[rows]
+
+
+class MessageReader:
+    """Unpacks the messages of one topic one by one, as they arrive; the parameters are those of
+    :class:`PartReader`.
+    """
+
+    def __init__(self, message_type: str, measures: str) -> None:
+        self._type, self._measures = message_type, measures
+        self._parts = PartReader(message_type, measures)
+
+    def __call__(self, data: Buffer) -> PoseFields:
+        """The next message, in CDR.
+
+        Raises
+        ------
+        InputError
+            If it cannot be unpacked, or lacks what is measured.
+        """
+        try:
+            if self._measures == "poses":
+                return unpack_pose(data, self._type, is_ros1=False)
+            columns = self._parts.columns([data], is_ros1=False)
+        except MALFORMED as error:
+            raise InputError(f"not a message of type {self._type}: {error}") from error
+        if not np.isfinite(columns.poses).all():
+            raise InputError(f"the message has no {_LACKS[self._measures]}")
+        position, quat_xyzw = columns.poses[0, :3].tolist(), columns.poses[0, 3:].tolist()
+        frames = columns.world_frames[0], columns.sensor_frames[0]
+        return PoseFields(int(columns.stamps_ns[0]), *frames, position, quat_xyzw)
