@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,19 +16,17 @@ from reproduction import (
     hindsight,
     repeats,
     runner,
-    statistics,
     tables,
     unlike,
 )
-from reproduction.published import KITTI, LEVELS, METHODS, SIMULATED
-from reproduction.rows import ALI_AS_PUBLISHED, Cell, Row, cells
-from reproduction.statistics import Table
+from reproduction.published import KITTI, METHODS, SIMULATED
+from reproduction.results import SIMULATION_METHODS, Results
+from reproduction.rows import Cell, cells
 
 if TYPE_CHECKING:
     from reproduction.sources import PublishedSource, Source
 
 Files = dict[str, list[Path]]
-_SIMULATION_METHODS = (*METHODS, ALI_AS_PUBLISHED)
 
 
 @dataclass(frozen=True)
@@ -61,7 +58,7 @@ class Artefact:
 
 
 def _artefacts() -> dict[str, Artefact]:
-    everything = cells(SIMULATED, _SIMULATION_METHODS) + cells(KITTI, METHODS)
+    everything = cells(SIMULATED, SIMULATION_METHODS) + cells(KITTI, METHODS)
     found = [
         Artefact("fig4", [], figures.write_components),
         *(
@@ -108,62 +105,6 @@ EXPERIMENTS = {
         "findings",
     ),
 }
-
-
-@dataclass(frozen=True)
-class Results:
-    """Solved rows and the output directory.
-
-    Attributes
-    ----------
-    source : PublishedSource or SimulatedSource
-    theirs_source : PublishedSource or None
-        Source of the published results to compare with.
-    rows : list of Row
-    out : pathlib.Path
-    jobs : int
-        Number of processes of the studies, which are not solved cell by cell.
-    """
-
-    source: Source
-    theirs_source: PublishedSource | None
-    rows: list[Row]
-    out: Path
-    jobs: int = 1
-
-    @property
-    def same_cases(self) -> bool:
-        """Whether ours and the published results are of the same trajectories."""
-        return self.source == self.theirs_source
-
-    @property
-    def n_runs(self) -> int:
-        """Number of runs per level of the simulated data sets."""
-        return self.source.runs
-
-    @cached_property
-    def ours(self) -> Table:
-        """:class:`~reproduction.statistics.Table` of our errors."""
-        return statistics.ours(self.rows)
-
-    @cached_property
-    def theirs(self) -> Table | None:
-        """Table of the published errors; None without published data."""
-        if self.same_cases:
-            return statistics.theirs(self.rows)
-        if self.theirs_source is None:
-            return None
-        cases = (
-            case
-            for dataset in SIMULATED
-            for level in LEVELS[dataset]
-            for case in self.theirs_source.cases(dataset, level)
-        )
-        return statistics.theirs_of_cases(cases, _SIMULATION_METHODS)
-
-    def of(self, dataset: str, method: str) -> list[Row]:
-        """Rows of a method on a data set."""
-        return [row for row in self.rows if (row.dataset, row.method) == (dataset, method)]
 
 
 class Experiment:

@@ -21,8 +21,8 @@ from reproduction.runner import in_parallel
 from reproduction.writing import markdown_table, write_csv, write_text
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Results
     from reproduction.published import Case
+    from reproduction.results import Results
     from reproduction.sources import Source
 
 _COLUMNS = (

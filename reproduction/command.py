@@ -23,7 +23,8 @@ from reproduction.rows import Row
 from reproduction.writing import put_into_page
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Files, Results
+    from reproduction.catalogue import Files
+    from reproduction.results import Results
     from reproduction.sources import PublishedSource, Source
 
 _SILENT_S = 2.0

@@ -17,7 +17,7 @@ from reproduction.tables import rectified_errors
 from reproduction.writing import write_csv, write_text
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Results
+    from reproduction.results import Results
 
 _AS_PUBLISHED = (ALI_AS_PUBLISHED, "dnl", "dnlo", "park", "taylor", "zhuang")
 _KITTI_TITLES = {"kitti_short": "short", "kitti_long": "long"}

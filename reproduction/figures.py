@@ -20,7 +20,7 @@ from reproduction.statistics import Summary, Table, quartile_summary
 from reproduction.writing import bullets, markdown_table, percent, write_csv, write_text
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Results
+    from reproduction.results import Results
 
 # Data set, method, reference; with level and metric.
 Choice = tuple[str, str, str]

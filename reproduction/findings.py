@@ -24,7 +24,7 @@ from reproduction.statistics import Table
 from reproduction.writing import markdown_table, percent, write_text
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Results
+    from reproduction.results import Results
     from reproduction.sources import Source
 
 _WRONG_DEG = 90.0

@@ -26,7 +26,7 @@ from reproduction.runner import in_parallel
 from reproduction.writing import markdown_table, write_csv, write_text
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Results
+    from reproduction.results import Results
     from reproduction.sources import Source
 
 _COVERAGE = 0.90

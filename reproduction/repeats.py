@@ -29,7 +29,7 @@ from reproduction.sources import PublishedSource
 from reproduction.writing import markdown_table, write_csv, write_text
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Results
+    from reproduction.results import Results
 
 METHODS = {
     "adaptive": {"method": "adaptive"},

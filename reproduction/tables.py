@@ -18,7 +18,7 @@ from reproduction.rows import TITLES, Row, agree
 from reproduction.writing import markdown_table, percent, write_csv, write_text
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Results
+    from reproduction.results import Results
 
 SUMMARY_TABLES = {"table1": "kitti_short", "table2": "kitti_long"}
 _DRIVES = {

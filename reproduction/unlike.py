@@ -22,7 +22,7 @@ from reproduction.sources import SimulatedSource
 from reproduction.writing import markdown_table, write_csv, write_text
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Results
+    from reproduction.results import Results
 
 # Handheld motion: every component of twist and place is the sum of this many sines of up to so many
 # Hz.

@@ -1,0 +1,74 @@
+"""What an experiment has solved, for those who write its files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from reproduction import statistics
+from reproduction.published import LEVELS, METHODS, SIMULATED
+from reproduction.rows import ALI_AS_PUBLISHED, Row
+from reproduction.statistics import Table
+
+if TYPE_CHECKING:
+    from reproduction.sources import PublishedSource, Source
+
+SIMULATION_METHODS = (*METHODS, ALI_AS_PUBLISHED)
+
+
+@dataclass(frozen=True)
+class Results:
+    """Solved rows and the output directory.
+
+    Attributes
+    ----------
+    source : PublishedSource or SimulatedSource
+    theirs_source : PublishedSource or None
+        Source of the published results to compare with.
+    rows : list of Row
+    out : pathlib.Path
+    jobs : int
+        Number of processes of the studies, which are not solved cell by cell.
+    """
+
+    source: Source
+    theirs_source: PublishedSource | None
+    rows: list[Row]
+    out: Path
+    jobs: int = 1
+
+    @property
+    def same_cases(self) -> bool:
+        """Whether ours and the published results are of the same trajectories."""
+        return self.source == self.theirs_source
+
+    @property
+    def n_runs(self) -> int:
+        """Number of runs per level of the simulated data sets."""
+        return self.source.runs
+
+    @cached_property
+    def ours(self) -> Table:
+        """:class:`~reproduction.statistics.Table` of our errors."""
+        return statistics.ours(self.rows)
+
+    @cached_property
+    def theirs(self) -> Table | None:
+        """Table of the published errors; None without published data."""
+        if self.same_cases:
+            return statistics.theirs(self.rows)
+        if self.theirs_source is None:
+            return None
+        cases = (
+            case
+            for dataset in SIMULATED
+            for level in LEVELS[dataset]
+            for case in self.theirs_source.cases(dataset, level)
+        )
+        return statistics.theirs_of_cases(cases, SIMULATION_METHODS)
+
+    def of(self, dataset: str, method: str) -> list[Row]:
+        """Rows of a method on a data set."""
+        return [row for row in self.rows if (row.dataset, row.method) == (dataset, method)]
