@@ -96,7 +96,7 @@ class CalibratorNode(Node):
         )
         self._parts = NodeParts(
             self.get_fully_qualified_name(), self._options, self._session, self._inputs,
-            self._cycle, self._checks, self._tf, self._mount,
+            self._cycle, self._checks, self._tf, self._robot, self._mount,
         )  # fmt: skip
         self._serve()
         self._start_timers()

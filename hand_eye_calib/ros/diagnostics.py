@@ -20,6 +20,7 @@ from hand_eye_calib.ros.live_session import LiveSession
 from hand_eye_calib.ros.mount import MountWatch
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.progress import progress_report
+from hand_eye_calib.ros.robot import Robot
 from hand_eye_calib.ros.solve_cycle import SolveCycle
 from hand_eye_calib.ros.solving import FailureKind
 from hand_eye_calib.ros.status import ERROR, OK, WARN, Report, to_status
@@ -45,6 +46,7 @@ class NodeParts:
     cycle: SolveCycle
     checks: CheckMonitor
     tf: TfBroadcaster
+    robot: Robot
     mount: MountWatch | None = None
 
 
@@ -64,7 +66,9 @@ def diagnostics(parts: NodeParts, steady_s: float, clock_ns: int) -> DiagnosticA
         return _message(parts.name, reports, clock_ns)
     reports = {
         "extrinsic": extrinsic_report(parts, steady_s, clock_ns),
-        "progress": progress_report(parts.cycle.goal.progress, parts.cycle.result),
+        "progress": progress_report(
+            parts.cycle.goal.progress, parts.cycle.result, parts.robot.why_not_compared
+        ),
         **_input_reports(parts, steady_s),
         "stream checks": parts.checks.report(steady_s),
         "journal": journal_report(parts.session, parts.options.node),

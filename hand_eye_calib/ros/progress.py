@@ -38,7 +38,9 @@ class ProgressLog:
             self._log.info(progress.sentence)
 
 
-def progress_report(progress: Progress, result: Calibration | None) -> Report:
+def progress_report(
+    progress: Progress, result: Calibration | None, why_not_compared: str = ""
+) -> Report:
     """Each axis against its target, the seconds left, and what to do now.
 
     WARN before the first result, and while the motion is of no use for an axis that lacks.
@@ -60,6 +62,11 @@ def progress_report(progress: Progress, result: Calibration | None) -> Report:
         values[f"reason.{number}"] = f"{reason.sentence}: {reason.what_to_do}"
     if result is not None and result.comparison:
         values |= _comparison_values(result.comparison)
+    elif why_not_compared:
+        values |= {
+            "comparison": "not yet",
+            "comparison_sentence": f"not compared yet: {why_not_compared}",
+        }
     return Report(level, progress.sentence, values)
 
 

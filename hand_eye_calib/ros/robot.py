@@ -87,6 +87,11 @@ class Robot:
             return calibration
         return with_base(calibration, self._base_frame, T_base_parent)
 
+    @property
+    def why_not_compared(self) -> str:
+        """Why a result is not compared with what is installed; empty if that was not asked for."""
+        return (self.problem or "no result yet") if self._source else ""
+
     def lacks_base(self, calibration: Calibration) -> bool:
         """Whether the pose in the base frame was asked for and is not there."""
         return calibration.base_frame != self._base_frame

@@ -456,14 +456,15 @@ def _watched(axis: str, values: Mapping[str, str]) -> Line:
 
 
 def _difference(axis: str, values: Mapping[str, str]) -> str:
-    """Result minus what is installed, with its standard deviation."""
+    """Result minus what is installed, with its standard deviation; unknown without one."""
     difference = _number(values, f"difference.{axis}")
     sigma = _number(values, f"difference_sigma.{axis}")
     if not math.isfinite(difference):
         return ""
+    if not math.isfinite(sigma):
+        return "unknown"
     sign = "+" if difference >= 0 else ""
-    known = f" ± {small(sigma, AXES[axis])}" if math.isfinite(sigma) else ""
-    return f"{sign}{small(difference, AXES[axis])}{known}"
+    return f"{sign}{small(difference, AXES[axis])} ± {small(sigma, AXES[axis])}"
 
 
 def _title(pose: Pose | None) -> str:

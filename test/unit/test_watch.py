@@ -131,14 +131,17 @@ def test_the_comparison_has_its_figures_and_a_sign():
         "difference.z": "0.031",
         "difference_sigma.z": "0.004",
         "difference.yaw": "-0.02",
+        "difference_sigma.yaw": "unobservable",
     }
     view = view_of(progress(**values))
     assert (view.result[1].tone, view.result[1].text) == (Tone.ACT, "z has moved by 3 cm")
     assert view.bars[2].difference == "+3.1 cm ± 4 mm"
-    assert view.bars[5].difference == "-1.1 deg"
+    assert view.bars[5].difference == "unknown"
     assert view_of(progress(comparison="same")).result[1].tone is Tone.GOOD
     assert view_of(progress(comparison="cannot tell")).result[1].tone is Tone.UNKNOWN
     assert "nothing to compare with" in view_of(progress()).result[1].text
+    waiting = {"comparison": "not yet", "comparison_sentence": "not compared yet: no result yet"}
+    assert view_of(progress(**waiting)).result[1].text == "not compared yet: no result yet"
 
 
 def test_verdict_and_reasons():
