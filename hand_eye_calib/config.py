@@ -567,6 +567,20 @@ class CalibratorConfig(OptionSet):
             )
         return "positions"
 
+    def require_poses(self, what: str) -> None:
+        """Check that both sensors measure whole poses.
+
+        Raises
+        ------
+        ConfigError
+            If one does not; the message begins with ``what`` needs them.
+        """
+        if self.measured != "poses":
+            raise ConfigError(
+                f"{what} needs poses of both sensors; the parent measures "
+                f"{self.parent_measures}, the child {self.child_measures}"
+            )
+
     @property
     def targets(self) -> tuple[float, ...]:
         """Targets of x, y, z (m), roll, pitch and yaw (rad)."""

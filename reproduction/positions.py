@@ -25,20 +25,21 @@ _VIO = SensorErrors(white=sigmas(0.0008, 0.03), walk=sigmas(0.004, 0.06))
 
 @dataclass(frozen=True)
 class Machine:
-    """How a machine moves, its odometry, how long it is recorded (s) and the size of its lever arm
-    (m).
+    """How a machine moves, its odometry and the rate of that (Hz), how long it is recorded (s) and
+    the size of its lever arm (m).
     """
 
     motion: Callable[[np.random.Generator, float], motions.Motion]
     odometry: SensorErrors
+    rate_hz: float
     duration_s: float
     lever_m: float
 
 
 MACHINES = {
-    "car": Machine(motions.car, _LIDAR, 240.0, 2.0),
-    "excavator": Machine(motions.excavator, _LIDAR, 240.0, 2.0),
-    "hand-held": Machine(motions.hand_held, _VIO, 120.0, 0.3),
+    "car": Machine(motions.car, _LIDAR, 10.0, 240.0, 2.0),
+    "excavator": Machine(motions.excavator, _LIDAR, 10.0, 240.0, 2.0),
+    "hand-held": Machine(motions.hand_held, _VIO, 30.0, 120.0, 0.3),
 }
 
 
@@ -60,15 +61,16 @@ class Receiver:
 
 
 def simulated_positions(name: str, seed: int) -> tuple[Trajectory, Trajectory, FloatArray]:
-    """Poses of the odometry at 10 Hz, positions of the antenna, and the lever arm (3,)."""
+    """Poses of the odometry, positions of the antenna, and the lever arm (3,)."""
     machine, receiver = MACHINES[name], Receiver()
     seeds = (seed, sorted(MACHINES).index(name))
     motion_rng, mount_rng, odometry_rng, rng = np.random.default_rng(seeds).spawn(4)
     motion = machine.motion(motion_rng, machine.duration_s)
     lever_arm = machine.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
-    times_s: FloatArray = np.arange(round(machine.duration_s * 10.0)) / 10.0
+    step_s = 1.0 / machine.rate_hz
+    times_s: FloatArray = step_s * np.arange(round(machine.duration_s * machine.rate_hz))
     true_poses, twists = motion.at(times_s), motion.twists(times_s)
-    poses = draw(machine.odometry, true_poses, twists, 0.1, odometry_rng).poses
+    poses = draw(machine.odometry, true_poses, twists, step_s, odometry_rng).poses
     n_fixes = round((machine.duration_s - 1.0) * receiver.rate_hz)
     fixes_s: FloatArray = (np.arange(n_fixes, dtype=np.float64) + 0.25) / receiver.rate_hz
     Ts = motion.at(fixes_s)

@@ -78,6 +78,8 @@ def deliver(
         if snapshot is not None and calibration.measured == "poses":
             with waiting_for("cross-checks with other methods and halves of the recording"):
                 calibration, evidence = with_cross_check(calibration, snapshot)
+        elif snapshot is not None:
+            note("no report.html: its figures are of two streams of poses")
         keep_earlier_results(arguments.out)
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
     print(

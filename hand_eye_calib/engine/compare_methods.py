@@ -51,13 +51,14 @@ def compare_methods(
     Raises
     ------
     ConfigError
-        For a method or reference that is not known.
+        For a method or reference that is not known, or if a stream is not one of poses.
     NotEnoughDataError
         If too few poses can be paired.
     MissingDependencyError
         Without pandas.
     """
     config = config or offline_config(parent, child, {})
+    config.require_poses("a comparison of methods")
     asked = list(_asked(methods, references))
     configs = [replace(config, method=method, reference=on or "auto") for method, on in asked]
     snapshot = whole_snapshot(config, parent, child).resolved()

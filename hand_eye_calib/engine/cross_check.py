@@ -35,10 +35,13 @@ def cross_check(
 
     Raises
     ------
+    ConfigError
+        If a stream is not one of poses.
     NotEnoughDataError
         If too few poses can be paired.
     """
     config = config or offline_config(parent, child, {"method": calibration.method})
+    config.require_poses("a cross-check")
     settled = replace(config, time_offset=calibration.time_offset_s)
     pose_pairs = whole_snapshot(settled, parent, child).pose_pairs()
     answers = OtherAnswers(calibration, config, pose_pairs)

@@ -41,7 +41,14 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
     -------
     Calibration
         Without frame names. Its translation is zero and unknown.
+
+    Raises
+    ------
+    ConfigError
+        If a scale is given or to be estimated: rotations have none.
     """
+    if config.scale not in ("none", "auto"):
+        config.require_poses(f"scale {config.scale}")
     Ts_pw_p, Ts_cw_c = (_without_positions(Ts) for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c))
     has_rates = "rates" in (config.parent_measures, config.child_measures)
     systematic = SYSTEMATIC_OF_RATES if has_rates else SYSTEMATIC_OF_ROTATIONS

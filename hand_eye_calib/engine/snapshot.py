@@ -30,6 +30,9 @@ STREAMS = ("parent", "child")
 # What estimates a part of the extrinsic, by what the streams measure.
 _OF_PARTS = {"rotations": estimate_rotation, "positions": estimate_lever_arm}
 
+# Options that have no meaning for them but with these values.
+_OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "backend": ("fast",)}
+
 # A time offset that is closer than this to the one that the poses were paired with stays (s).
 _NEGLIGIBLE_S = 0.005
 
@@ -144,6 +147,9 @@ class Snapshot:
 
     def _estimate_part(self) -> Calibration:
         """The part of the extrinsic that streams without rotations or positions show."""
+        for name in ("method", "reference", "backend"):
+            if getattr(self.config, name) not in _OF_PARTS_ALONE[name]:
+                self.config.require_poses(f"{name} {getattr(self.config, name)}")
         estimate = _OF_PARTS[self.config.measured]
         result = estimate(self._pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)

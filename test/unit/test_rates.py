@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, child_of, wandering_poses
+from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 import hand_eye_calib as hec
@@ -13,6 +14,7 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import RateIntegrator, integrated
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.bags.messages import unpack_fix, unpack_imu
 from hand_eye_calib.io.bags.parts import PartReader, measured_as
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
@@ -21,7 +23,8 @@ BIAS = np.array([0.02, -0.01, 0.03])
 OFFSET_S = 0.02
 STEP_NS = 50_000_000
 START_NS = 1_700_000_000_000_000_000
-TYPES = get_typestore(Stores.ROS2_HUMBLE).types
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+TYPES = STORE.types
 
 
 def smooth_streams(n_poses=500, noise_rad=2e-4, seed=1):
@@ -101,6 +104,20 @@ class TestRates:
         found = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, rates))
         assert found.verdict is hec.Verdict.DO_NOT_USE
         assert [finding["code"] for finding in found.findings] == ["unrelated"]
+
+    @pytest.mark.parametrize(
+        "options",
+        [{"method": "dnlo"}, {"reference": "B5"}, {"backend": "ipopt"}, {"scale": "estimate"}],
+    )
+    def test_options_that_mean_nothing_here_are_refused(self, streams, options):
+        with pytest.raises(ConfigError, match="needs poses of both sensors"):
+            hec.calibrate(*streams, **options)
+
+    def test_cross_checks_are_of_poses(self, streams, result):
+        with pytest.raises(ConfigError, match="a cross-check needs poses"):
+            hec.cross_check(result, *streams)
+        with pytest.raises(ConfigError, match="comparison of methods needs poses"):
+            hec.compare_methods(*streams)
 
     def test_it_survives_a_file(self, result, tmp_path):
         again = hec.load(hec.save(result, tmp_path))
@@ -191,21 +208,22 @@ class TestFiles:
         assert document["observability"][0]["sigma"] is None
 
 
-def message(kind, **fields):
+def message(kind, stamp_ns=12_000_000_005, **fields):
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
     header = TYPES["std_msgs/msg/Header"](
-        stamp=TYPES["builtin_interfaces/msg/Time"](sec=12, nanosec=5), frame_id="imu_link"
+        stamp=TYPES["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec), frame_id="imu_link"
     )
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    return bytes(store.serialize_cdr(TYPES[kind](header=header, **fields), kind))
+    return bytes(STORE.serialize_cdr(TYPES[kind](header=header, **fields), kind))
 
 
-def imu(rates, first_covariance=0.0):
+def imu(rates, first_covariance=0.0, stamp_ns=12_000_000_005):
     covariance = np.zeros(9)
     of_rates = np.zeros(9)
     of_rates[0] = first_covariance
     vector = TYPES["geometry_msgs/msg/Vector3"]
     return message(
         "sensor_msgs/msg/Imu",
+        stamp_ns,
         orientation=TYPES["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.6, w=0.8),
         orientation_covariance=covariance,
         angular_velocity=vector(*rates),
@@ -225,6 +243,27 @@ def fix(status, latitude=60.0):
         position_covariance=np.zeros(9),
         position_covariance_type=0,
     )
+
+
+def test_a_bag_with_an_imu(tmp_path, capsys):
+    parent, stamps_ns, rates = smooth_streams(n_poses=150)
+    kind = TYPES["sensor_msgs/msg/Imu"].__msgtype__
+    bag = tmp_path / "bag"
+    write_bag(bag, {"/odom": (parent, "nav_msgs/msg/Odometry")}, "mcap")
+    with Writer(tmp_path / "imu", version=9) as writer:
+        connection = writer.add_connection("/imu", kind, typestore=STORE)
+        for stamp_ns, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
+            writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
+    parts = [str(tmp_path / name) for name in ("bag", "imu")]
+    topics = ["--parent-topic", "/odom", "--child-topic", "/imu"]
+    assert main(["replay", *parts, *topics, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["measured"], document["child_frame"]) == ("rotations", "imu_link")
+    assert document["inputs"]["options"]["child_measures"] == "rates"
+    assert main(["replay", *parts, *topics, "--child-measures", "positions"]) == 2
+    assert "/imu has messages of type" in capsys.readouterr().err
+    found = hec.read_trajectory(parts[1], topic="/imu")
+    assert (found.measures, len(found)) == ("rates", len(stamps_ns))
 
 
 class TestMessages:
