@@ -68,7 +68,8 @@ def simulated_positions(name: str, seed: int) -> tuple[Trajectory, Trajectory, F
     motion = machine.motion(motion_rng, machine.duration_s)
     lever_arm = machine.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
     step_s = 1.0 / machine.rate_hz
-    times_s: FloatArray = step_s * np.arange(round(machine.duration_s * machine.rate_hz))
+    n_poses = round(machine.duration_s * machine.rate_hz)
+    times_s: FloatArray = step_s * np.arange(n_poses, dtype=np.float64)
     true_poses, twists = motion.at(times_s), motion.twists(times_s)
     poses = draw(machine.odometry, true_poses, twists, step_s, odometry_rng).poses
     n_fixes = round((machine.duration_s - 1.0) * receiver.rate_hz)
