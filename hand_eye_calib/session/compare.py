@@ -102,7 +102,9 @@ class Difference:
         moved = self.axes(Change.MOVED)
         if not moved:
             ratios = np.abs(self.values) / self.sigmas
-            moved = [AXES[axis] for axis in np.argsort(-ratios)[:2]]
+            moved = [AXES[axis] for axis in np.argsort(-ratios)[:2] if ratios[axis] > 0]
+        if not moved:
+            return "by what the axes show together, none of them alone"
         told = []
         for axis in moved:
             index = AXES.index(axis)
@@ -281,6 +283,8 @@ def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Differen
     sigmas = np.sqrt(np.diag(covariance))
     visible = (SIGMAS + MORE_SIGMAS) * sigmas
     distance = float(values @ np.linalg.solve(covariance, values))
+    unknown = sigmas > 0.1 * np.sqrt(np.diag(_UNKNOWN))
+    sigmas, visible = np.where(unknown, np.inf, sigmas), np.where(unknown, np.inf, visible)
     verdicts = tuple(
         _axis_verdict(abs(value) / sigma, seen <= limit)
         for value, sigma, seen, limit in zip(values, sigmas, visible, limits, strict=True)
@@ -289,13 +293,12 @@ def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Differen
         verdict = Change.MOVED
     else:
         verdict = Change.CANNOT_TELL if Change.CANNOT_TELL in verdicts else Change.SAME
-    unknown = sigmas > 0.1 * np.sqrt(np.diag(_UNKNOWN))
     return Difference(
         first=first.name,
         second=second.name,
         values=values,
-        sigmas=np.where(unknown, np.inf, sigmas),
-        visible=np.where(unknown, np.inf, visible),
+        sigmas=sigmas,
+        visible=visible,
         verdicts=verdicts,
         verdict=verdict,
         chi2=distance,
