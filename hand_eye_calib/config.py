@@ -598,6 +598,10 @@ class CalibratorConfig(OptionSet):
         return known
 
 
+# Further child sensors of the node.
+MOST_OTHERS = 7
+
+
 @dataclass(frozen=True, kw_only=True)
 class NodeConfig(OptionSet):
     """Options that only the node has."""
@@ -615,6 +619,15 @@ class NodeConfig(OptionSet):
         "auto",
         "Message type of child_odom; auto takes it from the publisher.",
         choices=POSE_TYPES,
+        read_only=True,
+    )
+    other_children: int = option(
+        0,
+        "Number of further child sensors, with poses on child2_odom, child3_odom and so on. "
+        "Whenever the result is saved, all sensors are also solved together, into rig/ of "
+        "output_directory, in a process of its own.",
+        minimum=0,
+        maximum=MOST_OTHERS,
         read_only=True,
     )
     parent_tf: str = _tf_source("parent")

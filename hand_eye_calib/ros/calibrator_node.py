@@ -20,7 +20,7 @@ from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
-from hand_eye_calib.ros.inputs import PoseInput, TopicInput, qos_parameter_names
+from hand_eye_calib.ros.inputs import PoseInput, TopicInput, other_names, qos_parameter_names
 from hand_eye_calib.ros.live_session import LiveSession, check_below, output_path
 from hand_eye_calib.ros.log import LOG_PERIOD_S, NodeLog
 from hand_eye_calib.ros.mount import LIMITS, MountWatch
@@ -73,6 +73,7 @@ class CalibratorNode(Node):
         self._files = ResultFiles()
         self._report = ReportProcess()
         self._inputs = self._make_input("parent"), self._make_input("child")
+        self._others = self._make_others()
         self._session.topics = {each.name: each.topic for each in self._inputs}
         self._open_journal()
         self._topics = ResultTopics(self)
@@ -96,7 +97,7 @@ class CalibratorNode(Node):
         )
         self._parts = NodeParts(
             self.get_fully_qualified_name(), self._options, self._session, self._inputs,
-            self._cycle, self._checks, self._tf, self._robot, self._mount,
+            self._cycle, self._checks, self._tf, self._robot, self._mount, self._others,
         )  # fmt: skip
         self._serve()
         self._start_timers()
@@ -128,6 +129,16 @@ class CalibratorNode(Node):
         made = TfInput(self, name, frames, *parts) if frames else TopicInput(self, name, *parts)
         made.configure(self._options)
         return made
+
+    def _make_others(self) -> tuple[PoseInput, ...]:
+        """Inputs of further child sensors."""
+        names = other_names(self._options.node.other_children)
+        self._session.take_others(names)
+        parts = self._session, self._log, self._begin_session
+        made = [TopicInput(self, name, *parts) for name in names]
+        for each in made:
+            each.configure(self._options)
+        return tuple(made)
 
     def _open_journal(self) -> None:
         resuming = self._options.node.journal == "resume"
@@ -163,11 +174,14 @@ class CalibratorNode(Node):
     def _discover(self) -> None:
         self._inputs[0].discover(self._options.node.parent_type)
         self._inputs[1].discover(self._options.node.child_type)
-        for each in self._inputs:
+        for each in self._others:
+            each.discover("auto")
+        for each in (*self._inputs, *self._others):
             each.flush()
 
     def _on_solve_timer(self) -> None:
-        silent = [each for each in self._inputs if each.guard.last_ns is None]
+        inputs = (*self._inputs, *self._others)
+        silent = [each for each in inputs if each.guard.last_ns is None]
         if silent and silent[0].is_enabled:
             text = "; ".join(each.describe_silence() for each in silent)
             self._log.info(text, "silent", 2 * LOG_PERIOD_S)
@@ -206,7 +220,7 @@ class CalibratorNode(Node):
         self._tf.restart()
         if self._mount is not None:
             self._mount.restart()
-        for each in self._inputs:
+        for each in (*self._inputs, *self._others):
             each.restart(because_of)
 
     def _save(self) -> tuple[bool, str]:
@@ -216,10 +230,13 @@ class CalibratorNode(Node):
         if result is not None:
             result = dataclasses.replace(result, goal=cycle.goal.progress.to_dict())
         saved, text = self._files.save(result, options.output_directory, inputs)
-        if saved and options.report and result is not None and cycle.snapshot is not None:
+        others = {name: each.snapshot() for name, each in self._session.others.items()}
+        is_wanted = options.report or others
+        if saved and is_wanted and result is not None and cycle.snapshot is not None:
             path = output_path(options.output_directory)
-            self._report.write(path, SessionResult(result, cycle.snapshot, inputs))
-            text += ", report.html follows"
+            told = SessionResult(result, cycle.snapshot, inputs, options.report, others)
+            self._report.write(path, told)
+            text += f", {told.what_follows}"
         return saved, text
 
     def _log_outcome(self, success: bool, text: str) -> None:
@@ -250,7 +267,7 @@ class CalibratorNode(Node):
     def _on_set_enabled(
         self, request: SetBool.Request, response: SetBool.Response
     ) -> SetBool.Response:
-        for each in self._inputs:
+        for each in (*self._inputs, *self._others):
             each.is_enabled = request.data
         ignored = sum(each.monitor.ignored for each in self._inputs)
         verb = "accepting" if request.data else "not accepting"
@@ -268,6 +285,8 @@ class CalibratorNode(Node):
             message_type("base_frame" if options.base_frame else "installed")
         if options.monitor and not options.installed:
             raise ConfigError("monitor needs installed: what the mount is watched against")
+        if options.monitor and options.other_children:
+            raise ConfigError("monitor watches one child sensor: leave other_children at 0")
         for name in ("parent", "child"):
             if tf_source(options, name):
                 message_type(f"{name}_tf")
@@ -281,7 +300,7 @@ class CalibratorNode(Node):
             self._session.reconfigure(options.calibrator)
             self._checks.hasten()
             self._cycle.aim(options.calibrator.targets)
-        for each in self._inputs:
+        for each in (*self._inputs, *self._others):
             each.configure(options)
         self._session.follow_journal(options.node)
         self._tf.switch(options.node.publish_tf)

@@ -48,6 +48,7 @@ class NodeParts:
     tf: TfBroadcaster
     robot: Robot
     mount: MountWatch | None = None
+    others: tuple[PoseInput, ...] = ()
 
 
 def diagnostics(parts: NodeParts, steady_s: float, clock_ns: int) -> DiagnosticArray:
@@ -202,15 +203,16 @@ def _input_reports(parts: NodeParts, steady_s: float) -> dict[str, Report]:
         each.name: each.monitor.report(
             each.topic, steady_s, each.statistics, may_rest, each.what_is_missing()
         )
-        for each in parts.inputs
+        for each in (*parts.inputs, *parts.others)
     }
+    others = {f"{each.name} input": reports.pop(each.name) for each in parts.others}
     seen_s = _clock_offset(*(each.monitor for each in parts.inputs))
     result = parts.cycle.result
     used_s = result.time_offset_s if result else parts.options.calibrator.time_offset
     return {
         f"{name} input": with_clock_offset(report, seen_s, used_s)
         for name, report in reports.items()
-    }
+    } | others
 
 
 def _clock_offset(parent: InputMonitor, child: InputMonitor) -> float | None:

@@ -11,6 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 
+from hand_eye_calib.config import MOST_OTHERS
 from hand_eye_calib.engine.pose_buffer import StreamStatistics
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.bags.messages import MALFORMED, PoseFields, unpack_stamp_ns
@@ -47,7 +48,8 @@ class PoseInput:
     Parameters
     ----------
     node : rclpy.node.Node
-    name : {"parent", "child"}
+    name : str
+        "parent", "child", or one of :func:`other_names`.
     topic : str
         Where they come from, for messages.
     session : LiveSession
@@ -89,12 +91,12 @@ class PoseInput:
     @property
     def statistics(self) -> StreamStatistics:
         """What the engine has taken from this input."""
-        return self._session.calibrator.statistics(self.name)
+        return self._session.statistics(self.name)
 
     def configure(self, options: Parameters) -> None:
         """Follow the parameters."""
         self._max_gap_ns = options.calibrator.max_gap * 1e9
-        self._wanted = getattr(options.calibrator, f"{self.name}_measures")
+        self._wanted = getattr(options.calibrator, f"{self.name}_measures", "auto")
         self._is_watching = options.node.monitor
 
     def restart(self, because_of: "PoseInput | None") -> None:
@@ -302,9 +304,14 @@ def relative_topic(name: str) -> str:
     return f"{name}_odom"
 
 
+def other_names(count: int) -> list[str]:
+    """Names of the inputs of so many further child sensors."""
+    return [f"child{number}" for number in range(2, count + 2)]
+
+
 def qos_parameter_names(node: Node) -> Iterator[str]:
     """The parameters that rclpy declares for the QoS of the inputs."""
-    for name in ("parent", "child"):
+    for name in ("parent", "child", *other_names(MOST_OTHERS)):
         topic = node.resolve_topic_name(relative_topic(name))
         for policy in _QOS_OVERRIDES:
             yield f"qos_overrides.{topic}.subscription.{policy.name.lower()}"

@@ -7,7 +7,7 @@ from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.pose_buffer import BufferLimits
+from hand_eye_calib.engine.pose_buffer import BufferLimits, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.journal import has_session
@@ -30,6 +30,8 @@ class LiveSession:
     calibrator : Calibrator
     number : int
         Rises with every new session; a result of another number is out of date.
+    others : dict of str to Calibrator
+        Further child sensors by the names of their inputs, each with the parent.
     topics : dict of str to str
         Where the poses of each stream come from, for the journal.
     has_new_poses : bool
@@ -40,6 +42,7 @@ class LiveSession:
         self.calibrator = Calibrator()
         self._is_solved = True
         self.number = 0
+        self.others: dict[str, Calibrator] = {}
         self.topics: dict[str, str] = {}
         self.has_new_poses = False
         self._log = log
@@ -61,11 +64,25 @@ class LiveSession:
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
     ) -> bool:
         """Take a pose; see :meth:`Calibrator.add_pose`."""
+        if stream in self.others:
+            return self.others[stream].add_pose("child", stamp_ns, position, quat_xyzw)
         added = self.calibrator.add_pose(stream, stamp_ns, position, quat_xyzw)
+        for other in self.others.values() if added and stream == "parent" else ():
+            other.add_pose("parent", stamp_ns, position, quat_xyzw)
         if added and self._journal is not None:
             self._journal.add_pose(stream, stamp_ns, position, quat_xyzw)
         self.has_new_poses |= added and self._is_solved
         return added
+
+    def take_others(self, names: Sequence[str]) -> None:
+        """Take further child sensors, known by the names of their inputs, from now on."""
+        self.others = {name: Calibrator(_of_other(self.calibrator.config)) for name in names}
+
+    def statistics(self, stream: str) -> StreamStatistics:
+        """What the engine has taken of a stream."""
+        if stream in self.others:
+            return self.others[stream].statistics("child")
+        return self.calibrator.statistics(stream)
 
     def watch_only(self, limits: BufferLimits) -> None:
         """Never solve, and keep few poses: somebody takes the pairs as they are made."""
@@ -74,12 +91,21 @@ class LiveSession:
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
         """Take the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
+        if stream in self.others:
+            self.others[stream].set_frame("child", sensor_frame)
+            return
         self.calibrator.set_frame(stream, sensor_frame)
+        for other in self.others.values() if stream == "parent" else ():
+            other.set_frame("parent", sensor_frame)
         if self._journal is not None:
             self._journal.set_frame(stream, sensor_frame)
 
     def set_measures(self, stream: str, measures: str) -> None:
         """Take what a stream measures, as its message type says, one of config.MEASURES."""
+        if stream in self.others:
+            other = self.others[stream]
+            other.reconfigure(replace(other.config, child_measures=measures))
+            return
         name = f"{stream}_measures"
         if self._measures.get(name, "poses") != measures:
             self._measures[name] = measures
@@ -88,6 +114,8 @@ class LiveSession:
     def reconfigure(self, config: CalibratorConfig) -> None:
         """Put other options in force; the poses stay, and are to be solved again."""
         self.calibrator.reconfigure(replace(config, **self._measures))
+        for other in self.others.values():
+            other.reconfigure(_of_other(config, other.config.child_measures))
         if self._journal is not None:
             self._journal.describe(self._about())
         received = sum(self.calibrator.statistics(stream).received for stream in STREAMS)
@@ -95,7 +123,8 @@ class LiveSession:
 
     def reset(self) -> None:
         """Forget everything and begin a new session; the journal of the old one is kept aside."""
-        self.calibrator.reset()
+        for calibrator in (self.calibrator, *self.others.values()):
+            calibrator.reset()
         self.number += 1
         self.has_new_poses = False
         if self._journal is not None:
@@ -191,6 +220,15 @@ class LiveSession:
                 self._log.warning(text, "journal")
             else:
                 self._log.info(text)
+
+
+def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorConfig:
+    """The options for a further child sensor: what is set for the child in numbers is not its."""
+    options = config.to_options()
+    of_child = [name for name in options if name.startswith("prior.")] + ["child_frame"]
+    of_child += [name for name in ("time_offset", "scale") if not isinstance(options[name], str)]
+    kept = {name: value for name, value in options.items() if name not in of_child}
+    return CalibratorConfig.from_options({**kept, "child_measures": measures})
 
 
 def journal_directory(options: NodeConfig) -> Path | None:

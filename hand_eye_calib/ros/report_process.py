@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,22 @@ _COMMAND = "from hand_eye_calib.cli.session_report import main; main()"
 
 @dataclass(frozen=True)
 class SessionResult:
-    """A result of the node, the poses that gave it, and where these came from."""
+    """A result of the node, the poses that gave it, and where these came from; whether a report is
+    wanted, and the poses of further child sensors, each with those of the parent.
+    """
 
     calibration: Calibration
     snapshot: Snapshot
     inputs: Mapping[str, Any]
+    with_report: bool = True
+    others: Mapping[str, Snapshot] = field(default_factory=dict)
+
+    @property
+    def what_follows(self) -> str:
+        """What is written, in words."""
+        if not self.others:
+            return "report.html follows"
+        return "report.html and rig/ follow" if self.with_report else "rig/ follows"
 
 
 class ReportProcess:

@@ -8,8 +8,18 @@ import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped
-from ros_harness import RELIABLE_INPUTS, NodeProcess, Peer, drive, free_domain, message
+from nav_msgs.msg import Odometry
+from ros_harness import (
+    RELIABLE_INPUTS,
+    T_PARENT_CHILD,
+    NodeProcess,
+    Peer,
+    drive,
+    free_domain,
+    message,
+)
 
+import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
 from hand_eye_calib.geometry import se3
@@ -17,6 +27,7 @@ from hand_eye_calib.io.journal import has_session
 
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 LAX = {"threshold": 1e-9}
+T_PARENT_REAR = se3.exp(np.array([-1.0, 0.1, 0.3, 0.2, 0.1, 2.5]))
 
 # Parameters that change the answer while the node runs: another value, and what has to be set
 # beforehand for it to matter.
@@ -140,6 +151,29 @@ def journal_is_used(start_node, peer, tmp_path):
     peer.spin_until(lambda: has_session(tmp_path / "new" / "journal"), "a journal")
 
 
+def others_are_solved_together(start_node, peer, tmp_path):
+    """Saving solves for all sensors, without a report of the two as well."""
+    node = start_node(
+        *RELIABLE_INPUTS,
+        "-p qos_overrides./child2_odom.subscription.reliability:=reliable",
+        "-p other_children:=1",
+        f"-p output_directory:={tmp_path / 'out'}",
+    )
+    rear = peer.publisher(Odometry, "child2_odom")
+    peer.wait_matched(rear)
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive(200)
+    for stamp_ns, T in zip(stamps_ns, Ts_pw_p @ T_PARENT_REAR, strict=True):
+        rear.publish(message(Odometry, stamp_ns, T, "rear"))
+    node.wait_for_log("first pose on /child2_odom")
+    peer.solve(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
+    assert peer.trigger("save").message.endswith("rig/ follows")
+    node.wait_for_text("rig/report.html\n")
+    for name, T in (("camera", T_PARENT_CHILD), ("rear", T_PARENT_REAR)):
+        found = hec.load(tmp_path / "out/rig" / name)
+        np.testing.assert_allclose(found.T_parent_child, T, atol=1e-3)
+    assert not (tmp_path / "out/report.html").exists()
+
+
 def report_is_used(start_node, peer, tmp_path):
     """The report follows after the end of the node; a replay of the journal makes it again."""
     out = tmp_path / "out"
@@ -227,6 +261,7 @@ EFFECTS = {
     "solve_period": solve_period_is_used,
     "output_directory": output_directory_is_used,
     "journal": journal_is_used,
+    "other_children": others_are_solved_together,
     "report": report_is_used,
     "publish_tf": publish_tf_is_used,
     "installed": installed_is_used,
