@@ -23,6 +23,7 @@ from hand_eye_calib.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.version import package_version
 
 FILE_NAME = "extrinsic.yaml"
+RIG_NAME = "rig.yaml"
 XACRO_NAME = "extrinsic.urdf.xacro"
 LAUNCH_NAME = "static_transform.launch.py"
 
@@ -148,12 +149,20 @@ def load_result(path: str | Path) -> Calibration:
     """
     path = Path(path)
     if path.is_dir():
+        _refuse_rig(path)
         path = path / FILE_NAME
     document = read_yaml(path)
     try:
         return Calibration.from_dict(document)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def _refuse_rig(directory: Path) -> None:
+    """Raise InputError for the directory of a rig, which has a result for each of its sensors."""
+    if (directory / RIG_NAME).exists() and not (directory / FILE_NAME).exists():
+        sensors = sorted(str(path.parent) for path in directory.glob(f"*/{FILE_NAME}"))
+        raise InputError(f"{directory} is of a rig; name one of its sensors: {', '.join(sensors)}")
 
 
 def _xacro_text(calibration: Calibration) -> str:

@@ -4,6 +4,7 @@ by itself.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,7 @@ import yaml
 from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.files import write_atomically
-from hand_eye_calib.io.results import LAUNCH_NAME, launch_text, provenance, save_result
-
-RIG_NAME = "rig.yaml"
+from hand_eye_calib.io.results import LAUNCH_NAME, RIG_NAME, launch_text, provenance, save_result
 
 
 def save_rig(
@@ -59,8 +58,8 @@ def save_rig(
     usable = [each for each in calibrations if each.verdict is not Verdict.DO_NOT_USE]
     if usable:
         texts[LAUNCH_NAME] = launch_text(usable)
-    for calibration in calibrations:
-        save_result(calibration, directory / directory_of(calibration), inputs)
+    for calibration, name in zip(calibrations, directories(calibrations), strict=True):
+        save_result(calibration, directory / name, inputs)
     try:
         write_atomically({directory / name: text for name, text in texts.items()})
         if not usable:
@@ -73,6 +72,13 @@ def save_rig(
     return directory / RIG_NAME
 
 
-def directory_of(calibration: Calibration) -> str:
-    """Name of the directory of a sensor: its frame, a slash replaced."""
-    return calibration.child_frame.strip("/").replace("/", "_") or "sensor"
+def directories(calibrations: Sequence[Calibration]) -> list[str]:
+    """Names of the sensors' directories: their frames, with what a name of a directory should not
+    have replaced, and a number if two would be the same.
+    """
+    names: list[str] = []
+    for calibration in calibrations:
+        name = re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".") or "sensor"
+        taken = sum(other == name for other in names)
+        names.append(f"{name}_{taken + 1}" if taken else name)
+    return names

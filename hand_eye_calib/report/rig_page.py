@@ -26,7 +26,7 @@ from hand_eye_calib.report.style import GREEN, new_figure
 from hand_eye_calib.report.words import counted, size, with_sigma
 from hand_eye_calib.rig.result import RigCalibration
 
-_VIEWS = ((0, 1, "from above"), (0, 2, "from the side"))
+_VIEWS = ((0, 1), (0, 2))
 # Of the figure's extent: the axes of a sensor; the least extent, m.
 _AXIS_SHARE, _LEAST_EXTENT = 0.12, 0.1
 
@@ -98,15 +98,16 @@ def _noise(rig: RigCalibration) -> list[tuple[str, ...]]:
 
 
 def draw_rig(rig: RigCalibration) -> str:
-    """SVG of where the sensors are and how they are turned, from above and from the side, with the
-    standard deviations of their positions.
+    """SVG of where the sensors are and how they are turned, in two planes of the first one, with
+    the standard deviations of their positions.
     """
     Xs = rig.solution.Xs
     extent = max(float(np.ptp(Xs[:, :3, 3], axis=0).max()), _LEAST_EXTENT)
     with page_style():
         figure = new_figure(WIDTH, 3.9)
-        for panel, (across, up, title) in zip(figure.subplots(1, 2), _VIEWS, strict=True):
-            panel.set_title(f"{rig.sensors[0]} {title}", loc="left")
+        for panel, (across, up) in zip(figure.subplots(1, 2), _VIEWS, strict=True):
+            title = f"{'xyz'[across]}-{'xyz'[up]} plane of {rig.sensors[0]}"
+            panel.set_title(title, loc="left", parse_math=False)
             panel.set_xlabel(f"{'xyz'[across]}, m")
             panel.set_ylabel(f"{'xyz'[up]}, m")
             panel.set_aspect("equal", adjustable="datalim")
@@ -127,7 +128,14 @@ def _draw_sensor(
     for axis, colour in zip(X[:3, :3].T, (BAD, GREEN, PARENT), strict=True):
         tip = at + length * axis[[across, up]]
         panel.plot([at[0], tip[0]], [at[1], tip[1]], color=colour, lw=1.6)
-    panel.annotate(name, (at[0], at[1]), xytext=(4, 5), textcoords="offset points", color=INK)
+    panel.annotate(
+        name,
+        (at[0], at[1]),
+        xytext=(4, 5),
+        textcoords="offset points",
+        color=INK,
+        parse_math=False,
+    )
 
 
 def _draw_edge(panel: Axes, calibration: Calibration, view: tuple[int, int]) -> None:

@@ -12,6 +12,8 @@ from hand_eye_calib.cli.rig import as_lines
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.rig_files import save_rig
+from hand_eye_calib.report.rig_page import render_rig
 from hand_eye_calib.rig import solution as joint
 from hand_eye_calib.rig.calibrate import solve_rig
 from hand_eye_calib.rig.increments import Aligned, linearised
@@ -185,6 +187,24 @@ def test_a_person_sees_the_tree_and_whether_pairs_close(found):
     assert lines[0] == "USE: 3 sensors in one solve"
     assert lines[4].startswith("`- rear: x")
     assert any(line.startswith("  lidar - front - rear closes: off by") for line in lines)
+
+
+def test_a_sensor_of_any_name_stays_below_the_directory(found, tmp_path):
+    first, second = found.calibrations
+    named = [
+        dataclasses.replace(first, child_frame="../$x$/a"),
+        dataclasses.replace(second, child_frame=".._$x$_a"),
+    ]
+    odd = dataclasses.replace(
+        found, sensors=("$", "../$x$/a", ".._$x$_a"), calibrations=tuple(named)
+    )
+    save_rig(odd.to_dict(), named, tmp_path / "rig")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig"]
+    saved = sorted(path.name for path in (tmp_path / "rig").iterdir() if path.is_dir())
+    assert saved == ["__x__a", "__x__a_2"]
+    assert "../$x$/a" in render_rig(odd, ["a.txt"])
+    with pytest.raises(InputError, match=r"of a rig; name one of its sensors: .*__x__a_2"):
+        hec.load(tmp_path / "rig")
 
 
 def test_topics_of_a_bag(rig, tmp_path, capsys):
