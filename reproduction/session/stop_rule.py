@@ -14,7 +14,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.session.goal import Goal
-from reproduction.session.prefixes import Kept, Recorded, load, save, steps
+from reproduction.session.prefixes import Kept, Recorded, Step, load, save, steps
 from reproduction.writing import markdown_table
 
 TARGET = np.r_[np.full(3, 0.02), np.full(3, 0.00524)]
@@ -35,7 +35,8 @@ class Stop:
         Largest error over its target, what the truth itself is unsure of taken off; NaN if the
         session was not told to stop.
     seconds, earliest_s : float
-        When it was told to stop, and from when on all errors were within their targets.
+        When it was told to stop, and from when on, until then, all errors were within their
+        targets.
     stuck_s : float
         When it was told that this motion will not get there; NaN if it was not.
     """
@@ -63,13 +64,13 @@ def stopped(kept: Kept, factor: float) -> Stop:
     """Let the goal judge the results of a recording in turn."""
     goal = Goal(factor * TARGET)
     stuck_s = np.nan
-    for step in kept.steps:
+    for number, step in enumerate(kept.steps, start=1):
         progress = goal.add(step.calibration, step.seen)
         if progress.will_not_get_there and np.isnan(stuck_s):
             stuck_s = step.end_s
         if progress.is_done:
             worst = _worst(step.error, kept.truth_sigmas, factor)
-            earliest_s = _earliest(kept, factor)
+            earliest_s = _earliest(kept.steps[:number], kept.truth_sigmas, factor)
             return Stop(kept.name, kept.kind, factor, True, worst, step.end_s, earliest_s, stuck_s)
     return Stop(kept.name, kept.kind, factor, False, np.nan, np.nan, np.nan, stuck_s)
 
@@ -81,11 +82,11 @@ def _worst(error: FloatArray, truth_sigmas: FloatArray, factor: float) -> float:
     return float((excess / (factor * TARGET)).max())
 
 
-def _earliest(kept: Kept, factor: float) -> float:
+def _earliest(steps: Sequence[Step], truth_sigmas: FloatArray, factor: float) -> float:
     """The time from which on all errors stay within their targets."""
-    good = [_worst(step.error, kept.truth_sigmas, factor) <= 1.0 for step in kept.steps]
+    good = [_worst(step.error, truth_sigmas, factor) <= 1.0 for step in steps]
     first = len(good) - next((i for i, is_good in enumerate(good[::-1]) if not is_good), len(good))
-    return kept.steps[first].end_s if first < len(good) else np.nan
+    return steps[first].end_s if first < len(good) else np.nan
 
 
 def table(stops: Sequence[Stop]) -> str:
