@@ -23,6 +23,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.rates import chained
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
 # of the child's or of the parent's path along the axes of that sensor (m/m), by how much the
@@ -270,3 +271,11 @@ def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
     """
     mean_axes: FloatArray = 0.5 * (np.eye(3) + np.swapaxes(rotations, 1, 2))
     return intervals_s[:, None, None] * mean_axes
+
+
+def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) at the origin, freed of a bias (3,), rad/s, of the rates they come from."""
+    rotations = motions(Ts_cw_c)[:, :3, :3]
+    by_rate = _by_rate_bias(rotations, np.diff(stamps_ns) * 1e-9)
+    freed = chained(rotations @ se3.rotation_exp(-by_rate @ bias))
+    return se3.from_rotation_translation(freed, np.zeros((len(freed), 3)))

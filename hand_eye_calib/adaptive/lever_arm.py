@@ -131,6 +131,13 @@ class LeverArmSolution:
         ).tolist()
         return float(np.sqrt(3.0 * (2.0 * white + n_poses * walk)))
 
+    @property
+    def rotation_walk(self) -> float:
+        """Variance (rad^2) per axis that the drift of the odometry's rotation grows by from pose to
+        pose.
+        """
+        return float(np.exp(self.levels[noise_model.WALK_ROTATION]))
+
     def describe(self, stamps_ns: IntArray) -> dict[str, object]:
         """The noise in plain values and in words, as of an AdaptiveSolution."""
         sigmas = np.exp(0.5 * self.levels)

@@ -50,6 +50,9 @@ _CHANCE = {6: np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28]), 3: np.array([0.64,
 # recordings: a chi-squared with 6, or 3, degrees of freedom.
 _HALVES_BY_CHANCE = {6: 10.64, 3: 6.25}
 
+# Of one degree of freedom.
+_MEDIAN_OF_CHI_SQUARE_1 = 0.455
+
 # An unseen direction with at least this length in its rotation is not one of translation alone.
 _SHARE_OF_ROTATION = 0.5
 
@@ -145,33 +148,42 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
     return combined(solution.T_parent_child, covariance, None, unseen)
 
 
-def assess_rotation(solution: AdaptiveSolution) -> Assessment:
+def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessment:
     """Covariance and observability of an answer of the adaptive estimator from rotations alone.
 
     Parameters
     ----------
+    Ts_pw_p : (N, 4, 4) array
+        Poses of the parent.
     solution : AdaptiveSolution
 
     Returns
     -------
     Assessment
-        The translation is unknown.
+        The translation is unknown. So is a rotation about the only axis that the sensors rotate
+        about: it is the axis along which they do not reveal a lever arm either.
     """
-    rotation, unseen = slice(3, 6), solution.unseen[3:]
-    covariance = solution.cov_parent_child_in_child[rotation, rotation]
-    covariance = _widened_part(covariance, solution, rotation)
+    part, unseen = slice(3, 6), solution.unseen[3:]
     whole = np.zeros((6, 6))
-    whole[rotation, rotation] = covariance
-    hidden = unseen[:, np.linalg.norm(unseen, axis=0) > _SHARE_OF_ROTATION]
-    unknown = [*np.eye(6)[:3], *(np.r_[np.zeros(3), direction] for direction in hidden.T)]
+    whole[part, part] = _widened_part(
+        solution.cov_parent_child_in_child[part, part], solution, part
+    )
+    lone_axes = noise_driven(
+        Ts_pw_p, solution.T_parent_child, solution.jumps, solution.noise.rotation_variance
+    )
+    hidden = [direction for direction in unseen.T if np.linalg.norm(direction) > _SHARE_OF_ROTATION]
+    hidden += [axis[:3] for axis in lone_axes]
+    unknown = [*np.eye(6)[:3], *(np.r_[np.zeros(3), direction] for direction in hidden)]
     return combined(solution.T_parent_child, whole, None, basis(unknown))
 
 
-def assess_lever_arm(solution: LeverArmSolution) -> Assessment:
+def assess_lever_arm(Ts: FloatArray, solution: LeverArmSolution) -> Assessment:
     """Covariance and observability of a lever arm.
 
     Parameters
     ----------
+    Ts : (N, 4, 4) array
+        Poses of the sensor in whose frame it is.
     solution : LeverArmSolution
 
     Returns
@@ -181,7 +193,24 @@ def assess_lever_arm(solution: LeverArmSolution) -> Assessment:
     """
     whole = np.zeros((6, 6))
     whole[:3, :3] = _widened_part(solution.covariance, solution, slice(0, 3))
-    return combined(np.eye(4), whole, None, np.eye(6)[:, 3:])
+    white, walk = _white_rotation(Ts), solution.rotation_walk
+    hidden = noise_driven(
+        Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)
+    )
+    return combined(np.eye(4), whole, None, basis([*np.eye(6)[3:], *hidden]))
+
+
+def _white_rotation(Ts: FloatArray) -> float:
+    """Variance (rad^2) per axis of the white rotation noise of poses: at most what differs
+    from step to step about the two axes with the smoothest rotation.
+
+    Nothing else shows it where positions alone are measured: noise of the orientation would look
+    like a small motion that does not move the lever arm.
+    """
+    steps = se3.rotation_log(np.swapaxes(Ts[:-1, :3, :3], 1, 2) @ Ts[1:, :3, :3])
+    # Differences of steps have six times the variance of white noise.
+    variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / _MEDIAN_OF_CHI_SQUARE_1 / 6.0
+    return float(np.sort(variances)[:2].mean())
 
 
 def _widened_part(

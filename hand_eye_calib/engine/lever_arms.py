@@ -51,7 +51,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     solution = lever_arm.solve(pose_pairs.stamps_ns, poses, positions, with_scale)
     sign = 1.0 if is_child else -1.0
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
-    fused = fuse(T, assess_lever_arm(solution), config.prior())
+    fused = fuse(T, assess_lever_arm(poses, solution), config.prior())
     result = _calibration(solution, fused.assessment, pose_pairs, config)
     status = SolveStatus.CONTRADICTED if fused.contradictions else result.status
     given = config.scale if not isinstance(config.scale, str) else 1.0
@@ -152,7 +152,7 @@ def _unrelated(
         stream="both",
         severity=Severity.ERROR,
         confidence=Confidence.LIKELY,
-        what=f"{share:.0%} of the motion of the positions is not that of the odometry",
+        what=f"{min(share, 1.0):.0%} of the motion of the positions is not that of the odometry",
         advice="check that both are on one rigid body, the units, the scale, and the clocks "
         "(time_offset estimate)",
     )

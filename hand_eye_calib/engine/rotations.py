@@ -5,12 +5,19 @@ The adaptive estimator sees trajectories that never leave their origins: their i
 translation, and what it finds for the rotation does not depend on the rest.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from hand_eye_calib.adaptive import estimator as adaptive_estimator
-from hand_eye_calib.adaptive.increments import SYSTEMATIC_OF_RATES, SYSTEMATIC_OF_ROTATIONS
+from hand_eye_calib.adaptive.increments import (
+    RATE,
+    SYSTEMATIC_OF_RATES,
+    SYSTEMATIC_OF_ROTATIONS,
+    without_rate_bias,
+)
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_rotation
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
@@ -51,9 +58,8 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         config.require_poses(f"scale {config.scale}")
     Ts_pw_p, Ts_cw_c = (_without_positions(Ts) for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c))
     has_rates = "rates" in (config.parent_measures, config.child_measures)
-    systematic = SYSTEMATIC_OF_RATES if has_rates else SYSTEMATIC_OF_ROTATIONS
-    solution = adaptive_estimator.solve(pose_pairs.stamps_ns, Ts_pw_p, Ts_cw_c, systematic)
-    fused = fuse(solution.T_parent_child, assess_rotation(solution), config.prior())
+    solution, Ts_cw_c = _solved(pose_pairs.stamps_ns, Ts_pw_p, Ts_cw_c, has_rates)
+    fused = fuse(solution.T_parent_child, assess_rotation(Ts_pw_p, solution), config.prior())
     verdicts = fused.assessment.observability[3:]
     is_known = all(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in verdicts)
     status = SolveStatus.OK if is_known else SolveStatus.UNOBSERVABLE
@@ -87,6 +93,25 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
         motion_residuals=residuals,
     )
+
+
+def _solved(
+    stamps_ns: IntArray, Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, has_rates: bool
+) -> tuple[AdaptiveSolution, FloatArray]:
+    """The solution, and the child's poses freed of the bias of the rates.
+
+    The noise is fitted to increments of up to some seconds. What a bias does to these is linear
+    only for what is left of it after a first solve.
+    """
+    if not has_rates:
+        solution = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_ROTATIONS)
+        return solution, Ts_cw_c
+    first = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES, quick=True)
+    Ts_cw_c = without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
+    solution = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES)
+    parameters = solution.parameters.copy()
+    parameters[RATE] += first.parameters[RATE]
+    return replace(solution, parameters=parameters), Ts_cw_c
 
 
 def _without_positions(Ts: FloatArray) -> FloatArray:
@@ -138,7 +163,7 @@ def _unrelated(
         stream="both",
         severity=Severity.ERROR,
         confidence=Confidence.LIKELY,
-        what=f"{share:.0%} of the rotation of one sensor is not that of the other",
+        what=f"{min(share, 1.0):.0%} of the rotation of one sensor is not that of the other",
         advice="check that both are on one rigid body, the unit of the rates, and the clocks "
         "(time_offset estimate)",
     )

@@ -35,6 +35,8 @@ _OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "back
 
 # A time offset that is closer than this to the one that the poses were paired with stays (s).
 _NEGLIGIBLE_S = 0.005
+# One that is farther away is no time offset (s).
+_BELIEVABLE_S = 1.0
 
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
@@ -153,7 +155,7 @@ class Snapshot:
         estimate = _OF_PARTS[self.config.measured]
         result = estimate(self._pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)
-        if len(self.kept) or abs(found_s - given_s) < _NEGLIGIBLE_S:
+        if len(self.kept) or not _NEGLIGIBLE_S < abs(found_s - given_s) < _BELIEVABLE_S:
             return result
         # Interpolated where the other stream has its poses, rather than moved along its velocity.
         config = replace(self.config, time_offset=found_s)

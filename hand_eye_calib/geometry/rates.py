@@ -18,8 +18,13 @@ def integrated(stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
     """
     intervals_s = np.diff(stamps_ns) * 1e-9
     steps = 0.5 * (rates[1:] + rates[:-1]) * intervals_s[:, None]
-    rotations = np.concatenate([np.eye(3)[None], se3.rotation_exp(steps)])
-    # Products of all rotations up to each, in as many passes as the number has digits.
+    return chained(se3.rotation_exp(steps))
+
+
+def chained(steps: FloatArray) -> FloatArray:
+    """Orientations (N + 1, 3, 3) after each of the rotations (N, 3, 3), from the identity on."""
+    rotations = np.concatenate([np.eye(3)[None], steps])
+    # Products of all up to each, in as many passes as their number has binary digits.
     span = 1
     while span < len(rotations):
         rotations[span:] = rotations[:-span] @ rotations[span:]

@@ -113,6 +113,15 @@ class TestLeverArm:
         known = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)})
         assert known.status is hec.SolveStatus.OK
 
+    def test_noise_of_the_orientation_does_not_show_the_height(self):
+        poses = planar_poses(400, seed=3)
+        parent, child = recorded(drift_rad=0.0, poses=poses)
+        tilt = 0.004 * np.random.default_rng(0).normal(size=(400, 3))
+        noisy = parent.poses @ se3.exp(np.c_[np.zeros((400, 3)), tilt])
+        found = hec.calibrate(Trajectory(parent.stamps_ns, noisy, "lidar"), child)
+        assert found.unobservable() == ["z", "roll", "pitch", "yaw"]
+        assert np.abs(distances(found)[:2]).max() < 4.0
+
     def test_positions_of_another_body_are_not_to_be_used(self, streams):
         found = hec.calibrate(streams[0], recorded(seed=8)[1])
         assert found.verdict is hec.Verdict.DO_NOT_USE

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, child_of, wandering_poses
+from motions import T_PARENT_CHILD, child_of, planar_poses, wandering_poses
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -97,6 +97,25 @@ class TestRates:
         found = hec.calibrate(parent, child)
         assert found.rate_bias is None
         assert angle_to(T_PARENT_CHILD[:3, :3], found) < np.radians(0.1)
+
+    def test_about_a_single_axis_the_angle_around_it_is_unobservable(self, streams):
+        poses = planar_poses(400, seed=2)
+        stamps_ns = START_NS + STEP_NS * np.arange(400)
+        noise = 1e-3 * np.random.default_rng(0).normal(size=(2, 400, 6))
+        parent, child = (
+            Trajectory(stamps_ns, Ts @ se3.exp(each), measures="rotations")
+            for Ts, each in zip((poses, child_of(poses)), noise, strict=True)
+        )
+        found = hec.calibrate(parent, child)
+        assert found.unobservable() == ["x", "y", "z", "yaw"]
+        assert found.status is hec.SolveStatus.UNOBSERVABLE
+        assert "the motion does not show yaw" in found.reasons[0].sentence
+
+    def test_a_sensor_that_stands_still_is_not_to_be_used(self, streams):
+        parent, _ = streams
+        _, stamps_ns, rates = smooth_streams()
+        found = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, 0.0 * rates))
+        assert found.verdict is hec.Verdict.DO_NOT_USE
 
     def test_rates_of_another_body_are_not_to_be_used(self, streams):
         parent, _ = streams
