@@ -412,8 +412,11 @@ def test_warnings_are_part_of_the_verdict(hilly):
         assert reason.what_to_do in verdict
 
 
-def test_what_is_installed_is_compared_axis_by_axis(planar, tmp_path):
-    snapshot, calibration, *_ = planar
+def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own_target(
+    planar, tmp_path
+):
+    snapshot, calibration, _, before = planar
+    calibration = dataclasses.replace(calibration, target_axes={"x": 0.2})
     to_parent = se3.from_rotation_translation(np.eye(3), np.array([0.5, 0.0, 0.0]))
     installed = Extrinsic(to_parent @ calibration.T_parent_child, "robot.urdf <b>")
     compared = with_comparison(calibration, installed)
@@ -427,6 +430,10 @@ def test_what_is_installed_is_compared_axis_by_axis(planar, tmp_path):
     assert "along z 0 mm ± unknown unknown cannot tell about x" in shown
     assert shown.count("deg same") == 3
     assert "robot.urdf <b>" in page.text
+    assert "mark: the target, 2.0 cm and 0.30 deg" in before.text
+    assert "mark: the target, 2.0 cm, 0.30 deg and x 20 cm" in page.text
+    widths = [[a["style"] for a in each.all("i")] for each in (before, page)]
+    assert [a == b for a, b in zip(*widths, strict=True)] == [False] + [True] * 5
     hec.save(compared, tmp_path)
     (file,) = tmp_path.glob("*.yaml")
     stated = yaml.safe_load(file.read_text())["comparison"]
@@ -434,16 +441,6 @@ def test_what_is_installed_is_compared_axis_by_axis(planar, tmp_path):
     assert stated["values"]["x"] == pytest.approx(installed.values[0])
     assert stated["differences"][0]["axes"]["x"]["difference"] == pytest.approx(-0.5)
     assert stated["differences"][0]["axes"]["z"]["sigma"] is None
-
-
-def test_targets_of_single_axes_are_marked_and_move_their_bars():
-    snapshot, calibration = simulated()
-    _, before = page_of(snapshot, calibration)
-    _, after = page_of(snapshot, dataclasses.replace(calibration, target_axes={"z": 0.2}))
-    assert "mark: the target, 2.0 cm and 0.30 deg" in before.text
-    assert "mark: the target, 2.0 cm, 0.30 deg and z 20 cm" in after.text
-    widths = [[a["style"] for a in page.all("i")] for page in (before, after)]
-    assert [a == b for a, b in zip(*widths, strict=True)] == [True, True, False, True, True, True]
 
 
 @pytest.mark.parametrize(
