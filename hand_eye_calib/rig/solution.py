@@ -310,8 +310,8 @@ def _outliers_found(state: _State) -> _State:
         of_walk.append(_surprises(force, own, jumps))
         at_poses = likelihood.precision_at_poses(sensor)
         of_white.append(_surprises(model.at_poses(force), at_poses, spikes))
-    walks = _of_the_loudest(np.array(of_walk), model.jumps)
-    whites = _of_the_loudest(np.array(of_white), model.spikes)
+    walks = _of_one_sensor(np.array(of_walk), model.jumps)
+    whites = _of_one_sensor(np.array(of_white), model.spikes)
     found = [
         judged(outliers, walk, white, with_spikes=True)
         for outliers, walk, white in zip(state.outliers, walks, whites, strict=True)
@@ -337,13 +337,13 @@ def _surprises(forces: FloatArray, covariances: FloatArray, left_out: BoolArray)
     return (expected * np.linalg.solve(spread, expected))[:, :, 0].sum(axis=1)
 
 
-def _of_the_loudest(surprises: FloatArray, known: BoolArray) -> FloatArray:
+def _of_one_sensor(surprises: FloatArray, known: BoolArray) -> FloatArray:
     """Surprises (S, n), zero where another sensor's is larger there or beside: one event is of one
     sensor. Those that are known stay.
     """
     padded = np.pad(surprises.max(axis=0), 1)
-    loudest = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
-    return np.where((surprises >= loudest) | known, surprises, 0.0)
+    largest = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.where((surprises >= largest) | known, surprises, 0.0)
 
 
 def _polished(state: _State) -> RigSolution:
