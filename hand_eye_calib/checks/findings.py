@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -95,6 +95,21 @@ class Finding:
             "evidence": dict(self.evidence),
             "options": dict(self.options),
         }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Build from the mapping that :meth:`to_dict` gave."""
+        return cls(
+            code=data["code"],
+            stream=data["stream"],
+            severity=Severity(data["severity"]),
+            confidence=Confidence(data["confidence"]),
+            what=data["what"],
+            advice=data["advice"],
+            cause=data["cause"],
+            evidence=tuple(data["evidence"].items()),
+            options=tuple(data["options"].items()),
+        )
 
     def __str__(self) -> str:
         cause = f" ({self.cause})" if self.cause else ""

@@ -13,7 +13,7 @@ from hand_eye_calib.alignment.time_offset import (
 )
 from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.checks.check import CheckResult, check_streams
-from hand_eye_calib.checks.findings import answered, gravest_first
+from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
 from hand_eye_calib.engine.lever_arms import estimate_lever_arm
@@ -196,7 +196,11 @@ class Snapshot:
         Returns
         -------
         CheckResult
+            Of streams that are no poses, what the solve itself found.
         """
+        if self.config.measured != "poses":
+            found = calibration.findings if calibration else ()
+            return CheckResult(tuple(Finding.from_dict(each) for each in found))
         offset_s = calibration.time_offset_s if calibration else self.config.time_offset
         scale = calibration.scale if calibration else self.config.scale
         max_gap_s = self.config.max_gap

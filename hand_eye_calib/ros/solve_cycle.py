@@ -229,6 +229,8 @@ class SolveCycle:
         return good, "; ".join((text, *said, *calibration.warnings))
 
     def _with_findings(self, calibration: Calibration) -> Calibration:
+        if calibration.measured != "poses":
+            return calibration  # which has its own
         return replace(calibration, findings=self._checks.findings())
 
     def _report_failure(self, failure: Failure) -> str:

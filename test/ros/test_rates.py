@@ -23,10 +23,10 @@ def imu_messages(stamps_ns, Ts_cw_c):
 
 
 def test_an_imu_as_child(start_node, peer):
-    start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
+    node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
     publishers = peer.publishers(Odometry, Imu)
     peer.wait_matched(*publishers)
-    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive(300)  # long enough for the stream checks
     for stamp_ns, T, imu in zip(stamps_ns, Ts_pw_p, imu_messages(stamps_ns, Ts_cw_c), strict=True):
         publishers[0].publish(message(Odometry, stamp_ns, T, "lidar"))
         publishers[1].publish(imu)
@@ -42,3 +42,5 @@ def test_an_imu_as_child(start_node, peer):
     assert float(se3.rotation_angle(T[:3, :3].T @ T_PARENT_CHILD[:3, :3])) < np.radians(3.0)
     peer.spin_until(lambda: with_covariance, "the pose with covariance")
     assert with_covariance[-1].pose.covariance[0] > 1.0
+    assert "DO NOT USE" not in peer.trigger("solve").message
+    assert "Traceback" not in node.log
