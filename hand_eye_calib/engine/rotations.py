@@ -19,7 +19,7 @@ from hand_eye_calib.adaptive.increments import (
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_rotation
-from hand_eye_calib.assessment.prior import fuse
+from hand_eye_calib.assessment.prior import Fused, fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.config import CalibratorConfig, parse_targets
@@ -59,18 +59,14 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
     Ts_pw_p, Ts_cw_c = (_without_positions(Ts) for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c))
     has_rates = "rates" in (config.parent_measures, config.child_measures)
     solution, Ts_cw_c = _solved(pose_pairs.stamps_ns, Ts_pw_p, Ts_cw_c, has_rates)
-    fused = fuse(solution.T_parent_child, assess_rotation(Ts_pw_p, solution), config.prior())
-    verdicts = fused.assessment.observability[3:]
-    is_known = all(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in verdicts)
-    status = SolveStatus.OK if is_known else SolveStatus.UNOBSERVABLE
-    if fused.contradictions:
-        status = SolveStatus.CONTRADICTED
+    assessment = assess_rotation(Ts_pw_p, solution)
+    fused = fuse(solution.T_parent_child, assessment, config.prior())
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
     residuals = _residuals(pairs, solution, pose_pairs)
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
-        status=status if solution.converged else SolveStatus.NOT_CONVERGED,
+        status=_status(solution, fused),
         observability=fused.assessment.observability,
         measured="rotations",
         T_method=solution.T_parent_child,
@@ -93,6 +89,16 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
         motion_residuals=residuals,
     )
+
+
+def _status(solution: AdaptiveSolution, fused: Fused) -> SolveStatus:
+    if not solution.converged:
+        return SolveStatus.NOT_CONVERGED
+    if fused.contradictions:
+        return SolveStatus.CONTRADICTED
+    angles = fused.assessment.observability[3:]
+    is_known = all(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in angles)
+    return SolveStatus.OK if is_known else SolveStatus.UNOBSERVABLE
 
 
 def _solved(
