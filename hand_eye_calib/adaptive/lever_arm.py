@@ -71,6 +71,9 @@ _MOST_POSES = 300
 # A jump is a step of the walk with this many times the variance that it needs.
 _JUMP_FACTOR = 10.0
 
+# Parts of a recording that are compared by themselves, and fewest positions of one.
+_PARTS = 10
+
 # The quality of a solution is that of so many positions around; those whose squared errors exceed
 # the median by this factor count less.
 _NEIGHBOURS, _WORSE, _STUDENT = 11, 16.0, 4.0
@@ -123,13 +126,6 @@ class LeverArmSolution:
     misfit: float
     objective: float
     converged: bool
-
-    def noise_over(self, n_poses: int) -> float:
-        """Standard deviation (m) of the error of the motion over so many poses."""
-        white, walk = np.exp(
-            self.levels[[noise_model.TRANSLATION, noise_model.WALK_TRANSLATION]]
-        ).tolist()
-        return float(np.sqrt(3.0 * (2.0 * white + n_poses * walk)))
 
     @property
     def rotation_walk(self) -> float:
@@ -234,6 +230,24 @@ def _first_answer(
         if np.abs(lever_arm - before).max() < _SETTLED_START:
             break
     return lever_arm, scale
+
+
+def unexplained_share(
+    Ts_pw_p: FloatArray, positions: FloatArray, solution: LeverArmSolution
+) -> float:
+    """Share of the path of positions (N, 3) that the poses (N, 4, 4) and the lever arm do not
+    explain, in tenths of the recording, each aligned by itself; 1 if nothing moves.
+    """
+    predicted = Ts_pw_p[:, :3, :3] @ solution.lever_arm + Ts_pw_p[:, :3, 3]
+    size = max(len(positions) // _PARTS, min(_PARTS, len(positions)))
+    end = len(positions) // size * size
+    expected, measured = (
+        _centred(path[:end].reshape(-1, size, 3))
+        for path in (predicted, solution.scale * positions)
+    )
+    residuals = measured @ _rotations(measured, expected) - expected
+    left, whole = ((path**2).sum(axis=(1, 2)) for path in (residuals, measured))
+    return float(np.sqrt(np.median(left) / np.median(whole))) if np.median(whole) else 1.0
 
 
 def _centred(windows: FloatArray) -> FloatArray:

@@ -19,9 +19,9 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 
-# Two streams of which more than this share of the path stays unexplained are not of one body, over
-# motions of so many poses.
-_UNRELATED, _SPAN = 0.5, 10
+# Two streams of which more than this share of the path stays unexplained are not of one body. Of
+# one body it is 0.05 at most, of two 0.5 and more.
+_UNRELATED = 0.3
 
 
 def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
@@ -141,10 +141,8 @@ def _residuals(
 def _unrelated(
     solution: LeverArmSolution, poses: FloatArray, positions: FloatArray
 ) -> list[dict[str, object]]:
-    """A finding if the noise that was found is as large as the motion."""
-    span = min(_SPAN, max(len(poses) // 10, 1))
-    motion_m = solution.scale * np.linalg.norm(positions[span:] - positions[:-span], axis=1)
-    share = solution.noise_over(span) / max(float(np.sqrt(np.mean(motion_m**2))), 1e-12)
+    """A finding if the path of the positions is not that of the odometry."""
+    share = lever_arm.unexplained_share(poses, positions, solution)
     if share < _UNRELATED:
         return []
     found = Finding(

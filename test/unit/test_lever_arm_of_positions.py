@@ -21,7 +21,7 @@ def antenna_of(poses, noise_m, seed=5):
     return positions + noise_m * np.random.default_rng(seed).standard_normal(positions.shape)
 
 
-def recorded(n_poses=400, noise_m=0.005, drift_rad=2e-4, seed=2, poses=None):
+def recorded(n_poses=300, noise_m=0.005, drift_rad=2e-4, seed=2, poses=None):
     """Odometry that drifts, and positions beside it."""
     poses = wandering_poses(n_poses, seed) if poses is None else poses
     random = np.random.default_rng(seed)
@@ -79,7 +79,7 @@ class TestLeverArm:
         assert found.T_parent_child[:3, 3] == pytest.approx(result.T_parent_child[:3, 3], abs=1e-9)
 
     def test_another_clock_is_found_from_the_speeds(self):
-        parent, child = recorded(poses=wandering_poses(600, seed=4, step_rad=0.02))
+        parent, child = recorded(poses=wandering_poses(400, seed=4, step_rad=0.02))
         found = hec.calibrate(parent, child.shifted(-7.31), time_offset="estimate")
         assert found.time_offset_s == pytest.approx(7.31, abs=0.01)
         assert np.abs(distances(found)).max() < 4.0

@@ -27,7 +27,7 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = STORE.types
 
 
-def smooth_streams(n_poses=500, noise_rad=2e-4, seed=1):
+def smooth_streams(n_poses=300, noise_rad=2e-4, seed=1):
     """Poses of the parent every 50 ms, and rates of the child five times as often, late and with a
     bias."""
     random = np.random.default_rng(seed)
