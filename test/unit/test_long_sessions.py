@@ -184,7 +184,7 @@ def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
     feed(calibrator, "child", child)
     snapshot = calibrator.snapshot().resolved()
     calibrator.adopt(snapshot.time_offset)
-    monkeypatch.setattr("hand_eye_calib.engine.calibrator.estimate_time_offset", None)
+    monkeypatch.setattr("hand_eye_calib.engine.calibrator.estimated_time_offset", None)
     extra = as_trajectory(wandering_poses(900))[400:]
     feed(calibrator, "parent", extra)
     assert calibrator.estimate().time_offset_s == snapshot.time_offset.seconds
