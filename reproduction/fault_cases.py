@@ -486,3 +486,91 @@ UNTUNED = (
     Fault("U11", "poses held", (0.1, 0.2, 0.5), held, "s", _ANY),
     Fault("U12", "two sensors, no order", (0.03, 0.1, 0.3), mixed, "m", _ANY),
 )
+
+
+# ------------------------------------- faults that were built when all was done
+
+
+def parent_positions_late(parent: Trajectory, child: Trajectory, s: float, random: Any) -> Streams:
+    """Positions of the parent later than the orientations of the same message."""
+    return late_positions(child, parent, s, random)[1], child
+
+
+def late_orientations(
+    parent: Trajectory, child: Trajectory, delay_s: float, random: Any
+) -> Streams:
+    """Orientations of the child later than the positions of the same message."""
+    late = child.shifted(delay_s).at(child.stamps_ns, extrapolate=True)
+    return parent, with_poses(child, rotations=late[:, :3, :3])
+
+
+def height_gain(parent: Trajectory, child: Trajectory, gain: float, random: Any) -> Streams:
+    """Heights of the child off by a factor, as of a barometer."""
+    return parent, with_poses(child, positions=child.poses[:, :3, 3] * [1.0, 1.0, 1.0 + gain])
+
+
+def heading_drift(parent: Trajectory, child: Trajectory, degrees: float, random: Any) -> Streams:
+    """The child's world turns about its vertical, by so many degrees a minute."""
+    minutes = (child.stamps_ns - child.stamps_ns[0]) / 60e9
+    worlds = np.tile(np.eye(4), (len(child), 1, 1))
+    worlds[:, :3, :3] = se3.rotation_exp(np.outer(np.radians(degrees) * minutes, [0.0, 0.0, 1.0]))
+    return parent, dataclasses.replace(child, poses=worlds @ child.poses)
+
+
+def flat_positions(parent: Trajectory, child: Trajectory, share: float, random: Any) -> Streams:
+    """Heights of the child a share less than they were; orientations as they are."""
+    return parent, with_poses(child, positions=child.poses[:, :3, 3] * [1.0, 1.0, 1.0 - share])
+
+
+def jittered(parent: Trajectory, child: Trajectory, sigma_s: float, random: Any) -> Streams:
+    """Stamps of the child scatter; in the order of the stamps."""
+    stamps_ns = child.stamps_ns + np.round(1e9 * sigma_s * random.standard_normal(len(child)))
+    stamps_ns, first = np.unique(stamps_ns.astype(np.int64), return_index=True)
+    return parent, Trajectory(stamps_ns, child.poses[first])
+
+
+def every_second_late(parent: Trajectory, child: Trajectory, late_s: float, random: Any) -> Streams:
+    """Every second pose of the child has a stamp that is too late."""
+    stamps_ns = child.stamps_ns.copy()
+    stamps_ns[1::2] += round(late_s * 1e9)
+    stamps_ns, first = np.unique(stamps_ns, return_index=True)
+    return parent, Trajectory(stamps_ns, child.poses[first])
+
+
+def swinging(parent: Trajectory, child: Trajectory, degrees: float, random: Any) -> Streams:
+    """The child swings on its mount about one axis, once in seven seconds."""
+    elapsed_s = (child.stamps_ns - child.stamps_ns[0]) * 1e-9
+    angles = np.radians(degrees) * np.sin(2 * np.pi * elapsed_s / 7.0)
+    turned = child.poses.copy()
+    turned[:, :3, :3] = turned[:, :3, :3] @ se3.rotation_exp(np.outer(angles, [0.0, 1.0, 0.0]))
+    return parent, dataclasses.replace(child, poses=turned)
+
+
+def coarse_angles(parent: Trajectory, child: Trajectory, degrees: float, random: Any) -> Streams:
+    """Euler angles of the child in whole steps."""
+    angles = Rotation.from_matrix(child.poses[:, :3, :3]).as_euler("ZYX", degrees=True)
+    angles = np.round(angles / degrees) * degrees
+    return parent, with_poses(child, Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+
+
+def both_low_passed(parent: Trajectory, child: Trajectory, tau_s: float, random: Any) -> Streams:
+    """Positions of both streams low-passed, orientations not."""
+    _, slow_child = low_passed(parent, child, tau_s, random)
+    _, slow_parent = low_passed(child, parent, tau_s, random)
+    return slow_parent, slow_child
+
+
+UNSEEN = (
+    Fault("V1", "parent's positions late", (0.02, 0.05, 0.1), parent_positions_late, "s", _ANY),
+    Fault("V2", "child's orientations late", (0.02, 0.05, 0.1), late_orientations, "s", _ANY),
+    Fault("V3", "heights off by a factor", (0.02, 0.1, 0.5), height_gain, "", _ANY),
+    Fault("V4", "heading drifts", (1.0, 5.0, 20.0), heading_drift, "deg/min", _ANY),
+    Fault("V5", "positions flat", (0.2, 0.5, 1.0), flat_positions, "share", _ANY),
+    Fault("V6", "stamps scatter", (0.005, 0.02, 0.05), jittered, "s", _ANY),
+    Fault("V7", "every second stamp late", (0.01, 0.02, 0.04), every_second_late, "s", _ANY),
+    Fault("V8", "child swings on its mount", (0.2, 1.0, 5.0), swinging, "deg", _ANY),
+    Fault("V9", "angles in whole steps", (0.2, 1.0, 5.0), coarse_angles, "deg", _ANY),
+    Fault(
+        "V10", "both streams' positions low-passed", (0.05, 0.1, 0.2), both_low_passed, "s", _ANY
+    ),
+)

@@ -3,15 +3,17 @@ nobody gave.
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
-from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.engine.snapshot import GAP_INTERVALS, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.pairing.synchronise import PosePairs
 
 # Options that a check can be certain of.
 _MENDED = ("time_offset", "scale")
@@ -21,13 +23,35 @@ _MENDED = ("time_offset", "scale")
 _MOST_MOVED_S = 0.003
 
 
+@dataclass(frozen=True)
+class Mended:
+    """A result after the stream checks.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        With its findings.
+    snapshot : Snapshot
+        With the options that gave it.
+    check : CheckResult
+        Of its streams.
+    options : dict
+        What was set because a check is certain of it; empty if nothing was.
+    told : tuple of str
+        Warnings about that.
+    """
+
+    calibration: Calibration
+    snapshot: Snapshot
+    check: CheckResult
+    options: dict[str, Any] = field(default_factory=dict)
+    told: tuple[str, ...] = ()
+
+
 def checked(
     calibration: Calibration, snapshot: Snapshot, given: Collection[str] | None = None
 ) -> tuple[Calibration, Snapshot]:
-    """Check the streams of a result.
-
-    If a check is certain of the time offset or of the scale, and the option was not given, the
-    extrinsic is solved again with it, and a warning of the result says so.
+    """Check the streams of a result, and mend what a check is certain of.
 
     Parameters
     ----------
@@ -40,48 +64,91 @@ def checked(
     Returns
     -------
     calibration : Calibration
-        With its findings.
+        With its findings, and with a warning about each option that was set.
     snapshot : Snapshot
         With the options that gave it.
     """
-    if calibration.measured != "poses":
-        return calibration, snapshot  # the checks are of poses; the solve has its own findings
-    findings = snapshot.check(calibration).findings
-    found = _with(calibration, findings)
-    if given is None or len(snapshot.kept):
-        return found, snapshot
-    certain = _certain(findings, given)
+    found = mend(calibration, snapshot, given)
+    warnings = dict.fromkeys((*found.told, *calibration.warnings, *found.calibration.warnings))
+    return replace(found.calibration, warnings=tuple(warnings)), found.snapshot
+
+
+def mend(
+    calibration: Calibration, snapshot: Snapshot, given: Collection[str] | None = None
+) -> Mended:
+    """Check the streams of a result. If a check is certain of the time offset or of the scale, and
+    the option was not given, solve again with it. Parameters as of :func:`checked`.
+    """
+    check = snapshot.check(calibration)
+    found = Mended(_with(calibration, check.findings), snapshot, check)
+    if given is None:
+        return found
+    certain = _certain(check.findings, given)
     options = _offset_of_model(calibration, snapshot, given) | certain
     if not options:
-        return found, snapshot
-    mended = replace(snapshot, config=replace(snapshot.config, **options), time_offset=None)
+        return found
     try:
-        again = mended.estimate()
-        again = _with(again, mended.check(again).findings)
+        other = with_options(snapshot, options)
+        again = other.estimate()
+        check = other.check(again)
     except HandEyeCalibError:
-        return found, snapshot
-    if _serious(again) > _serious(found) - bool(certain):
-        return found, snapshot
-    told = _told(findings, options) or (
-        f"the child's clock is {again.time_offset_s:.4f} s off: solved with time_offset estimate",
+        return found
+    again = _with(again, check.findings)
+    if _serious(again) > _serious(found.calibration) - bool(certain):
+        return found
+    return Mended(again, other, check, options, _told(found.check.findings, options, again))
+
+
+def with_options(snapshot: Snapshot, options: Mapping[str, Any]) -> Snapshot:
+    """The snapshot with other options. Poses that were paired with another time offset are paired
+    anew, from the stamps of the pairs.
+    """
+    if not options:
+        return snapshot
+    config = replace(snapshot.config, **options)
+    if "time_offset" not in options:
+        return replace(snapshot, config=config)
+    if not len(snapshot.kept):
+        return replace(snapshot, config=config, time_offset=None)
+    parent, child = snapshot.streams
+    max_gap_s = max(config.max_gap, GAP_INTERVALS * parent.interval_s)
+    return replace(
+        snapshot,
+        config=replace(config, max_gap=max_gap_s),
+        kept=PosePairs.empty(),
+        buffered_parent=parent,
+        buffered_child=child,
+        paired_at=None,
+        time_offset=None,
     )
-    warnings = dict.fromkeys((*told, *calibration.warnings, *again.warnings))
-    return replace(again, warnings=tuple(warnings)), mended
 
 
-def _told(findings: Collection[Finding], options: Mapping[str, Any]) -> tuple[str, ...]:
-    """Warnings about findings that these options mend."""
-    return tuple(
-        f"{finding.what}: solved with {name} {options[name]}; to take the stream as it is, give "
-        f"{name} {getattr(CalibratorConfig, name)}"
-        for finding in findings
-        for name, _ in finding.options
-        if name in options
+def set_options(config: CalibratorConfig) -> frozenset[str]:
+    """Of the options that a check can be certain of, those that differ from their default."""
+    return frozenset(
+        name for name in _MENDED if getattr(config, name) != getattr(CalibratorConfig, name)
     )
 
 
 def _with(calibration: Calibration, findings: Collection[Finding]) -> Calibration:
     return replace(calibration, findings=tuple(finding.to_dict() for finding in findings))
+
+
+def _told(
+    findings: Collection[Finding], options: Mapping[str, Any], calibration: Calibration
+) -> tuple[str, ...]:
+    """Warnings about options that were set, and what they gave."""
+    what = {name: finding.what for finding in findings for name, _ in finding.options}
+    offset_s = calibration.time_offset_s
+    what["time_offset"] = (
+        f"the child's clock is {abs(offset_s):.4f} +/- {calibration.time_offset_sigma_s:.4f} s "
+        f"{'behind' if offset_s > 0 else 'ahead of'} the parent's"
+    )
+    return tuple(
+        f"{what[name]}: solved with {name} {value}; to take the stream as it is, give {name} "
+        f"{getattr(CalibratorConfig, name)}"
+        for name, value in options.items()
+    )
 
 
 def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, Any]:

@@ -40,7 +40,7 @@ _BELIEVABLE_S = 1.0
 
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
-_GAP_INTERVALS = 4
+GAP_INTERVALS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +205,7 @@ class Snapshot:
         scale = calibration.scale if calibration else self.config.scale
         max_gap_s = self.config.max_gap
         if len(self.kept):
-            max_gap_s = max(max_gap_s, _GAP_INTERVALS * self.streams[0].interval_s)
+            max_gap_s = max(max_gap_s, GAP_INTERVALS * self.streams[0].interval_s)
         result = check_streams(
             *self.streams,
             time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,

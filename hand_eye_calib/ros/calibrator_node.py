@@ -226,6 +226,8 @@ class CalibratorNode(Node):
     def _save(self) -> tuple[bool, str]:
         options, cycle = self._options.node, self._cycle
         inputs = self._session.inputs()
+        if cycle.snapshot is not None:  # a check may have been certain of other options
+            inputs["options"] = cycle.snapshot.config.to_options()
         result = cycle.result
         if result is not None:
             result = dataclasses.replace(result, goal=cycle.goal.progress.to_dict())

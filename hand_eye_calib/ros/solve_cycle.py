@@ -4,11 +4,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 from rclpy.task import Future
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.calibration import Calibration, SolveStatus
+from hand_eye_calib.engine.checked import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.live_session import LiveSession
@@ -93,11 +95,14 @@ class SolveCycle:
         self.solved_at_s: float | None = None
         self.seen: Excitation | None = None
         self.failure: Failure | None = None
+        self._certain: dict[str, Any] = {}
+        self._told: tuple[str, ...] = ()
         self.goal.restart()
 
     def aim(self, targets: Sequence[float]) -> None:
         """Start over with a goal of these targets (6; m, rad): options have changed."""
         self.goal = Goal(targets)
+        self._certain, self._told = {}, ()
 
     @property
     def has_valid_result(self) -> bool:
@@ -157,8 +162,9 @@ class SolveCycle:
         check = self._checks.is_due(now_s)
         if check:
             self._checks.begin(now_s)
-        self._submitted = self._session.calibrator.snapshot()
-        self._process.submit(Job(self._session.number, self._submitted, check))
+        snapshot = self._session.calibrator.snapshot()
+        self._submitted = with_options(snapshot, self._certain)
+        self._process.submit(Job(self._session.number, snapshot, check, self._certain))
 
     def _take_check(self, checked: Checked) -> None:
         if checked.session != self._session.number:
@@ -169,6 +175,9 @@ class SolveCycle:
             text = f"the streams cannot be checked: {checked.failure.what}"
             self._log.warning(text, "unchecked")
             return
+        if checked.options:
+            self._certain, self._told = checked.options, checked.told
+            self._session.has_new_poses = True  # to be solved with these options
         new, gone = self._checks.take(checked.result, now_s)
         if self.result is not None:
             self.result = self._with_findings(self.result)
@@ -203,6 +212,8 @@ class SolveCycle:
         return self._report_result(solved.calibration)
 
     def _report_result(self, calibration: Calibration) -> tuple[bool, str]:
+        warnings = dict.fromkeys((*self._told, *calibration.warnings))
+        calibration = replace(calibration, warnings=tuple(warnings))
         if not calibration.status.failure:
             assert self.seen is not None
             calibration = self._complete(calibration)

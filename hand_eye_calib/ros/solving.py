@@ -12,14 +12,15 @@ import threading
 import time
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.check import CheckResult, can_check
+from hand_eye_calib.engine.checked import mend, set_options, with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 
@@ -46,13 +47,22 @@ class Failure:
 
 @dataclass(frozen=True)
 class Job:
-    """A snapshot to solve, and whether to check its streams as well. The answers carry the number
-    of its session.
+    """A snapshot to solve. The answers carry the number of its session.
+
+    Attributes
+    ----------
+    session : int
+    snapshot : Snapshot
+    check : bool
+        Check its streams as well.
+    options : dict
+        Options that an earlier check was certain of.
     """
 
     session: int
     snapshot: Snapshot
     check: bool = False
+    options: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -79,12 +89,21 @@ class Solved:
 class Checked:
     """How a stream check ended, after how many seconds: with neither findings nor a failure if the
     motion is too short or has too little rotation to tell.
+
+    Attributes
+    ----------
+    options : dict
+        Options that the check is certain of: the result is of streams that were solved with them.
+    told : tuple of str
+        Warnings about that.
     """
 
     session: int
     seconds: float
     result: CheckResult | None = None
     failure: Failure | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    told: tuple[str, ...] = ()
 
 
 Answer = Solved | Checked
@@ -102,7 +121,7 @@ def _solve(job: Job) -> Solved:
     start, snapshot = time.monotonic(), job.snapshot
     seen = calibration = failure = None
     try:
-        snapshot = snapshot.resolved()
+        snapshot = with_options(snapshot, job.options).resolved()
         seen = excitation(snapshot.pose_pairs())
         calibration = snapshot.estimate()
     except Exception as error:  # the node reports it
@@ -112,14 +131,21 @@ def _solve(job: Job) -> Solved:
 
 
 def _check(job: Job, calibration: Calibration | None) -> Checked:
-    """Check the streams with the time offset and the scale that the solve found."""
-    start, result, failure = time.monotonic(), None, None
+    """Check the streams with the time offset and the scale that the solve found; if that makes
+    certain of another one, as it is after solving with that.
+    """
+    start = time.monotonic()
     try:
-        if can_check(*job.snapshot.streams):
-            result = job.snapshot.check(calibration)
+        if not can_check(*job.snapshot.streams):
+            return Checked(job.session, time.monotonic() - start)
+        snapshot = with_options(job.snapshot, job.options)
+        if calibration is None:
+            return Checked(job.session, time.monotonic() - start, snapshot.check())
+        found = mend(calibration, snapshot, set_options(snapshot.config))
     except Exception as error:  # the node reports it
-        failure = _failure(error)
-    return Checked(job.session, time.monotonic() - start, result, failure)
+        return Checked(job.session, time.monotonic() - start, failure=_failure(error))
+    seconds = time.monotonic() - start
+    return Checked(job.session, seconds, found.check, options=found.options, told=found.told)
 
 
 def _failure(error: Exception) -> Failure:

@@ -243,7 +243,6 @@ class TestStreamChecks:
         [
             (reordered, "the child stream's quaternions seem to be written w x y z"),
             (inverted, "the child stream seems to hold inverse poses"),
-            (lambda child: child.scaled(1000.0), "the child's lengths are millimetres"),
         ],
     )
     def test_faulty_streams_are_named(self, start_node, peer, heard, damage, said):
@@ -263,7 +262,10 @@ class TestStreamChecks:
         self, start_node, peer, heard, tmp_path
     ):
         node = start_node(
-            "-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS
+            "-p solve_period:=0.5",
+            "-p scale:=0.002",
+            f"-p output_directory:={tmp_path}",
+            *RELIABLE_INPUTS,
         )
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
         Ts_cw_c[:, :3, 3] *= 1000.0
@@ -275,15 +277,31 @@ class TestStreamChecks:
             lambda status: status.message.endswith(": set scale to 0.001"),
         )
         assert peer.trigger("save").success
-        assert load_result(tmp_path).headline.startswith("DO NOT USE: the child's lengths are mill")
+        assert load_result(tmp_path).headline.startswith("DO NOT USE: the child's lengths must be")
         assert peer.set_parameter("scale", 0.001).successful
         status = wait(
             peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK
         )
         assert status.message == "both streams can be of one rigid body"
         wait(peer, heard, "extrinsic", lambda status: status.level == DiagnosticStatus.OK)
-        log = node.wait_for_log("no longer found: the child's lengths are millimetres")
+        log = node.wait_for_log("no longer found: the child's lengths must be")
         assert log.count("set scale to 0.001") == 1
+
+    def test_a_unit_that_is_certain_is_used_and_said(self, start_node, peer, heard, tmp_path):
+        node = start_node(
+            "-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS
+        )
+        stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
+        Ts_cw_c[:, :3, 3] *= 1000.0
+        peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
+        said = "the child's lengths are millimetres: solved with scale 0.001"
+        node.wait_for_log(said)
+        wait(peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK)
+        wait(peer, heard, "extrinsic", lambda status: status.level == DiagnosticStatus.OK)
+        assert peer.trigger("save").success
+        result = load_result(tmp_path)
+        assert result.scale == 0.001
+        assert any(said in text for text in result.warnings)
 
     def test_sound_streams_raise_nothing(self, start_node, peer, heard):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)

@@ -41,6 +41,18 @@ def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer, use_s
     )
 
 
+def test_a_clock_offset_that_is_certain_is_used_and_said(start_node, peer):
+    node = start_node("-p solve_period:=0.2", *RELIABLE_INPUTS)
+    extrinsics = peer.listen(TransformStamped, "extrinsic")
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive(260)
+    peer.feed(peer.publishers(), stamps_ns[3:], Ts_pw_p[:-3], Ts_cw_c[3:])
+    peer.spin_until(
+        lambda: extrinsics and np.allclose(matrix(extrinsics[-1]), T_PARENT_CHILD, atol=0.01),
+        "a result with the clock offset",
+    )
+    node.wait_for_log("solved with time_offset estimate")
+
+
 @pytest.mark.parametrize("kind", POSE_KINDS[1:])
 def test_each_message_type_is_found_from_the_graph(start_node, peer, kind):
     start_node("-p solve_period:=1000.0", *FRAMES, *RELIABLE_INPUTS)

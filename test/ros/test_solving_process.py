@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, feed, wandering_poses
+from motions import as_trajectory, child_of, disturbed, feed, wandering_poses
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.ros.solving import Checked, Failure, FailureKind, Job, Solved, answers
 from hand_eye_calib.ros.solving_process import SolvingProcess
 
@@ -210,6 +212,8 @@ def test_it_ends_with_the_node_however_that_ends(tmp_path, command):
     program = f"""
 import time
 from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.ros.solving import Job
 from hand_eye_calib.ros.solving_process import SolvingProcess
 process = SolvingProcess(lambda: None, {SLOW!r})
@@ -234,3 +238,29 @@ def test_it_imports_neither_ros_nor_plots_nor_bags():
     )
     unwanted = {"rclpy", "matplotlib", "rosbags", "casadi", "jinja2", "yaml", "rich"}
     assert not unwanted & set(done.stdout.split())
+
+
+@pytest.mark.parametrize("pairing_starts", [2000, 100])
+def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts):
+    limits = BufferLimits(pairing_starts=pairing_starts, batch=64)
+    calibrator = Calibrator(CalibratorConfig(reference="B3"), limits)
+    parent = wandering_poses(400)
+    child = disturbed(child_of(parent), 1, 0.001, 0.001)
+    # Turn by turn, as live: the oldest are made into pairs on the way.
+    streams = as_trajectory(parent), as_trajectory(child).shifted(-0.3)
+    for start in range(0, 400, 50):
+        for stream, poses in zip(("parent", "child"), streams, strict=True):
+            feed(calibrator, stream, poses[start : start + 50])
+    live = calibrator.snapshot()
+    assert (len(live.kept) > 0) == (pairing_starts < 400)
+    solved, check = answers(Job(1, live, check=True))
+    assert solved.calibration.time_offset_s == 0.0
+    assert check.options == {"time_offset": "estimate"}
+    assert "solved with time_offset estimate" in check.told[0]
+    again, settled = answers(Job(1, live, check=True, options=check.options))
+    replayed, _ = checked(live.estimate(), live, ())
+    assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
+    np.testing.assert_array_equal(again.calibration.T_parent_child, replayed.T_parent_child)
+    np.testing.assert_array_equal(again.calibration.covariance, replayed.covariance)
+    assert (settled.options, settled.told) == ({}, ())
+    assert "time_offset" not in {finding.code for finding in settled.result.findings}
