@@ -72,13 +72,18 @@ class Simulated:
         return cramer_rao_bound(self.sides, self.sides[1].Ts, self.dt)
 
 
-def simulate(kind: RecordingClass, seed: int | tuple[int, ...]) -> Simulated:
-    """One recording; the same seed gives the same."""
+def simulate(
+    kind: RecordingClass,
+    seed: int | tuple[int, ...],
+    T_parent_child: FloatArray | None = None,
+) -> Simulated:
+    """One recording; the same seed gives the same. The extrinsic is drawn if it is not given."""
     motion_rng, mount_rng, parent_rng, child_rng = np.random.default_rng(seed).spawn(4)
     dt = 1.0 / kind.rate_hz
     times_s: FloatArray = dt * np.arange(round(kind.duration_s * kind.rate_hz), dtype=np.float64)
     motion = kind.motion(motion_rng, kind.duration_s)
-    X = _mount(mount_rng, kind.lever_m)
+    drawn = _mount(mount_rng, kind.lever_m)
+    X = drawn if T_parent_child is None else T_parent_child
     Ts, twists = motion.at(times_s), motion.twists(times_s)
     to_child = se3.adjoint(se3.inverse(X))
     parent = draw(kind.parent, Ts, twists, dt, parent_rng)

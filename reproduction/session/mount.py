@@ -79,11 +79,8 @@ def pieces(name: str, seed: int, X: FloatArray, duration_s: float) -> Iterator[P
     rate_hz = min(CLASSES[name].rate_hz, _RATE_HZ)
     kind = dataclasses.replace(CLASSES[name], duration_s=min(duration_s, PIECE_S), rate_hz=rate_hz)
     for number in range(round(duration_s / kind.duration_s)):
-        made = simulate(kind, (_MOUNT_SEED, seed, number, sorted(CLASSES).index(name)))
-        child = dataclasses.replace(
-            made.child, poses=made.child.poses @ se3.inverse(made.T_parent_child) @ X
-        )
-        pairs = synchronise(made.parent, child, 0.5)
+        made = simulate(kind, (_MOUNT_SEED, seed, number, sorted(CLASSES).index(name)), X)
+        pairs = synchronise(made.parent, made.child, 0.5)
         # Half a minute between the pieces: nothing runs across.
         yield shifted_in_time(pairs, round(number * (kind.duration_s + 30.0)) * _SECOND_NS)
 
