@@ -1,0 +1,55 @@
+"""The study of faults: its cases, and what its page says."""
+
+import pytest
+
+from reproduction import clean_recordings, faults
+from reproduction.command import main
+
+
+def test_there_are_more_than_a_hundred_clean_recordings_of_more_than_ten_kinds():
+    names = clean_recordings.names(None)
+    assert len(names) == len(set(names)) > 100
+    assert len({clean_recordings.kind_of(name) for name in names}) > 10
+    cases = faults.clean_cases(None)
+    assert [case.recording for case in cases] == names
+    assert {case.method for case in cases} == {"auto"}
+
+
+def test_each_fault_has_three_drives_and_both_methods():
+    of_smoothing = [case for case in faults.cases(None) if case.fault == "S5"]
+    assert len(of_smoothing) == 3 * 3 * 2
+    assert len({case.key for case in faults.cases(None)}) == len(faults.cases(None))
+
+
+def test_the_page_names_what_is_wrong_in_confidence_and_wrong_findings():
+    text = faults.report(
+        [
+            faults.Outcome(key="S5 0 hilly_1 auto", verdict="USE", findings=[], z=4.0),
+            faults.Outcome(key="S5 1 hilly_1 auto", verdict="USE WITH CARE", findings=[], z=9.0),
+            faults.Outcome(key="none 0 hilly_1 auto", verdict="USE", findings=[], z=1.0),
+            faults.Outcome(key="clean 0 hilly 50 auto", verdict="USE", findings=["note:jumps"]),
+            faults.Outcome(
+                key="clean 0 hand_mixture_30s 50 auto",
+                verdict="USE WITH CARE",
+                findings=["jumps", "scale"],
+                rules=["warning_finding"],
+            ),
+        ],
+        None,
+    )
+    assert "Of 2 calibrations with a fault, 1 are more than 3 standard deviations off" in text
+    assert "- S5 0 hilly_1 auto: z 4.0" in text
+    assert "Wrong findings in 1 of 2 clean recordings (50.0%)" in text
+    assert "| hand_mixture_30s | 1 | scale 1 |" in text
+
+
+def test_clean_goes_with_faults(capsys):
+    assert main(["adaptive", "--clean"]) == 2
+    assert "--clean is for faults" in capsys.readouterr().err
+
+
+def test_a_clean_recording_has_its_truth():
+    clean = clean_recordings.recording("hilly_noisy 50", None)
+    assert clean.T_parent_child.shape == (4, 4)
+    with pytest.raises(KeyError):
+        clean_recordings.recording("no such 50", None)
