@@ -160,7 +160,11 @@ def cases(folder: Path | None) -> list[Case]:
             for case in _cases(fault.code, len(fault.severities), recordings(folder))
         ),
         *clean_cases(folder),
-        *(case for fault in UNTUNED for case in _cases(fault.code, len(fault.severities), others)),
+        *(
+            case
+            for fault in (*UNTUNED, *UNSEEN)
+            for case in _cases(fault.code, len(fault.severities), others)
+        ),
     ]
 
 
