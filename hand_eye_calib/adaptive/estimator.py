@@ -33,6 +33,7 @@ from hand_eye_calib.adaptive.noise_model import (
     NoiseModel,
 )
 from hand_eye_calib.adaptive.outliers import (
+    LONGEST_GAP,
     Outliers,
     bridged,
     first_outliers,
@@ -279,7 +280,7 @@ class _State:
         outliers, columns = self.outliers, self.columns
         if kept is not None:
             poses, course, error, weights = poses[kept], course[kept], error[kept], weights[kept]
-            outliers = outliers.across(kept)
+            outliers = outliers.across(kept, LONGEST_GAP)
         linearisation = linearise(poses, course, self.T, self.parameters)
         if error.any():
             linearisation = restored(linearisation, error)

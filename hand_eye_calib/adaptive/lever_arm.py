@@ -29,7 +29,7 @@ from hand_eye_calib.adaptive.increments import (
     linearise,
 )
 from hand_eye_calib.adaptive.noise_model import SCALE_DRIFT, Extent, NoiseModel, Slow
-from hand_eye_calib.adaptive.outliers import Outliers, judged, surprises
+from hand_eye_calib.adaptive.outliers import LONGEST_GAP, Outliers, judged, surprises
 from hand_eye_calib.adaptive.resampling import part_products
 from hand_eye_calib.adaptive.state_space import Posterior, StateSpace, multiplied
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
@@ -366,7 +366,7 @@ class _State:
         kept = sample(len(self.streams), _MOST_POSES)
         if kept is None:
             return self.space(model)
-        jumps = self.outliers.across(kept).jumps
+        jumps = self.outliers.across(kept, LONGEST_GAP).jumps
         return dataclasses.replace(
             self,
             streams=self.streams[kept],

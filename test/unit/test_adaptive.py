@@ -228,6 +228,14 @@ def test_the_noise_levels_are_recovered(white, drift):
     assert (median[~strong] < 0.5 * expected.max()).all()
 
 
+def test_the_walk_of_a_long_recording_is_found_from_bursts_far_apart():
+    drift = (0.001, 0.0005)
+    parent, child = noisy_drive(1, 5_000, white=(0.002, 0.001), drift=drift)
+    levels = estimator.solve(stamps(5_000), parent, child, systematic=("none",)).noise
+    found = (levels.translation_drift, levels.rotation_drift)
+    np.testing.assert_allclose(found, drift, rtol=0.3)
+
+
 def lasting(seed, n_poses, sigmas, tau_poses):
     """Gauss-Markov errors (N, 6) of these standard deviations and correlation time."""
     random, phi = np.random.default_rng(seed), np.exp(-1.0 / tau_poses)
