@@ -51,12 +51,14 @@ def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, t
     peer.solve(peer.publishers(), *noisy(*drive(400)))
 
     def is_told(each):
-        return {pair.key: pair.value for pair in each.values}.get("comparison") == "moved"
+        told = {pair.key: pair.value for pair in each.values}
+        # Not the one of an early solve, of a few poses.
+        return told.get("comparison") == "moved" and float(told["difference_sigma.z"]) < 0.02
 
     _, values = status("progress", is_told)
     assert float(values["difference.z"]) == pytest.approx(-0.2, abs=0.02)
     assert float(values["installed.z"]) == pytest.approx(float(moved[2]))
-    assert 0 < float(values["difference_sigma.z"]) < 0.02
+    assert float(values["difference_sigma.z"]) > 0
     assert values["verdict"].startswith(("USE", "DO NOT"))
     assert peer.trigger("save").success
     saved = load_result(tmp_path)
