@@ -110,7 +110,7 @@ def test_shorter_solve_period_takes_effect_at_once(start_node, peer):
         ("scale", "[]", "a parameter that was given has no usable value, such as []"),
         (
             "parent_type",
-            "sensor_msgs/msg/Imu",
+            "sensor_msgs/msg/LaserScan",
             "parent_type must be one of auto, nav_msgs/msg/Odometry",
         ),
     ],
