@@ -184,7 +184,7 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
         "calibrator",
         "--ros-args",
         "-p",
-        "solve_period:=0.5",
+        "solve_period:=1000.0",  # the player asks for the solve of all poses
     ]
     for stream, topic in TOPICS.items():
         command += ["-r", f"{stream}_odom:={topic}"]

@@ -150,13 +150,14 @@ class Goal:
         ratios = np.where(exempt, 0.0, (calibration.sigmas / wanted) ** 2)
         worst = int(np.argmax(ratios))
         motion_s = seen.motion_s
-        is_known = calibration.status is SolveStatus.OK and not faults and ratios[worst] <= 1.0
-        is_known = is_known and motion_s >= _least_motion_s(calibration)
+        is_within = calibration.status is SolveStatus.OK and not faults and ratios[worst] <= 1.0
+        is_known = bool(is_within) and motion_s >= _least_motion_s(calibration)
         point = _Point(motion_s, 1.0 / max(ratios[worst], 1e-12), is_known)
         # Every result of a robot that stands still is the same result.
         if not self._points or motion_s > self._points[-1].motion_s:
             self._points.append(point)
-        self._keep_best(calibration, point)
+        if is_within:
+            self._keep_best(calibration, point)
         # Not 0 seconds of motion: an axis that was not seen at all takes for ever, not "nan".
         left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
         left_s = np.maximum(left_s, max(_least_motion_s(calibration) - motion_s, 0.0))
@@ -175,7 +176,9 @@ class Goal:
 
     def _keep_best(self, calibration: Calibration, point: _Point) -> None:
         recent = list(self._points)[-_RESULTS:]
-        if not point.is_known or len(recent) < _RESULTS or not all(p.is_known for p in recent):
+        is_first = self._best is None
+        are_known = len(recent) == _RESULTS and all(each.is_known for each in (*recent, point))
+        if is_first and not are_known:
             return
         if point.information * _AS_GOOD**2 >= self._best_information:
             self._best = calibration
