@@ -147,7 +147,7 @@ def test_the_newest_of_equally_good_results_is_kept():
 
 
 def test_once_done_a_newer_result_need_not_have_moved_long_enough_again():
-    """What lasts longer may show late; without this the result kept would be an old one for ever."""
+    """What lasts may show late; without this an old result would be kept for ever."""
     goal = Goal(TARGETS)
     for motion_s in (40.0, 42.0):
         goal.add(result(), seen(motion_s))
