@@ -27,7 +27,7 @@ SOLVE_GRACE_S = 0.5
 # message than the node to use it. A pause lets several come together: on a slow computer the node
 # keeps up.
 _AT_HIGH_RATE, _AT_HIGH_RATE_WITHIN_S = 8, 0.04
-_PAUSE_S = 0.0025
+_PAUSE_S, _BETWEEN_PAUSES_S = 0.002, 0.001
 
 
 def run(arguments: list[str], signals: int) -> int:
@@ -99,9 +99,11 @@ def _spin(executor: SingleThreadedExecutor, signals: int) -> None:
         executor.create_task(stopping.set)
 
     threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
-    newest = deque([0.0], maxlen=_AT_HIGH_RATE)
+    newest, resumed = deque([0.0], maxlen=_AT_HIGH_RATE), 0.0
     while not stopping.is_set():
         executor.spin_once()
         newest.append(time.monotonic())
-        if newest[-1] - newest[0] < _AT_HIGH_RATE_WITHIN_S:
+        is_busy = newest[-1] - newest[0] < _AT_HIGH_RATE_WITHIN_S
+        if is_busy and newest[-1] - resumed > _BETWEEN_PAUSES_S:
             time.sleep(_PAUSE_S)
+            resumed = time.monotonic()
