@@ -307,6 +307,19 @@ def not_one_body(unexplained: float, limit: float) -> Finding:
     )
 
 
+def unrelated_parts(unexplained: float, what: str, other: str, unit_of: str) -> Finding:
+    """The parts that two streams measure are not of one body: ``what`` of one does not follow from
+    ``other``; ``unit_of`` is what may have a wrong unit.
+    """
+    return _error(
+        "unrelated",
+        "both",
+        f"{min(unexplained, 1.0):.0%} of the {what} is not that of the {other}",
+        f"check that both are on one rigid body, {unit_of}, and the clocks (time_offset estimate)",
+        Confidence.LIKELY,
+    )
+
+
 def noisy(unexplained: float) -> Finding:
     """The angular rates agree and the motion does not."""
     return Finding(

@@ -3,7 +3,7 @@ command ``check``.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,10 +72,8 @@ def write_report(
         If it cannot be written.
     """
     if can_draw(REPORT):
-        with waiting_for("writing the report"):
-            page = rendered(calibration, evidence, config, inputs)
-            path = save_page(Path(directory) / REPORT, page)
-        note(f"wrote {path}")
+        given = (calibration, evidence, config, inputs)
+        _write(Path(directory) / REPORT, "the report", rendered, *given)
 
 
 def write_check(directory: Path, *arguments: Any) -> None:
@@ -96,9 +94,7 @@ def write_check(directory: Path, *arguments: Any) -> None:
     if can_draw(CHECK):
         from hand_eye_calib.report.check_page import render_check
 
-        with waiting_for("writing the page"):
-            path = save_page(Path(directory) / CHECK, render_check(*arguments))
-        note(f"wrote {path}")
+        _write(Path(directory) / CHECK, "the page", render_check, *arguments)
 
 
 def write_rig_report(directory: Path, *arguments: Any) -> None:
@@ -118,9 +114,13 @@ def write_rig_report(directory: Path, *arguments: Any) -> None:
     if can_draw(REPORT):
         from hand_eye_calib.report.rig_page import render_rig
 
-        with waiting_for("writing the report"):
-            path = save_page(Path(directory) / REPORT, render_rig(*arguments))
-        note(f"wrote {path}")
+        _write(Path(directory) / REPORT, "the report", render_rig, *arguments)
+
+
+def _write(path: Path, what: str, render: Callable[..., str], *arguments: Any) -> None:
+    with waiting_for(f"writing {what}"):
+        save_page(path, render(*arguments))
+    note(f"wrote {path}")
 
 
 def can_draw(file_name: str) -> bool:

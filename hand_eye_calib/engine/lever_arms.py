@@ -14,7 +14,7 @@ from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
 from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.checks.findings import unrelated_parts
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -145,13 +145,5 @@ def _unrelated(
     share = lever_arm.unexplained_share(poses, positions, solution)
     if share < _UNRELATED:
         return []
-    found = Finding(
-        code="unrelated",
-        stream="both",
-        severity=Severity.ERROR,
-        confidence=Confidence.LIKELY,
-        what=f"{min(share, 1.0):.0%} of the motion of the positions is not that of the odometry",
-        advice="check that both are on one rigid body, the units, the scale, and the clocks "
-        "(time_offset estimate)",
-    )
+    found = unrelated_parts(share, "motion of the positions", "odometry", "the units, the scale")
     return [found.to_dict()]

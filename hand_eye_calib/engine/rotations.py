@@ -21,7 +21,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.checks.findings import unrelated_parts
 from hand_eye_calib.config import CalibratorConfig, parse_targets
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
@@ -164,13 +164,5 @@ def _unrelated(
     share = float(np.median(left) / max(float(np.median(turned)), 1e-12))
     if share < _UNRELATED:
         return []
-    found = Finding(
-        code="unrelated",
-        stream="both",
-        severity=Severity.ERROR,
-        confidence=Confidence.LIKELY,
-        what=f"{min(share, 1.0):.0%} of the rotation of one sensor is not that of the other",
-        advice="check that both are on one rigid body, the unit of the rates, and the clocks "
-        "(time_offset estimate)",
-    )
+    found = unrelated_parts(share, "rotation of one sensor", "other", "the unit of the rates")
     return [found.to_dict()]

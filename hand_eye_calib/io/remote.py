@@ -1,5 +1,5 @@
-"""Bags in object storage and on web servers: whatever fsspec reaches, such as ``s3://bucket/run_1``,
-``gs://...``, ``https://host/run_1.mcap``.
+"""Bags in object storage and on web servers: whatever fsspec reaches, such as
+``s3://bucket/run_1``, ``gs://...``, ``https://host/run_1.mcap``.
 
 A bag is copied to a temporary folder, read there, and the copy removed.
 """

@@ -49,17 +49,22 @@ def poses_of(table: Table) -> Poses:
     InputError
         For values that cannot be; the message names the line.
     """
-    values = np.array(table.values)
-    table.refuse(
-        ~np.isfinite(values).all(axis=1),
-        lambda _: "found a value that is not finite; remove the line or repair its source",
-    )
+    values = _finite_values(table)
     if table.quantities == MATRIX:
         matrices = values.reshape(-1, 3, 4)
         positions = _checked(table, matrices[:, :, 3])
         return Poses(positions, _from_matrices(table, matrices[:, :, :3]))
     columns = dict(zip(table.quantities, values.T, strict=True))
     return (_in_local_frame if "lat" in columns else _in_metres)(table, columns)
+
+
+def _finite_values(table: Table) -> FloatArray:
+    values = np.array(table.values)
+    table.refuse(
+        ~np.isfinite(values).all(axis=1),
+        lambda _: "found a value that is not finite; remove the line or repair its source",
+    )
+    return values
 
 
 def rates_of(table: Table) -> FloatArray:
@@ -71,11 +76,7 @@ def rates_of(table: Table) -> FloatArray:
     InputError
         For values that cannot be; the message names the line.
     """
-    values = np.array(table.values)
-    table.refuse(
-        ~np.isfinite(values).all(axis=1),
-        lambda _: "found a value that is not finite; remove the line or repair its source",
-    )
+    values = _finite_values(table)
     units = {_checked_unit(table, name, _RADIANS_PER_S) for name in table.quantities}
     if len(units) > 1:
         raise InputError(f"{table.path}: the columns of the rates have different units")
