@@ -588,6 +588,14 @@ class CalibratorConfig(OptionSet):
         of_unit = {"m": self.target_translation, "rad": self.target_rotation}
         return tuple(single.get(axis, of_unit[unit]) for axis, unit in AXIS_UNITS.items())
 
+    def target_fields(self) -> dict[str, Any]:
+        """The targets as the fields of a result."""
+        return {
+            "target_translation": self.target_translation,
+            "target_rotation": self.target_rotation,
+            "target_axes": parse_targets("target.axes", self.target_axes),
+        }
+
     def prior(self) -> dict[str, tuple[float, float]]:
         """The prior: axis name to (value, standard deviation), in m and rad; an option of a single
         axis overrides ``prior.transform``.

@@ -21,7 +21,7 @@ from hand_eye_calib.assessment.model_fit import MAX_JUMPS, why_not
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
-from hand_eye_calib.config import CalibratorConfig, parse_targets
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
@@ -157,9 +157,7 @@ def _calibration(
         n_pairs=len(residuals),
         n_inliers=int(residuals.is_inlier.sum()),
         contradictions=fused.contradictions,
-        target_translation=config.target_translation,
-        target_rotation=config.target_rotation,
-        target_axes=parse_targets("target.axes", config.target_axes),
+        **config.target_fields(),
         stamp_ns=int(stamps_ns[-1]),
         warnings=(*_warnings_of(fused), *evaluation.warnings),
         motion_residuals=residuals,

@@ -103,8 +103,7 @@ def _calibration(
         n_inliers=len(pose_pairs) - 1 - int((solution.jumps | solution.spikes[1:]).sum()),
         time_offset_sigma_s=solution.time_offset_sigma_s,
         noise=solution.describe(pose_pairs.stamps_ns),
-        target_translation=config.target_translation,
-        target_rotation=config.target_rotation,
+        **config.target_fields(),
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
     )
 

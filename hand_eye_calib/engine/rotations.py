@@ -22,7 +22,7 @@ from hand_eye_calib.assessment.covariance import assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.checks.findings import unrelated_parts
-from hand_eye_calib.config import CalibratorConfig, parse_targets
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -83,9 +83,7 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         noise=solution.describe(pose_pairs.stamps_ns),
         findings=tuple(_unrelated(Ts_pw_p, Ts_cw_c, solution)),
         contradictions=fused.contradictions,
-        target_translation=config.target_translation,
-        target_rotation=config.target_rotation,
-        target_axes=parse_targets("target.axes", config.target_axes),
+        **config.target_fields(),
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
         motion_residuals=residuals,
     )

@@ -148,3 +148,8 @@ def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, caps
     assert code == 0
     assert "roll, pitch and yaw are not estimated" in printed.out
     assert "became metres east and north" in printed.err
+
+
+def test_targets_of_single_axes_are_those_of_the_verdict(streams):
+    result = hec.calibrate(*streams, target_axes="z=5cm")
+    assert result.target_axes == {"z": 0.05}
