@@ -98,8 +98,9 @@ _NOISY, _FREED_ROUNDS = 0.2, 2
 # the model if it is so much lower in the end.
 _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
 
-# Sizes of errors that last longer than those found, as shares of their variance.
-_LONGER_SIZES = np.array([0.0, 0.25, 1.0])
+# Size of errors that last longer than those found, as a share of their variance, if there are any.
+# A loss larger by so much leaves no chance.
+_LONGER_SHARE, _NO_CHANCE = 0.5, 100.0
 
 # Systematic errors larger than this (of the length, m/m, s, rad/s) are none: a wrong unit, a clock
 # that was not aligned, or noise. Nor is one assumed that can hardly be told from X: on a road
@@ -511,19 +512,18 @@ def _mean_variances(found: _State, kept: IntArray | None) -> FloatArray:
     """Variances (6,) of the mean of errors fixed to the body that last too long to be found.
 
     Errors that last often do so on all scales (flicker). A recording hardly shows those about as
-    long as itself, and X takes their mean. So beside each process that was found, the longest that
-    is modelled gets the mean of sizes from none to that of the one found, weighted by likelihood.
+    long as itself, and X takes their mean. So beside each process that was found, there is the
+    longest that is modelled with half the variance, as flicker has, or none, both weighted by
+    likelihood.
     """
     variances = np.zeros(6)
     none = Posterior(found.space(kept), found.levels).loss
     for process, size in found.model.fixed_to_body(found.levels):
-        losses = [none]
-        for share in _LONGER_SIZES[1:]:
-            model, levels = found.model.with_longer(process, found.levels, share * size)
-            losses.append(Posterior(found.space(kept, model), levels).loss)
-        likelihoods = np.exp(min(losses) - np.array(losses))
-        expected = size * float(likelihoods @ _LONGER_SIZES) / float(likelihoods.sum())
-        variances[noise_model.states_of(process.part)] = LONGEST_IN_THE_MEAN * expected
+        model, levels = found.model.with_longer(process, found.levels, _LONGER_SHARE * size)
+        loss = Posterior(found.space(kept, model), levels).loss
+        probability = 1.0 / (1.0 + np.exp(min(loss - none, _NO_CHANCE)))
+        variance = probability * _LONGER_SHARE * size
+        variances[noise_model.states_of(process.part)] = LONGEST_IN_THE_MEAN * variance
     return variances
 
 

@@ -18,7 +18,7 @@ MAX_JUMPS = 0.25
 
 # Largest weighted squared residual per degree of freedom: it is 1 if the model holds, and less if
 # there is no noise.
-_MAX_MISFIT = 2.0
+MAX_MISFIT = 2.0
 
 # Largest distance of both answers, squared, in units of their joint covariance: a chi-squared with
 # 6 degrees of freedom exceeds it once in a thousand recordings.
@@ -60,7 +60,7 @@ def why_not(
     jumps = float(np.mean(model.jumps))
     if jumps > MAX_JUMPS:
         return f"{jumps:.0%} of the increments are jumps (at most {MAX_JUMPS:.0%} may be)"
-    if model.misfit > _MAX_MISFIT:
+    if model.misfit > MAX_MISFIT:
         return f"its residuals have {model.misfit:.2g} times the variance that it predicts"
     joint = of_model.cov_parent_child_in_child + of_dnlo.cov_parent_child_in_child
     apart = squared_distance(difference, joint + floor)

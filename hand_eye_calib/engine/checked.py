@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from hand_eye_calib.assessment.model_fit import MAX_MISFIT
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
@@ -77,7 +78,8 @@ def mend(
     calibration: Calibration, snapshot: Snapshot, given: Collection[str] | None = None
 ) -> Mended:
     """Check the streams of a result. If a check is certain of the time offset or of the scale, and
-    the option was not given, solve again with it. Parameters as of :func:`checked`.
+    the option was not given, solve again with it, and keep that if there is less to say against it.
+    Parameters as of :func:`checked`.
     """
     check = snapshot.check(calibration)
     found = Mended(_with(calibration, check.findings), snapshot, check)
@@ -94,7 +96,9 @@ def mend(
     except HandEyeCalibError:
         return found
     again = _with(again, check.findings)
-    if _serious(again) > _serious(found.calibration) - bool(certain):
+    if _serious(again) > _serious(found.calibration) - bool(certain) or (
+        _noise_fits(calibration) and not _noise_fits(again)
+    ):
         return found
     return Mended(again, other, check, options, _told(found.check.findings, options, again))
 
@@ -181,6 +185,14 @@ def _offset_of_model(
 def _is_grave(finding: Finding, option: str) -> bool:
     least = (Severity.ERROR,) if option == "scale" else (Severity.ERROR, Severity.WARNING)
     return finding.severity in least
+
+
+def _noise_fits(calibration: Calibration) -> bool:
+    """Whether the result is the noise model's, and its residuals fit: an option after which they no
+    longer do was not what the streams lack.
+    """
+    noise = calibration.noise
+    return noise is not None and noise["misfit"] <= MAX_MISFIT
 
 
 def _serious(calibration: Calibration) -> int:

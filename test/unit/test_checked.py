@@ -1,5 +1,7 @@
 """What a stream check is certain of is used, and said."""
 
+from itertools import accumulate
+
 import numpy as np
 import pytest
 from motions import as_trajectory, child_of, disturbed, wandering_poses
@@ -8,6 +10,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.calibration import Verdict
 from hand_eye_calib.engine.checked import checked
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.geometry import se3
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +55,16 @@ def test_good_streams_are_left_alone(streams):
     result, same = checked(plain, snapshot, ())
     assert same is snapshot
     assert (result.warnings, result.findings) == (plain.warnings, ())
+
+
+def test_a_scale_with_which_the_noise_model_does_not_fit_is_not_used():
+    poses = wandering_poses(100)
+    child = child_of(poses)
+    # A drift of 5 % of the path along one axis of the child, hence partly along the path.
+    steps = se3.inverse(child[:-1]) @ child[1:]
+    steps[:, 0, 3] += 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1)
+    drifting = np.stack(list(accumulate(steps, np.matmul, initial=child[0])))
+    result = hec.calibrate(as_trajectory(poses), as_trajectory(drifting))
+    assert {"scale"} == {finding["code"] for finding in result.findings}
+    assert (result.method, result.scale) == ("adaptive", 1.0)
+    assert result.noise["systematic"] == "bias"
