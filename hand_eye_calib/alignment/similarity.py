@@ -79,7 +79,8 @@ class SimilarityFit:
     rms_translation, rms_rotation : float
         Root mean square of the translations (m) and of the parent's rotation angles (rad), to
         compare the residuals with. The translations are the parent's or the child's times s,
-        whichever are smaller: a scale near zero explains nothing, however small the residuals.
+        whichever are smaller: a scale near zero explains nothing, however small the residuals. If
+        the scale is kept at 1, whichever are larger.
     inliers : (K,) bool array
         Pairs that agree with the fit.
     """
@@ -128,6 +129,7 @@ def fit_similarity(
     twists_i: FloatArray | None = None,
     twists_j: FloatArray | None = None,
     start: SimilarityFit | None = None,
+    same_unit: bool = False,
 ) -> SimilarityFit:
     """Fit X, the scale and, with twists, the time offset.
 
@@ -140,13 +142,18 @@ def fit_similarity(
         end of every pair.
     start : SimilarityFit, optional
         Fit whose X and scale to start at; a start is searched for without one.
+    same_unit : bool
+        Keep the scale at 1. A sensor that the body only rotates about hardly moves, and any small
+        scale would do.
 
     Returns
     -------
     SimilarityFit
     """
-    problem = _Problem(pairs, twists_i, twists_j)
+    problem = _Problem(pairs, twists_i, twists_j, same_unit)
     starts = [(start.T_parent_child, start.scale)] if start else _starts(pairs)
+    if same_unit:
+        starts = [(T, 1.0) for T, _ in starts]
     states = []
     for T, scale in starts:
         states.append(problem.refine(T, scale))
@@ -254,7 +261,11 @@ class _Problem:
     """Residuals of all pairs, their derivatives, and the iteration."""
 
     def __init__(
-        self, pairs: MotionPairs, twists_i: FloatArray | None, twists_j: FloatArray | None
+        self,
+        pairs: MotionPairs,
+        twists_i: FloatArray | None,
+        twists_j: FloatArray | None,
+        same_unit: bool,
     ) -> None:
         A, B = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
         rotation_a, self.translation_a = A[:, :3, :3], A[:, :3, 3]
@@ -265,6 +276,7 @@ class _Problem:
         self.rms_a, self.rms_b = _rms(self.translation_a), _rms(self.translation_b)
         self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
         self.free = np.ones(_UNKNOWNS, dtype=bool)
+        self.free[_SCALE] = not same_unit
         if twists_i is None or twists_j is None:
             self.free[_OFFSET] = False
             twists_i = twists_j = np.zeros((len(pairs), 6))
@@ -335,8 +347,11 @@ class _Problem:
         return float(np.log(sigma_t / min(state.scale, 1.0)) + np.log(sigma_r))
 
     def rms_translation(self, scale: float) -> float:
-        """Root mean square translation of the stream that moves less, m."""
-        return min(self.rms_a, scale * self.rms_b)
+        """Root mean square translation, m: of the stream that moves less, or with one unit of
+        length of the one that moves more.
+        """
+        lengths = (self.rms_a, scale * self.rms_b)
+        return min(lengths) if self.free[_SCALE] else max(lengths)
 
     def unexplained(self, state: _State) -> float:
         """Share of the motion that a state leaves unexplained."""

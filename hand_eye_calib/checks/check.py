@@ -163,10 +163,7 @@ def _check_agreeing(
     pose_pairs = synchronise(
         corrected.parent, corrected.child.shifted(correlation.offset_s), corrected.max_gap_s
     )
-    try:
-        scale = estimate_scale(pose_pairs, start=explanation.fit)
-    except NotEnoughDataError:
-        scale = None  # too few poses to tell
+    scale = None if explanation.same_unit else _scale(pose_pairs, explanation.fit)
     rotations = _motions(pose_pairs).Ts_parenti_parentj[:, :3, :3]
     fit = scale.fit if scale else explanation.fit
     aligned = _aligned(streams, offset.seconds, fit) if is_sound else None
@@ -184,6 +181,14 @@ def _check_agreeing(
         explanation.fit,
         dict(zip("xyz", rms.tolist(), strict=True)),
     )
+
+
+def _scale(pose_pairs: PosePairs, start: SimilarityFit) -> Scale | None:
+    """The scale; None if the poses are too few to tell."""
+    try:
+        return estimate_scale(pose_pairs, start=start)
+    except NotEnoughDataError:
+        return None
 
 
 def _aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit) -> Aligned:

@@ -125,12 +125,15 @@ class Explanation:
     findings : tuple of Finding
     limit : float
         Unexplained share below which it holds.
+    same_unit : bool
+        The scale was kept at 1.
     """
 
     hypothesis: Hypothesis
     fit: SimilarityFit
     findings: tuple[Finding, ...] = ()
     limit: float = HOLDS
+    same_unit: bool = False
 
     @property
     def holds(self) -> bool:
@@ -260,7 +263,13 @@ def _plain_or_usual(streams: StreamPair, lag_s: float, limit: float) -> Explanat
     if plain.fit.unexplained < EXPLAINED:
         return plain
     usual = _simplest_of_the_best([_fitted(hypothesis, streams, lag_s) for hypothesis in _USUAL])
-    return usual if _is_decisive(plain, usual, limit) else plain
+    if _is_decisive(plain, usual, limit):
+        return usual
+    if plain.holds:
+        return plain
+    # A body that rotates about one of its sensors: that one's translations are noise.
+    in_one_unit = _fitted(_PLAIN, streams, lag_s, same_unit=True)
+    return in_one_unit if in_one_unit.holds else plain
 
 
 def _or_other_axes(plain: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
@@ -287,9 +296,11 @@ def _fitted(
     lag_s: float,
     max_pairs: int = MAX_PAIRS,
     start: SimilarityFit | None = None,
+    same_unit: bool = False,
 ) -> Explanation:
     pairs = hypothesis.undo(streams).pairs(lag_s, max_pairs)
-    return Explanation(hypothesis, fit_similarity(pairs, start=start))
+    fit = fit_similarity(pairs, start=start, same_unit=same_unit)
+    return Explanation(hypothesis, fit, same_unit=same_unit)
 
 
 def _agreed_rotation(streams: StreamPair, lag_s: float) -> FloatArray | None:
@@ -331,7 +342,7 @@ def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
     hypothesis = explanation.hypothesis
     if hypothesis.code not in ("", "inverse"):
         return replace(explanation, findings=(_finding(hypothesis),))
-    evidence, inverted_fit = _evidence_for_inverse(hypothesis.undo(streams), explanation.fit, lag_s)
+    evidence, inverted_fit = _evidence_for_inverse(streams, explanation, lag_s)
     if evidence < _INVERTED:
         if not hypothesis.code:
             return explanation
@@ -361,12 +372,13 @@ def _confidence(evidence: float, likely: float) -> Confidence:
 
 
 def _evidence_for_inverse(
-    streams: StreamPair, fit: SimilarityFit, lag_s: float
+    streams: StreamPair, explanation: Explanation, lag_s: float
 ) -> tuple[float, SimilarityFit]:
     """Sum of logarithms by which paths and lever arm are shorter with both streams inverted, and
     the fit then.
     """
-    inverted = _fitted(_BOTH_INVERTED, streams, lag_s).fit
+    streams, fit = explanation.hypothesis.undo(streams), explanation.fit
+    inverted = _fitted(_BOTH_INVERTED, streams, lag_s, same_unit=explanation.same_unit).fit
     by_paths = sum(
         np.log(_path_length(stream) / _path_length(_inverted(stream)))
         for stream in (streams.parent, streams.child)

@@ -34,12 +34,17 @@ _MAX_FROZEN = 0.02
 # Two sensors take turns if a stream is this many times rougher from pose to pose than over some
 # longer lag (in poses), by at least so many metres. Repeated poses are another matter.
 _ALTERNATES, _MAX_PERIOD, _LEAST_LEVELS_M = 2.0, 6, 0.01
+# Their levels are steady over so many turns, in the world or in the sensor's axes, and make up this
+# share of the roughness: a body that shakes at about half the rate of the poses does not keep step.
+_TURNS, _STEADY_SHARE = 10, 0.5
 _MIN_POSES_OF_TURNS, _MAX_REPEATS = 60, 0.1
 
 # Two sensors in no order: how many times more a pose is off along one direction than along others,
 # its largest kurtosis there (3 for noise, 2 for two levels), and largest growth with the lag (1 for
-# noise and levels, 4 for curves).
+# noise and levels, 4 for curves). A body that shakes has half of the power in three neighbouring
+# frequencies of a spectrum over so many poses.
 _MIN_POSES_OF_MIX, _ONE_DIRECTION, _FEW_AMOUNTS, _STEADY = 300, 8.0, 2.4, 1.5
+_SPECTRUM_POSES, _SHAKES = 64, 0.5
 
 # Positions are on a grid if this share of so many differences, those of a few steps, are multiples
 # of the smallest, to this share of a step. Steps (m) from which on that matters.
@@ -202,11 +207,28 @@ def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
     repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME_POSE
     if repeats.mean() > _MAX_REPEATS:
         return None
-    rough = [_roughness(positions, stamps_ns, lag) for lag in range(1, _MAX_PERIOD + 1)]
-    smoothest = max(min(rough[1:]), 1e-9)
+    off = [_off_line(positions, stamps_ns, lag) for lag in range(1, _MAX_PERIOD + 1)]
+    rough = [float(np.median(np.linalg.norm(vectors, axis=1))) for vectors in off]
+    period = 2 + int(np.argmin(rough[1:]))
+    smoothest = max(rough[period - 1], 1e-9)
     if rough[0] < max(_ALTERNATES * smoothest, _LEAST_LEVELS_M):
         return None
+    in_body = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], off[0])
+    if max(_share_of_levels(vectors, period) for vectors in (off[0], in_body)) < _STEADY_SHARE:
+        return None
     return rough[0] / smoothest, rough[0]
+
+
+def _share_of_levels(vectors: FloatArray, period: int) -> float:
+    """Share of the mean square of vectors (M, 3) that repeats after ``period`` of them: the median
+    over some turns each.
+    """
+    n_turns = min(_TURNS, len(vectors) // period)
+    n_windows = len(vectors) // (n_turns * period)
+    windows = vectors[: n_windows * n_turns * period].reshape(n_windows, n_turns, period, 3)
+    levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
+    total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
+    return float(np.median(levels / np.maximum(total, 1e-300)))
 
 
 def _mixed(trajectory: Trajectory) -> tuple[float, float] | None:
@@ -224,9 +246,23 @@ def _mixed(trajectory: Trajectory) -> tuple[float, float] | None:
         sizes[2] > max(_ONE_DIRECTION * sizes[1], _LEAST_LEVELS_M**2 / 4)
         and peakedness < _FEW_AMOUNTS
         and growth < _STEADY
+        and not _shakes(along)
     )
     # A quarter of the poses are off by the distance of the levels, half by a half of it.
     return (1.0 / growth, float(np.sqrt(sizes[2] / 0.375))) if is_mixed else None
+
+
+def _shakes(off: FloatArray) -> bool:
+    """Whether deviations (M,) from the middle of both neighbours are those of an oscillation:
+    sensors in no order have all frequencies.
+    """
+    n_windows = len(off) // _SPECTRUM_POSES
+    windows = off[: n_windows * _SPECTRUM_POSES].reshape(n_windows, _SPECTRUM_POSES)
+    power = (np.abs(np.fft.rfft(windows * np.hanning(_SPECTRUM_POSES), axis=1)) ** 2).mean(axis=0)
+    # Of the positions themselves, without the slow motion.
+    cycles = np.arange(_SPECTRUM_POSES // 8, len(power))
+    power = power[cycles] / (1.0 - np.cos(2 * np.pi * cycles / _SPECTRUM_POSES)) ** 2
+    return bool(np.convolve(power, np.ones(3), "valid").max() > _SHAKES * power.sum())
 
 
 def _off_in_body(trajectory: Trajectory, lag: int) -> FloatArray:
@@ -244,13 +280,12 @@ def _rms(vectors: FloatArray) -> float:
     return float(np.sqrt(np.mean((vectors**2).sum(axis=1))))
 
 
-def _roughness(positions: FloatArray, stamps_ns: IntArray, lag: int) -> float:
-    """Median distance (m) of a pose from the line between those ``lag`` poses before and after."""
+def _off_line(positions: FloatArray, stamps_ns: IntArray, lag: int) -> FloatArray:
+    """How far (M, 3) each position is off the line between those ``lag`` poses before and after."""
     before, middle, after = positions[: -2 * lag], positions[lag:-lag], positions[2 * lag :]
     elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
     share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
-    off = middle - before - share[:, None] * (after - before)
-    return float(np.median(np.linalg.norm(off, axis=1)))
+    return middle - before - share[:, None] * (after - before)
 
 
 def _check_grid(positions: FloatArray, stream: str) -> Finding | None:

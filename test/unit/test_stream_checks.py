@@ -57,6 +57,41 @@ def test_no_false_alarm(seed, wander):
     assert agreement.is_good
 
 
+@pytest.mark.parametrize("centred", ["parent", "child"])
+def test_a_body_that_rotates_about_one_of_its_sensors(centred):
+    """The translations of that sensor are noise, and any small scale would fit them."""
+    rotating = wandering_poses(500, 3)
+    rotating[:, :3, 3] = 0.0
+    streams = [rotating, child_of(rotating, T_cw_pw=np.eye(4))]
+    parent, child = (
+        as_trajectory(disturbed(se3.inverse(poses[0]) @ poses, seed, 0.005, 0.001))
+        for seed, poses in enumerate(streams if centred == "parent" else streams[::-1])
+    )
+    assert grave(check_streams(parent, child)) == []
+
+
+class TestTwoSensorsInOneStream:
+    """Levels in turn or in no order; a body that shakes has none."""
+
+    def codes(self, heights):
+        poses = planar_poses(len(heights), 4)
+        poses[:, 2, 3] += heights
+        stream = as_trajectory(disturbed(poses, 5, 0.001, 0.001))
+        return {finding.code for finding in check_stream(stream, "child")}
+
+    @pytest.mark.parametrize("shakes_hz", [3.9, 4.2, 4.7])
+    def test_shaking_at_about_half_the_rate(self, shakes_hz):
+        times_s = np.arange(900) / 10.0
+        assert self.codes(0.03 * np.sin(2 * np.pi * shakes_hz * times_s)) == set()
+
+    def test_levels_in_turn(self):
+        assert self.codes(0.03 * (np.arange(900) % 2)) == {"interleaved"}
+
+    def test_levels_in_no_order(self):
+        levels = np.random.default_rng(6).integers(0, 2, 900)
+        assert self.codes(0.06 * levels) == {"interleaved"}
+
+
 def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     seconds = np.arange(400) * 0.05
     turns = np.stack(
