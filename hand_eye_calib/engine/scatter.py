@@ -59,10 +59,11 @@ class CrossCheck:
         Distance from the answer under other assumptions on the noise; NaN if there is none.
     excess_of_methods, excess_of_halves, excess_of_model : (6,) arrays
         Distance of the answers in their joint standard deviations (of the methods: the median over
-        that of a normal variable). Those of methods contain the common-mode floor.
+        that of a normal variable), which contain the common-mode floor; those of the halves also
+        the result's own standard deviations if the halves are solved with another method.
     excess_over_own : (6,) array
-        Distance of other methods and references in the result's own standard deviations, over those
-        that are not much less certain; NaN if there are fewer than two.
+        Distance of other methods and references in the result's own standard deviations with the
+        floor, over those that are not much less certain; NaN if there are fewer than two.
     """
 
     axes: tuple[str, ...]
@@ -141,7 +142,8 @@ def compare_answers(
         apart, allowed = _apart(halves[0], halves[1])
         # The whole is the mean of both halves: its standard deviation is half of that of their
         # difference.
-        of_halves, excess_of_halves = apart / 2, apart / allowed
+        of_halves = apart / 2
+        excess_of_halves = of_halves / np.hypot(allowed / 2, _beside_halves(calibration, halves[0]))
     of_model, excess_of_model = _from_other_model(calibration)
     known = np.isfinite(calibration.sigmas)
     return CrossCheck(
@@ -155,6 +157,15 @@ def compare_answers(
         excess_of_model=np.where(known, excess_of_model, np.nan),
         excess_over_own=np.where(known, _over_own(calibration, robust), np.nan),
     )
+
+
+def _beside_halves(calibration: Calibration, half: Calibration) -> FloatArray:
+    """Standard deviations (6,) that the halves do not state: the floor, and those of a result of
+    another method, which may know of errors that last.
+    """
+    if half.method == calibration.method:
+        return calibration.sigmas_of_floor
+    return np.hypot(calibration.sigmas, calibration.sigmas_of_floor)
 
 
 def _scatter(
@@ -186,6 +197,7 @@ def _over_own(calibration: Calibration, others: Sequence[Calibration]) -> FloatA
         return np.full(6, np.nan)
     own = np.maximum(calibration.sigmas, _ROUNDING)
     as_certain = np.array([other.sigmas for other in others]) < _AS_CERTAIN * own
+    own = np.hypot(own, calibration.sigmas_of_floor)
     apart = np.array([_apart(calibration, other)[0] for other in others])
     apart[~as_certain] = np.nan
     apart[:, np.isfinite(apart).sum(axis=0) < _MIN_AS_CERTAIN] = np.nan
@@ -224,4 +236,5 @@ def _from_other_model(calibration: Calibration) -> tuple[FloatArray, FloatArray]
     distance = np.abs(deviation(T_other, calibration.T_parent_child))
     to_parent = np.kron(np.eye(2), T_other[:3, :3])
     variances = np.diag(to_parent @ covariance @ to_parent.T) + calibration.sigmas**2
+    variances += calibration.sigmas_of_floor**2
     return distance, distance / np.sqrt(np.maximum(variances, _ROUNDING**2))

@@ -153,7 +153,7 @@ def test_from_python():
     loosened[150:] = loosened[150:] @ se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1]))
     streams = as_trajectory(parent), as_trajectory(loosened)
     found = hec.cross_check(calibrate(*streams, reference="B5"), *streams)
-    assert found.excess_of_halves[0] > 10
+    assert found.excess_of_halves[0] > 5
 
 
 def test_every_solve_is_checked_with_other_references_and_halves():
@@ -161,7 +161,8 @@ def test_every_solve_is_checked_with_other_references_and_halves():
     child = disturbed(child_of(parent), 1, 0.003, 0.003)
     loosened = child.copy()
     loosened[150:] = loosened[150:] @ se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1]))
-    good, bad = (calibrate(as_trajectory(parent), as_trajectory(one)) for one in (child, loosened))
+    good = calibrate(as_trajectory(parent), as_trajectory(child))
+    bad = calibrate(as_trajectory(parent), as_trajectory(loosened), method="dnlo")
     for row in good.cross_check.values():
         assert row["of_methods"] > 0
         assert row["of_halves"] > 0
