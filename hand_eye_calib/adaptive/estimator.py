@@ -44,7 +44,7 @@ from hand_eye_calib.adaptive.outliers import (
     tails_are_heavy,
     with_jumps_across_spikes,
 )
-from hand_eye_calib.adaptive.part_delays import PartDelay, part_delays, with_delay_columns
+from hand_eye_calib.adaptive.part_delays import part_delay, with_delay_columns
 from hand_eye_calib.adaptive.relinearise import corrected, restored
 from hand_eye_calib.adaptive.resampling import answers_without, part_products
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
@@ -55,6 +55,7 @@ from hand_eye_calib.adaptive.state_space import (
     StateSpace,
     selected,
 )
+from hand_eye_calib.adaptive.world_drift import N_COLUMNS, with_world_columns, world_drift
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -121,6 +122,9 @@ _BLOCKS, _CHANCE = 10, 1.63
 # exceeds: of six, once in ten times; of three, once in a hundred.
 _HARDLY_BY_CHANCE = 3.3
 
+# Columns of errors that are looked for beside the model: delays of positions, a moving world.
+_MORE_COLUMNS = range(N_SYSTEMATIC, N_SYSTEMATIC + 2 + N_COLUMNS)
+
 # X is followed until it moves by less than this share of its sigma, at least one round.
 _MAX_ROUNDS = 6
 _SETTLED_SIGMAS, _SETTLED_STEP = 0.1, 1e-9
@@ -153,7 +157,7 @@ def solve(
         The clock offset was estimated from these poses, so that X is as uncertain as that makes it:
         the model has a time offset, unless the motion hardly tells it from X.
     with_delays : bool
-        Estimate the delays of positions against orientations, too.
+        Estimate delays, and how a world moves, too.
 
     Returns
     -------
@@ -244,7 +248,7 @@ class _State:
     is_clock_free : bool
         Whether a time offset is in the model if the motion tells it from X.
     with_delays : bool
-        Whether the solution has delays of positions.
+        Whether the solution has delays, and how a world moves.
     weights : (N,) array
         Of white errors; other than 1 where tails are heavy.
     """
@@ -274,8 +278,8 @@ class _State:
         model: NoiseModel | None = None,
         with_delays: bool = False,
     ) -> StateSpace:
-        """State space of all or some of the poses; with the columns of a clock offset and of the
-        delays of positions if asked for.
+        """State space of all or some of the poses; with the columns of a clock offset, of delays of
+        positions, and of a world that moves if asked for.
         """
         poses, course, error, weights = self.poses, self.course, self.error, self.weights
         outliers, columns = self.outliers, self.columns
@@ -288,7 +292,8 @@ class _State:
         if with_delays:
             at_poses = course_of(poses, self.T)
             linearisation = with_delay_columns(linearisation, at_poses, self.T)
-            columns = [*dict.fromkeys((*columns, TIME)), N_SYSTEMATIC, N_SYSTEMATIC + 1]
+            linearisation = with_world_columns(linearisation, poses)
+            columns = [*dict.fromkeys((*columns, TIME)), *_MORE_COLUMNS]
         return (model or self.model).state_space(
             poses,
             linearisation,
@@ -666,7 +671,7 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
     covariance[:6, :6] += np.diag(state.mean_variances)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     parts = part_products(posterior)
-    return AdaptiveSolution(
+    solution = AdaptiveSolution(
         T_parent_child=state.T,
         cov_parent_child_in_child=covariance[:6, :6],
         unseen=normal.unseen[:6],
@@ -682,16 +687,30 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
         misfit=misfit,
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
         part_products=parts,
-        delays=_delays(state, misfit) if state.with_delays else None,
         objective=0.5 * (posterior.log_determinant + normal.cost),
         converged=converged,
         iterations=state.n_evaluations,
     )
+    return _with_more(solution, state) if state.with_delays else solution
 
 
-def _delays(state: _State, misfit: float) -> tuple[PartDelay, PartDelay]:
+def _with_more(solution: AdaptiveSolution, state: _State) -> AdaptiveSolution:
+    """With errors that are not in the model, as they would be with each alone in it."""
     posterior = Posterior(state.space(with_delays=True), state.levels)
-    return part_delays(posterior, misfit)
+    products, parts = posterior.products, part_products(posterior)
+    known = list(range(6 + len(state.columns)))
+    *with_clock, child, parent = range(len(products) - 1 - N_COLUMNS)
+    world = list(range(parent + 1, parent + 1 + N_COLUMNS))
+    misfit = solution.misfit
+    of_child, of_parent = (
+        part_delay(products, parts, with_clock, column, misfit) for column in (child, parent)
+    )
+    has_clock = TIME in state.columns
+    clock = None if has_clock else part_delay(products, parts, known, with_clock[-1], misfit)
+    drift = world_drift(products, known, world, misfit)
+    return dataclasses.replace(
+        solution, delays=(of_child, of_parent), clock=clock, world_drift=drift
+    )
 
 
 def _sigmas(state: _State, covariance: FloatArray, parts: FloatArray) -> FloatArray:

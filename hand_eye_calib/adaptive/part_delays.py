@@ -1,4 +1,4 @@
-"""Delay of the positions of a stream against its own orientations.
+"""Delay of the positions of a stream against its own orientations, and of a stream as a whole.
 
 Positions and orientations of one pose may come from different filters. Poses whose positions are
 late by d are ``T Exp(-d (v, 0))``, with the velocity v of that sensor in its own frame. At a
@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive.increments import Course, Linearisation, turned
-from hand_eye_calib.adaptive.resampling import answers_without, part_products
-from hand_eye_calib.adaptive.state_space import NormalEquations, Posterior, selected
+from hand_eye_calib.adaptive.resampling import answers_without
+from hand_eye_calib.adaptive.state_space import NormalEquations, selected
 from hand_eye_calib.arrays import FloatArray
 
 # Blocks of the jackknife.
@@ -32,12 +32,12 @@ _UNSEEN = 1e-6
 
 @dataclass(frozen=True)
 class PartDelay:
-    """A delay of positions against orientations.
+    """A delay of positions against orientations, or of a stream against the other.
 
     Attributes
     ----------
     seconds : float
-        Positive if the positions are late.
+        Positive if the positions, or the child's poses, are late.
     sigma_s : float
         Standard deviation: the larger of that of the model and that of the jackknife. Infinite if
         the motion shows nothing of it.
@@ -55,9 +55,10 @@ class PartDelay:
         return abs(self.seconds) / max(self.sigma_s, 1e-12)
 
 
-def spread_by_delays(delays: tuple[PartDelay, ...], clock_offset_s: float) -> FloatArray:
-    """Covariance (6, 6) of xi by delays that the model does not have: of the stream that matters
-    more.
+def spread_by_delays(
+    delays: tuple[PartDelay, ...], clock_offset_s: float, clock: PartDelay | None = None
+) -> FloatArray:
+    """Covariance (6, 6) of xi by delays that the model does not have: of the one that matters most.
 
     A delay that is likely counts with its size. If the clocks were found to be apart, one of the
     streams may have a latency rather than another clock, and its positions and orientations need
@@ -68,10 +69,12 @@ def spread_by_delays(delays: tuple[PartDelay, ...], clock_offset_s: float) -> Fl
     delays : sequence of PartDelay
     clock_offset_s : float
         As estimated; zero if it was given.
+    clock : PartDelay, optional
+        Of the child's clock, if the model has none.
     """
     spreads = [np.zeros((6, 6))]
-    for delay in delays:
-        variance = min(delay.sigma_s, abs(clock_offset_s)) ** 2
+    for delay in filter(None, (*delays, clock)):
+        variance = 0.0 if delay is clock else min(delay.sigma_s, abs(clock_offset_s)) ** 2
         if delay.sigmas > _LIKELY:
             variance += delay.seconds**2
         spreads.append(variance * np.outer(delay.sensitivity, delay.sensitivity))
@@ -100,30 +103,27 @@ def _column(linearisation: Linearisation, velocities: FloatArray) -> FloatArray:
     return (turned(linearisation.adjoints, twists[:-1]) - twists[1:])[:, :, None]
 
 
-def part_delays(posterior: Posterior, misfit: float) -> tuple[PartDelay, PartDelay]:
-    """Delays of the child's and of the parent's positions, each without the other.
+def part_delay(
+    products: FloatArray, parts: FloatArray, known: list[int], column: int, misfit: float
+) -> PartDelay:
+    """A delay, beside X and the systematic errors of a model.
 
     Parameters
     ----------
-    posterior : Posterior
-        Of a state space whose last two columns, before the residuals, are those of
-        :func:`with_delay_columns`.
+    products : (p + 1, p + 1) array
+        Of all columns and, last, the residuals.
+    parts : (K, p + 1, p + 1) array
+        What each part of the recording adds to them.
+    known : list of int
+        Columns of X and of the systematic errors in the model.
+    column : int
+        That of the delay.
     misfit : float
         Factor of the covariance.
     """
-    parts = part_products(posterior)
-    n_columns = parts.shape[1] - 1
-    child, parent = (
-        _delay([*range(n_columns - 2), column], posterior.products, parts, misfit)
-        for column in (n_columns - 2, n_columns - 1)
-    )
-    return child, parent
-
-
-def _delay(columns: list[int], products: FloatArray, parts: FloatArray, misfit: float) -> PartDelay:
-    others, column = columns[:-1], columns[-1]
-    without = NormalEquations(selected(products, others))
-    sensitivity = (without.covariance @ products[others, column])[:6]
+    columns = [*known, column]
+    without = NormalEquations(selected(products, known))
+    sensitivity = (without.covariance @ products[known, column])[:6]
     normal = NormalEquations(selected(products, columns))
     if np.abs(normal.unseen[-1]).max(initial=0.0) > _UNSEEN:
         return PartDelay(0.0, np.inf, sensitivity)

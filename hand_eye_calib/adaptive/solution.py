@@ -19,6 +19,7 @@ from hand_eye_calib.adaptive.noise_model import (
     NoiseModel,
 )
 from hand_eye_calib.adaptive.part_delays import PartDelay
+from hand_eye_calib.adaptive.world_drift import WorldDrift
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 
 _TURNING = {
@@ -160,6 +161,10 @@ class AdaptiveSolution:
     delays : (PartDelay, PartDelay) or None
         Of the child's and of the parent's positions against their orientations, if they were
         estimated.
+    clock : PartDelay or None
+        Of the child's clock, if delays were estimated and the model has none.
+    world_drift : WorldDrift or None
+        How one world moves against the other, if delays were estimated.
     objective : float
         Negative log likelihood.
     converged : bool
@@ -187,6 +192,8 @@ class AdaptiveSolution:
     iterations: int
     is_drowned: bool = False
     delays: tuple[PartDelay, PartDelay] | None = None
+    clock: PartDelay | None = None
+    world_drift: WorldDrift | None = None
 
     @cached_property
     def noise(self) -> NoiseLevels:

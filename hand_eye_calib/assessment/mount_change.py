@@ -24,6 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hand_eye_calib.adaptive.state_space import NormalEquations
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
@@ -52,6 +53,10 @@ _LEAST_WINDOW_S = 3.0
 SIGNIFICANT = 12.0
 
 _STEPS = 3
+
+# Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
+# recording before and after that. Log odds beyond these are certain.
+_MOVES, _LEAST_PARTS, _CERTAIN = 0.02, 4, 50.0
 
 
 def shift_covariance(metres: float = SHIFT_M, radians: float = SHIFT_RAD) -> FloatArray:
@@ -277,6 +282,51 @@ def find_change(found: Information) -> MountChange | None:
         covariance=covariance,
         log_ratio=float(ratios[best]),
     )
+
+
+def spread_by_shift(products: FloatArray, misfit: float) -> FloatArray:
+    """Covariance (6, 6) of xi in ``X exp(xi)`` because the mount may have moved in the recording.
+
+    What the parts before and after each time say of X is compared under the noise model that gave
+    X. The likelihood ratio of a shift, averaged over the times, gives its probability. An answer
+    between both mounts is half the shift away from either.
+
+    Parameters
+    ----------
+    products : (K, p + 1, p + 1) array
+        What each part of the recording adds, see :mod:`~hand_eye_calib.adaptive.resampling`.
+    misfit : float
+        Factor of the covariances.
+    """
+    found = [
+        _shift_between(products[:cut].sum(axis=0), products[cut:].sum(axis=0), max(misfit, 1.0))
+        for cut in range(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
+    ]
+    tried = [shift for shift in found if shift is not None]
+    if not tried:
+        return np.zeros((6, 6))
+    ratios = np.array([ratio for ratio, _ in tried])
+    shifts = np.array([xi for _, xi in tried])
+    weights = np.exp(ratios - ratios.max())
+    log_odds = ratios.max() + np.log(weights.mean() * _MOVES / (1.0 - _MOVES))
+    probability = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -_CERTAIN, _CERTAIN)))
+    squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
+    return np.asarray(probability * squared / 4.0)
+
+
+def _shift_between(
+    before: FloatArray, after: FloatArray, misfit: float
+) -> tuple[float, FloatArray] | None:
+    """Log likelihood ratio of a shift between two parts, and the shift (6,) that is expected if
+    there is one; None if either says nothing of some direction.
+    """
+    first, second = NormalEquations(before), NormalEquations(after)
+    if first.unseen.size or second.unseen.size:
+        return None
+    H = np.linalg.inv(misfit * (first.covariance + second.covariance)[:6, :6])
+    S = H @ (second.step - first.step)[:6]
+    expected = np.linalg.solve(H + np.linalg.inv(shift_covariance()), S)
+    return float(log_ratio(H, S, 1.0)), expected
 
 
 def _best_split(found: Information, n_windows: int) -> tuple[int, float]:

@@ -54,6 +54,10 @@ _SPEED_SPAN_S = 0.4
 # unusable.
 _SHIFT_M, _SHIFT_ERROR_M = 0.008, 0.05
 
+# A world moves if it does so at this share of the sensor's speed: its direction is then off by half
+# the usual target of a rotation.
+_MOVING = 0.003
+
 # Shifts of the mount (m, rad) from which on they count, and from which on a result is unusable.
 _MOVED_M, _MOVED_RAD = 0.005, float(np.radians(0.2))
 _MOVED_ERROR_M, _MOVED_ERROR_RAD = 0.02, float(np.radians(1.0))
@@ -139,6 +143,7 @@ def check_aligned(aligned: Aligned) -> list[Finding]:
     return [
         *gain_findings,
         *(_check_delays(aligned) or (_check_smoothing(found, aligned.rms_speed) if found else [])),
+        *_check_world(aligned),
         *_check_mount(aligned),
     ]
 
@@ -188,6 +193,17 @@ def _check_delays(aligned: Aligned) -> list[Finding]:
     if delay.sigmas < _DELAY_SIGMAS or abs(delay.seconds) < _DELAY_S or shift_m < _SHIFT_M:
         return []
     return [wording.position_clock(stream, delay, shift_m, _severity(shift_m))]
+
+
+def _check_world(aligned: Aligned) -> list[Finding]:
+    """Finding about a world that moves against the other."""
+    drift = aligned.solution.world_drift if aligned.solution else None
+    if drift is None or not drift.is_significant:
+        return []
+    share = drift.speed_at(aligned.pose_pairs.Ts_cw_c[:, :3, 3]) / max(aligned.rms_speed, 1e-9)
+    if share < _MOVING:
+        return []
+    return [wording.world_drift(drift, share)]
 
 
 def _check_smoothing(found: Response, rms_speed: float) -> list[Finding]:

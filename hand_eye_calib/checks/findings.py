@@ -13,6 +13,7 @@ from hand_eye_calib.methods import METHODS
 
 if TYPE_CHECKING:
     from hand_eye_calib.adaptive.part_delays import PartDelay
+    from hand_eye_calib.adaptive.world_drift import WorldDrift
     from hand_eye_calib.alignment.angular_rates import Correlation
     from hand_eye_calib.alignment.scale import Scale
     from hand_eye_calib.alignment.time_offset import TimeOffset
@@ -607,6 +608,30 @@ def smoothed(
             ("smoothing_s", seconds),
             ("sigmas", smoothing.value / max(smoothing.sigma, 1e-12)),
             ("shift_m", shift_m),
+        ),
+    )
+
+
+def world_drift(drift: WorldDrift, share: float) -> Finding:
+    """One world moves against the other, at this share of the sensor's speed."""
+    speed = float(np.linalg.norm(drift.twist[:3]))
+    rate = float(np.linalg.norm(drift.twist[3:]))
+    return Finding(
+        code="world_drift",
+        stream="both",
+        severity=Severity.WARNING,
+        confidence=Confidence.LIKELY,
+        what=f"the child's world turns by {np.degrees(60 * rate):.2g} deg and moves by "
+        f"{60 * speed:.2g} m a minute against the parent's: at {100 * share:.2g} % of the "
+        "sensor's speed",
+        cause="a map that is corrected bit by bit, a heading that drifts, or poses published in a "
+        "frame that moves",
+        advice="use the poses before that correction, in the frame of the odometry",
+        evidence=(
+            ("evidence", drift.evidence),
+            ("rate_rad_s", rate),
+            ("speed_m_s", speed),
+            ("share_of_speed", share),
         ),
     )
 

@@ -2,7 +2,7 @@
 assess, add the prior, judge.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive
 from hand_eye_calib.assessment.floor import common_mode_floor
 from hand_eye_calib.assessment.model_fit import MAX_JUMPS, why_not
+from hand_eye_calib.assessment.mount_change import spread_by_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
@@ -48,6 +49,8 @@ class _Evaluation:
     ----------
     spans : MotionPairs and (K,) array
         Pairs that are long enough to show the motion, and their weights, for the floor.
+    spread : (6, 6) array
+        Covariance of xi by what may have moved within the recording.
     """
 
     solution: Solution | AdaptiveSolution
@@ -68,6 +71,8 @@ class _Evaluation:
     warnings: tuple[str, ...] = ()
     other_answer: tuple[FloatArray, FloatArray] | None = None
     delays: tuple[PartDelay, ...] = ()
+    clock: PartDelay | None = None
+    spread: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,8 @@ def estimate_extrinsic(
     spread = _spread_by_alignment(
         scale.estimate, None if evaluation.time_correction_s else time_offset
     )
-    spread += spread_by_delays(evaluation.delays, time_offset.seconds if time_offset else 0.0)
+    offset_s = time_offset.seconds if time_offset else 0.0
+    spread += spread_by_delays(evaluation.delays, offset_s, evaluation.clock) + evaluation.spread
     assessment = widened(evaluation.assessment, T_method[:3, :3], spread)
     fused = fuse(T_method, assessment, config.prior())
     result = _calibration(evaluation, fused, pose_pairs.stamps_ns, config)
@@ -369,7 +375,18 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         time_correction_s=solution.time_offset_s,
         time_sigma_s=solution.time_offset_sigma_s,
         delays=solution.delays or (),
+        clock=solution.clock,
+        spread=_spread_by_moves(solution),
     )
+
+
+def _spread_by_moves(solution: AdaptiveSolution) -> FloatArray:
+    """Covariance (6, 6) of xi because the mount may have moved, or a world has."""
+    spread = spread_by_shift(solution.part_products, solution.misfit)
+    drift = solution.world_drift
+    if drift is not None and drift.is_significant:
+        spread = spread + np.outer(drift.shift, drift.shift)
+    return spread
 
 
 def _spans(

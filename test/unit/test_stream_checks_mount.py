@@ -10,6 +10,7 @@ from hand_eye_calib.assessment.mount_change import (
     information,
     log_ratio,
     long_run_variance,
+    spread_by_shift,
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import synchronise
@@ -73,3 +74,27 @@ def test_blocks_add_up_to_the_shift_from_an_old_extrinsic():
 def test_too_short_to_tell():
     pose_pairs, truth = recording(4)
     assert find_change(information(pose_pairs[:200], truth)) is None
+
+
+def products_of(steps, sigma=0.01):
+    """Products of parts that each show a shift (6,) to this standard deviation."""
+    parts = []
+    for step in steps:
+        rows = np.concatenate([np.eye(6), -np.asarray(step)[:, None]], axis=1) / sigma
+        parts.append(rows.T @ rows)
+    return np.array(parts)
+
+
+def test_a_shift_between_parts_counts_with_half_of_it():
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (20, 6))
+    moved = noise + np.where(np.arange(20)[:, None] < 8, 0.0, SHIFT)
+    assert np.sqrt(np.diag(spread_by_shift(products_of(noise), 1.0))).max() < 5e-4
+    spread = spread_by_shift(products_of(moved), 1.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(spread)), np.abs(SHIFT) / 2, atol=4e-3)
+    assert not spread_by_shift(products_of(moved[:7]), 1.0).any()
+
+
+def test_a_shift_that_noise_explains_hardly_counts():
+    noise = np.random.default_rng(1).normal(0.0, 0.01, (20, 6))
+    steps = noise + np.where(np.arange(20)[:, None] < 8, 0.0, 0.2 * SHIFT)
+    assert np.sqrt(np.diag(spread_by_shift(products_of(steps), 1.0))).max() < 1e-3
