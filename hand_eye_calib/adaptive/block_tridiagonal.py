@@ -17,8 +17,10 @@ import numpy as np
 from hand_eye_calib.adaptive import lapack
 from hand_eye_calib.arrays import FloatArray
 
-# So few matrices are inverted faster by LAPACK, one by one, than by stacked rows.
+# So few matrices are inverted faster by LAPACK, one by one, than by stacked rows. So many small
+# ones are factored faster entry by entry, all at once.
 _FEW = 32
+_MANY, _SMALL = 200, 8
 
 
 def transposed(blocks: FloatArray) -> FloatArray:
@@ -29,7 +31,14 @@ def transposed(blocks: FloatArray) -> FloatArray:
 def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Inverses (n, d, d) of the lower Cholesky factors of positive definite matrices (n, d, d), and
     the logarithms (n,) of the matrices' determinants.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a matrix is not positive definite.
     """
+    if len(matrices) >= _MANY and matrices.shape[1] <= _SMALL:
+        return _inverse_roots_by_entry(matrices)
     lower = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
     pivots = np.diagonal(lower, axis1=1, axis2=2)
     log_determinants = 2.0 * np.log(pivots).sum(axis=1)
@@ -42,6 +51,50 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse[:, row : row + 1, :row] = scaled @ inverse[:, :row, :row]
         inverse[:, row, row] = 1.0 / pivots[:, row]
     return inverse, log_determinants
+
+
+def _inverse_roots_by_entry(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """:func:`inverse_roots` with the matrices last, so that every operation runs along them: rows
+    are eliminated in turn, and the same is done to the identity.
+    """
+    size = matrices.shape[1]
+    left: FloatArray = np.array(matrices.transpose(1, 2, 0), order="C")
+    inverse: FloatArray = np.zeros_like(left)
+    for row in range(size):
+        pivot = left[row, row]
+        if not (pivot > 0.0).all():
+            raise np.linalg.LinAlgError("not positive definite")
+        root = 1.0 / np.sqrt(pivot)
+        inverse[row, :row] *= root
+        inverse[row, row] = root
+        below = left[row + 1 :, row] * root
+        left[row + 1 :, row + 1 :] -= below[:, None] * below
+        inverse[row + 1 :, : row + 1] -= below[:, None] * inverse[row, : row + 1]
+    log_determinants = np.log(left[range(size), range(size)]).sum(axis=0)
+    return inverse.transpose(2, 0, 1).copy(), log_determinants
+
+
+def inverse_products(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """``v' M^-1 v`` (n,) of positive definite matrices (n, d, d) and vectors (n, d)."""
+    if len(matrices) < _MANY or matrices.shape[1] > _SMALL:
+        return (vectors * np.linalg.solve(matrices, vectors[:, :, None])[:, :, 0]).sum(axis=1)
+    size = matrices.shape[1]
+    # The matrices last, the vectors as one more row: its elimination leaves the product.
+    rows = np.concatenate([matrices, vectors[:, None]], axis=1).transpose(1, 2, 0).copy()
+    products = np.zeros(len(vectors))
+    for row in range(size):
+        factors = rows[row + 1 :, row] / rows[row, row]
+        products += rows[size, row] * factors[-1]
+        rows[row + 1 :, row + 1 :] -= factors[:, None] * rows[row + 1 : size, row]
+    return products
+
+
+def squared(blocks: FloatArray) -> FloatArray:
+    """Products A'A (n, k, k) of matrices (n, d, k).
+
+    numpy multiplies two arrays of small matrices faster than it squares one.
+    """
+    return np.asarray(transposed(blocks) @ blocks.copy(), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -80,7 +133,8 @@ class _Level:
         with_before[:n_behind] += to_behind @ below[:n_behind]
         with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
         with_behind += below[:n_behind] @ transposed(to_before[:n_behind])
-        own = root @ self.inverse + with_before @ transposed(to_before)
+        own = squared(self.inverse)
+        own += with_before @ transposed(to_before)
         own[:n_behind] += transposed(to_behind @ with_behind)
         all_diagonal = np.empty((len(diagonal) + n_before, *diagonal.shape[1:]))
         all_diagonal[::2], all_diagonal[1::2] = diagonal, own
@@ -113,8 +167,8 @@ class Factor:
             before = inverse @ below[::2]
             behind = inverse[:n_behind] @ transposed(below[1::2])
             diagonal = diagonal[::2].copy()
-            diagonal[: len(before)] -= transposed(before) @ before
-            diagonal[1 : 1 + n_behind] -= transposed(behind) @ behind
+            diagonal[: len(before)] -= squared(before)
+            diagonal[1 : 1 + n_behind] -= squared(behind)
             below = -transposed(behind) @ before[:n_behind]
             self._levels.append(_Level(inverse, before, behind))
         self._last = self._inverse_root(diagonal)

@@ -286,7 +286,8 @@ class _State:
         if kept is not None:
             poses, course, error, weights = poses[kept], course[kept], error[kept], weights[kept]
             outliers = outliers.across(kept, LONGEST_GAP)
-        linearisation = linearise(poses, course, self.T, self.parameters)
+        asked = [*columns, TIME] if with_delays else columns
+        linearisation = linearise(poses, course, self.T, self.parameters, asked)
         if error.any():
             linearisation = restored(linearisation, error)
         if with_delays:
@@ -320,14 +321,14 @@ def _start(streams: Streams, columns: list[int]) -> _State:
     pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, _START_REFERENCE)
     T = Method("dnlo").solve(pairs).T_parent_child
     course = course_of(streams, T)
-    linearisation = linearise(streams, course, T, np.zeros(N_SYSTEMATIC))
+    linearisation = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), ())
     interval_s = float(np.median(np.diff(streams.stamps_s)))
     metres = max(float(np.median(linearisation.metres)), 1e-9)
     extent = Extent(interval_s, metres, float(streams.stamps_s[-1]))
     outliers = first_outliers(linearisation.residuals)
     poses = bridged(streams, T, outliers.spikes)
     if outliers.spikes.any():
-        bridging = linearise(poses, course, T, np.zeros(N_SYSTEMATIC)).residuals
+        bridging = linearise(poses, course, T, np.zeros(N_SYSTEMATIC), ()).residuals
         outliers = with_jumps_across_spikes(outliers, linearisation.residuals, bridging)
     model = NoiseModel((SCALE_DRIFT,), "time", _centre(streams, T, linearisation.residuals), extent)
     beside = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]

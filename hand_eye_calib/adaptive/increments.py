@@ -16,6 +16,7 @@ steps are lost in noise would seem to shrink.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,6 +59,7 @@ _CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
 _EVEN = 0.2
 
 SCALE, TIME, RATE = 0, 7, slice(8, 11)
+_CHILD_BIASES, _PARENT_BIASES, _RATES = {1, 2, 3}, {4, 5, 6}, {8, 9, 10}
 
 
 def parameters_of(systematic: str) -> list[int]:
@@ -189,7 +191,10 @@ def _twists(by_child: FloatArray, intervals_s: FloatArray) -> FloatArray:
     rates = se3.log(by_child) / intervals_s[:, None]
     padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
     around = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=0)
-    return np.sort(around, axis=2)[:, :, 1:3].mean(axis=2)
+    first, second, third, fourth = np.moveaxis(around, 2, 0)
+    lower = np.maximum(np.minimum(first, second), np.minimum(third, fourth))
+    upper = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
+    return 0.5 * (lower + upper)
 
 
 @dataclass(frozen=True)
@@ -218,7 +223,11 @@ class Linearisation:
 
 
 def linearise(
-    streams: Streams, course: Course, T_parent_child: FloatArray, parameters: FloatArray
+    streams: Streams,
+    course: Course,
+    T_parent_child: FloatArray,
+    parameters: FloatArray,
+    columns: Sequence[int] = range(N_SYSTEMATIC),
 ) -> Linearisation:
     """Residuals and derivatives.
 
@@ -230,23 +239,28 @@ def linearise(
     T_parent_child : (4, 4) array
     parameters : (11,) array
         Of all systematic errors, see the module.
+    columns : sequence of int
+        Those whose derivatives are asked for; those by others may be zero.
     """
+    used = {*columns, *np.flatnonzero(parameters).tolist()}
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
     back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
-    metres_c = back_c @ np.diff(course.along_c, axis=0)
-    metres_p = back_p @ np.diff(course.along_p, axis=0)
     step = turned(back_c, np.diff(course.path, axis=0))
 
     Ts_cw_c = streams.Ts_cw_c
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
     by_child, by_parent = motions(Ts_cw_c), motions(streams.Ts_pw_p)
-    by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
-    if parameters[RATE].any():
+    if used & _RATES:
+        by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
         by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
     by_child[:, :3, 3] *= 1.0 + parameters[SCALE]
-    by_child[:, :3, 3] -= metres_c @ parameters[1:4]
-    by_parent[:, :3, 3] -= metres_p @ parameters[4:7]
+    if used & _CHILD_BIASES:
+        metres_c = back_c @ np.diff(course.along_c, axis=0)
+        by_child[:, :3, 3] -= metres_c @ parameters[1:4]
+    if used & _PARENT_BIASES:
+        metres_p = back_p @ np.diff(course.along_p, axis=0)
+        by_parent[:, :3, 3] -= metres_p @ parameters[4:7]
     back = se3.inverse(by_child)
     as_child = se3.inverse(T_parent_child) @ by_parent @ T_parent_child
     adjoints = se3.adjoint(back)
@@ -255,11 +269,15 @@ def linearise(
     jacobian[:, :, :6] = np.eye(6) - adjoints
     by = jacobian[:, :, 6:]
     by[:, :3, SCALE] = -turned(back[:, :3, :3], step)
-    by[:, :3, 1:4] = back[:, :3, :3] @ metres_c
-    axes = T_parent_child[:3, :3].T @ np.swapaxes(by_parent[:, :3, :3], 1, 2)
-    by[:, :3, 4:7] = -axes @ metres_p
-    by[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
-    by[:, 3:, RATE] = by_rate
+    if used & _CHILD_BIASES:
+        by[:, :3, 1:4] = back[:, :3, :3] @ metres_c
+    if used & _PARENT_BIASES:
+        axes = T_parent_child[:3, :3].T @ np.swapaxes(by_parent[:, :3, :3], 1, 2)
+        by[:, :3, 4:7] = -axes @ metres_p
+    if TIME in used:
+        by[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+    if used & _RATES:
+        by[:, 3:, RATE] = by_rate
     residuals = se3.log(back @ as_child)
     by_scale = by[:, :, SCALE : SCALE + 1].copy()
     return Linearisation(residuals, jacobian, adjoints, by_scale, np.linalg.norm(step, axis=1))

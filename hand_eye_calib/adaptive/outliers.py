@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import transposed
+from hand_eye_calib.adaptive.block_tridiagonal import inverse_products, transposed
 from hand_eye_calib.adaptive.increments import Streams
 from hand_eye_calib.adaptive.reml import walk_covariance
 from hand_eye_calib.adaptive.state_space import WHITE, Posterior, chunks
@@ -187,7 +187,7 @@ def _chi_squares(
     """Of smoothed values (n, 6), whose own evidence counted unless it was left out."""
     spread = np.where(left_out[:, None, None], prior + posterior, prior - posterior)
     spread += _ROUNDING * prior + _LEAST_VARIANCE * np.eye(6)
-    return (values * np.linalg.solve(spread, values[:, :, None])[:, :, 0]).sum(axis=1)
+    return inverse_products(spread, values)
 
 
 def judged(

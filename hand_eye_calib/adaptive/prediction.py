@@ -65,8 +65,8 @@ class ReferencePredictor:
         X = solution.T_parent_child
         course = course_of(streams, X)
         # As the method sees them: systematic errors are part of the residual, not taken out.
-        plain = linearise(streams, course, X, np.zeros(N_SYSTEMATIC))
-        modelled = linearise(streams, course, X, solution.parameters).residuals
+        plain = linearise(streams, course, X, np.zeros(N_SYSTEMATIC), ())
+        modelled = linearise(streams, course, X, solution.parameters, ()).residuals
         cut = np.zeros(len(streams) - 1, dtype=bool)
         space = solution.model.state_space(
             streams, plain, course.twists, X, [], solution.weights, cut

@@ -45,7 +45,8 @@ def corrected(
     sensors, the others in halves.
     """
     both = white.of_parent + white.of_child
-    by_parent = (white.of_parent @ np.linalg.solve(both, white_error[:, :, None]))[:, :, 0]
+    share = np.swapaxes(np.linalg.solve(both, white.of_parent), 1, 2)
+    by_parent = (share @ white_error[:, :, None])[:, :, 0]
     by_child = by_parent - white_error
     by_parent = by_parent + 0.5 * other_error
     by_child = by_child - 0.5 * other_error

@@ -204,10 +204,11 @@ def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
 def walk_covariance(posterior: Posterior, part: slice = slice(None)) -> FloatArray:
     """Covariance (n, 6, 6) of the walk's increments, or of a part of them, for known parameters."""
     covariance, below = posterior.selected_inverse
-    ahead, behind = posterior.space.ahead[part], posterior.space.behind[part]
-    own = ahead @ covariance[1:][part] @ transposed(ahead)
-    own += behind @ covariance[:-1][part] @ transposed(behind)
-    mixed = ahead @ below[part] @ transposed(behind)
+    space, back = posterior.space, transposed(posterior.space.behind[part])
+    half = space.ahead_times(covariance[1:][part], part)
+    own = space.ahead_times(transposed(half), part)
+    own = own + transposed(back) @ covariance[:-1][part] @ back
+    mixed = space.ahead_times(below[part], part) @ back
     own -= mixed
     own -= transposed(mixed)
     return own

@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.adaptive import lapack
-from hand_eye_calib.adaptive.block_tridiagonal import Factor, inverse_roots, transposed
+from hand_eye_calib.adaptive.block_tridiagonal import Factor, inverse_roots, squared, transposed
 from hand_eye_calib.arrays import BoolArray, FloatArray
 
 WHITE = 6
@@ -79,7 +79,7 @@ class StateSpace:
     columns : (n, 6, p + 1) array
         J and, last, e.
     ahead, behind : (n, 6, d) arrays
-        H1 and H0.
+        H1 and H0. H1 is the identity for the white error.
     white, walk : tuples of (1 or N, 6, 6) and (6, 6) arrays
         What log levels scale: the covariances are ``sum exp(level) basis``.
     twists : (N, 6) array
@@ -116,6 +116,12 @@ class StateSpace:
         """d."""
         return self.ahead.shape[2]
 
+    @cached_property
+    def slow_ahead(self) -> FloatArray | None:
+        """H1 (n, 6, d - 6) of the states behind the white error; None if it is zero."""
+        slow = self.ahead[:, :, WHITE:]
+        return slow if slow.any() else None
+
     @property
     def n_white(self) -> int:
         """Number of levels of the white errors, the first ones."""
@@ -143,7 +149,7 @@ class StateSpace:
         grown = np.log1p(np.exp(levels[len(self.white)]) * squares)
         share = -np.expm1(-0.5 * grown) / np.where(squares > 0.0, squares, 1.0)
         roots = roots - share * along @ (transposed(along) @ roots)
-        return transposed(roots) @ roots, log_determinants + grown[:, 0, 0]
+        return squared(roots), log_determinants + grown[:, 0, 0]
 
     def walk_covariance(self, levels: FloatArray) -> FloatArray:
         """Covariance (6, 6) of the walk over a typical increment."""
@@ -151,16 +157,24 @@ class StateSpace:
 
     def observed(self, states: FloatArray, part: slice = slice(None)) -> FloatArray:
         """What states (N, d, k) contribute to the increments, or to a part of them, (n, 6, k)."""
-        observed = self.ahead[part] @ states[1:][part]
-        observed -= self.behind[part] @ states[:-1][part]
-        return observed
+        observed = self.behind[part] @ states[:-1][part]
+        return np.subtract(self.ahead_times(states[1:][part], part), observed, out=observed)
+
+    def ahead_times(self, blocks: FloatArray, part: slice = slice(None)) -> FloatArray:
+        """H1 of the increments, or of a part of them, times blocks (n, d, k): (n, 6, k)."""
+        if self.slow_ahead is None:
+            return blocks[:, :WHITE]
+        return blocks[:, :WHITE] + self.slow_ahead[part] @ blocks[:, WHITE:]
 
     def gathered(self, columns: FloatArray) -> FloatArray:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
         states = np.empty((len(self) + 1, self.n_states, columns.shape[2]))
         states[0] = 0.0
+        states[1:, :WHITE], states[1:, WHITE:] = columns, 0.0
         for part in chunks(len(self)):
-            np.matmul(transposed(self.ahead[part]), columns[part], out=states[1:][part])
+            if self.slow_ahead is not None:
+                slow = transposed(self.slow_ahead[part])
+                np.matmul(slow, columns[part], out=states[1:, WHITE:][part])
             states[:-1][part] -= transposed(self.behind[part]) @ columns[part]
         return states
 
@@ -252,14 +266,14 @@ class Posterior:
     def precision(self) -> tuple[FloatArray, FloatArray]:
         """Blocks of P on the diagonal (N, d, d) and below it (n, d, d)."""
         space, size = self.space, self.space.n_states
-        diagonal = np.empty((len(space) + 1, size, size))
-        below = np.empty((len(space), size, size))
-        diagonal[0] = 0.0
+        diagonal = np.zeros((len(space) + 1, size, size))
+        below = np.zeros((len(space), size, size))
+        diagonal[1:, :WHITE, :WHITE] = self._weights
         for part in chunks(len(space)):
-            ahead, behind = space.ahead[part], space.behind[part]
+            behind = space.behind[part]
             weighed = self._weights[part] @ behind
-            np.matmul(transposed(ahead), self._weights[part] @ ahead, out=diagonal[1:][part])
-            np.matmul(transposed(ahead), np.negative(weighed), out=below[part])
+            np.negative(weighed, out=below[part, :WHITE])
+            self._add_slow(diagonal[1:][part], below[part], weighed, part)
             diagonal[:-1][part] += transposed(behind) @ weighed
         white = space.weights[:, None, None] * self.white_precision
         white[space.is_free] = FREE * np.eye(WHITE)
@@ -271,6 +285,17 @@ class Posterior:
             below[:, states, states] += (beside / process.variance)[:, None]
         diagonal[:, range(size), range(size)] *= 1.0 + _ROUNDING
         return diagonal, below
+
+    def _add_slow(
+        self, diagonal: FloatArray, below: FloatArray, weighed: FloatArray, part: slice
+    ) -> None:
+        """Fill in the blocks of the slow states of the poses ahead; ``weighed`` is W H0."""
+        if (slow := self.space.slow_ahead) is None:
+            return
+        beside = self._weights[part] @ slow[part]
+        diagonal[:, :WHITE, WHITE:], diagonal[:, WHITE:, :WHITE] = beside, transposed(beside)
+        diagonal[:, WHITE:, WHITE:] = transposed(slow[part]) @ beside
+        below[:, WHITE:] = transposed(slow[part]) @ np.negative(weighed)
 
     def weighed(self, columns: FloatArray) -> FloatArray:
         """W times columns (n, 6, k)."""
