@@ -16,6 +16,9 @@ in units of H, says how much more they scatter than H predicts. The logarithm of
 ratio of a shift with covariance L against none is then
 
     1/2 S' (H + f L^-1)^-1 S / f - 1/2 log|I + L H / f|.
+
+Errors that wander over minutes, of a map that bends or a bias, give a large ratio, too. A shift is
+a step: it remains if the answers of both sides may drift linearly.
 """
 
 from __future__ import annotations
@@ -49,8 +52,9 @@ _MEDIAN_LENGTH = 1.538
 _WINDOWS, _LEAST_WINDOWS = (8, 16), 2
 _LEAST_WINDOW_S = 3.0
 
-# Log likelihood ratio from which on a shift is significant.
-SIGNIFICANT = 12.0
+# Log likelihood ratio from which on a shift is significant, and squared step in its covariance from
+# which on it is no drift (0.3 % of chi2 of 6 degrees of freedom).
+SIGNIFICANT, _LEAST_STEP = 12.0, 20.0
 
 _STEPS = 3
 
@@ -111,6 +115,8 @@ class MountChange:
         Of ``xi``, with the long-run variance.
     log_ratio : float
         Logarithm of the likelihood ratio of this shift against none.
+    step : float
+        Squared step, in its covariance, between the answers of both sides if they may drift.
     """
 
     at_ns: int
@@ -119,11 +125,17 @@ class MountChange:
     xi: FloatArray
     covariance: FloatArray
     log_ratio: float
+    step: float
 
     @property
     def is_significant(self) -> bool:
         """Whether the recording shows it beyond doubt."""
         return self.log_ratio > SIGNIFICANT
+
+    @property
+    def is_step(self) -> bool:
+        """Whether it happened at once; otherwise something may as well drift."""
+        return self.step > _LEAST_STEP
 
 
 def residuals_and_jacobians(
@@ -281,6 +293,7 @@ def find_change(found: Information) -> MountChange | None:
         xi=after - before,
         covariance=covariance,
         log_ratio=float(ratios[best]),
+        step=_step(found, int(edges_ns[best])),
     )
 
 
@@ -346,6 +359,39 @@ def _within(windows: Information, split: int) -> float:
         centred.append(side.about(_solve(side.H.sum(axis=0), side.S.sum(axis=0))))
     H, S = (np.concatenate([getattr(side, name) for side in centred]) for name in ("H", "S"))
     return long_run_variance(Information(windows.starts_ns, H, S), n_parameters=12)
+
+
+def _step(found: Information, at_ns: int) -> float:
+    """Squared step at a time, in its covariance, if the answer before and the one after may drift
+    linearly.
+    """
+    is_after = found.starts_ns >= at_ns
+    (before, cov_before, rest_before), (after, cov_after, rest_after) = (
+        _drifting(Information(found.starts_ns[part], found.H[part], found.S[part]), at_ns)
+        for part in (~is_after, is_after)
+    )
+    rest = Information(found.starts_ns, found.H, np.concatenate([rest_before, rest_after]))
+    long_run = max(
+        long_run_variance(rest.merged(np.arange(n) * len(rest) // n), n_parameters=24)
+        for n in _WINDOWS
+    )
+    step = after - before
+    return float(step @ np.linalg.solve(cov_before + cov_after, step)) / long_run
+
+
+def _drifting(side: Information, at_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Answer at a time if it drifts linearly over these blocks, its covariance without the long-run
+    variance, and the scores (M, 6) about the drifting answer.
+    """
+    times = (side.starts_ns - at_ns).astype(float)
+    times /= max(np.abs(times).max(), 1.0)
+    powers = np.stack([np.ones_like(times), times])
+    H = np.einsum("ak,bk,kij->aibj", powers, powers, side.H).reshape(12, 12)
+    prior = np.linalg.inv(shift_covariance())
+    covariance = np.linalg.inv(H + 0.01 * np.kron(np.eye(2), prior))
+    answer, drift = np.split(covariance @ (powers @ side.S).ravel(), 2)
+    rest = side.S - np.einsum("kij,kj->ki", side.H, answer + times[:, None] * drift)
+    return answer, covariance[:6, :6], rest
 
 
 def _log_ratios(

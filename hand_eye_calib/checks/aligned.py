@@ -240,8 +240,8 @@ def _check_mount(aligned: Aligned) -> list[Finding]:
     )
     if moved_m < _MOVED_M and moved_rad < _MOVED_RAD:
         return []
-    is_large = moved_m > _MOVED_ERROR_M or moved_rad > _MOVED_ERROR_RAD
+    is_error = change.is_step and (moved_m > _MOVED_ERROR_M or moved_rad > _MOVED_ERROR_RAD)
     at_s = (change.at_ns - pose_pairs.stamps_ns[0]) * 1e-9
     span_s = (change.latest_ns - change.earliest_ns) * 1e-9
-    severity = Severity.ERROR if is_large else Severity.WARNING
-    return [wording.mount_moved(change, at_s, max(span_s, 1.0), severity)]
+    severity = Severity.ERROR if is_error else Severity.WARNING
+    return [wording.mount_moved(change, at_s, max(span_s, 1.0), (moved_m, moved_rad), severity)]

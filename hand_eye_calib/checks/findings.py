@@ -636,18 +636,30 @@ def world_drift(drift: WorldDrift, share: float) -> Finding:
     )
 
 
-def mount_moved(change: MountChange, at_s: float, span_s: float, severity: Severity) -> Finding:
-    """The mount has moved within the recording; ``at_s`` seconds after its start."""
-    distance_m = float(np.linalg.norm(change.xi[:3]))
-    angle_rad = float(np.linalg.norm(change.xi[3:]))
+def mount_moved(
+    change: MountChange,
+    at_s: float,
+    span_s: float,
+    moved: tuple[float, float],
+    severity: Severity,
+) -> Finding:
+    """The mount has moved within the recording, ``at_s`` seconds after its start, by so much (m,
+    rad); or something drifts.
+    """
+    distance_m, angle_rad = moved
+    when = f"changes {at_s:.0f} s after the start (within {span_s:.0f} s)"
+    cause = "a mount that came loose or was knocked, or an estimator that started anew"
+    if not change.is_step:
+        when = "seems to change in the course of the recording"
+        cause = "a mount that gives way, or a sensor whose errors wander over minutes"
     return Finding(
         code="mount_moved",
         stream="both",
         severity=severity,
-        confidence=Confidence.LIKELY,
-        what=f"the extrinsic changes {at_s:.0f} s after the start (within {span_s:.0f} s) by "
-        f"{100 * distance_m:.2g} cm and {np.degrees(angle_rad):.2g} deg",
-        cause="a mount that came loose or was knocked, or an estimator that started anew",
+        confidence=Confidence.LIKELY if change.is_step else Confidence.POSSIBLE,
+        what=f"the extrinsic {when} by {100 * distance_m:.2g} cm and "
+        f"{np.degrees(angle_rad):.2g} deg",
+        cause=cause,
         advice="tighten it and record again, or calibrate the parts before and after on their own",
         evidence=(
             ("at_s", at_s),

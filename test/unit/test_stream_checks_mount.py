@@ -37,11 +37,24 @@ def test_a_shift_is_found_with_its_time_and_size(share):
     pose_pairs, truth = recording(1, SHIFT, share)
     change = find_change(information(pose_pairs, truth))
     assert change.is_significant
+    assert change.is_step
     at_s = (change.at_ns - pose_pairs.stamps_ns[0]) * 1e-9
     assert at_s == pytest.approx(120 * share, abs=2.0)
     assert change.earliest_ns <= change.at_ns <= change.latest_ns
     error = change.xi - SHIFT
     assert error @ np.linalg.solve(change.covariance, error) < 25.0
+
+
+@pytest.mark.parametrize("periods", [0.6, 0.7, 0.8])
+def test_errors_that_wander_over_minutes_are_no_step(periods):
+    drive = simulate_drive(6, HILLY_DRIVE, NOISE)
+    phases = np.linspace(0, 2 * np.pi * periods, len(drive.child.poses))
+    errors = np.sin(phases)[:, None] * SHIFT
+    child = dataclasses.replace(drive.child, poses=drive.child.poses @ se3.exp(errors))
+    pose_pairs = synchronise(drive.parent, child, 0.5)
+    change = find_change(information(pose_pairs, drive.T_parent_child))
+    assert change.is_significant
+    assert not change.is_step
 
 
 @pytest.mark.parametrize("seed", range(5))
