@@ -19,7 +19,7 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction.coverage.classes import CLASSES, make
 from reproduction.coverage.real_sets import Rig, real_rigs
 
-SEEDS = range(50, 55)
+SEEDS = range(60, 65)
 
 # Noise (m; twice as many radians) of simulated hilly drives.
 _HILLY = {"hilly": 0.003, "hilly_noisy": 0.02}

@@ -111,7 +111,7 @@ def interleaved(worlds: bool) -> Callable[..., Streams]:
     return damage
 
 
-def _low_passed(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
+def low_passed_values(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
     """First-order low-pass filter."""
     out = values.copy()
     shares = 1.0 - np.exp(-np.diff(stamps_ns) * 1e-9 / tau_s)
@@ -122,14 +122,14 @@ def _low_passed(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
 
 def _smoothed(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
     """The same filter forwards and backwards: no delay."""
-    ahead = _low_passed(values, stamps_ns, tau_s)
-    return _low_passed(ahead[::-1], -stamps_ns[::-1], tau_s)[::-1]
+    ahead = low_passed_values(values, stamps_ns, tau_s)
+    return low_passed_values(ahead[::-1], -stamps_ns[::-1], tau_s)[::-1]
 
 
 def low_passed(parent: Trajectory, child: Trajectory, tau_s: float, random: Any) -> Streams:
     """Positions low-passed, orientations not."""
     return parent, with_poses(
-        child, positions=_low_passed(child.poses[:, :3, 3], child.stamps_ns, tau_s)
+        child, positions=low_passed_values(child.poses[:, :3, 3], child.stamps_ns, tau_s)
     )
 
 
@@ -145,7 +145,7 @@ def all_low_passed(parent: Trajectory, child: Trajectory, tau_s: float, random: 
     return parent, with_poses(
         child,
         _low_passed_rotations(child, tau_s),
-        _low_passed(child.poses[:, :3, 3], child.stamps_ns, tau_s),
+        low_passed_values(child.poses[:, :3, 3], child.stamps_ns, tau_s),
     )
 
 

@@ -32,6 +32,7 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction import clean_recordings
 from reproduction.coverage.real_sets import Rig, real_rigs
 from reproduction.fault_cases import FAULTS, UNSEEN, UNTUNED, Fault
+from reproduction.unseen_faults import LAST
 from reproduction.writing import markdown_table, put_into_page
 
 METHODS = ("dnlo", "auto")
@@ -54,8 +55,10 @@ _SOUND, _CLEAN = "none", "clean"
 # Titles of the tables of faults that were built later.
 _LATER = {
     "Twelve faults that were built without a limit for them": UNTUNED,
-    "Ten faults that were built when all was done, as they came": UNSEEN,
+    "Ten faults that were built after those": UNSEEN,
+    "Ten faults that were built when all was done, as they came": LAST,
 }
+_OF_LATER = tuple(fault for faults in _LATER.values() for fault in faults)
 
 # Rules of the verdict that state how a recording is, not that something is wrong.
 _PHYSICAL = frozenset(
@@ -150,7 +153,7 @@ def recordings(folder: Path | None) -> list[str]:
 
 
 def cases(folder: Path | None) -> list[Case]:
-    """All cases of the study: faults, clean recordings, faults that were built later."""
+    """All cases of the study: faults, those that were built later, clean recordings."""
     others = [name for name in recordings(folder) if name in _FOR_UNTUNED]
     return [
         *_cases(_SOUND, 1, recordings(folder)),
@@ -159,12 +162,12 @@ def cases(folder: Path | None) -> list[Case]:
             for fault in FAULTS
             for case in _cases(fault.code, len(fault.severities), recordings(folder))
         ),
-        *clean_cases(folder),
         *(
             case
-            for fault in (*UNTUNED, *UNSEEN)
+            for fault in _OF_LATER
             for case in _cases(fault.code, len(fault.severities), others)
         ),
+        *clean_cases(folder),
     ]
 
 
@@ -209,7 +212,7 @@ def _of_clean(case: Case, folder: Path | None) -> Outcome:
     return _judged(case.key, result, clean.T_parent_child)
 
 
-_FAULTS: dict[str, Fault] = {fault.code: fault for fault in (*FAULTS, *UNTUNED, *UNSEEN)}
+_FAULTS: dict[str, Fault] = {fault.code: fault for fault in (*FAULTS, *_OF_LATER)}
 
 
 def _codes(parent: Trajectory, child: Trajectory) -> list[str]:

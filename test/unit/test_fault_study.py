@@ -1,9 +1,15 @@
 """The study of faults: its cases, and what its page says."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE
 from reproduction import clean_recordings, faults
 from reproduction.command import main
+from reproduction.unseen_faults import LAST
 
 
 def test_there_are_more_than_a_hundred_clean_recordings_of_more_than_ten_kinds():
@@ -53,3 +59,14 @@ def test_a_clean_recording_has_its_truth():
     assert clean.T_parent_child.shape == (4, 4)
     with pytest.raises(KeyError):
         clean_recordings.recording("no such 50", None)
+
+
+@pytest.mark.parametrize("fault", LAST, ids=lambda fault: fault.code)
+def test_faults_that_were_built_last_change_the_streams(fault):
+    drive = simulate_drive(0, dataclasses.replace(HILLY_DRIVE, poses=400))
+    for severity in fault.severities:
+        parent, child = fault.damage(drive.parent, drive.child, severity, np.random.default_rng(0))
+        assert min(len(parent), len(child)) > 250
+        same = len(child) == len(drive.child) and np.array_equal(child.poses, drive.child.poses)
+        same &= np.array_equal(child.stamps_ns, drive.child.stamps_ns)
+        assert not same or not np.array_equal(parent.poses, drive.parent.poses)
