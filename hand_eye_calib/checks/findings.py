@@ -647,6 +647,8 @@ def mount_moved(
     rad); or something drifts.
     """
     distance_m, angle_rad = moved
+    sizes = [f"{100 * distance_m:.2g} cm"] if distance_m else []
+    sizes += [f"{np.degrees(angle_rad):.2g} deg"] if angle_rad else []
     when = f"changes {at_s:.0f} s after the start (within {span_s:.0f} s)"
     cause = "a mount that came loose or was knocked, or an estimator that started anew"
     if not change.is_step:
@@ -657,8 +659,7 @@ def mount_moved(
         stream="both",
         severity=severity,
         confidence=Confidence.LIKELY if change.is_step else Confidence.POSSIBLE,
-        what=f"the extrinsic {when} by {100 * distance_m:.2g} cm and "
-        f"{np.degrees(angle_rad):.2g} deg",
+        what=f"the extrinsic {when} by {' and '.join(sizes)}",
         cause=cause,
         advice="tighten it and record again, or calibrate the parts before and after on their own",
         evidence=(
