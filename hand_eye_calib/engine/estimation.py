@@ -276,7 +276,8 @@ def _solve_pairs(
         longer = _solve_reference(pose_pairs, method, reference, reason)
         if _n_unobservable(longer.assessment) < n_unobservable:
             chosen = longer
-    return replace(chosen, other_answer=choice.answer)
+    spread = chosen.spread if choice.spread is None else choice.spread
+    return replace(chosen, other_answer=choice.answer, spread=spread)
 
 
 def _solve_reference(
