@@ -59,8 +59,8 @@ SIGNIFICANT, _LEAST_STEP = 12.0, 20.0
 _STEPS = 3
 
 # Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
-# recording before and after that. Log odds beyond these are certain.
-_MOVES, _LEAST_PARTS, _CERTAIN = 0.02, 4, 50.0
+# recording before and after that. A smaller probability is none; log odds beyond these are certain.
+_MOVES, _LEAST_PARTS, _LEAST_PROBABILITY, _CERTAIN = 0.02, 4, 1e-3, 50.0
 
 
 def shift_covariance(metres: float = SHIFT_M, radians: float = SHIFT_RAD) -> FloatArray:
@@ -323,6 +323,8 @@ def spread_by_shift(products: FloatArray, misfit: float) -> FloatArray:
     weights = np.exp(ratios - ratios.max())
     log_odds = ratios.max() + np.log(weights.mean() * _MOVES / (1.0 - _MOVES))
     probability = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -_CERTAIN, _CERTAIN)))
+    if probability < _LEAST_PROBABILITY:
+        return np.zeros((6, 6))
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
     return np.asarray(probability * squared / 4.0)
 

@@ -101,7 +101,7 @@ def products_of(steps, sigma=0.01):
 def test_a_shift_between_parts_counts_with_half_of_it():
     noise = np.random.default_rng(0).normal(0.0, 0.01, (20, 6))
     moved = noise + np.where(np.arange(20)[:, None] < 8, 0.0, SHIFT)
-    assert np.sqrt(np.diag(spread_by_shift(products_of(noise), 1.0))).max() < 5e-4
+    assert not spread_by_shift(products_of(noise), 1.0).any()
     spread = spread_by_shift(products_of(moved), 1.0)
     np.testing.assert_allclose(np.sqrt(np.diag(spread)), np.abs(SHIFT) / 2, atol=4e-3)
     assert not spread_by_shift(products_of(moved[:7]), 1.0).any()
