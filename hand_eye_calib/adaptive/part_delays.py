@@ -23,8 +23,8 @@ from hand_eye_calib.arrays import FloatArray
 # Blocks of the jackknife.
 _BLOCKS = 10
 
-# Delays from so many standard deviations on are likely.
-_LIKELY = 2.0
+# Delays from so many standard deviations on are likely; a clock is more often right.
+_LIKELY, _LIKELY_OF_CLOCK = 2.0, 3.0
 
 # A direction without evidence that has this much of a delay in it leaves the delay open.
 _UNSEEN = 1e-6
@@ -73,11 +73,13 @@ def spread_by_delays(
         Of the child's clock, if the model has none.
     """
     spreads = [np.zeros((6, 6))]
-    for delay in filter(None, (*delays, clock)):
-        variance = 0.0 if delay is clock else min(delay.sigma_s, abs(clock_offset_s)) ** 2
+    for delay in delays:
+        variance = min(delay.sigma_s, abs(clock_offset_s)) ** 2
         if delay.sigmas > _LIKELY:
             variance += delay.seconds**2
         spreads.append(variance * np.outer(delay.sensitivity, delay.sensitivity))
+    if clock is not None and clock.sigmas > _LIKELY_OF_CLOCK:
+        spreads.append(clock.seconds**2 * np.outer(clock.sensitivity, clock.sensitivity))
     return max(spreads, key=lambda spread: float(np.trace(spread[:3, :3])))
 
 

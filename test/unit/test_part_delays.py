@@ -68,7 +68,7 @@ def test_a_clock_offset_that_is_not_in_the_model_is_told_and_counts():
 
 
 def test_a_clock_offset_that_is_noise_does_not_count():
-    clock = PartDelay(0.001, 0.001, np.ones(6))
+    clock = PartDelay(0.0028, 0.001, np.ones(6))
     assert not spread_by_delays((), 0.0, clock).any()
 
 
