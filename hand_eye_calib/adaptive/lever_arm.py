@@ -46,7 +46,7 @@ _LEAST_WHITE_SHARE, _LEAST_WALK_SHARE = -14.0, -12.0
 
 # Poses of the windows that are aligned by themselves: for the first lever arm, and for the first
 # orientations. The first lever arm is drawn to zero by so much where the motion does not show it.
-_START_WINDOW, _ALIGNED_WINDOW = 60, 100
+_START_WINDOWS, _ALIGNED_WINDOW = (480, 60), 100
 _START_STEPS, _SETTLED_START, _DRAWN = 50, 1e-6, 1e-6
 
 # Rounds of updating the orientations; those after which noise levels are fitted, errors that last
@@ -206,15 +206,41 @@ def _first_answer(
 ) -> tuple[FloatArray, float]:
     """The lever arm (3,) and the scale, if it is asked for, that fit windows best, each aligned by
     itself; bad ones count less.
+
+    Short windows hardly know of the drift, but have local minima: long ones lead to the right one,
+    and know the scale.
     """
-    size = min(_START_WINDOW, len(positions))
+    lever_arm, scale = np.zeros(3), 1.0
+    for size in _START_WINDOWS:
+        windows = _windows(Ts_pw_p, positions, size)
+        lever_arm, scale = _fitting(*windows, lever_arm, scale, with_scale)
+        with_scale = False
+    return lever_arm, scale
+
+
+def _windows(
+    Ts_pw_p: FloatArray, positions: FloatArray, size: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Orientations (n, k, 3, 3), path (n, k, 3) and positions (n, k, 3) of windows, centred."""
+    size = min(size, len(positions))
     count = len(positions) // size
     axes, path, measured = (
         _centred(values[: count * size].reshape(count, size, *values.shape[1:]))
         for values in (Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions)
     )
-    information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
-    lever_arm, scale = np.zeros(3), 1.0
+    return axes, path, measured
+
+
+def _fitting(
+    axes: FloatArray,
+    path: FloatArray,
+    measured: FloatArray,
+    lever_arm: FloatArray,
+    scale: float,
+    with_scale: bool,
+) -> tuple[FloatArray, float]:
+    """Lever arm and scale that fit windows best, from first ones on."""
+    information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * axes.shape[1] * np.eye(3)
     for _ in range(_START_STEPS):
         predicted = axes @ lever_arm + path
         aligned = measured @ _rotations(measured, predicted)
@@ -328,9 +354,15 @@ class _State:
             weights=np.ones(n + 1),
         )
         residuals = linearise(streams, state.course, state.X, state.parameters).residuals
-        white, walk = rough_levels(residuals, np.zeros(n, dtype=bool))
+        squares = (residuals[:, :3] ** 2).sum(axis=1)
+        weights = _quality(
+            np.concatenate([squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]])
+        )
+        is_worse = (weights[1:] < 1.0) | (weights[:-1] < 1.0)
+        white, walk = rough_levels(residuals, is_worse)
         white[1], walk[1] = _ANY_ROTATION, _FIRST_WALK
-        return dataclasses.replace(state, levels=state.model.first_levels(white, walk))
+        levels = state.model.first_levels(white, walk)
+        return dataclasses.replace(state, levels=levels, weights=weights)
 
     @property
     def X(self) -> FloatArray:
@@ -416,14 +448,7 @@ class _State:
         """With weights below 1 where the positions around one are clearly worse than the rest."""
         states = posterior.states_after(posterior.normal.step)[:, :3]
         spread = posterior.selected_inverse[0][:, range(3), range(3)]
-        squares = (states**2 + spread).sum(axis=1) / np.exp(self.levels[noise_model.TRANSLATION])
-        window = min(_NEIGHBOURS, len(squares))
-        around = np.convolve(squares, np.ones(window), mode="same")
-        counts = np.convolve(np.ones(len(squares)), np.ones(window), mode="same")
-        expected = 3.0 * counts
-        is_worse = around / counts > _WORSE * float(np.median(around / counts))
-        weights = np.where(is_worse, (_STUDENT + expected) / (_STUDENT + around), 1.0)
-        return dataclasses.replace(self, weights=np.minimum(weights, 1.0))
+        return dataclasses.replace(self, weights=_quality((states**2 + spread).sum(axis=1)))
 
     def moved(self, posterior: _Posterior) -> _State:
         """After a step, with the orientations that the positions ask for."""
@@ -438,6 +463,18 @@ class _State:
             lever_arm=self.lever_arm + posterior.normal.step[:3],
             parameters=parameters,
         )
+
+
+def _quality(squares: FloatArray) -> FloatArray:
+    """Weights (N,) of positions by their squared errors (N,) and those around: below 1 where these
+    are clearly larger than usual.
+    """
+    window = np.ones(min(_NEIGHBOURS, len(squares)))
+    around = np.convolve(squares, window, mode="same")
+    counts = np.convolve(np.ones(len(squares)), window, mode="same")
+    usual = max(float(np.median(around / counts)), noise_model.LOWEST_VARIANCE)
+    weights = (_STUDENT + 3.0 * counts) / (_STUDENT + 3.0 * around / usual)
+    return np.where(around > _WORSE * usual * counts, np.minimum(weights, 1.0), 1.0)
 
 
 class _Posterior(Posterior):
