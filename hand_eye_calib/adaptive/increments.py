@@ -153,9 +153,9 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
     axes_c, axes_p = streams.Ts_cw_c[:-1, :3, :3], streams.Ts_pw_p[:-1, :3, :3]
     return Course(
         _twists(by_child, intervals_s),
-        _summed(turned(axes_c, step)),
-        _summed(axes_c * metres_c[:, None, None]),
-        _summed(axes_p * metres_p[:, None, None]),
+        summed(turned(axes_c, step)),
+        summed(axes_c * metres_c[:, None, None]),
+        summed(axes_p * metres_p[:, None, None]),
     )
 
 
@@ -180,7 +180,8 @@ def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> Floa
     return cleaned + believed * (steps - cleaned)
 
 
-def _summed(steps: FloatArray) -> FloatArray:
+def summed(steps: FloatArray) -> FloatArray:
+    """Sums (N, ...) of the steps (N - 1, ...) up to each instant, from zero on."""
     return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 

@@ -27,8 +27,10 @@ from hand_eye_calib.adaptive.increments import (
     Streams,
     course_of,
     linearise,
+    summed,
+    turned,
 )
-from hand_eye_calib.adaptive.noise_model import SCALE_DRIFT, Extent, NoiseModel, Slow
+from hand_eye_calib.adaptive.noise_model import N_FAST, Extent, NoiseModel, Slow
 from hand_eye_calib.adaptive.outliers import LONGEST_GAP, Outliers, judged, surprises
 from hand_eye_calib.adaptive.resampling import part_products
 from hand_eye_calib.adaptive.state_space import Posterior, StateSpace, multiplied
@@ -347,7 +349,7 @@ class _State:
             lever_arm=lever_arm,
             columns=[SCALE, TIME] if with_scale else [TIME],
             parameters=np.zeros(N_SYSTEMATIC),
-            model=NoiseModel((SCALE_DRIFT,), "time", "sensors", extent),
+            model=NoiseModel((), "time", "sensors", extent),
             levels=np.zeros(0),
             outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
             boost=np.ones(n),
@@ -361,7 +363,7 @@ class _State:
         is_worse = (weights[1:] < 1.0) | (weights[:-1] < 1.0)
         white, walk = rough_levels(residuals, is_worse)
         white[1], walk[1] = _ANY_ROTATION, _FIRST_WALK
-        levels = state.model.first_levels(white, walk)
+        levels = state.model.first_levels(white, walk)[:N_FAST]
         return dataclasses.replace(state, levels=levels, weights=weights)
 
     @property
@@ -371,10 +373,19 @@ class _State:
 
     @property
     def course(self) -> Course:
-        """Of the sensor with poses, at the lever arm: free of the noise of the positions."""
+        """Of the sensor with poses, at the lever arm: free of the noise of the positions, but in
+        their world.
+        """
         streams = self.streams
         moved = Streams(streams.stamps_s, streams.Ts_pw_p, streams.Ts_pw_p @ self.X)
-        return course_of(moved, self.X)
+        course = course_of(moved, self.X)
+        back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
+        worlds = streams.Ts_cw_c[:-1, :3, :3] @ back_p
+        return dataclasses.replace(
+            course,
+            path=summed(turned(worlds, np.diff(course.path, axis=0))),
+            along_c=summed(worlds @ np.diff(course.along_c, axis=0)),
+        )
 
     def space(
         self, model: NoiseModel | None = None, columns: list[int] | None = None
@@ -423,11 +434,9 @@ class _State:
         fits = []
         for kind in ("body", "world"):
             for tau_s in self.model.taus_s():
-                model = self.model.richer((Slow(kind, "translation"), *self.model.slow))
+                model = self.model.richer((Slow(kind, "translation"),))
                 more = [start + np.log(_FIRST_SHARE), np.log(max(tau_s, 2 * extent.interval_s))]
-                richer = np.concatenate(
-                    [levels[: noise_model.N_FAST], more, levels[noise_model.N_FAST :]]
-                )
+                richer = np.concatenate([levels, more])
                 fits.append(
                     (model, reml.fit(self.sampled_space(model), richer, _prior(model, richer)))
                 )

@@ -8,6 +8,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from reproduction.positions import simulated_positions
 
 LEVER_ARM = np.array([0.8, -0.5, 1.2])
 START_NS = 1_700_000_000_000_000_000
@@ -33,6 +34,19 @@ def recorded(n_poses=300, noise_m=0.005, drift_rad=2e-4, seed=2, poses=None):
     stamps_ns = START_NS + STEP_NS * np.arange(len(poses))
     child = Trajectory.from_positions(stamps_ns, antenna_of(poses, noise_m), "antenna", "map")
     return Trajectory(stamps_ns, np.array(odometry), "lidar", "odom"), child
+
+
+def swaying_poses(count, seed):
+    """Poses of a body that sways slowly about all axes, many per period."""
+    random = np.random.default_rng(seed)
+    phases, hertz = random.uniform(0, 6, (6, 1, 3)), random.uniform(0.1, 0.5, (6, 1, 3))
+    sizes = random.normal(size=(6, 1, 3)) * np.repeat([0.004, 0.01], 3)[:, None, None]
+    waves = sizes * np.sin(0.2094 * hertz * np.arange(count)[:, None] + phases)
+    twists = np.concatenate([waves[:3].sum(axis=0), waves[3:].sum(axis=0)], axis=1)
+    poses = [np.eye(4)]
+    for motion in se3.exp(twists[1:]):
+        poses.append(poses[-1] @ motion)
+    return np.array(poses)
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +104,25 @@ class TestLeverArm:
         found = hec.calibrate(small, child, scale="estimate")
         assert found.scale == pytest.approx(0.5, rel=0.01)
         assert found.T_parent_child[:3, 3] == pytest.approx(0.5 * LEVER_ARM, abs=0.02)
+
+    def test_a_scale_is_within_its_sigma_whatever_the_worlds(self):
+        parent, child = recorded(drift_rad=1e-3, noise_m=0.02, seed=1)
+        small = Trajectory(parent.stamps_ns, parent.scaled(0.97).poses, "camera")
+        found = hec.calibrate(small, child, scale="estimate")
+        assert abs(found.scale - 0.97) < 4.0 * found.scale_sigma < 0.01
+        assert found.T_parent_child[:3, 3] == pytest.approx(0.97 * LEVER_ARM, abs=0.02)
+
+    def test_short_windows_do_not_lead_to_a_false_minimum(self):
+        poses = swaying_poses(720, seed=4)
+        parent, child = recorded(drift_rad=3e-4, noise_m=0.001, poses=poses)
+        found = hec.calibrate(parent, child)
+        assert found.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
+
+    def test_float_solutions_of_a_receiver_leave_millimetres(self):
+        parent, child, lever_arm = simulated_positions("excavator", seed=0)
+        found = hec.calibrate(parent, child)
+        assert found.T_parent_child[:3, 3] == pytest.approx(lever_arm, abs=0.02)
+        assert found.sigmas[:2].max() < 0.004
 
     def test_float_solutions_outages_and_a_jump_do_little(self, streams):
         parent, child = streams
