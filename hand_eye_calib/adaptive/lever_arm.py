@@ -77,8 +77,8 @@ _JUMP_FACTOR = 10.0
 _PARTS = 10
 
 # The quality of a solution is that of so many positions around; those whose squared errors exceed
-# the median by this factor count less.
-_NEIGHBOURS, _WORSE, _STUDENT = 11, 16.0, 4.0
+# that of the best quarter of the recording by this factor count less.
+_NEIGHBOURS, _USUAL, _WORSE, _STUDENT = 11, 0.25, 16.0, 4.0
 
 # Errors of odometry that are the same all the time: of the direction of travel (rad) and of the
 # scale, as in the common-mode floor.
@@ -476,12 +476,12 @@ class _State:
 
 def _quality(squares: FloatArray) -> FloatArray:
     """Weights (N,) of positions by their squared errors (N,) and those around: below 1 where these
-    are clearly larger than usual.
+    are clearly larger than in the best quarter.
     """
     window = np.ones(min(_NEIGHBOURS, len(squares)))
     around = np.convolve(squares, window, mode="same")
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
-    usual = max(float(np.median(around / counts)), noise_model.LOWEST_VARIANCE)
+    usual = max(float(np.quantile(around / counts, _USUAL)), noise_model.LOWEST_VARIANCE)
     weights = (_STUDENT + 3.0 * counts) / (_STUDENT + 3.0 * around / usual)
     return np.where(around > _WORSE * usual * counts, np.minimum(weights, 1.0), 1.0)
 
