@@ -22,8 +22,11 @@ from hand_eye_calib.geometry import se3
 # False alarms expected in a whole recording.
 _FALSE_ALARMS = 0.01
 
-# Large steps of a walk are no jumps: these exceed the level of false alarms by this factor.
-_DECISIVE = 2.5
+# Large steps of a walk with heavy tails are no jumps: these exceed the level of false alarms by
+# this factor. Tails are heavy from this ratio on of the fourth moment of the steps that are below
+# that level to the square of the second (4/3 for normal ones).
+_DECISIVE, _WALK_KURTOSIS = 2.5, 1.5
+_MEDIAN_OF_CHI_6 = 5.348
 
 # No more than this share of the increments can be jumps: otherwise the noise levels are wrong.
 _MOST_JUMPS = 0.5
@@ -197,7 +200,7 @@ def judged(
     neighbourhood is one, and what a walk makes probable is no jump.
     """
     alarming = chi_square_quantile(_FALSE_ALARMS / len(of_white))
-    decisive = of_walk > _DECISIVE * alarming
+    decisive = of_walk > _decisive(of_walk[~outliers.jumps], alarming)
     beside = np.maximum(of_white[1:], of_white[:-1])
     found = decisive & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
     jumps = outliers.jumps & decisive
@@ -208,6 +211,16 @@ def judged(
         walks = np.maximum(np.r_[0.0, of_walk], np.r_[of_walk, 0.0])
         spikes = spikes | (of_white > alarming) & _is_peak(of_white) & (of_white > walks)
     return Outliers(jumps, spikes)
+
+
+def _decisive(of_walk: FloatArray, alarming: float) -> float:
+    """Chi-square from which a step of the walk is a jump: that of false alarms if the others are
+    normal, in the units of what they are as a rule.
+    """
+    ordinary = of_walk[of_walk < alarming]
+    if len(ordinary) == 0 or np.mean(ordinary**2) > _WALK_KURTOSIS * np.mean(ordinary) ** 2:
+        return _DECISIVE * alarming
+    return float(max(np.median(ordinary) / _MEDIAN_OF_CHI_6, 1.0)) * alarming
 
 
 def _is_peak(values: FloatArray) -> BoolArray:

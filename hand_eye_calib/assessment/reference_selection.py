@@ -24,6 +24,10 @@ CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 # Among references with a predicted error within this factor of the smallest, their answers decide.
 _NEARLY_AS_GOOD = 1.3
 
+# Of these, answers whose distances from the adaptive estimator's are within this factor of the
+# smallest are alike, and the predicted error decides.
+_NEARLY_AS_NEAR = 1.1
+
 # Fewest poses from which the noise can be estimated.
 MIN_POSES = 13
 
@@ -170,7 +174,9 @@ def _rms(covariances: Mapping[str, FloatArray], part: slice) -> dict[str, float]
 def _nearest(
     pose_pairs: PosePairs, method: Method, choice: ReferenceChoice, solution: AdaptiveSolution
 ) -> str:
-    """The one of the alike references with which the method's answer is nearest to a solution."""
+    """The one of the alike references with which the method's answer is nearest to a solution; of
+    those that are about as near, the one with the smallest predicted error.
+    """
     if len(choice.alike) == 1:
         return choice.alike[0]
     fast = dataclasses.replace(method, backend="fast")
@@ -179,4 +185,6 @@ def _nearest(
         pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
         return choice.distance(fast.solve(pairs).T_parent_child, solution.T_parent_child)
 
-    return min(choice.alike, key=distance)
+    distances = {reference: distance(reference) for reference in choice.alike}
+    limit, joint = _NEARLY_AS_NEAR * min(distances.values()), choice.joint_errors()
+    return min((name for name in distances if distances[name] <= limit), key=joint.__getitem__)
