@@ -46,9 +46,6 @@ _MAX_PAIRS = 400
 
 _NO_ANSWER = "no answer"
 
-# Recordings for the faults that no limit was set with.
-_FOR_UNTUNED = ("hilly_0", "tango_mars_nero")
-
 # Fault of a case without one, in a recording that the faults are put into, and in a clean one.
 _SOUND, _CLEAN = "none", "clean"
 
@@ -154,18 +151,13 @@ def recordings(folder: Path | None) -> list[str]:
 
 def cases(folder: Path | None) -> list[Case]:
     """All cases of the study: faults, those that were built later, clean recordings."""
-    others = [name for name in recordings(folder) if name in _FOR_UNTUNED]
+    names = recordings(folder)
     return [
-        *_cases(_SOUND, 1, recordings(folder)),
+        *_cases(_SOUND, 1, names),
         *(
             case
-            for fault in FAULTS
-            for case in _cases(fault.code, len(fault.severities), recordings(folder))
-        ),
-        *(
-            case
-            for fault in _OF_LATER
-            for case in _cases(fault.code, len(fault.severities), others)
+            for fault in (*FAULTS, *_OF_LATER)
+            for case in _cases(fault.code, len(fault.severities), names)
         ),
         *clean_cases(folder),
     ]
