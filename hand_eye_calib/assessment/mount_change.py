@@ -297,12 +297,46 @@ def find_change(found: Information) -> MountChange | None:
     )
 
 
-def spread_by_shift(products: FloatArray, misfit: float) -> FloatArray:
-    """Covariance (6, 6) of xi in ``X exp(xi)`` because the mount may have moved in the recording.
+@dataclass(frozen=True, kw_only=True)
+class PossibleShift:
+    """A shift of the mount that the parts of a recording may show.
+
+    Attributes
+    ----------
+    probability : float
+    share : float
+        Of the recording before it, where it is most likely.
+    xi : (6,) array
+        Shift there, as of a MountChange, if there is one.
+    spread : (6, 6) array
+        Covariance of xi in ``X exp(xi)`` because of it: an answer between both mounts is half of
+        the shift away from either.
+    """
+
+    probability: float
+    share: float
+    xi: FloatArray
+    spread: FloatArray
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A warning if it is more likely than not."""
+        if self.probability < 0.5:
+            return ()
+        return (
+            f"the first {self.share:.0%} of the recording and the rest differ by "
+            f"{100 * np.linalg.norm(self.xi[:3]):.2g} cm and "
+            f"{np.degrees(np.linalg.norm(self.xi[3:])):.2g} deg, more than their noise explains: "
+            "the mount may have moved, or an odometry has changed; the standard deviations contain "
+            "half of that",
+        )
+
+
+def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
+    """The shift of the mount that the parts of a recording may show; None if it is improbable.
 
     What the parts before and after each time say of X is compared under the noise model that gave
-    X. The likelihood ratio of a shift, averaged over the times, gives its probability. An answer
-    between both mounts is half the shift away from either.
+    X. The likelihood ratio of a shift, averaged over the times, gives its probability.
 
     Parameters
     ----------
@@ -311,31 +345,35 @@ def spread_by_shift(products: FloatArray, misfit: float) -> FloatArray:
     misfit : float
         Factor of the covariances.
     """
-    found = [
-        _shift_between(products[:cut].sum(axis=0), products[cut:].sum(axis=0), max(misfit, 1.0))
-        for cut in range(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
-    ]
-    tried = [shift for shift in found if shift is not None]
-    if not tried:
-        return np.zeros((6, 6))
-    ratios = np.array([ratio for ratio, _ in tried])
-    shifts = np.array([xi for _, xi in tried])
+    cuts = range(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
+    found = {
+        cut: shift
+        for cut in cuts
+        if (shift := _shift_at(products, cut, max(misfit, 1.0))) is not None
+    }
+    if not found:
+        return None
+    ratios, shifts = (np.array(values) for values in zip(*found.values(), strict=True))
     weights = np.exp(ratios - ratios.max())
     log_odds = ratios.max() + np.log(weights.mean() * _MOVES / (1.0 - _MOVES))
-    probability = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -_CERTAIN, _CERTAIN)))
+    probability = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -_CERTAIN, _CERTAIN))))
     if probability < _LEAST_PROBABILITY:
-        return np.zeros((6, 6))
+        return None
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
-    return np.asarray(probability * squared / 4.0)
+    best = int(np.argmax(ratios))
+    return PossibleShift(
+        probability=probability,
+        share=list(found)[best] / len(products),
+        xi=shifts[best],
+        spread=probability * squared / 4.0,
+    )
 
 
-def _shift_between(
-    before: FloatArray, after: FloatArray, misfit: float
-) -> tuple[float, FloatArray] | None:
-    """Log likelihood ratio of a shift between two parts, and the shift (6,) that is expected if
-    there is one; None if either says nothing of some direction.
+def _shift_at(products: FloatArray, cut: int, misfit: float) -> tuple[float, FloatArray] | None:
+    """Log likelihood ratio of a shift after so many parts, and the shift (6,) that is expected if
+    there is one; None if either side says nothing of some direction.
     """
-    first, second = NormalEquations(before), NormalEquations(after)
+    first, second = (NormalEquations(side.sum(axis=0)) for side in (products[:cut], products[cut:]))
     if first.unseen.size or second.unseen.size:
         return None
     H = np.linalg.inv(misfit * (first.covariance + second.covariance)[:6, :6])

@@ -13,7 +13,7 @@ from hand_eye_calib.adaptive.estimator import AdaptiveSolution
 from hand_eye_calib.adaptive.prediction import ReferencePredictor
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import absolute_errors
-from hand_eye_calib.assessment.mount_change import spread_by_shift
+from hand_eye_calib.assessment.mount_change import PossibleShift, possible_shift
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -48,8 +48,8 @@ class ReferenceChoice:
         The candidates with nearly the smallest joint error, among which their answers decided.
     answer : ((4, 4) array, (6, 6) array) or None
         The adaptive estimator's answer and its covariance, if it knows all axes.
-    spread : (6, 6) array or None
-        Covariance of xi because the mount may have moved within the recording, by that estimator.
+    shift : PossibleShift or None
+        Of the mount within the recording, by that estimator.
     """
 
     reference: str
@@ -57,7 +57,7 @@ class ReferenceChoice:
     predicted_rad: dict[str, float]
     alike: tuple[str, ...] = ()
     answer: tuple[FloatArray, FloatArray] | None = None
-    spread: FloatArray | None = None
+    shift: PossibleShift | None = None
 
     def joint_errors(self) -> dict[str, float]:
         """Candidate to its predicted error in translation and rotation together: the root mean
@@ -159,8 +159,8 @@ def select_reference(
     if not solution.converged or solution.unseen.size:
         return found
     answer = solution.T_parent_child, solution.cov_parent_child_in_child
-    spread = spread_by_shift(solution.part_products, solution.misfit)
-    return dataclasses.replace(found, answer=answer, spread=spread)
+    shift = possible_shift(solution.part_products, solution.misfit)
+    return dataclasses.replace(found, answer=answer, shift=shift)
 
 
 def _rms(covariances: Mapping[str, FloatArray], part: slice) -> dict[str, float]:

@@ -2,7 +2,7 @@
 assess, add the prior, judge.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from hand_eye_calib.adaptive import estimator as adaptive_estimator
 from hand_eye_calib.adaptive.estimator import AdaptiveSolution
 from hand_eye_calib.adaptive.increments import Streams, course_of
 from hand_eye_calib.adaptive.part_delays import PartDelay, spread_by_delays
+from hand_eye_calib.adaptive.world_drift import WorldDrift
 from hand_eye_calib.alignment.scale import Scale, child_scaled, estimate_scale
 from hand_eye_calib.alignment.similarity import MAX_UNEXPLAINED_TRANSLATION
 from hand_eye_calib.alignment.time_offset import TimeOffset
@@ -18,7 +19,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive
 from hand_eye_calib.assessment.floor import common_mode_floor
 from hand_eye_calib.assessment.model_fit import MAX_JUMPS, why_not
-from hand_eye_calib.assessment.mount_change import spread_by_shift
+from hand_eye_calib.assessment.mount_change import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
@@ -49,8 +50,8 @@ class _Evaluation:
     ----------
     spans : MotionPairs and (K,) array
         Pairs that are long enough to show the motion, and their weights, for the floor.
-    spread : (6, 6) array
-        Covariance of xi by what may have moved within the recording.
+    shift : PossibleShift or None
+        Of the mount within the recording.
     """
 
     solution: Solution | AdaptiveSolution
@@ -72,7 +73,21 @@ class _Evaluation:
     other_answer: tuple[FloatArray, FloatArray] | None = None
     delays: tuple[PartDelay, ...] = ()
     clock: PartDelay | None = None
-    spread: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    drift: WorldDrift | None = None
+    shift: PossibleShift | None = None
+
+    def spread(self, clock_offset_s: float) -> FloatArray:
+        """Covariance (6, 6) of xi by what is not in the model.
+
+        Parameters
+        ----------
+        clock_offset_s : float
+            As estimated before; zero if it was given.
+        """
+        spread = spread_by_delays(self.delays, clock_offset_s, self.clock)
+        if self.drift is not None and self.drift.is_significant:
+            spread = spread + np.outer(self.drift.shift, self.drift.shift)
+        return spread if self.shift is None else spread + self.shift.spread
 
 
 @dataclass(frozen=True)
@@ -120,8 +135,7 @@ def estimate_extrinsic(
     spread = _spread_by_alignment(
         scale.estimate, None if evaluation.time_correction_s else time_offset
     )
-    offset_s = time_offset.seconds if time_offset else 0.0
-    spread += spread_by_delays(evaluation.delays, offset_s, evaluation.clock) + evaluation.spread
+    spread += evaluation.spread(time_offset.seconds if time_offset else 0.0)
     assessment = widened(evaluation.assessment, T_method[:3, :3], spread)
     fused = fuse(T_method, assessment, config.prior())
     result = _calibration(evaluation, fused, pose_pairs.stamps_ns, config)
@@ -165,7 +179,11 @@ def _calibration(
         contradictions=fused.contradictions,
         **config.target_fields(),
         stamp_ns=int(stamps_ns[-1]),
-        warnings=(*_warnings_of(fused), *evaluation.warnings),
+        warnings=(
+            *_warnings_of(fused),
+            *evaluation.warnings,
+            *(evaluation.shift.warnings if evaluation.shift else ()),
+        ),
         motion_residuals=residuals,
         other_answer=evaluation.other_answer,
     )
@@ -276,8 +294,7 @@ def _solve_pairs(
         longer = _solve_reference(pose_pairs, method, reference, reason)
         if _n_unobservable(longer.assessment) < n_unobservable:
             chosen = longer
-    spread = chosen.spread if choice.spread is None else choice.spread
-    return replace(chosen, other_answer=choice.answer, spread=spread)
+    return replace(chosen, other_answer=choice.answer, shift=choice.shift)
 
 
 def _solve_reference(
@@ -377,17 +394,9 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         time_sigma_s=solution.time_offset_sigma_s,
         delays=solution.delays or (),
         clock=solution.clock,
-        spread=_spread_by_moves(solution),
+        drift=solution.world_drift,
+        shift=possible_shift(solution.part_products, solution.misfit),
     )
-
-
-def _spread_by_moves(solution: AdaptiveSolution) -> FloatArray:
-    """Covariance (6, 6) of xi because the mount may have moved, or a world has."""
-    spread = spread_by_shift(solution.part_products, solution.misfit)
-    drift = solution.world_drift
-    if drift is not None and drift.is_significant:
-        spread = spread + np.outer(drift.shift, drift.shift)
-    return spread
 
 
 def _spans(

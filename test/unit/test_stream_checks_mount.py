@@ -10,7 +10,7 @@ from hand_eye_calib.assessment.mount_change import (
     information,
     log_ratio,
     long_run_variance,
-    spread_by_shift,
+    possible_shift,
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import synchronise
@@ -101,13 +101,17 @@ def products_of(steps, sigma=0.01):
 def test_a_shift_between_parts_counts_with_half_of_it():
     noise = np.random.default_rng(0).normal(0.0, 0.01, (20, 6))
     moved = noise + np.where(np.arange(20)[:, None] < 8, 0.0, SHIFT)
-    assert not spread_by_shift(products_of(noise), 1.0).any()
-    spread = spread_by_shift(products_of(moved), 1.0)
-    np.testing.assert_allclose(np.sqrt(np.diag(spread)), np.abs(SHIFT) / 2, atol=4e-3)
-    assert not spread_by_shift(products_of(moved[:7]), 1.0).any()
+    assert possible_shift(products_of(noise), 1.0) is None
+    found = possible_shift(products_of(moved), 1.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.spread)), np.abs(SHIFT) / 2, atol=4e-3)
+    np.testing.assert_allclose(found.xi, SHIFT, atol=8e-3)
+    assert (found.probability > 0.99, found.share) == (True, 0.4)
+    assert "the first 40% of the recording" in found.warnings[0]
+    assert possible_shift(products_of(moved[:7]), 1.0) is None
 
 
-def test_a_shift_that_noise_explains_hardly_counts():
+def test_a_shift_that_noise_explains_does_not_count():
     noise = np.random.default_rng(1).normal(0.0, 0.01, (20, 6))
     steps = noise + np.where(np.arange(20)[:, None] < 8, 0.0, 0.2 * SHIFT)
-    assert np.sqrt(np.diag(spread_by_shift(products_of(steps), 1.0))).max() < 1e-3
+    found = possible_shift(products_of(steps), 1.0)
+    assert found is None or (np.diag(found.spread).max() < 1e-6 and not found.warnings)
