@@ -166,7 +166,12 @@ def _fine_offset(
             return offset_s, None
         used, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
         twists = _twists(shifted, pose_pairs.stamps_ns[used], span_s)[where]
-        fit = fit_similarity(pairs, twists[: len(pairs)], twists[len(pairs) :], start=fit)
+        of_child = twists[: len(pairs)], twists[len(pairs) :]
+        fit = fit_similarity(pairs, *of_child, start=fit)
+        if not fit.explains_translation:
+            # A body that rotates about one of its sensors shows no scale.
+            in_one_unit = fit_similarity(pairs, *of_child, same_unit=True)
+            fit = in_one_unit if in_one_unit.explains_translation else fit
         rate = float(np.sqrt(np.mean((twists[:, 3:] ** 2).sum(axis=1))))
         of_noise_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(rate, 1e-9)
         span_s = max(span_s, min(of_noise_s, _MOST_SPAN_S))

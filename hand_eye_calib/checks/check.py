@@ -171,6 +171,7 @@ def _check_agreeing(
         *findings,
         *_check_offset(aligned.refined(offset) if aligned else offset, known_offset_s),
         *(_check_scale(scale, known_scale) if scale else []),
+        *([wording.unit_unseen()] if explanation.same_unit else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
         *(check_aligned(aligned) if aligned else []),
     ]

@@ -636,6 +636,20 @@ def world_drift(drift: WorldDrift, share: float) -> Finding:
     )
 
 
+def unit_unseen() -> Finding:
+    """One sensor hardly moves, so that no motion shows the ratio of the units of length."""
+    return Finding(
+        code="unit_unseen",
+        stream="both",
+        severity=Severity.WARNING,
+        confidence=Confidence.LIKELY,
+        what="the body rotates about one of the sensors, and nothing shows whether both streams "
+        "have one unit of length: the translation is as long as the other sensor's stream has it",
+        cause="a pan-tilt unit, or a robot that rotates on the spot",
+        advice="nothing, if both measure in metres; otherwise move the body as well",
+    )
+
+
 def mount_moved(
     change: MountChange,
     at_s: float,

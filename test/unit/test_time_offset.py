@@ -63,6 +63,31 @@ def test_any_offset_is_found_also_without_common_time(shift_s):
     assert found.sigma_s < 0.002
 
 
+def test_a_body_that_rotates_about_one_of_its_sensors():
+    """No scale shows, and the offset does all the same."""
+
+    def rotating(n_poses, seed):
+        poses = wandering_poses(n_poses, seed)
+        poses[:, :3, 3] = 0.0
+        return poses
+
+    found = estimate_time_offset(*drive(shift_s=0.1234, noise=0.002, wander=rotating))
+    assert found.seconds == pytest.approx(0.1234, abs=0.002)
+    assert found.sigma_s < 0.002
+
+
+def test_a_usual_offset_needs_less_evidence():
+    correlation = correlate_rates(*drive(shift_s=0.1))
+    for offset_s, distinctness, is_clear in (
+        (0.1, 1.5, True),
+        (0.1, 1.3, False),
+        (3.0, 1.5, False),
+    ):
+        doubtful = dataclasses.replace(correlation, offset_s=offset_s, distinctness=distinctness)
+        assert doubtful.is_clear == is_clear
+        assert bool(doubtful.doubt()) != is_clear
+
+
 def test_streams_that_overlap_only_in_part():
     parent, child = drive(seconds=90, shift_s=-17.5)
     child = child[child.stamps_ns > child.stamps_ns[0] + 40_000_000_000]
