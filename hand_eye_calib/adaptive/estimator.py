@@ -24,6 +24,7 @@ from hand_eye_calib.adaptive.increments import (
     course_of,
     linearise,
     parameters_of,
+    twists_of,
 )
 from hand_eye_calib.adaptive.noise_model import (
     CENTRES,
@@ -291,8 +292,7 @@ class _State:
         if error.any():
             linearisation = restored(linearisation, error)
         if with_delays:
-            at_poses = course_of(poses, self.T)
-            linearisation = with_delay_columns(linearisation, at_poses, self.T)
+            linearisation = with_delay_columns(linearisation, twists_of(poses), self.T)
             linearisation = with_world_columns(linearisation, poses)
             columns = [*dict.fromkeys((*columns, TIME)), *_MORE_COLUMNS]
         return (model or self.model).state_space(
@@ -622,7 +622,7 @@ def _polished_once(state: _State, is_last: bool) -> AdaptiveSolution | _State:
     posterior = state.posterior()
     converged = _is_settled(posterior.normal)
     if converged or is_last:
-        return _solution(state.moved(posterior.normal.step), posterior, converged)
+        return _solution(state, posterior, converged)
     return _relinearised(state, posterior)
 
 
@@ -663,6 +663,7 @@ def _freed(state: _State, states: FloatArray) -> _State:
 
 
 def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveSolution:
+    """The solution one step from where the search stands."""
     normal, streams = posterior.normal, state.streams
     n_columns = len(state.columns)
     n_evidence = int((~state.outliers.jumps).sum()) - int(state.outliers.spikes.sum())
@@ -671,7 +672,12 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
     covariance = max(misfit, 1.0) * normal.covariance
     covariance[:6, :6] += np.diag(state.mean_variances)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
-    parts = part_products(posterior)
+    if state.with_delays:
+        posterior = posterior.with_columns(state.space(with_delays=True).columns)
+    all_parts = part_products(posterior)
+    own = [*range(6 + n_columns), all_parts.shape[1] - 1]
+    parts = all_parts[:, own][:, :, own]
+    state = state.moved(normal.step)
     solution = AdaptiveSolution(
         T_parent_child=state.T,
         cov_parent_child_in_child=covariance[:6, :6],
@@ -692,21 +698,25 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
         converged=converged,
         iterations=state.n_evaluations,
     )
-    return _with_more(solution, state) if state.with_delays else solution
+    if not state.with_delays:
+        return solution
+    return _with_more(solution, state.columns, posterior.products, all_parts)
 
 
-def _with_more(solution: AdaptiveSolution, state: _State) -> AdaptiveSolution:
-    """With errors that are not in the model, as they would be with each alone in it."""
-    posterior = Posterior(state.space(with_delays=True), state.levels)
-    products, parts = posterior.products, part_products(posterior)
-    known = list(range(6 + len(state.columns)))
+def _with_more(
+    solution: AdaptiveSolution, columns: list[int], products: FloatArray, parts: FloatArray
+) -> AdaptiveSolution:
+    """With errors that are not in the model, as they would be with each alone in it: from the
+    products of all columns, whole and by parts.
+    """
+    known = list(range(6 + len(columns)))
     *with_clock, child, parent = range(len(products) - 1 - N_COLUMNS)
     world = list(range(parent + 1, parent + 1 + N_COLUMNS))
     misfit = solution.misfit
     of_child, of_parent = (
         part_delay(products, parts, with_clock, column, misfit) for column in (child, parent)
     )
-    has_clock = TIME in state.columns
+    has_clock = TIME in columns
     clock = None if has_clock else part_delay(products, parts, known, with_clock[-1], misfit)
     drift = world_drift(products, known, world, misfit)
     return dataclasses.replace(

@@ -159,6 +159,11 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
     )
 
 
+def twists_of(streams: Streams) -> FloatArray:
+    """Velocity (N, 6), m/s and rad/s, of the child in its own frame."""
+    return _twists(motions(streams.Ts_cw_c), np.diff(streams.stamps_s))
+
+
 def motions(Ts_world_sensor: FloatArray) -> FloatArray:
     """Motions (N - 1, 4, 4) from each pose to the next."""
     return se3.inverse(Ts_world_sensor[:-1]) @ Ts_world_sensor[1:]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import Course, Linearisation, turned
+from hand_eye_calib.adaptive.increments import Linearisation, turned
 from hand_eye_calib.adaptive.resampling import answers_without
 from hand_eye_calib.adaptive.state_space import NormalEquations, selected
 from hand_eye_calib.arrays import FloatArray
@@ -84,13 +84,13 @@ def spread_by_delays(
 
 
 def with_delay_columns(
-    linearisation: Linearisation, course: Course, T_parent_child: FloatArray
+    linearisation: Linearisation, twists: FloatArray, T_parent_child: FloatArray
 ) -> Linearisation:
     """A linearisation with two more columns: of a delay of the child's positions, and of the
-    parent's.
+    parent's; from the velocities (N, 6) of the child in its own frame.
     """
     rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
-    velocities, rates = course.twists[:, :3], course.twists[:, 3:]
+    velocities, rates = twists[:, :3], twists[:, 3:]
     of_parent = velocities - np.cross(rates, translation @ rotation)
     columns = [
         sign * _column(linearisation, of_sensor)

@@ -17,6 +17,8 @@ whitened columns ``Y = L^-1 U' W Z``.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -349,6 +351,14 @@ class Posterior:
         each pose's and the one's before (n, d, d).
         """
         return self.factor.selected_inverse()
+
+    def with_columns(self, columns: FloatArray) -> Posterior:
+        """The posterior of the same increments with other columns (n, 6, k)."""
+        other = copy.copy(self)
+        other.space = dataclasses.replace(self.space, columns=columns)
+        for name in ("whitened", "products", "normal", "loss"):
+            other.__dict__.pop(name, None)
+        return other
 
     def states_after(self, step: FloatArray, columns: list[int] | None = None) -> FloatArray:
         """States (N, d) expected after a step of the parameters, or of some of them."""
