@@ -22,6 +22,9 @@ from hand_eye_calib.arrays import FloatArray
 _FEW = 32
 _MANY, _SMALL = 200, 8
 
+# The blocks that are left when they have so few rows together are one dense matrix.
+_DENSE = 64
+
 
 def transposed(blocks: FloatArray) -> FloatArray:
     """The transposes (..., k, d) of matrices (..., d, k)."""
@@ -143,6 +146,16 @@ class _Level:
         return all_diagonal, all_below
 
 
+def _whole(diagonal: FloatArray, below: FloatArray) -> FloatArray:
+    """The lower half of a matrix (n d, n d) from its blocks."""
+    n_blocks, size, _ = diagonal.shape
+    whole = np.zeros((n_blocks, size, n_blocks, size))
+    blocks = np.arange(n_blocks)
+    whole[blocks, :, blocks] = diagonal
+    whole[blocks[1:], :, blocks[:-1]] = below
+    return whole.reshape(n_blocks * size, -1)
+
+
 class Factor:
     """Cholesky factor L of a positive definite matrix with permuted rows and columns.
 
@@ -161,7 +174,7 @@ class Factor:
     def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
         self._levels: list[_Level] = []
         self._log_determinant = 0.0
-        while len(diagonal) > 1:
+        while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _DENSE:
             inverse = self._inverse_root(diagonal[1::2])
             n_behind = (len(diagonal) - 1) // 2
             before = inverse @ below[::2]
@@ -171,7 +184,8 @@ class Factor:
             diagonal[1 : 1 + n_behind] -= squared(behind)
             below = -transposed(behind) @ before[:n_behind]
             self._levels.append(_Level(inverse, before, behind))
-        self._last = self._inverse_root(diagonal)
+        self._n_last, self._size, _ = diagonal.shape
+        self._last = self._inverse_root(_whole(diagonal, below)[None])[0]
 
     def _inverse_root(self, blocks: FloatArray) -> FloatArray:
         inverse, log_determinants = inverse_roots(blocks)
@@ -189,13 +203,15 @@ class Factor:
             part = slice(start, start + len(level.inverse))
             whitened[part], right = level.whiten(right)
             start = part.stop
-        whitened[start:] = self._last @ right
+        last = right.reshape(len(self._last), -1)
+        whitened[start:] = (self._last @ last).reshape(right.shape)
         return whitened
 
     def restore(self, whitened: FloatArray) -> FloatArray:
         """``L^-T`` times columns of :meth:`whiten`, or combinations of them."""
-        start = len(whitened) - 1
-        solved = transposed(self._last) @ whitened[start:]
+        start = len(whitened) - self._n_last
+        last = whitened[start:].reshape(len(self._last), -1)
+        solved = (self._last.T @ last).reshape(whitened[start:].shape)
         for level in reversed(self._levels):
             part = slice(start - len(level.inverse), start)
             solved = level.restore(whitened[part], solved)
@@ -204,8 +220,10 @@ class Factor:
 
     def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
         """Blocks of the inverse on the diagonal (n, d, d) and below it (n - 1, d, d)."""
-        diagonal = transposed(self._last) @ self._last
-        below = np.empty((0, *diagonal.shape[1:]))
+        shape = (self._n_last, self._size) * 2
+        whole = (self._last.T @ self._last).reshape(shape).transpose(0, 2, 1, 3)
+        blocks = np.arange(self._n_last)
+        diagonal, below = whole[blocks, blocks], whole[blocks[1:], blocks[:-1]]
         for level in reversed(self._levels):
             diagonal, below = level.extend(diagonal, below)
         return diagonal, below

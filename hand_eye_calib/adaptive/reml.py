@@ -163,22 +163,22 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """Gradient (m,) of the loss by the log levels and the average information (m, m)."""
     states = posterior.restricted()
     walk = posterior.restricted_walk(states)
-    covariance, below = posterior.selected_inverse
-    second = covariance + states @ states.transpose(0, 2, 1)
-    joined = below + states[1:] @ states[:-1].transpose(0, 2, 1)
     gradient = np.concatenate(
         [
-            _white_gradient(posterior, second),
+            _white_gradient(posterior, states[:, :WHITE]),
             _walk_gradient(posterior, walk),
-            *(_markov_gradient(process, second, joined) for process in posterior.markov),
+            *(_markov_gradient(posterior, process, states) for process in posterior.markov),
         ]
     )
     return gradient, _average_information(posterior, states[:, :, 0], walk[:, :, 0])
 
 
-def _white_gradient(posterior: Posterior, second: FloatArray) -> FloatArray:
+def _white_gradient(posterior: Posterior, states: FloatArray) -> FloatArray:
     space, precision = posterior.space, posterior.white_precision
-    moments = second[:, :WHITE, :WHITE] * space.weights[:, None, None]
+    covariance, _ = posterior.selected_inverse
+    moments = states @ transposed(states)
+    moments += covariance[:, :WHITE, :WHITE]
+    moments *= space.weights[:, None, None]
     excess = precision - precision @ moments @ precision
     excess[space.is_free] = 0.0
     total = excess.sum(axis=0)
@@ -214,10 +214,13 @@ def walk_covariance(posterior: Posterior, part: slice = slice(None)) -> FloatArr
     return own
 
 
-def _markov_gradient(process: Markov, second: FloatArray, joined: FloatArray) -> FloatArray:
-    phi, rest, states = process.phi, process.rest, process.group.states
-    here = np.einsum("nii->n", second[:, states, states])
-    ahead = np.einsum("nii->n", joined[:, states, states])
+def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) -> FloatArray:
+    phi, rest, group = process.phi, process.rest, process.group.states
+    covariance, below = posterior.selected_inverse
+    own = states[:, group]
+    here = np.einsum("nii->n", covariance[:, group, group]) + np.einsum("nij,nij->n", own, own)
+    ahead = np.einsum("nii->n", below[:, group, group])
+    ahead += np.einsum("nij,nij->n", own[1:], own[:-1])
     innovations = here[1:] - 2.0 * phi * ahead + phi**2 * here[:-1]
     size, variance = process.group.size, process.variance
     by_variance = 0.5 * (
