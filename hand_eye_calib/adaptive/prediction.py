@@ -129,16 +129,18 @@ class ReferencePredictor:
         increment pushes xi against it.
         """
         i, j, path = pairs.i, pairs.j, self._path
-        turned = self._into_world[j] - self._into_world[i]
-        jacobian = np.zeros((len(pairs), 6, 6))  # of r_R before r_t, by xi
-        jacobian[:, :3, 3:] = jacobian[:, 3:, :3] = turned
-        jacobian[:, 3:, 3:] = self._into_world[i] @ se3.skew(pairs.Ts_childi_childj[:, :3, 3])
-        weighted = weights[:, None, None] * jacobian
-        weighted[:, :3] *= 2
-        hessian = weighted.reshape(-1, 6).T @ jacobian.reshape(-1, 6)
+        # Of r_t by xi; of r_R by phi alone, the same as of r_t by rho.
+        jacobian = np.empty((len(pairs), 3, 6))
+        np.subtract(self._into_world[j], self._into_world[i], out=jacobian[:, :, :3])
+        jacobian[:, :, 3:] = self._into_world[i] @ se3.skew(pairs.Ts_childi_childj[:, :3, 3])
+        weighted = np.empty((len(pairs), 6, 6))  # r_R before r_t
+        np.multiply(weights[:, None, None], jacobian, out=weighted[:, 3:])
+        hessian = weighted[:, 3:].reshape(-1, 6).T @ jacobian.reshape(-1, 6)
+        hessian[3:, 3:] += 2.0 * hessian[:3, :3]
         # What a rotation error does to the path still ahead, from its own increment's end to the
         # pair's.
-        weighted[:, :3] += se3.skew(path[j]) @ weighted[:, 3:]
+        np.matmul(se3.skew(path[j]), weighted[:, 3:], out=weighted[:, :3])
+        weighted[:, :3, 3:] += 2.0 * weighted[:, 3:, :3]
         pushes = _sum_over_spans(weighted, i, j, len(path) - 1)
         pushes[:, :3] -= se3.skew(path[1:]) @ pushes[:, 3:]
         # Increments are translation before rotation, along the child's axes at their ends.

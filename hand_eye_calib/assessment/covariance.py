@@ -306,17 +306,17 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     n_effective = max(float(weights.sum()) - 3.0, 1.0)
     residual_t, residual_r = pairs.residuals(solution.T_parent_child)
     variance_t = (weights @ (residual_t**2).sum(axis=1)) / (3 * n_effective)
-    cov_r = np.einsum("k,ki,kj->ij", weights, residual_r, residual_r) / n_effective
+    cov_r = (weights[:, None] * residual_r).T @ residual_r / n_effective
     variance_r = np.trace(cov_r) / 3
 
     rotation = solution.T_parent_child[:3, :3]
     rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
     translation_b, moved = pairs.Ts_childi_childj[:, :3, 3], rotation_a - np.eye(3)
     jacobian_t = np.concatenate([moved @ rotation, rotation @ se3.skew(translation_b)], axis=2)
-    information_t = np.einsum("k,kai,kaj->ij", weights, jacobian_t, jacobian_t)
+    information_t = _weighted_products(weights, jacobian_t)
     jacobian_r = np.swapaxes(rotation_b, 1, 2) - np.eye(3)
     information_r = np.zeros((6, 6))
-    information_r[3:, 3:] = np.einsum("k,kai,kaj->ij", weights, jacobian_r, jacobian_r)
+    information_r[3:, 3:] = _weighted_products(weights, jacobian_r)
 
     hessian = information_t + 2 * information_r
     values, vectors = np.linalg.eigh(hessian)
@@ -326,6 +326,13 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
 
     hidden = _hidden_translations(LeverArms.of(moved @ rotation, weights), cov_r)
     return covariance, basis([*hidden, *vectors[:, ~seen].T])
+
+
+def _weighted_products(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """``sum w J'J`` (p, p) of derivatives J (K, r, p) with weights (K,)."""
+    size = jacobian.shape[2]
+    weighted = weights[:, None, None] * jacobian
+    return weighted.reshape(-1, size).T @ jacobian.reshape(-1, size)
 
 
 def _hidden_translations(

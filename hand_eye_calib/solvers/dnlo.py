@@ -333,16 +333,18 @@ def _settle(
     left_out: BoolArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Take Gauss-Newton steps and new weights in turn until no objective falls; returns the best
-    transforms (S, 4, 4) and their objectives (S,).
+    transforms (S, 4, 4) and their objectives (S,). Those that have converged wait for the others.
     """
     weights, objectives = truncate(_costs(condensed, Ts, left_out), threshold, floor)
+    Ts, falling = Ts.copy(), np.arange(len(Ts))
     for _ in range(_MAX_ROUNDS):
-        Ts_new = _refit(condensed, weights, Ts)
-        weights, objectives_new = truncate(_costs(condensed, Ts_new, left_out), threshold, floor)
-        settled = objectives_new >= objectives * (1 - tolerance)
-        better = objectives_new < objectives
-        Ts = np.where(better[:, None, None], Ts_new, Ts)
-        objectives = np.where(better, objectives_new, objectives)
-        if settled.all():
+        Ts_new, before = _refit(condensed, weights, Ts[falling]), objectives[falling]
+        costs = _costs(condensed, Ts_new, None if left_out is None else left_out[falling])
+        weights, objectives_new = truncate(costs, threshold, floor)
+        better = objectives_new < before
+        Ts[falling[better]], objectives[falling[better]] = Ts_new[better], objectives_new[better]
+        if (objectives_new >= before * (1 - tolerance)).all():
             break
+        still = objectives_new < before * (1 - _CONVERGED)
+        falling, weights = falling[still], weights[still]
     return Ts, objectives

@@ -70,7 +70,8 @@ def condense(pairs: MotionPairs) -> FloatArray:
     """
     condensed = np.empty((len(pairs), len(_UPPER)))
     # New large arrays take time to allocate: these are used for every block.
-    residuals, forms = np.empty((_BLOCK, 12, DIMENSION)), np.empty((_BLOCK, DIMENSION, DIMENSION))
+    residuals, again = np.empty((2, _BLOCK, 12, DIMENSION))
+    forms = np.empty((_BLOCK, DIMENSION, DIMENSION))
     u = coefficients(pairs)
     for start in range(0, len(pairs), _BLOCK):
         block = slice(start, min(start + _BLOCK, len(pairs)))
@@ -80,7 +81,9 @@ def condense(pairs: MotionPairs) -> FloatArray:
             _RESIDUAL.reshape(24, -1),
             out=residuals[part].reshape(-1, 12 * DIMENSION),
         )
-        np.matmul(np.swapaxes(residuals[part], 1, 2), residuals[part], out=forms[part])
+        # numpy multiplies two arrays of small matrices faster than it squares one.
+        np.copyto(again[part], residuals[part])
+        np.matmul(np.swapaxes(residuals[part], 1, 2), again[part], out=forms[part])
         np.take(
             forms[part].reshape(-1, DIMENSION**2), _UPPER, axis=1, out=condensed[block], mode="clip"
         )
