@@ -152,7 +152,7 @@ class PoseInput:
         self.monitor.restored += len(judgement.restored)
         for stamp_ns in judgement.dropped:
             text = "its stamp does not fit those before and after it"
-            self._refuse(stamp_ns, "corrupt stamp", text)
+            self._refuse(with_stamp(stamp_ns), "corrupt stamp", text)
         for stamp_ns, read in judgement.taken:
             self._take(stamp_ns, read)
         if is_first and judgement.taken:
@@ -166,7 +166,7 @@ class PoseInput:
                 self._set_frame(pose.sensor_frame)
             self._session.add_pose(self.name, stamp_ns, pose.position, pose.quat_xyzw)
         except InputError as error:
-            self._refuse(stamp_ns, "unusable", str(error))
+            self._refuse(with_stamp(stamp_ns), "unusable", str(error))
 
     def _set_frame(self, sensor_frame: str) -> None:
         if sensor_frame == self._sensor_frame:  # an empty one too: parameters or a default name it
@@ -181,13 +181,18 @@ class PoseInput:
             "reset?): new session, earlier poses forgotten"
         )
 
-    def _refuse(self, stamp_ns: int, reason: str, text: str) -> None:
+    def _refuse(self, which: str, reason: str, text: str) -> None:
         self.monitor.note_refused(reason, text, time.monotonic())
         self._log.warning(
-            f"{self.topic}: message with stamp {stamp_ns * 1e-9:.9f} s refused: {text} "
+            f"{self.topic}: message {which} refused: {text} "
             f"({self.monitor.refused.total()} refused so far)",
             ("refused", self.name),
         )
+
+
+def with_stamp(stamp_ns: int) -> str:
+    """Which message, in words."""
+    return f"with stamp {stamp_ns * 1e-9:.9f} s"
 
 
 class TopicInput(PoseInput):
@@ -242,7 +247,7 @@ class TopicInput(PoseInput):
         measures = measured_as(type_name, self._wanted, self.topic)
         if self._is_watching and measures != "poses":
             raise ConfigError(f"monitor watches poses; {self.topic} has {measures}")
-        read = MessageReader(type_name, measures)
+        read = MessageReader(type_name, measures, self._session.origin(self.name))
         self._session.set_measures(self.name, measures)
 
         def on_message(data: Any, info: dict[str, Any]) -> None:
@@ -278,7 +283,8 @@ class TopicInput(PoseInput):
         try:
             stamp_ns = unpack_stamp_ns(data)
         except MALFORMED as error:
-            self._refuse(0, "malformed", str(error))
+            received_s = info["received_timestamp"] * 1e-9
+            self._refuse(f"received at {received_s:.3f} s", "malformed", str(error))
             return
         self.accept(stamp_ns, partial(read, data))
 

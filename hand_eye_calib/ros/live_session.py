@@ -9,8 +9,9 @@ from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError
-from hand_eye_calib.io.journal import has_session
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
+from hand_eye_calib.io.journal import ABOUT_NAME, has_session, read_about
+from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.session_journal import DirectoryLock, SessionJournal, resume
 
@@ -47,6 +48,8 @@ class LiveSession:
         self.has_new_poses = False
         self._log = log
         self._measures: dict[str, Any] = {}
+        self._origins: dict[str, LocalOrigin] = {}
+        self._origins_on_disk: dict[str, Any] = {}
         self._journal: SessionJournal | None = None
         self._lock: DirectoryLock | None = None
 
@@ -110,6 +113,10 @@ class LiveSession:
         if self._measures.get(name, "poses") != measures:
             self._measures[name] = measures
             self.reconfigure(self.calibrator.config)
+
+    def origin(self, stream: str) -> LocalOrigin:
+        """Where the latitudes and longitudes of a stream count from, also after a restart."""
+        return self._origins.setdefault(stream, LocalOrigin())
 
     def reconfigure(self, config: CalibratorConfig) -> None:
         """Put other options in force; the poses stay, and are to be solved again."""
@@ -176,6 +183,8 @@ class LiveSession:
     def flush_journal(self) -> None:
         """Hand what came in to the disk; to be called often."""
         if self._journal is not None:
+            if self._known_origins() != self._origins_on_disk:
+                self._journal.describe(self._about())
             self._journal.flush(self.calibrator.state)
             self._log_notes(self._journal)
 
@@ -197,11 +206,14 @@ class LiveSession:
             self._log.info(f"no session to resume in {directory}: a new one begins")
             return False
         try:
+            origins = _origins_in(directory)
             poses = resume(directory, self.calibrator)
         except HandEyeCalibError as error:
             self._log.error(f"cannot resume: {error}; a new session begins")
             self.calibrator.reset()
             return False
+        for stream, geodetic in origins.items():
+            self.origin(stream).geodetic = geodetic
         self.has_new_poses = poses > 0
         self._log.info(f"session resumed from {directory}: {poses} poses")
         return True
@@ -211,8 +223,15 @@ class LiveSession:
         return self.calibrator.inputs(self.topics)
 
     def _about(self) -> dict[str, dict[str, Any]]:
-        """Options and topics, for whoever reads the journal."""
-        return {"options": self.calibrator.config.to_options(), "topics": dict(self.topics)}
+        """Options, topics and origins, for whoever reads the journal."""
+        self._origins_on_disk = self._known_origins()
+        about = {"options": self.calibrator.config.to_options(), "topics": dict(self.topics)}
+        return about | ({"origins": self._origins_on_disk} if self._origins_on_disk else {})
+
+    def _known_origins(self) -> dict[str, Any]:
+        """Latitude and longitude (rad) and height (m) that positions count from, by stream."""
+        known = {stream: origin.geodetic for stream, origin in self._origins.items()}
+        return {stream: [*geodetic] for stream, geodetic in known.items() if geodetic}
 
     def _log_notes(self, journal: SessionJournal) -> None:
         for is_warning, text in journal.notes():
@@ -220,6 +239,21 @@ class LiveSession:
                 self._log.warning(text, "journal")
             else:
                 self._log.info(text)
+
+
+def _origins_in(directory: Path) -> dict[str, tuple[float, float, float]]:
+    """Latitude and longitude (rad) and height (m) that the positions of a session count from."""
+    origins = {}
+    for stream, values in read_about(directory).get("origins", {}).items():
+        try:
+            latitude, longitude, height = map(float, values)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{directory / ABOUT_NAME}: origins must be latitude and longitude (rad) and "
+                f"height (m); found {values!r} of {stream}"
+            ) from None
+        origins[stream] = latitude, longitude, height
+    return origins
 
 
 def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorConfig:

@@ -14,7 +14,7 @@ from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.io.bags.messages import PoseFields
 from hand_eye_calib.io.transforms import TfSource
 from hand_eye_calib.ros.conversions import to_ns
-from hand_eye_calib.ros.inputs import PoseInput, waiting_messages
+from hand_eye_calib.ros.inputs import PoseInput, waiting_messages, with_stamp
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
 from hand_eye_calib.ros.tf_stream import StampedPose, StampedTransform, TfStream
@@ -80,7 +80,7 @@ class TfInput(PoseInput):
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):
                     self.accept(pose.stamp_ns, partial(self._fields, pose))
             except InputError as error:
-                self._refuse(transform.stamp_ns, "unusable", str(error))
+                self._refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
 
     def _fields(self, pose: StampedPose) -> PoseFields:
         frames = self._source.world_frame, self._source.sensor_frame

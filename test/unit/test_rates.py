@@ -15,7 +15,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import RateIntegrator, integrated
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
-from hand_eye_calib.io.bags.messages import unpack_fix, unpack_imu
+from hand_eye_calib.io.bags.messages import FIX_TYPE, IMU_TYPE, unpack_part
 from hand_eye_calib.io.bags.parts import PartReader, measured_as
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
 
@@ -287,14 +287,14 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
 
 class TestMessages:
     def test_an_imu(self):
-        found = unpack_imu(imu((0.1, 0.2, 0.3)), is_ros1=False)
+        found = unpack_part(imu((0.1, 0.2, 0.3)), IMU_TYPE, is_ros1=False)
         assert (found.stamp_ns, found.frame) == (12_000_000_005, "imu_link")
         assert found.values == [0.0, 0.0, 0.6, 0.8, 0.1, 0.2, 0.3]
-        assert np.isnan(unpack_imu(imu((0, 0, 0), -1.0), is_ros1=False).values[4:]).all()
+        assert np.isnan(unpack_part(imu((0, 0, 0), -1.0), IMU_TYPE, is_ros1=False).values[4:]).all()
 
     def test_a_fix(self):
-        assert unpack_fix(fix(2), is_ros1=False).values == [60.0, 25.0, 30.0]
-        assert np.isnan(unpack_fix(fix(-1), is_ros1=False).values).all()
+        assert unpack_part(fix(2), FIX_TYPE, is_ros1=False).values == [60.0, 25.0, 30.0]
+        assert np.isnan(unpack_part(fix(-1), FIX_TYPE, is_ros1=False).values).all()
 
     def test_without_a_fix_a_message_is_left_out(self):
         reader = PartReader("sensor_msgs/msg/NavSatFix", "positions")

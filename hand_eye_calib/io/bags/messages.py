@@ -25,6 +25,8 @@ POSE_TYPES = {
     "geometry_msgs/msg/TransformStamped": True,
 }
 PATH_TYPE = "nav_msgs/msg/Path"
+IMU_TYPE, FIX_TYPE = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
+POINT_TYPE = "geometry_msgs/msg/PointStamped"
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 # What unpacking bytes that are not a message of its type may raise.
@@ -361,9 +363,12 @@ class PartFields(NamedTuple):
     values: list[float]
 
 
-def unpack_imu(data: Buffer, is_ros1: bool) -> PartFields:
-    """Orientation, quaternion with the scalar last, and angular rates (rad/s) of a sensor_msgs/Imu:
-    NaN for what its covariance says it does not have, 0 for the other.
+def unpack_part(data: Buffer, message_type: str, is_ros1: bool) -> PartFields:
+    """Unpack a message of a part of a pose.
+
+    An Imu has orientation, quaternion with the scalar last, and angular rates (rad/s): NaN for what
+    its covariance says it does not have. A NavSatFix has latitude, longitude (deg) and height (m):
+    NaN without a fix. A PointStamped has a position (m).
 
     Raises
     ------
@@ -371,39 +376,27 @@ def unpack_imu(data: Buffer, is_ros1: bool) -> PartFields:
         If the bytes are not such a message.
     """
     cursor = _Cursor(data, is_ros1)
-    stamp_ns, frame = cursor.header()
+    return PartFields(*cursor.header(), _VALUES[message_type](cursor))
+
+
+def _of_imu(cursor: _Cursor) -> list[float]:
     values = cursor.doubles(4 + 9 + 3 + 9)
     orientation, rates = values[:4], values[13:16]
     if values[4] == -1.0:
         orientation = [math.nan] * 4
     if values[16] == -1.0:
         rates = [math.nan] * 3
-    return PartFields(stamp_ns, frame, orientation + rates)
+    return orientation + rates
 
 
-def unpack_fix(data: Buffer, is_ros1: bool) -> PartFields:
-    """Latitude, longitude (deg) and height (m) of a sensor_msgs/NavSatFix: NaN without a fix.
-
-    Raises
-    ------
-    struct.error, ValueError
-        If the bytes are not such a message.
-    """
-    cursor = _Cursor(data, is_ros1)
-    stamp_ns, frame = cursor.header()
+def _of_fix(cursor: _Cursor) -> list[float]:
     has_fix = cursor.fix_status() >= 0
     values = cursor.doubles(3)
-    return PartFields(stamp_ns, frame, values if has_fix else [math.nan] * 3)
+    return values if has_fix else [math.nan] * 3
 
 
-def unpack_point(data: Buffer, is_ros1: bool) -> PartFields:
-    """Position (m) of a geometry_msgs/PointStamped.
+def _of_point(cursor: _Cursor) -> list[float]:
+    return cursor.doubles(3)
 
-    Raises
-    ------
-    struct.error, ValueError
-        If the bytes are not such a message.
-    """
-    cursor = _Cursor(data, is_ros1)
-    stamp_ns, frame = cursor.header()
-    return PartFields(stamp_ns, frame, cursor.doubles(3))
+
+_VALUES = {IMU_TYPE: _of_imu, FIX_TYPE: _of_fix, POINT_TYPE: _of_point}

@@ -10,27 +10,27 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.rates import RateIntegrator
 from hand_eye_calib.io.bags.messages import (
+    FIX_TYPE,
+    IMU_TYPE,
     MALFORMED,
+    POINT_TYPE,
     POSE_TYPES,
     Buffer,
     MalformedMessage,
     PoseColumns,
     PoseFields,
-    unpack_fix,
-    unpack_imu,
-    unpack_point,
+    unpack_part,
     unpack_pose,
     unpack_poses,
 )
 from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
 
-_IMU, _FIX, _POINT = (
-    "sensor_msgs/msg/Imu",
-    "sensor_msgs/msg/NavSatFix",
-    "geometry_msgs/msg/PointStamped",
-)
 #: What each type can be read as, the usual first.
-PART_TYPES = {_IMU: ("rates", "rotations"), _FIX: ("positions",), _POINT: ("positions",)}
+PART_TYPES = {
+    IMU_TYPE: ("rates", "rotations"),
+    FIX_TYPE: ("positions",),
+    POINT_TYPE: ("positions",),
+}
 _OF_POSES = ("poses", "positions", "rotations")
 
 _LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -66,6 +66,8 @@ class PartReader:
     ----------
     message_type, measures : str
         As of :func:`measured_as`.
+    origin : LocalOrigin, optional
+        Of latitudes and longitudes; the first one read by default.
 
     Attributes
     ----------
@@ -73,9 +75,9 @@ class PartReader:
         Messages without a fix or an orientation.
     """
 
-    def __init__(self, message_type: str, measures: str) -> None:
+    def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
         self._type, self._measures = message_type, measures
-        self._integrator, self._origin = RateIntegrator(), LocalOrigin()
+        self._integrator, self._origin = RateIntegrator(), origin or LocalOrigin()
         self.n_left_out = 0
 
     def columns(self, messages: Sequence[Buffer], is_ros1: bool) -> PoseColumns:
@@ -94,18 +96,17 @@ class PartReader:
             elif self._measures == "rotations":
                 poses[:, :3] = 0.0
             return columns._replace(poses=poses)
-        unpack = {_IMU: unpack_imu, _FIX: unpack_fix, _POINT: unpack_point}[self._type]
         rows = []
         for index, data in enumerate(messages):
             try:
-                rows.append(unpack(data, is_ros1))
+                rows.append(unpack_part(data, self._type, is_ros1))
             except MALFORMED as error:
                 raise MalformedMessage(index, error) from error
         stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
         poses = np.zeros((len(rows), 7))
         poses[:, 3:] = _LEVEL
         values = np.array([row.values for row in rows], dtype=float)
-        if self._type == _IMU:
+        if self._type == IMU_TYPE:
             values = values[:, 4:] if self._measures == "rates" else values[:, :4]
         is_usable = np.isfinite(values).all(axis=1)
         self.n_left_out += int((~is_usable).sum())
@@ -113,7 +114,7 @@ class PartReader:
             self._fill(poses, stamps_ns, values, is_usable)
         poses[~is_usable] = np.nan
         names = [row.frame for row in rows]
-        is_fixed = self._type == _POINT
+        is_fixed = self._type == POINT_TYPE
         return PoseColumns(
             stamps_ns,
             names if is_fixed else [""] * len(rows),
@@ -125,10 +126,10 @@ class PartReader:
         self, poses: FloatArray, stamps_ns: IntArray, values: FloatArray, rows: BoolArray
     ) -> None:
         """Write what was measured into some rows of poses (N, 7)."""
-        if self._type == _FIX:
+        if self._type == FIX_TYPE:
             lat, lon = np.radians(values[rows, :2]).T
             poses[rows, :3] = self._origin.local(lat, lon, values[rows, 2])
-        elif self._type == _POINT:
+        elif self._type == POINT_TYPE:
             poses[rows, :3] = values[rows]
         elif self._measures == "rates":
             poses[rows, 3:] = self._integrator.quats_xyzw(stamps_ns[rows], values[rows])
@@ -141,9 +142,9 @@ class MessageReader:
     :class:`PartReader`.
     """
 
-    def __init__(self, message_type: str, measures: str) -> None:
+    def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
         self._type, self._measures = message_type, measures
-        self._parts = PartReader(message_type, measures)
+        self._parts = PartReader(message_type, measures, origin)
 
     def __call__(self, data: Buffer) -> PoseFields:
         """The next message, in CDR.

@@ -43,10 +43,16 @@ def local_positions(
 
 
 class LocalOrigin:
-    """The first position of a stream, from which the others count."""
+    """The first position of a stream, from which the others count.
+
+    Attributes
+    ----------
+    geodetic : tuple of 3 floats or None
+        Its latitude and longitude (rad) and height (m), if it is known.
+    """
 
     def __init__(self) -> None:
-        self._origin: tuple[float, float, float] | None = None
+        self.geodetic: tuple[float, float, float] | None = None
 
     def local(self, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
         """Metres (N, 3) east, north and up of the first position of all that were asked for.
@@ -64,8 +70,9 @@ class LocalOrigin:
                 "latitude and longitude need the package pymap3d, which is not installed: "
                 "pip install 'hand_eye_calib[gnss]'"
             ) from None
-        self._origin = self._origin or (lat_rad[0], lon_rad[0], height_m[0])
-        east_north_up = geodetic2enu(lat_rad, lon_rad, height_m, *self._origin, deg=False)
+        if self.geodetic is None:
+            self.geodetic = float(lat_rad[0]), float(lon_rad[0]), float(height_m[0])
+        east_north_up = geodetic2enu(lat_rad, lon_rad, height_m, *self.geodetic, deg=False)
         return np.stack(east_north_up, axis=1)
 
 

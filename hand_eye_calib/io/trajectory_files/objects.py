@@ -146,8 +146,8 @@ def _of_table(
     return values, stamps, stamp_unit or chosen.stamp_unit or None, table.guesses
 
 
-def _is_rows(source: object) -> bool:
-    return not hasattr(source, "orientations_quat_wxyz") and np.ndim(source) == 2  # type: ignore[arg-type]
+def _is_rows(source: Any) -> bool:
+    return not hasattr(source, "orientations_quat_wxyz") and np.ndim(source) == 2
 
 
 def _of_array(source: Any, columns: str | None, needs_times: bool) -> tuple[FloatArray, Any]:
