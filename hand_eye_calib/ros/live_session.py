@@ -225,8 +225,13 @@ class LiveSession:
     def _about(self) -> dict[str, dict[str, Any]]:
         """Options, topics and origins, for whoever reads the journal."""
         self._origins_on_disk = self._known_origins()
-        about = {"options": self.calibrator.config.to_options(), "topics": dict(self.topics)}
-        return about | ({"origins": self._origins_on_disk} if self._origins_on_disk else {})
+        about: dict[str, dict[str, Any]] = {
+            "options": self.calibrator.config.to_options(),
+            "topics": dict(self.topics),
+        }
+        if self._origins_on_disk:
+            about["origins"] = self._origins_on_disk
+        return about
 
     def _known_origins(self) -> dict[str, Any]:
         """Latitude and longitude (rad) and height (m) that positions count from, by stream."""
