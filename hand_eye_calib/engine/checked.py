@@ -20,8 +20,8 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 _MENDED = ("time_offset", "scale")
 
 # A model's own time offset moves poses along their velocities. From this one (s) on, poses are
-# paired anew instead.
-_MOST_MOVED_S = 0.003
+# paired anew instead; positions alone later, as their model knows the offset better than speeds do.
+_MOST_MOVED_S, _MOST_MOVED_POSITIONS_S = 0.003, 0.05
 
 
 @dataclass(frozen=True)
@@ -175,11 +175,9 @@ def _offset_of_model(
 ) -> dict[str, Any]:
     """The option that pairs the poses anew if the model found a large time offset by itself."""
     moved_s = calibration.time_offset_s - fixed_time_offset(snapshot.resolved().config)
-    return (
-        {}
-        if "time_offset" in given or abs(moved_s) < _MOST_MOVED_S
-        else {"time_offset": "estimate"}
-    )
+    most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else _MOST_MOVED_S
+    is_small = "time_offset" in given or abs(moved_s) < most_s
+    return {} if is_small else {"time_offset": "estimate"}
 
 
 def _is_grave(finding: Finding, option: str) -> bool:
