@@ -39,10 +39,6 @@ _PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS = 2.0, 5.0
 DISTINCT = 2.0
 CORRELATED = 0.5
 
-# An offset of less than this (s) is usual among clocks of one machine: of all offsets of unrelated
-# streams hardly one in a hundred is. It needs less evidence.
-_USUAL_OFFSET_S, _DISTINCT_USUAL = 0.25, 1.4
-
 # Smallest standard deviation of the angular rate (rad/s) that can be correlated.
 MIN_VARIATION = 0.01
 
@@ -76,15 +72,16 @@ class Correlation:
     @property
     def is_clear(self) -> bool:
         """Whether the evidence suffices to trust the offset."""
-        return (
-            self.correlation >= CORRELATED
-            and self.distinctness >= self._least_distinctness
-            and self.variation >= MIN_VARIATION
-        )
+        return self._agrees and self.distinctness >= DISTINCT
 
     @property
-    def _least_distinctness(self) -> float:
-        return _DISTINCT_USUAL if abs(self.offset_s) < _USUAL_OFFSET_S else DISTINCT
+    def is_ambiguous(self) -> bool:
+        """Whether the streams agree, but at other offsets almost as well."""
+        return self._agrees and self.distinctness < DISTINCT
+
+    @property
+    def _agrees(self) -> bool:
+        return self.correlation >= CORRELATED and self.variation >= MIN_VARIATION
 
     def doubt(self) -> str:
         """What is wrong with the evidence, in words; empty if nothing is."""
@@ -95,10 +92,10 @@ class Correlation:
                 f"their angular rates are correlated by {self.correlation:.2f} at best "
                 f"({CORRELATED} is needed)"
             )
-        if self.distinctness < self._least_distinctness:
+        if self.distinctness < DISTINCT:
             return (
                 f"the best offset is only {self.distinctness:.1f} times better than the next "
-                f"({self._least_distinctness:g} is needed)"
+                f"({DISTINCT:g} is needed)"
             )
         return ""
 

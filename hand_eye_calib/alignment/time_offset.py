@@ -1,6 +1,6 @@
 """The clock offset: seconds to add to the child's stamps to get the parent's clock."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,10 @@ _MAX_ROUNDS, _SETTLED_S = 4, 2e-5
 # stream if those are longer.
 _FINE_RANGE_S, _FINE_RANGE_INTERVALS = 0.25, 2.0
 
+# Largest share of the motion that an offset near zero leaves unexplained, if the angular rates
+# match at many.
+_EXPLAINED_NEAR = 0.12
+
 
 @dataclass(frozen=True)
 class TimeOffset:
@@ -58,8 +62,8 @@ class TimeOffset:
 def estimate_time_offset(
     parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
 ) -> TimeOffset:
-    """Estimate the offset of the child's clock: coarse from the angular rates, then fine together
-    with X and the scale.
+    """Estimate the offset of the child's clock: coarse from the angular rates, or near zero if they
+    leave it open and the streams agree there; then fine together with X and the scale.
 
     Parameters
     ----------
@@ -83,12 +87,18 @@ def estimate_time_offset(
         if leap := find_leap(stream.stamps_ns):
             raise InputError(f"the {name} stream's {leap.what()}; {leap.advice()}")
     correlation = correlate_rates(parent, child, max_gap_s)
-    if not correlation.is_clear:
-        raise NotEnoughDataError(
-            f"the time offset cannot be estimated: {correlation.doubt()}; "
-            "drive more varied turns, or give time_offset in seconds"
-        )
-    return refine_time_offset(parent, child, correlation, max_gap_s)
+    if correlation.is_clear:
+        return refine_time_offset(parent, child, correlation, max_gap_s)
+    if correlation.is_ambiguous:
+        # Rhythmic motion matches at many offsets; clocks of one machine are hardly apart.
+        near_s = correlation.offset_s if abs(correlation.offset_s) < _FINE_RANGE_S else 0.0
+        near = refine_time_offset(parent, child, replace(correlation, offset_s=near_s), max_gap_s)
+        if near.fit and near.fit.unexplained < _EXPLAINED_NEAR:
+            return near
+    raise NotEnoughDataError(
+        f"the time offset cannot be estimated: {correlation.doubt()}; "
+        "drive more varied turns, or give time_offset in seconds"
+    )
 
 
 def time_offset_of_speeds(

@@ -301,8 +301,9 @@ def not_one_body(unexplained: float, limit: float) -> Finding:
     return _error(
         "unrelated",
         "both",
-        f"no extrinsic, scale or usual mistake explains both streams: {unexplained:.0%} of the "
-        f"motion stays unexplained (at most {limit:.0%} would be good)",
+        "no extrinsic, scale or usual mistake explains both streams: "
+        f"{min(unexplained, 1):.0%} of the motion stays unexplained (at most {limit:.0%} would be "
+        "good)",
         "check that both sensors are on one rigid body and that the poses are those of the sensors",
         Confidence.LIKELY,
     )
@@ -399,8 +400,8 @@ def inverse(stream: str, confidence: Confidence) -> Finding:
 
 
 def inverse_both(confidence: Confidence) -> Finding:
-    """Poses of both streams are inverted."""
-    return _error(
+    """Poses of both streams are inverted: a warning if that is only possible."""
+    found = _error(
         "inverse_both",
         "both",
         "both streams seem to hold inverse poses (of the world in the sensor): inverted, their "
@@ -409,6 +410,8 @@ def inverse_both(confidence: Confidence) -> Finding:
         "other",
         confidence,
     )
+    is_likely = confidence is not Confidence.POSSIBLE
+    return found if is_likely else replace(found, severity=Severity.WARNING)
 
 
 def time_offset(found: TimeOffset, total_s: float, severity: Severity) -> Finding:

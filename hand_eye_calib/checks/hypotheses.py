@@ -353,6 +353,8 @@ def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
         finding = wording.inverse(other, _confidence(evidence, _INVERTED))
         return Explanation(Hypothesis("inverse", other, _inverted), inverted_fit, (finding,))
     finding = wording.inverse_both(_confidence(evidence, _LIKELY_INVERTED))
+    if finding.confidence is Confidence.POSSIBLE:
+        return replace(explanation, findings=(finding,))
     return Explanation(_BOTH_INVERTED, inverted_fit, (finding,))
 
 
