@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, median
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, quadratic_form
@@ -177,7 +177,7 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     coefficients = quadratic_form.coefficients(ranked)
     # In the smaller unit of length: otherwise a scale of zero would cost least.
     costs = [
-        np.median(quadratic_form.costs(coefficients * _child_lengths(scale), T))
+        median(quadratic_form.costs(coefficients * _child_lengths(scale), T))
         / min(scale, 1.0) ** 2
         for T, scale in candidates
     ]
@@ -327,8 +327,8 @@ class _Problem:
 
     def sigmas(self, translations: FloatArray, rotations: FloatArray) -> tuple[float, float]:
         """Robust standard deviations per axis, m and rad, of residuals of these lengths (K,)."""
-        sigma_t = float(np.median(translations)) / _MEDIAN_LENGTH
-        sigma_r = float(np.median(rotations)) / _MEDIAN_LENGTH
+        sigma_t = median(translations) / _MEDIAN_LENGTH
+        sigma_r = median(rotations) / _MEDIAN_LENGTH
         return (
             max(sigma_t, _MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12),
             max(sigma_r, _MIN_SIGMA_ROTATION),
@@ -362,8 +362,8 @@ class _Problem:
         """Gauss-Newton steps with robust weights from a start until they are small."""
         state = _State(T, scale, 0.0)
         for _ in range(_MAX_STEPS):
-            rows = self.whitened(state)[0].reshape(-1, _UNKNOWNS + 1)
-            moments = rows.T @ rows
+            rows = [part.reshape(-1, _UNKNOWNS + 1) for part in self.whitened(state)[:2]]
+            moments = sum((part.T @ part for part in rows), np.zeros(2 * (_UNKNOWNS + 1,)))
             step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
             rotation = state.T[:3, :3]
@@ -377,23 +377,23 @@ class _Problem:
                 break
         return state
 
-    def whitened(self, state: _State) -> tuple[FloatArray, FloatArray]:
-        """Rows of :meth:`linearised` in standard deviations and times their robust weights
-        (K, 6, 9), and the weights (K,).
+    def whitened(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Both arrays of :meth:`linearised` in standard deviations and times their robust weights,
+        and the weights (K,).
         """
         parts = self.linearised(state)
         lengths = [np.linalg.norm(part[:, :, -1], axis=1) for part in parts]
         sigmas = self.sigmas(*lengths)
         squared = sum((length / sigma) ** 2 for length, sigma in zip(lengths, sigmas, strict=True))
         root = 1.0 / (1.0 + squared / (6 * _TUNING**2))
-        scaled = [
-            part * (root / sigma)[:, None, None] for part, sigma in zip(parts, sigmas, strict=True)
-        ]
-        return np.concatenate(scaled, axis=1), root**2
+        for part, sigma in zip(parts, sigmas, strict=True):
+            part *= (root / sigma)[:, None, None]
+        return *parts, root**2
 
     def describe(self, state: _State) -> SimilarityFit:
         """The state as a result, with its uncertainty."""
-        rows, robust = self.whitened(state)
+        *parts, robust = self.whitened(state)
+        rows = np.concatenate(parts, axis=1)
         blocks = [
             block.reshape(-1, _UNKNOWNS + 1)
             for block in np.array_split(rows, min(_BLOCKS, len(rows)))
@@ -432,29 +432,24 @@ def _times(matrices: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _solve(normal: FloatArray, right: FloatArray, free: BoolArray) -> FloatArray:
-    """Solution for the free unknowns, in balanced units; zero along directions without curvature
-    and for the others.
+    """Solutions (..., 8) for the free unknowns of normal equations (..., 8, 8), in balanced units;
+    zero along directions without curvature and for the others.
     """
     step = np.zeros_like(right)
-    part = normal[np.ix_(free, free)]
-    diagonal = np.diag(part)
+    part = normal[..., free, :][..., free]
+    diagonal = np.diagonal(part, axis1=-2, axis2=-1)
     units = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    balanced = part * units * units[:, None]
-    step[free] = units * np.linalg.solve(
-        balanced + _DAMPING * np.eye(len(units)), units * right[free]
-    )
+    balanced = part * units[..., None, :] * units[..., None]
+    balanced = balanced + _DAMPING * np.eye(units.shape[-1])
+    scaled = (units * right[..., free])[..., None]
+    step[..., free] = units * np.linalg.solve(balanced, scaled)[..., 0]
     return step
 
 
 def _jackknife(normal: FloatArray, gradient: FloatArray, free: BoolArray) -> FloatArray:
     """Covariance (8, 8) of one-step answers without each block of time."""
     total, total_gradient = normal.sum(axis=0), gradient.sum(axis=0)
-    answers = np.array(
-        [
-            _solve(total - part, -(total_gradient - share), free)
-            for part, share in zip(normal, gradient, strict=True)
-        ]
-    )
+    answers = _solve(total - normal, -(total_gradient - gradient), free)
     answers -= answers.mean(axis=0)
     return (len(answers) - 1) / len(answers) * answers.T @ answers
 
