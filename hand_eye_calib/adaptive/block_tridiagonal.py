@@ -22,6 +22,9 @@ from hand_eye_calib.arrays import FloatArray
 _FEW = 32
 _MANY, _SMALL = 200, 8
 
+# Rows that are transposed at a time, so that they stay in the cache.
+_TRANSPOSED_ROWS = 2048
+
 # The blocks that are left when they have so few rows together are one dense matrix.
 _DENSE = 64
 
@@ -252,7 +255,11 @@ class InOrder:
 
     def whiten(self, right: FloatArray) -> FloatArray:
         """``L^-1`` times columns (n, d, k)."""
-        columns = np.asfortranarray(right.reshape(self._n_blocks * self._size, -1))
+        rows = right.reshape(self._n_blocks * self._size, -1)
+        columns = np.empty(rows.shape, order="F")
+        for start in range(0, len(rows), _TRANSPOSED_ROWS):
+            part = slice(start, start + _TRANSPOSED_ROWS)
+            columns[part] = rows[part]
         whitened, _ = lapack.dtbtrs(self._bands, columns, uplo="L", overwrite_b=1)
         return whitened.reshape(right.shape)
 

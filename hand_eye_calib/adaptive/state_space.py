@@ -172,11 +172,12 @@ class StateSpace:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
         states = np.empty((len(self) + 1, self.n_states, columns.shape[2]))
         states[0] = 0.0
-        states[1:, :WHITE], states[1:, WHITE:] = columns, 0.0
         for part in chunks(len(self)):
+            ahead = states[1:][part]
+            ahead[:, :WHITE], ahead[:, WHITE:] = columns[part], 0.0
             if self.slow_ahead is not None:
                 slow = transposed(self.slow_ahead[part])
-                np.matmul(slow, columns[part], out=states[1:, WHITE:][part])
+                np.matmul(slow, columns[part], out=ahead[:, WHITE:])
             states[:-1][part] -= transposed(self.behind[part]) @ columns[part]
         return states
 
