@@ -369,7 +369,7 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     rows: dict[str, list[tuple[Outcome, set[str]]]] = {}
     wrong: dict[str, set[str]] = {}
     for found in outcomes:
-        name = found.key.split(" ", 2)[2].rpartition(" ")[0]
+        name = _recording_of(found)
         codes = {code for code in found.findings if not code.startswith("note:")}
         codes -= clean_recordings.known_in(name, folder)
         rows.setdefault(clean_recordings.kind_of(name), []).append((found, codes))
@@ -385,9 +385,20 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
         f", solved with the default method. {len(outcomes) - len(unexplained)} of "
         f"{len(outcomes)} results are called USE or have reasons that the recording itself has: an "
         "axis that the motion does not show, or less well than the target, the common-mode floor, "
-        "outliers, a finding that is right. In the others answers contradict each other (`halves`, "
-        f"`methods`, `model`).\n\n{table}"
+        f"outliers, a finding that is right.{_contradicted_text(unexplained)}\n\n{table}"
     )
+
+
+def _contradicted_text(outcomes: Sequence[Outcome]) -> str:
+    """Of clean recordings in which answers contradict each other."""
+    if not outcomes:
+        return ""
+    kinds = _counted(clean_recordings.kind_of(_recording_of(found)) for found in outcomes)
+    return f" In the others answers contradict each other (`halves`, `methods`, `model`): {kinds}."
+
+
+def _recording_of(found: Outcome) -> str:
+    return found.key.split(" ", 2)[2].rpartition(" ")[0]
 
 
 def _clean_row(kind: str, found: Sequence[tuple[Outcome, set[str]]]) -> list[object]:
