@@ -78,6 +78,9 @@ _BURST = np.array([0, 1, 2, 3, 5, 8, 13, 21, 34, 55])
 # biases at once would differ by noise alone.
 _WHILE_FITTING = [0, 1, 2, 3, 7]
 
+# No lever arm is that long (m).
+_LONGEST_STEP_M = 1000.0
+
 # Rounds of looking for jumps; of weighing heavy tails.
 _OUTLIER_ROUNDS, _TAIL_ROUNDS = 4, 3
 
@@ -313,7 +316,14 @@ class _State:
         """After a step of xi and of the parameters in the model."""
         parameters = self.parameters.copy()
         parameters[self.columns[: len(step) - 6]] += step[6:]
-        return dataclasses.replace(self, T=self.T @ se3.exp(step[:6]), parameters=parameters)
+        return dataclasses.replace(self, T=_after(self.T, step[:6]), parameters=parameters)
+
+
+def _after(T: FloatArray, step: FloatArray) -> FloatArray:
+    """X after a step (6,); as it is if noise alone makes a step so long, along a direction that the
+    motion hardly shows.
+    """
+    return T @ se3.exp(step) if np.linalg.norm(step[:3]) < _LONGEST_STEP_M else T
 
 
 def _start(streams: Streams, columns: list[int]) -> _State:
@@ -403,7 +413,7 @@ def _fitted(state: _State, walks: tuple[str, ...] = ("time", "distance")) -> _St
         levels = model.raised(fits[0][1].levels)
     model, fit = min(fits, key=lambda each: each[1].loss)
     step = NormalEquations(selected(fit.posterior.products, list(range(6)))).step
-    T = state.T @ se3.exp(step)
+    T = _after(state.T, step)
     n_evaluations = state.n_evaluations + sum(fit.n_evaluations for _, fit in fits)
     return dataclasses.replace(
         state,

@@ -70,3 +70,8 @@ def test_faults_that_were_built_last_change_the_streams(fault):
         same = len(child) == len(drive.child) and np.array_equal(child.poses, drive.child.poses)
         same &= np.array_equal(child.stamps_ns, drive.child.stamps_ns)
         assert not same or not np.array_equal(parent.poses, drive.parent.poses)
+
+
+def test_orientations_with_yaw_only_end_in_a_verdict():
+    case = faults.Case(fault="U1", severity=2, recording="hilly_1", method="auto")
+    assert faults.outcome(case, None).verdict == "DO NOT USE"
