@@ -260,8 +260,10 @@ class InOrder:
         for start in range(0, len(rows), _TRANSPOSED_ROWS):
             part = slice(start, start + _TRANSPOSED_ROWS)
             columns[part] = rows[part]
+        shape = right.shape
+        del right, rows  # as large as the answer
         whitened, _ = lapack.dtbtrs(self._bands, columns, uplo="L", overwrite_b=1)
-        return whitened.reshape(right.shape)
+        return whitened.reshape(shape)
 
     def below(self, block: int) -> FloatArray:
         """Block (d, d) of L below its diagonal block of this number."""

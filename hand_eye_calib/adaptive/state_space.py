@@ -325,7 +325,7 @@ class Posterior:
     @cached_property
     def whitened(self) -> FloatArray:
         """Y (N, d, p + 1) of the space's columns."""
-        return self.halves(self.space.columns)[1]
+        return self.factor.whiten(self.space.gathered(self.weighed(self.space.columns)))
 
     @cached_property
     def products(self) -> FloatArray:
