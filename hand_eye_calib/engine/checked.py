@@ -81,26 +81,36 @@ def mend(
     the option was not given, solve again with it, and keep that if there is less to say against it.
     Parameters as of :func:`checked`.
     """
+    by_model = {} if given is None else _offset_of_model(calibration, snapshot, given)
+    again = _solved_with(snapshot, by_model)
+    if again and _noise_fits(again.calibration) and not _serious(again.calibration):
+        # There cannot be less to say against the first result.
+        return replace(again, told=_told((), by_model, again.calibration))
     check = snapshot.check(calibration)
     found = Mended(_with(calibration, check.findings), snapshot, check)
-    if given is None:
+    certain = {} if given is None else _certain(check.findings, given)
+    options = by_model | certain
+    if options != by_model:
+        again = _solved_with(snapshot, options)
+    if again is None or (
+        _serious(again.calibration) > _serious(found.calibration) - bool(certain)
+        or (_noise_fits(calibration) and not _noise_fits(again.calibration))
+    ):
         return found
-    certain = _certain(check.findings, given)
-    options = _offset_of_model(calibration, snapshot, given) | certain
+    return replace(again, told=_told(check.findings, options, again.calibration))
+
+
+def _solved_with(snapshot: Snapshot, options: Mapping[str, Any]) -> Mended | None:
+    """What other options give; None without any, or if nothing can be solved with them."""
     if not options:
-        return found
+        return None
     try:
         other = with_options(snapshot, options)
         again = other.estimate()
         check = other.check(again)
     except HandEyeCalibError:
-        return found
-    again = _with(again, check.findings)
-    if _serious(again) > _serious(found.calibration) - bool(certain) or (
-        _noise_fits(calibration) and not _noise_fits(again)
-    ):
-        return found
-    return Mended(again, other, check, options, _told(found.check.findings, options, again))
+        return None
+    return Mended(_with(again, check.findings), other, check, dict(options))
 
 
 def with_options(snapshot: Snapshot, options: Mapping[str, Any]) -> Snapshot:
