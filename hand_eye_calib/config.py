@@ -610,6 +610,11 @@ class CalibratorConfig(OptionSet):
 MOST_OTHERS = 7
 
 
+def other_names(count: int = MOST_OTHERS) -> list[str]:
+    """Names of the inputs of so many further child sensors."""
+    return [f"child{number}" for number in range(2, count + 2)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class NodeConfig(OptionSet):
     """Options that only the node has."""

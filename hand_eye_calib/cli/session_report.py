@@ -1,5 +1,6 @@
 """The process that writes ``report.html`` of a session of the node: it reads the result from
-standard input, as ``ros/report_process.py`` writes it.
+standard input, as ``ros/report_process.py`` writes it. The results of further child sensors go to
+standard output.
 """
 
 import os
@@ -12,6 +13,7 @@ from hand_eye_calib.cli.console import fail
 from hand_eye_calib.errors import HandEyeCalibError, InputError
 
 if TYPE_CHECKING:
+    from hand_eye_calib.calibration import Calibration
     from hand_eye_calib.geometry.trajectory import Trajectory
     from hand_eye_calib.ros.report_process import SessionResult
 
@@ -41,7 +43,7 @@ def write(directory: Path, result: "SessionResult") -> None:
         If it cannot be written.
     """
     if result.others:
-        write_rig(directory / "rig", result)
+        pickle.dump(write_rig(directory / "rig", result), sys.stdout.buffer)
     if not result.with_report:
         return
     from hand_eye_calib.cli.findings import with_findings
@@ -55,8 +57,9 @@ def write(directory: Path, result: "SessionResult") -> None:
     write_report(directory, calibration, evidence, config, inputs)
 
 
-def write_rig(directory: Path, result: "SessionResult") -> None:
-    """Solve for all sensors of the session together, and write the files and the page.
+def write_rig(directory: Path, result: "SessionResult") -> "list[Calibration]":
+    """Solve for all sensors of the session together, and write the files and the page; returns the
+    results of the further child sensors.
 
     Raises
     ------
@@ -71,6 +74,7 @@ def write_rig(directory: Path, result: "SessionResult") -> None:
     inputs = {**result.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
     write_rig_report(directory, rig, rig.sensors)
+    return [*rig.calibrations[1:]]
 
 
 def rig_of(result: "SessionResult") -> "tuple[dict[str, Trajectory], dict[str, Any]]":

@@ -23,6 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from hand_eye_calib.config import other_names
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.files import read_bytes, write_atomically
 from hand_eye_calib.io.limits import LARGEST_RECORD, LARGEST_SEGMENT, LONGEST_NAME
@@ -32,7 +33,7 @@ _MAGIC = b"hand_eye_calib journal 1\n"
 _HEADER = struct.Struct("<cII")  # kind, payload length, checksum of kind and payload
 _POSE = struct.Struct("<Bq7d")
 _CHECKPOINT, _POSE_KIND, _FRAME = b"C", b"P", b"F"
-_STREAMS = ("parent", "child")
+_STREAMS = ("parent", "child", *other_names())
 
 #: Options and topics of the session, beside its segments.
 ABOUT_NAME = "session.yaml"
@@ -202,7 +203,7 @@ def count_poses(directory: str | Path) -> int | None:
     """
     try:
         checkpoint, events, _ = read_journal(directory)
-        kept = sum(int(checkpoint[f"{stream}.statistics"][0]) for stream in _STREAMS)
+        kept = sum(int(checkpoint[f"{stream}.statistics"][0]) for stream in _STREAMS[:2])
     except (InputError, LookupError, ValueError, TypeError):
         return None
     return kept + sum(event[0] == "pose" for event in events)

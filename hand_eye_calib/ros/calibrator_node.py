@@ -16,11 +16,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.config import NodeConfig
+from hand_eye_calib.config import NodeConfig, other_names
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
-from hand_eye_calib.ros.inputs import PoseInput, TopicInput, other_names, qos_parameter_names
+from hand_eye_calib.ros.inputs import PoseInput, TopicInput, qos_parameter_names
 from hand_eye_calib.ros.live_session import LiveSession, check_below, output_path
 from hand_eye_calib.ros.log import LOG_PERIOD_S, NodeLog
 from hand_eye_calib.ros.mount import LIMITS, MountWatch
@@ -143,7 +143,7 @@ class CalibratorNode(Node):
     def _open_journal(self) -> None:
         resuming = self._options.node.journal == "resume"
         self._session.follow_journal(self._options.node, resuming)
-        for each in self._inputs:
+        for each in (*self._inputs, *self._others):
             each.resume()
 
     def _serve(self) -> None:
@@ -204,6 +204,8 @@ class CalibratorNode(Node):
 
     def _publish_diagnostics(self) -> None:
         self._tf.look()
+        for each, calibration in zip(self._others, self._report.take_others(), strict=False):
+            self._topics.publish_other(each.name, calibration)
         if self._mount is not None:
             self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds
@@ -217,6 +219,7 @@ class CalibratorNode(Node):
         self._cycle.restart()
         self._checks.restart()
         self._topics.clear()
+        self._report.forget()
         self._tf.restart()
         if self._mount is not None:
             self._mount.restart()

@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from hand_eye_calib.config import MOST_OTHERS
+from hand_eye_calib.config import other_names
 from hand_eye_calib.engine.pose_buffer import StreamStatistics
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.bags.messages import MALFORMED, PoseFields, unpack_stamp_ns
@@ -49,7 +49,7 @@ class PoseInput:
     ----------
     node : rclpy.node.Node
     name : str
-        "parent", "child", or one of :func:`other_names`.
+        "parent", "child", or one of :func:`~hand_eye_calib.config.other_names`.
     topic : str
         Where they come from, for messages.
     session : LiveSession
@@ -310,14 +310,9 @@ def relative_topic(name: str) -> str:
     return f"{name}_odom"
 
 
-def other_names(count: int) -> list[str]:
-    """Names of the inputs of so many further child sensors."""
-    return [f"child{number}" for number in range(2, count + 2)]
-
-
 def qos_parameter_names(node: Node) -> Iterator[str]:
     """The parameters that rclpy declares for the QoS of the inputs."""
-    for name in ("parent", "child", *other_names(MOST_OTHERS)):
+    for name in ("parent", "child", *other_names()):
         topic = node.resolve_topic_name(relative_topic(name))
         for policy in _QOS_OVERRIDES:
             yield f"qos_overrides.{topic}.subscription.{policy.name.lower()}"

@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits, StreamStatistics
@@ -13,7 +15,13 @@ from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
 from hand_eye_calib.io.journal import ABOUT_NAME, has_session, read_about
 from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
 from hand_eye_calib.ros.log import NodeLog
-from hand_eye_calib.ros.session_journal import DirectoryLock, SessionJournal, resume
+from hand_eye_calib.ros.session_journal import (
+    DirectoryLock,
+    SessionJournal,
+    resume,
+    takers,
+    whole_state,
+)
 
 # How long a disk may hold up the end of the program.
 _GRACE_S = 0.3
@@ -67,14 +75,13 @@ class LiveSession:
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
     ) -> bool:
         """Take a pose; see :meth:`Calibrator.add_pose`."""
-        if stream in self.others:
-            return self.others[stream].add_pose("child", stamp_ns, position, quat_xyzw)
-        added = self.calibrator.add_pose(stream, stamp_ns, position, quat_xyzw)
-        for other in self.others.values() if added and stream == "parent" else ():
-            other.add_pose("parent", stamp_ns, position, quat_xyzw)
+        (own_stream, first), *others = takers(stream, self.calibrator, self.others)
+        added = first.add_pose(own_stream, stamp_ns, position, quat_xyzw)
+        for _, other in others if added else ():
+            other.add_pose(own_stream, stamp_ns, position, quat_xyzw)
         if added and self._journal is not None:
             self._journal.add_pose(stream, stamp_ns, position, quat_xyzw)
-        self.has_new_poses |= added and self._is_solved
+        self.has_new_poses |= added and self._is_solved and stream in STREAMS
         return added
 
     def take_others(self, names: Sequence[str]) -> None:
@@ -94,12 +101,8 @@ class LiveSession:
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
         """Take the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
-        if stream in self.others:
-            self.others[stream].set_frame("child", sensor_frame)
-            return
-        self.calibrator.set_frame(stream, sensor_frame)
-        for other in self.others.values() if stream == "parent" else ():
-            other.set_frame("parent", sensor_frame)
+        for own_stream, each in takers(stream, self.calibrator, self.others):
+            each.set_frame(own_stream, sensor_frame)
         if self._journal is not None:
             self._journal.set_frame(stream, sensor_frame)
 
@@ -135,7 +138,7 @@ class LiveSession:
         self.number += 1
         self.has_new_poses = False
         if self._journal is not None:
-            self._journal.begin(self.calibrator.state())
+            self._journal.begin(self._state())
 
     # -------------------------------------------------------------- journal
 
@@ -175,9 +178,7 @@ class LiveSession:
         if directory is not None:
             self._lock = DirectoryLock(directory.parent)
             resumed = resuming and self._resume(directory)
-            self._journal = SessionJournal(
-                directory, self.calibrator.state(), self._about(), resumed
-            )
+            self._journal = SessionJournal(directory, self._state(), self._about(), resumed)
         return True
 
     def flush_journal(self) -> None:
@@ -185,14 +186,14 @@ class LiveSession:
         if self._journal is not None:
             if self._known_origins() != self._origins_on_disk:
                 self._journal.describe(self._about())
-            self._journal.flush(self.calibrator.state)
+            self._journal.flush(self._state)
             self._log_notes(self._journal)
 
     def stop_journal(self) -> bool:
         """Write what is left; False if the disk keeps it busy."""
         if self._journal is None:
             return True
-        ended = self._journal.stop(self.calibrator.state, _GRACE_S)
+        ended = self._journal.stop(self._state, _GRACE_S)
         self._log_notes(self._journal)
         self._journal = None
         if self._lock is not None:
@@ -207,16 +208,20 @@ class LiveSession:
             return False
         try:
             origins = _origins_in(directory)
-            poses = resume(directory, self.calibrator)
+            poses = resume(directory, self.calibrator, self.others)
         except HandEyeCalibError as error:
             self._log.error(f"cannot resume: {error}; a new session begins")
-            self.calibrator.reset()
+            for calibrator in (self.calibrator, *self.others.values()):
+                calibrator.reset()
             return False
         for stream, geodetic in origins.items():
             self.origin(stream).geodetic = geodetic
         self.has_new_poses = poses > 0
         self._log.info(f"session resumed from {directory}: {poses} poses")
         return True
+
+    def _state(self) -> dict[str, np.ndarray]:
+        return whole_state(self.calibrator, self.others)
 
     def inputs(self) -> dict[str, Any]:
         """Where the poses came from and the options, in plain values."""

@@ -1,4 +1,4 @@
-"""Starts the process that writes the report of a session, and leaves it to itself."""
+"""Starts the process that writes the report of a session and solves for all sensors of a rig."""
 
 import contextlib
 import os
@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.engine.snapshot import Snapshot
@@ -42,6 +42,7 @@ class ReportProcess:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
+        self._answer: IO[bytes] | None = None
 
     def write(self, directory: Path, result: SessionResult) -> None:
         """Start to write ``report.html`` into a directory; takes milliseconds.
@@ -50,6 +51,7 @@ class ReportProcess:
         pipe has to be waited for at the end of the node.
         """
         self._end_earlier()
+        self._answer = tempfile.TemporaryFile() if result.others else None  # noqa: SIM115
         path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
         with tempfile.TemporaryFile() as file:
             pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
@@ -58,10 +60,24 @@ class ReportProcess:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _COMMAND, str(directory.resolve())],
                 stdin=file,
-                stdout=subprocess.DEVNULL,
+                stdout=self._answer or subprocess.DEVNULL,
                 env=os.environ | {"PYTHONPATH": path},
                 process_group=0,
             )
+
+    def take_others(self) -> list[Calibration]:
+        """Results of further child sensors in their order, once, when they are there."""
+        if self._answer is None or self._process is None or self._process.poll() is None:
+            return []
+        with self._answer as answer:
+            self._answer = None
+            answer.seek(0)
+            found: list[Calibration] = pickle.load(answer) if self._process.returncode == 0 else []
+            return found
+
+    def forget(self) -> None:
+        """A new session has begun: results of the one before are of no use."""
+        self._answer = None
 
     def _end_earlier(self) -> None:
         if self._process is not None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
@@ -22,10 +23,13 @@ _LATCHED = QoSProfile(
 
 
 class ResultTopics:
-    """Publishes results on ``~/extrinsic`` and ``~/extrinsic_with_covariance``, latched."""
+    """Publishes results on ``~/extrinsic`` and ``~/extrinsic_with_covariance``, latched; those of
+    further child sensors on ``~/extrinsic_child2`` and so on.
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._others: dict[str, Publisher] = {}
         self._open()
 
     def publish(self, calibration: Calibration) -> None:
@@ -33,8 +37,18 @@ class ResultTopics:
         self._extrinsic.publish(to_transform(calibration))
         self._with_covariance.publish(to_pose_with_covariance(calibration))
 
+    def publish_other(self, name: str, calibration: Calibration) -> None:
+        """Publish a result of a further child sensor, by the name of its input."""
+        if name not in self._others:
+            topic = f"~/extrinsic_{name}"
+            self._others[name] = self._node.create_publisher(TransformStamped, topic, _LATCHED)
+        self._others[name].publish(to_transform(calibration))
+
     def clear(self) -> None:
-        """Withdraw the result: who subscribes from now on gets none."""
+        """Withdraw the results: who subscribes from now on gets none."""
+        for publisher in self._others.values():
+            self._node.destroy_publisher(publisher)
+        self._others.clear()
         self._node.destroy_publisher(self._extrinsic)
         self._node.destroy_publisher(self._with_covariance)
         self._open()

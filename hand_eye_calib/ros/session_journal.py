@@ -42,19 +42,53 @@ State = dict[str, np.ndarray]
 _Work = Callable[[Any], None]
 
 
-def resume(directory: Path, calibrator: Calibrator) -> int:
-    """Bring a calibrator to where the session in a directory ended; returns how many poses it has.
+def whole_state(calibrator: Calibrator, others: Mapping[str, Calibrator]) -> State:
+    """The state of the engine, and those of further child sensors under their names."""
+    state = calibrator.state()
+    for name, other in others.items():
+        state |= {f"{name}/{part}": value for part, value in other.state().items()}
+    return state
+
+
+def resume(
+    directory: Path, calibrator: Calibrator, others: Mapping[str, Calibrator] | None = None
+) -> int:
+    """Bring a calibrator, and those of further child sensors, to where the session in a directory
+    ended; returns how many poses the first one has.
 
     Raises
     ------
     InputError
         If there is no session, or it is damaged.
     """
+    others = others or {}
     checkpoint, events, _ = read_journal(directory)
-    calibrator.restore(checkpoint)
-    for kind, *event in events:
-        calibrator.add_pose(*event) if kind == "pose" else calibrator.set_frame(*event)
+    calibrator.restore({part: value for part, value in checkpoint.items() if "/" not in part})
+    for name, other in others.items():
+        beginning = f"{name}/"
+        state = {
+            part.removeprefix(beginning): value
+            for part, value in checkpoint.items()
+            if part.startswith(beginning)
+        }
+        if state:
+            other.restore(state)
+    for kind, stream, *event in events:
+        for own_stream, each in takers(stream, calibrator, others):
+            take = each.add_pose if kind == "pose" else each.set_frame
+            take(own_stream, *event)
     return sum(calibrator.statistics(stream).received for stream in ("parent", "child"))
+
+
+def takers(
+    stream: str, calibrator: Calibrator, others: Mapping[str, Calibrator]
+) -> list[tuple[str, Calibrator]]:
+    """Who takes a message of a stream, and as which: the parent's counts for all child sensors."""
+    if stream == "parent":
+        return [(stream, each) for each in (calibrator, *others.values())]
+    if stream == "child":
+        return [(stream, calibrator)]
+    return [("child", others[stream])] if stream in others else []
 
 
 class DirectoryLock:

@@ -16,6 +16,7 @@ from ros_harness import (
     Peer,
     drive,
     free_domain,
+    matrix,
     message,
 )
 
@@ -172,6 +173,10 @@ def others_are_solved_together(start_node, peer, tmp_path):
         found = hec.load(tmp_path / "out/rig" / name)
         np.testing.assert_allclose(found.T_parent_child, T, atol=1e-3)
     assert not (tmp_path / "out/report.html").exists()
+    heard = peer.listen(TransformStamped, "extrinsic_child2")
+    peer.spin_until(lambda: heard, "the result of the further child sensor")
+    assert heard[-1].child_frame_id == "rear"
+    np.testing.assert_allclose(matrix(heard[-1]), T_PARENT_REAR, atol=1e-3)
 
 
 def report_is_used(start_node, peer, tmp_path):

@@ -13,6 +13,7 @@ from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import JournalWriter, has_session, read_journal
+from hand_eye_calib.ros.session_journal import resume, takers, whole_state
 
 CONFIG = CalibratorConfig(reference="B3")
 
@@ -239,3 +240,22 @@ def test_a_state_that_no_calibrator_gave_is_refused(name, change):
     assert again.statistics("parent").received == 1
     again.restore(state)
     assert again.statistics("parent") == calibrator.statistics("parent")
+
+
+def test_further_child_sensors_are_resumed_too(tmp_path):
+    calibrator, others = Calibrator(CONFIG), {"child2": Calibrator(CONFIG)}
+    writer = JournalWriter(tmp_path / "journal", whole_state(calibrator, others))
+    for number, (stream, *pose) in enumerate(messages()):
+        if number == 60:  # half of it is in a checkpoint
+            writer.rotate(whole_state(calibrator, others))
+        for name in [stream, "child2"] if stream == "child" else [stream]:
+            writer.add_pose(name, *pose)
+            for own_stream, each in takers(name, calibrator, others):
+                each.add_pose(own_stream, *pose)
+    writer.close()
+    again = {"child2": Calibrator(CONFIG)}
+    assert resume(tmp_path / "journal", Calibrator(CONFIG), again) == 120
+    assert again["child2"].statistics("child").received == 60
+    T = calibrator.estimate().T_parent_child
+    assert np.array_equal(again["child2"].estimate().T_parent_child, T)
+    assert resume(tmp_path / "journal", Calibrator(CONFIG)) == 120
