@@ -16,13 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
 from hand_eye_calib.rig import solution as joint
 from hand_eye_calib.rig.calibrate import calibrate_rig, solve_rig
 from hand_eye_calib.rig.result import RigCalibration
-from hand_eye_calib.rig.table import Table
+from hand_eye_calib.rig.table import Table, synchronised
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE
 from reproduction.writing import markdown_table, put_into_page
@@ -212,19 +213,19 @@ def _since(started: float) -> float:
     return time.process_time() - started
 
 
-def real_rigs(folder: Path) -> Iterator[tuple[str, RigCalibration]]:
+def real_rigs(folder: Path) -> Iterator[tuple[str, Mapping[str, Trajectory], RigCalibration]]:
     """The three devices of tango, and the three sensors of zxl19's vehicle in three recordings."""
     tango = folder / "asl_tango_easy"
     if tango.is_dir():
         devices = {
             name: _read(tango / f"{file}.csv", _ASL_COLUMNS) for name, file in _TANGO.items()
         }
-        yield "tango", solve_rig(devices, {"time_offset": "estimate", "scale": "auto"})
+        yield "tango", devices, solve_rig(devices, {"time_offset": "estimate", "scale": "auto"})
     for bag in (1, 2, 3) if (folder / "zxl19").is_dir() else ():
         files = {name: folder / f"zxl19/bag{bag}/{name}_FCPE.mat" for name in ("INS", "LO", "VO")}
         sensors = {name: _read(file, _ZXL19_COLUMNS) for name, file in files.items()}
         options: Mapping[str, Any] = {"time_offset": "estimate", "scale": "estimate"}
-        yield f"zxl19 bag{bag}", solve_rig(sensors, options)
+        yield f"zxl19 bag{bag}", sensors, solve_rig(sensors, options)
 
 
 def _read(path: Path, columns: str) -> Trajectory:
@@ -234,22 +235,45 @@ def _read(path: Path, columns: str) -> Trajectory:
 def real_table(folder: Path) -> str:
     """A row for every sensor of every real rig."""
     rows = []
-    for name, found in real_rigs(folder):
+    for name, streams, found in real_rigs(folder):
+        same_model = _same_model(streams, found)
         miss = "; ".join(
             f"{1e3 * each.translation_m:.0f} mm, {np.degrees(each.rotation_rad):.2f} deg, "
             f"{each.chi2:.1f} of {each.dof}"
             for each in found.closures
         )
-        for own, pairwise in zip(found.calibrations, found.pairwise, strict=True):
-            rows.append((name, own.child_frame, *_edge(own.sigmas, pairwise.sigmas), miss))
+        for own, pairwise, ratios in zip(
+            found.calibrations, found.pairwise, same_model, strict=True
+        ):
+            cells = *_edge(own.sigmas, pairwise.sigmas), f"{ratios.mean():.2f}, {ratios.max():.2f}"
+            rows.append((name, own.child_frame, *cells, miss))
             miss = ""
     return markdown_table(
         (
             *("Rig", "Sensor", "Sigma x y z (mm)", "Pairwise", "roll pitch yaw (deg)", "Pairwise"),
-            *("Joint / pairwise", "Pairwise answers miss closing by, chi-square of degrees"),
+            *("Joint / pairwise", "The same noise model: mean, largest axis"),
+            "Pairwise answers miss closing by, chi-square of degrees",
         ),
         rows,
     )
+
+
+def _same_model(streams: Mapping[str, Trajectory], found: RigCalibration) -> list[FloatArray]:
+    """Standard deviations (6,) of each sensor under the model, over those of the same model for
+    this sensor and the first one alone.
+    """
+    moved = [
+        streams[each.child_frame].scaled(each.scale).shifted(each.time_offset_s)
+        for each in found.pairwise
+    ]
+    table = synchronised([streams[found.sensors[0]], *moved], CalibratorConfig().max_gap)
+    Xs, ratios = found.solution.Xs, []
+    whole = joint.solve(table, Xs)
+    for at in range(1, len(Xs)):
+        pair = joint.solve(Table(table.stamps_ns, table.poses[[0, at]]), Xs[[0, at]])
+        own = np.diag(whole.covariance)[6 * at - 6 : 6 * at]
+        ratios.append(np.sqrt(own / np.diag(pair.covariance)))
+    return ratios
 
 
 def _edge(own: FloatArray, pairwise: FloatArray) -> list[str]:
