@@ -177,8 +177,7 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     coefficients = quadratic_form.coefficients(ranked)
     # In the smaller unit of length: otherwise a scale of zero would cost least.
     costs = [
-        median(quadratic_form.costs(coefficients * _child_lengths(scale), T))
-        / min(scale, 1.0) ** 2
+        median(quadratic_form.costs(coefficients * _child_lengths(scale), T)) / min(scale, 1.0) ** 2
         for T, scale in candidates
     ]
     return [

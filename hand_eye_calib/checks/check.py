@@ -35,7 +35,13 @@ from hand_eye_calib.checks.hypotheses import (
     StreamPair,
     explain,
 )
-from hand_eye_calib.checks.streams import check_flat, check_frozen, check_stamps, check_stream
+from hand_eye_calib.checks.streams import (
+    check_flat,
+    check_frozen,
+    check_sampling,
+    check_stamps,
+    check_stream,
+)
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
@@ -49,8 +55,8 @@ from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 _OFFSET_ERROR_S, _OFFSET_WARNING_S, _OFFSET_NOTE_S, _OFFSET_SIGMAS = 0.1, 0.01, 0.005, 5.0
 _SCALE_ERROR = 0.03
 
-_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
-_UNIT_TOLERANCE = 0.1
+UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
+UNIT_TOLERANCE = 0.1
 
 # Shortest duration and smallest rotation with which the checks of a live session mean something.
 MIN_DURATION_S, MIN_ROTATION_RAD = 20.0, float(np.radians(30.0))
@@ -135,6 +141,16 @@ def check_streams(
         correlation = replace(correlation, offset_s=0.0)
     findings += explanation.findings
     return _check_agreeing(streams, explanation, correlation, findings, time_offset_s, scale)
+
+
+def check_samplings(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
+    """Findings about the stamps of two streams, whatever they measure."""
+    findings = []
+    if min(len(parent), len(child)):
+        findings += check_stamps(parent.stamps_ns, child.stamps_ns)
+    for stream, trajectory in (("parent", parent), ("child", child)):
+        findings += check_sampling(trajectory, stream, max_gap_s)
+    return findings
 
 
 def _check_each(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
@@ -233,9 +249,9 @@ def _check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
 def _check_scale(scale: Scale, known: float) -> list[Finding]:
     if not scale.differs:
         return []
-    for factor, unit in _UNITS.items():
-        if abs(scale.value / factor - 1.0) < _UNIT_TOLERANCE:
-            return [wording.units(scale, unit, round(known * factor, 9))]
+    for factor, unit in UNITS.items():
+        if abs(scale.value / factor - 1.0) < UNIT_TOLERANCE:
+            return [wording.units(scale.value, scale.sigma, unit, round(known * factor, 9))]
     severity = Severity.ERROR if abs(scale.value - 1.0) > _SCALE_ERROR else Severity.WARNING
     return [wording.scale_differs(scale, round(known * scale.value, 4), severity)]
 

@@ -430,17 +430,17 @@ def time_offset(found: TimeOffset, total_s: float, severity: Severity) -> Findin
     )
 
 
-def units(scale: Scale, unit: str, factor: float) -> Finding:
-    """The child's lengths are in another unit."""
+def units(scale: float, sigma: float, unit: str, factor: float) -> Finding:
+    """The child's lengths are in another unit, by the scale that was found."""
     return Finding(
         code="units",
         stream="child",
         severity=Severity.ERROR,
         confidence=Confidence.CERTAIN,
         what=f"the child's lengths are {unit} while the parent's are metres (factor "
-        f"{scale.value:.5g} +/- {scale.sigma:.2g})",
+        f"{scale:.5g} +/- {sigma:.2g})",
         advice="convert them to metres",
-        evidence=(("scale", scale.value), ("sigma", scale.sigma)),
+        evidence=(("scale", scale), ("sigma", sigma)),
         options=(("scale", factor),),
     )
 

@@ -174,17 +174,9 @@ def check_stream(
     -------
     list of Finding
     """
-    if len(trajectory) < 4:
-        return [wording.too_few_poses(stream, len(trajectory))]
-    if leap := find_leap(trajectory.stamps_ns):
-        return [wording.leaping_stamps(stream, leap)]
-    findings = []
-    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    gaps = are_gaps(intervals_s, max_gap_s)
-    if gaps.any():
-        share = float(intervals_s[gaps].sum() / intervals_s.sum())
-        longest_s = float(intervals_s.max())
-        findings.append(wording.gaps(stream, int(gaps.sum()), longest_s, share))
+    findings = check_sampling(trajectory, stream, max_gap_s)
+    if any(finding.severity is wording.Severity.ERROR for finding in findings):
+        return findings
     if levels := _interleaved(trajectory):
         return [*findings, wording.interleaved(stream, *levels)]
     if coarse := _check_grid(trajectory.poses[:, :3, 3], stream):
@@ -195,6 +187,20 @@ def check_stream(
     if share > _MIN_JUMPS:
         findings.append(wording.jumps(stream, share))
     return findings
+
+
+def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
+    """Findings about the stamps of one stream, whatever it measures: too few, a leap, gaps."""
+    if len(trajectory) < 4:
+        return [wording.too_few_poses(stream, len(trajectory))]
+    if leap := find_leap(trajectory.stamps_ns):
+        return [wording.leaping_stamps(stream, leap)]
+    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
+    gaps = are_gaps(intervals_s, max_gap_s)
+    if not gaps.any():
+        return []
+    share = float(intervals_s[gaps].sum() / intervals_s.sum())
+    return [wording.gaps(stream, int(gaps.sum()), float(intervals_s.max()), share)]
 
 
 def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:

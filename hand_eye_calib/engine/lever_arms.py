@@ -9,12 +9,13 @@ import numpy as np
 
 from hand_eye_calib.adaptive import lever_arm
 from hand_eye_calib.adaptive.lever_arm import LeverArmSolution
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
 from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
-from hand_eye_calib.checks.findings import unrelated_parts
+from hand_eye_calib.checks.check import UNIT_TOLERANCE, UNITS
+from hand_eye_calib.checks.findings import units, unrelated_parts
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -56,17 +57,20 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     status = SolveStatus.CONTRADICTED if fused.contradictions else result.status
     given = config.scale if not isinstance(config.scale, str) else 1.0
     scale = solution.scale if is_child else 1.0 / solution.scale
+    findings = _unrelated(solution, pose_pairs.stamps_ns, poses, positions, is_child)
+    # What does not explain the positions has no time offset either.
+    offset_s = 0.0 if findings else sign * solution.time_offset_s
     return replace(
         result,
         T_parent_child=fused.T_parent_child,
         T_method=T,
         status=status,
         contradictions=fused.contradictions,
-        time_offset_s=float(config.time_offset) + sign * solution.time_offset_s,
+        time_offset_s=float(config.time_offset) + offset_s,
         scale=given * scale,
         scale_sigma=solution.scale_sigma * scale**2,
         motion_residuals=_residuals(solution, poses, positions, pose_pairs),
-        findings=tuple(_unrelated(solution, poses, positions)),
+        findings=tuple(findings),
     )
 
 
@@ -138,11 +142,22 @@ def _residuals(
 
 
 def _unrelated(
-    solution: LeverArmSolution, poses: FloatArray, positions: FloatArray
+    solution: LeverArmSolution,
+    stamps_ns: IntArray,
+    poses: FloatArray,
+    positions: FloatArray,
+    is_child: bool,
 ) -> list[dict[str, object]]:
-    """A finding if the path of the positions is not that of the odometry."""
+    """A finding if the path of the positions is not that of the odometry, or in another unit."""
     share = lever_arm.unexplained_share(poses, positions, solution)
     if share < _UNRELATED:
         return []
+    scaled = lever_arm.solve(stamps_ns, poses, positions, with_scale=True)
+    scale = scaled.scale if is_child else 1.0 / scaled.scale
     found = unrelated_parts(share, "motion of the positions", "odometry", "the units, the scale")
+    if lever_arm.unexplained_share(poses, positions, scaled) < _UNRELATED:
+        for factor, unit in UNITS.items():
+            if abs(scale / factor - 1.0) < UNIT_TOLERANCE:
+                sigma = scaled.scale_sigma * (scale / scaled.scale)
+                found = units(scale, sigma, unit, factor)
     return [found.to_dict()]

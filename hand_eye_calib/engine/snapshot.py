@@ -12,7 +12,7 @@ from hand_eye_calib.alignment.time_offset import (
     time_offset_of_speeds,
 )
 from hand_eye_calib.calibration import Calibration, DofVerdict
-from hand_eye_calib.checks.check import CheckResult, check_streams
+from hand_eye_calib.checks.check import CheckResult, check_samplings, check_streams
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
@@ -196,11 +196,10 @@ class Snapshot:
         Returns
         -------
         CheckResult
-            Of streams that are no poses, what the solve itself found.
+            Of streams that are no poses, their sampling, and what the solve itself found.
         """
         if self.config.measured != "poses":
-            found = calibration.findings if calibration else ()
-            return CheckResult(tuple(Finding.from_dict(each) for each in found))
+            return CheckResult(gravest_first(self._check_parts(calibration)))
         offset_s = calibration.time_offset_s if calibration else self.config.time_offset
         scale = calibration.scale if calibration else self.config.scale
         max_gap_s = self.config.max_gap
@@ -219,6 +218,12 @@ class Snapshot:
             obsolete.add("one_axis")  # the result has shown otherwise
         findings = [found for found in result.findings if found.code not in obsolete]
         return replace(result, findings=gravest_first(answered(findings, self.config)))
+
+    def _check_parts(self, calibration: Calibration | None) -> list[Finding]:
+        found = [Finding.from_dict(each) for each in (calibration.findings if calibration else ())]
+        if not len(self.kept):  # pairs may have gaps where the streams have none
+            found += check_samplings(*self.streams, self.config.max_gap)
+        return [*dict.fromkeys(found)]
 
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"

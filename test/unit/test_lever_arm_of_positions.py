@@ -159,6 +159,20 @@ class TestLeverArm:
         found = hec.calibrate(streams[0], recorded(seed=8)[1])
         assert found.verdict is hec.Verdict.DO_NOT_USE
 
+    def test_positions_in_millimetres_are_named_and_mended(self, streams):
+        parent, child = streams
+        found = hec.calibrate(parent, child.scaled(1000.0))
+        assert "millimetres" in found.warnings[0]
+        assert found.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
+        assert found.verdict is not hec.Verdict.DO_NOT_USE
+
+    def test_gaps_are_named(self, streams):
+        parent, child = streams
+        kept = (np.arange(len(child)) < 100) | (np.arange(len(child)) > 130)
+        fixes = Trajectory.from_positions(child.stamps_ns[kept], child.poses[kept, :3, 3])
+        (found,) = hec.calibrate(parent, fixes).findings
+        assert (found["code"], found["stream"]) == ("gaps", "child")
+
     def test_it_survives_a_file(self, result, tmp_path):
         again = hec.load(hec.save(result, tmp_path))
         assert again.out_of_reach == ("roll", "pitch", "yaw")
