@@ -103,6 +103,10 @@ _NOISY, _FREED_ROUNDS = 0.2, 2
 # the model if it is so much lower in the end.
 _LEAST_PROMISE, _LEAST_GAIN = 2.0, 4.0
 
+# The covariance of white errors has 19 shape parameters: they are used if they lower the loss by so
+# much.
+_LEAST_GAIN_OF_SHAPE = 19.0
+
 # Size of errors that last longer than those found, as a share of their variance, if there are any.
 # A loss larger by so much leaves no chance.
 _LONGER_SHARE, _NO_CHANCE = 0.5, 100.0
@@ -190,7 +194,7 @@ def solve(
             with_delays,
         )
         return _at_all_poses(fewer, kept, plain.outliers.spikes)
-    found = plain if quick else _with_lasting_errors(plain)
+    found = plain if quick else _with_lasting_errors(_with_shape_of_white(plain))
     solution = _polished(_with_systematic_errors(found, systematic))
     if not solution.converged:
         solution = _polished(_with_systematic_errors(plain, systematic[:1]))
@@ -501,6 +505,24 @@ def _is_noisy(state: _State) -> bool:
     """Whether the rotation between poses is not large beside its noise."""
     noise = np.exp(0.5 * state.levels[noise_model.ROTATION])
     return bool(noise > _NOISY * state.streams.typical_turn)
+
+
+def _with_shape_of_white(state: _State) -> _State:
+    """With the white errors' own covariance if the data ask for it: a camera may be ten times as
+    precise across its optical axis as along it.
+    """
+    streams, of_sensors = state.streams, state.model.centre == "sensors"
+    if not of_sensors or streams.n_rows < WHITE or _is_noisy(state):
+        return state
+    model, levels = state.model.shaped(reml.white_moments(state.posterior()), state.levels)
+    kept = sample(len(state.streams), _MOST_POSES)
+    before = Posterior(state.space(kept), state.levels)
+    space = state.space(kept, model)
+    if before.loss - Posterior(space, levels).loss < _LEAST_GAIN_OF_SHAPE:
+        return state
+    fit = reml.fit(space, levels, model.prior(levels))
+    n_evaluations = state.n_evaluations + fit.n_evaluations + 2
+    return dataclasses.replace(state, model=model, levels=fit.levels, n_evaluations=n_evaluations)
 
 
 def _with_lasting_errors(plain: _State) -> _State:

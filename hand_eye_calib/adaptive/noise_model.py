@@ -62,6 +62,9 @@ _AUDIBLE_WHITE, _AUDIBLE_WALK = 0.1, 1e-3
 # A process whose variance the data say less about than this is left out: it makes no difference.
 _LEAST_INFORMATION = 0.3
 
+# No axis has less than this share of the mean variance of white errors.
+_LEAST_SHARE = 1e-3
+
 _TRANSLATIONS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 _ROTATIONS = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
 _PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
@@ -109,12 +112,17 @@ class NoiseModel:
     walk_by : {"time", "distance"}
     centre : {"sensors", "child", "parent"}
     extent : Extent
+    white : ((6, 6) array, (6, 6) array) or None
+        Covariance of white errors of translation, and of rotation with the translation that comes
+        with it, of unit variance per axis in the mean. None: the same about all axes, of both
+        sensors.
     """
 
     slow: tuple[Slow, ...]
     walk_by: str
     centre: str
     extent: Extent
+    white: tuple[FloatArray, FloatArray] | None = None
 
     def state_space(
         self,
@@ -144,6 +152,8 @@ class NoiseModel:
         ahead, behind = self._entries(streams, linearisation, to_child)
         walk = (_TRANSLATIONS, _both_rotations(to_child))
         white = (_TRANSLATIONS[None], self._white_rotation(streams, to_child))
+        if self.white is not None:
+            white = (self.white[0][None], self.white[1][None])
         used = [*range(6), *(6 + column for column in columns)]
         jacobian, residuals = linearisation.jacobian[:, :, used], linearisation.residuals
         return StateSpace(
@@ -216,6 +226,22 @@ class NoiseModel:
         if self.centre == "child":
             return SensorWhite(of_parent, of_child + turning)
         return SensorWhite(of_parent + turning, of_child)
+
+    def shaped(self, moments: FloatArray, levels: FloatArray) -> tuple[NoiseModel, FloatArray]:
+        """The model and log levels with white errors of these second moments (6, 6)."""
+        both, turning = moments[:3, 3:], moments[3:, 3:]
+        follows = both @ np.linalg.inv(turning)
+        of_rotation, of_translation = moments.copy(), np.zeros((6, 6))
+        of_rotation[:3, :3] = follows @ both.T
+        of_translation[:3, :3] = moments[:3, :3] - of_rotation[:3, :3]
+        variances = np.trace(of_translation) / 3.0, np.trace(turning) / 3.0
+        levels = levels.copy()
+        levels[[TRANSLATION, ROTATION]] = np.log(variances)
+        white = (
+            of_translation / variances[0] + _LEAST_SHARE * _TRANSLATIONS,
+            of_rotation / variances[1] + _LEAST_SHARE * _ROTATIONS,
+        )
+        return dataclasses.replace(self, white=white), levels
 
     def richer(self, slow: tuple[Slow, ...]) -> NoiseModel:
         """The same with other slow processes."""

@@ -201,6 +201,15 @@ def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
     return 0.5 * np.exp(posterior.levels[first : first + len(traces)]) * traces
 
 
+def white_moments(posterior: Posterior) -> FloatArray:
+    """Mean second moments (6, 6) of the white errors, what is uncertain of them included."""
+    space, white = posterior.space, slice(0, WHITE)
+    states, counted = posterior.restricted()[:, white], ~space.is_free
+    second = posterior.selected_inverse[0][:, white, white] + states @ transposed(states)
+    weighed = second * space.weights[:, None, None]
+    return np.asarray(weighed[counted].mean(axis=0))
+
+
 def walk_covariance(posterior: Posterior, part: slice = slice(None)) -> FloatArray:
     """Covariance (n, 6, 6) of the walk's increments, or of a part of them, for known parameters."""
     covariance, below = posterior.selected_inverse

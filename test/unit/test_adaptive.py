@@ -485,6 +485,15 @@ def test_a_camera_that_sees_a_target_swings_about_it(centre):
     assert 2.0 < np.median(distances) < 11.0
 
 
+def test_white_errors_get_a_covariance_of_their_own_if_they_differ_from_axis_to_axis():
+    parent, child = noisy_drive(5, n_poses=400, white=(0.002, 0.002))
+    assert estimator.solve(stamps(400), parent, child).model.white is None
+    depth = np.random.default_rng(6).normal(0.0, 0.02, 400)
+    child[:, :3, 3] += child[:, :3, 2] * depth[:, None]
+    of_translation, _ = estimator.solve(stamps(400), parent, child).model.white
+    np.testing.assert_allclose(np.diag(of_translation)[:3], [0.05, 0.05, 2.9], atol=0.1)
+
+
 @pytest.mark.parametrize(("heavy_tails", "found"), [(False, True), (True, False)])
 def test_a_step_above_the_level_of_false_alarms_is_a_jump_unless_tails_are_heavy(
     heavy_tails, found
