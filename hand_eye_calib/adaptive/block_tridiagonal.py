@@ -263,7 +263,9 @@ class InOrder:
         shape = right.shape
         del right, rows  # as large as the answer
         whitened, _ = lapack.dtbtrs(self._bands, columns, uplo="L", overwrite_b=1)
-        return whitened.reshape(shape)
+        # A view: rows of one column follow each other in memory.
+        n_blocks, size, n_columns = shape
+        return whitened.T.reshape(n_columns, n_blocks, size).transpose(1, 2, 0)
 
     def below(self, block: int) -> FloatArray:
         """Block (d, d) of L below its diagonal block of this number."""
