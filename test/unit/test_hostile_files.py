@@ -424,7 +424,7 @@ def test_stray_files_in_the_journals_directory_are_left_alone(journal):
     "bad",
     [
         record_of(b"P", b"short"),
-        record_of(b"P", struct.pack("<Bq7d", 7, 5, *range(7))),
+        record_of(b"P", struct.pack("<Bq7d", 9, 5, *range(7))),
         record_of(b"F", b""),
         record_of(b"F", b"\x09lidar"),
         record_of(b"F", b"\x00\xff\xfe"),
