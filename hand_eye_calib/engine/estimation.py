@@ -242,7 +242,8 @@ def _solve_auto(
     dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
     by_model = _evaluated(pose_pairs, solution)
     floor = common_mode_floor(*by_model.spans, solution.T_parent_child)
-    misfit = why_not(solution, by_model.assessment, _answer(dnlo), floor)
+    witness = dnlo
+    misfit = why_not(solution, by_model.assessment, _answer(witness), floor)
     if misfit and solution.systematic != "none":
         # DNLO does not know of systematic errors. Without them it may agree.
         corrected = _without_biases(_corrected(pose_pairs, solution), solution)
@@ -253,7 +254,7 @@ def _solve_auto(
         reason = f"auto: {compared} stands, because the noise model does not fit: {misfit}"
         return replace(dnlo, method_reason=reason, other_answer=_beside(by_model))
     reason = f"auto: the noise model fits, and its answer agrees with that of {compared}"
-    return replace(by_model, method_reason=reason, other_answer=_beside(dnlo))
+    return replace(by_model, method_reason=reason, other_answer=_beside(witness))
 
 
 def _beside(evaluation: _Evaluation) -> tuple[FloatArray, FloatArray] | None:

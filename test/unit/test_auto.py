@@ -109,6 +109,10 @@ class TestWhichAnswerStands:
         assert apart > 22.46
         assert result.method == "adaptive"
         assert result.time_offset_s == pytest.approx(0.05, abs=1e-3)
+        # The verdict compares with the same answer: of DNLO without that offset.
+        T_other, covariance = result.other_answer
+        error = se3.log(result.T_child_parent @ T_other)
+        assert model_fit.squared_distance(error, result.covariance + covariance) < 22.46
 
     def test_the_witness_gets_poses_without_the_bias_that_was_found(self):
         """Of a path that is off by so much per metre, DNLO knows nothing."""
