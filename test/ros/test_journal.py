@@ -152,6 +152,7 @@ def test_a_disk_that_is_full_is_reported_the_node_goes_on_and_the_journal_comes_
     assert answer.success
     peer.spin_until(lambda: not peer.trigger("save").success, "the save to fail")
     assert fingerprints(tmp_path / "out") == saved
+    node.wait_for_log("cannot write the session journal in", "going on without it")
     resource.prlimit(
         node.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
     )
