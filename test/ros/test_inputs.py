@@ -115,7 +115,7 @@ def test_reset_forgets_the_poses(start_node, peer):
 
 
 def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, peer):
-    start_node(*QUIET, "-p reference:=B1")
+    start_node(*QUIET, "-p method:=dnl", "-p reference:=B1")
     peer.solve(peer.publishers(), *drive(1500, period_ns=20_000_000))
     assert peer.set_parameter("backend", "ipopt").successful  # slow: a second or so
     heard = peer.listen(TransformStamped, "extrinsic")
