@@ -12,6 +12,7 @@ import os
 import shutil
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -157,8 +158,10 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
         ours = set(multiprocessing.active_children()) - others
         for child in ours:
             child.kill()
-        for child in ours:
-            child.join()
+        # Not ``join``: it returns at once for a process that the executor's thread has collected,
+        # before that thread has noted it.
+        while ours.intersection(multiprocessing.active_children()):
+            time.sleep(0.01)
         raise
     else:
         executor.shutdown()
