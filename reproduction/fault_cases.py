@@ -373,9 +373,14 @@ FAULTS = (
 
 def upright(parent: Trajectory, child: Trajectory, share: float, random: Any) -> Streams:
     """Orientations with yaw only, or with a share less of roll and pitch."""
-    angles = Rotation.from_matrix(child.poses[:, :3, :3]).as_euler("ZYX")
+    return parent, uprighted(child, share)
+
+
+def uprighted(stream: Trajectory, share: float = 1.0) -> Trajectory:
+    """A stream with a share less of roll and pitch."""
+    angles = Rotation.from_matrix(stream.poses[:, :3, :3]).as_euler("ZYX")
     angles[:, 1:] *= 1.0 - share
-    return parent, with_poses(child, Rotation.from_euler("ZYX", angles).as_matrix())
+    return with_poses(stream, Rotation.from_euler("ZYX", angles).as_matrix())
 
 
 def rounded_stamps(parent: Trajectory, child: Trajectory, step_s: float, random: Any) -> Streams:

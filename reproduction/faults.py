@@ -36,7 +36,7 @@ from reproduction.unseen_faults import LAST
 from reproduction.writing import markdown_table, put_into_page
 
 METHODS = ("dnlo", "auto")
-_SEEDS, _CLEAN_SEEDS = (0, 1, 2), range(5)
+_SEEDS = (0, 1, 2)
 _NOISE = NoiseConfig(gaussian=0.003)
 _TANGO = ("tango_caligula_mars", "tango_mars_nero")
 _LIMIT_Z = 3.0

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from reproduction.fault_cases import Fault, Streams, low_passed_values, with_poses
+from reproduction.fault_cases import Fault, Streams, low_passed_values, uprighted, with_poses
 
 # Time between two world jumps (s).
 _BETWEEN_JUMPS_S = 20.0
@@ -88,13 +88,7 @@ def without_heights(parent: Trajectory, child: Trajectory, which: float, random:
         return flat[0], child
     if which == 1.0:
         return flat[0], flat[1]
-    return _upright(flat[0]), _upright(flat[1])
-
-
-def _upright(stream: Trajectory) -> Trajectory:
-    angles = Rotation.from_matrix(stream.poses[:, :3, :3]).as_euler("ZYX")
-    angles[:, 1:] = 0.0
-    return with_poses(stream, Rotation.from_euler("ZYX", angles).as_matrix())
+    return uprighted(flat[0]), uprighted(flat[1])
 
 
 def slow_heading(parent: Trajectory, child: Trajectory, tau_s: float, random: Any) -> Streams:

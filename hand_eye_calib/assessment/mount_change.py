@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive.state_space import NormalEquations
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
@@ -55,8 +55,6 @@ _LEAST_WINDOW_S = 3.0
 # Log likelihood ratio from which on a shift is significant, and squared step in its covariance from
 # which on it is no drift (0.3 % of chi2 of 6 degrees of freedom).
 SIGNIFICANT, _LEAST_STEP = 12.0, 20.0
-
-_STEPS = 3
 
 # Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
 # recording before and after that. A smaller probability is none; log odds beyond these are certain.
@@ -91,6 +89,14 @@ class Information:
     def about(self, xi: FloatArray) -> Information:
         """The information about shifts from ``X0 exp(xi)``, to first order."""
         return Information(self.starts_ns, self.H, self.S - self.H @ xi)
+
+    def part(self, which: slice | BoolArray) -> Information:
+        """The information of some of the blocks."""
+        return Information(self.starts_ns[which], self.H[which], self.S[which])
+
+    def in_windows(self, n_windows: int) -> Information:
+        """The information in so many windows of about equal duration."""
+        return self.merged(np.arange(n_windows) * len(self) // n_windows)
 
     def merged(self, edges: IntArray) -> Information:
         """The information in longer blocks, each from one edge (an index) to the next."""
@@ -384,7 +390,7 @@ def _shift_at(products: FloatArray, cut: int, misfit: float) -> tuple[float, Flo
 
 def _best_split(found: Information, n_windows: int) -> tuple[int, float]:
     """Of so many windows, those before the most likely shift, and the long-run variance with it."""
-    windows = found.merged(np.arange(n_windows) * len(found) // n_windows)
+    windows = found.in_windows(n_windows)
     splits = range(_LEAST_WINDOWS, n_windows - _LEAST_WINDOWS + 1)
     variances = [_within(windows, split) for split in splits]
     best = int(np.argmin(variances))
@@ -395,7 +401,7 @@ def _within(windows: Information, split: int) -> float:
     """Long-run variance about the answers of the windows before and after a split."""
     centred = []
     for part in (slice(None, split), slice(split, None)):
-        side = Information(windows.starts_ns[part], windows.H[part], windows.S[part])
+        side = windows.part(part)
         centred.append(side.about(_solve(side.H.sum(axis=0), side.S.sum(axis=0))))
     H, S = (np.concatenate([getattr(side, name) for side in centred]) for name in ("H", "S"))
     return long_run_variance(Information(windows.starts_ns, H, S), n_parameters=12)
@@ -407,14 +413,10 @@ def _step(found: Information, at_ns: int) -> float:
     """
     is_after = found.starts_ns >= at_ns
     (before, cov_before, rest_before), (after, cov_after, rest_after) = (
-        _drifting(Information(found.starts_ns[part], found.H[part], found.S[part]), at_ns)
-        for part in (~is_after, is_after)
+        _drifting(found.part(side), at_ns) for side in (~is_after, is_after)
     )
     rest = Information(found.starts_ns, found.H, np.concatenate([rest_before, rest_after]))
-    long_run = max(
-        long_run_variance(rest.merged(np.arange(n) * len(rest) // n), n_parameters=24)
-        for n in _WINDOWS
-    )
+    long_run = max(long_run_variance(rest.in_windows(n), n_parameters=24) for n in _WINDOWS)
     step = after - before
     return float(step @ np.linalg.solve(cov_before + cov_after, step)) / long_run
 

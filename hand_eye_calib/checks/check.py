@@ -9,6 +9,7 @@ wrong with them.
 4. Under the hypothesis that holds: clock offset, scale, and directions that the motion hides.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -55,8 +56,8 @@ from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 _OFFSET_ERROR_S, _OFFSET_WARNING_S, _OFFSET_NOTE_S, _OFFSET_SIGMAS = 0.1, 0.01, 0.005, 5.0
 _SCALE_ERROR = 0.03
 
-UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
-UNIT_TOLERANCE = 0.1
+_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
+_UNIT_TOLERANCE = 0.1
 
 # Shortest duration and smallest rotation with which the checks of a live session mean something.
 MIN_DURATION_S, MIN_ROTATION_RAD = 20.0, float(np.radians(30.0))
@@ -113,7 +114,7 @@ def check_streams(
     -------
     CheckResult
     """
-    findings = _check_each(parent, child, max_gap_s)
+    findings = _check_each(parent, child, max_gap_s, check_stream)
     if any(finding.severity is Severity.ERROR for finding in findings):
         return CheckResult(gravest_first(findings))
     streams = StreamPair(parent, child.shifted(time_offset_s).scaled(scale), max_gap_s)
@@ -145,21 +146,30 @@ def check_streams(
 
 def check_samplings(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
     """Findings about the stamps of two streams, whatever they measure."""
+    return _check_each(parent, child, max_gap_s, check_sampling)
+
+
+def _check_each(
+    parent: Trajectory,
+    child: Trajectory,
+    max_gap_s: float,
+    check: Callable[[Trajectory, str, float], list[Finding]],
+) -> list[Finding]:
+    """Findings about the stamps of two streams together, and by a check of each alone."""
     findings = []
     if min(len(parent), len(child)):
         findings += check_stamps(parent.stamps_ns, child.stamps_ns)
     for stream, trajectory in (("parent", parent), ("child", child)):
-        findings += check_sampling(trajectory, stream, max_gap_s)
+        findings += check(trajectory, stream, max_gap_s)
     return findings
 
 
-def _check_each(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
-    findings = []
-    if min(len(parent), len(child)):
-        findings += check_stamps(parent.stamps_ns, child.stamps_ns)
-    findings += check_stream(parent, "parent", max_gap_s)
-    findings += check_stream(child, "child", max_gap_s)
-    return findings
+def unit_of(scale: float) -> tuple[float, str] | None:
+    """Factor to metres and name of the usual unit of length that a scale is about; None if it is
+    about none.
+    """
+    near = (each for each in _UNITS.items() if abs(scale / each[0] - 1.0) < _UNIT_TOLERANCE)
+    return next(near, None)
 
 
 def _check_agreeing(
@@ -249,9 +259,9 @@ def _check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
 def _check_scale(scale: Scale, known: float) -> list[Finding]:
     if not scale.differs:
         return []
-    for factor, unit in UNITS.items():
-        if abs(scale.value / factor - 1.0) < UNIT_TOLERANCE:
-            return [wording.units(scale.value, scale.sigma, unit, round(known * factor, 9))]
+    if found := unit_of(scale.value):
+        factor, unit = found
+        return [wording.units(scale.value, scale.sigma, unit, round(known * factor, 9))]
     severity = Severity.ERROR if abs(scale.value - 1.0) > _SCALE_ERROR else Severity.WARNING
     return [wording.scale_differs(scale, round(known * scale.value, 4), severity)]
 

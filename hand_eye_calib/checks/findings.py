@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hand_eye_calib.methods import METHODS
+from hand_eye_calib.status import listing
 
 if TYPE_CHECKING:
     from hand_eye_calib.adaptive.part_delays import PartDelay
@@ -676,7 +677,7 @@ def mount_moved(
         stream="both",
         severity=severity,
         confidence=Confidence.LIKELY if change.is_step else Confidence.POSSIBLE,
-        what=f"the extrinsic {when} by {' and '.join(sizes)}",
+        what=f"the extrinsic {when} by {listing(sizes)}",
         cause=cause,
         advice="tighten it and record again, or calibrate the parts before and after on their own",
         evidence=(

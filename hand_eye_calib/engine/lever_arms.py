@@ -14,7 +14,7 @@ from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
 from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
-from hand_eye_calib.checks.check import UNIT_TOLERANCE, UNITS
+from hand_eye_calib.checks.check import unit_of
 from hand_eye_calib.checks.findings import units, unrelated_parts
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
@@ -155,9 +155,8 @@ def _unrelated(
     scaled = lever_arm.solve(stamps_ns, poses, positions, with_scale=True)
     scale = scaled.scale if is_child else 1.0 / scaled.scale
     found = unrelated_parts(share, "motion of the positions", "odometry", "the units, the scale")
-    if lever_arm.unexplained_share(poses, positions, scaled) < _UNRELATED:
-        for factor, unit in UNITS.items():
-            if abs(scale / factor - 1.0) < UNIT_TOLERANCE:
-                sigma = scaled.scale_sigma * (scale / scaled.scale)
-                found = units(scale, sigma, unit, factor)
+    explains = lever_arm.unexplained_share(poses, positions, scaled) < _UNRELATED
+    if explains and (in_unit := unit_of(scale)):
+        factor, unit = in_unit
+        found = units(scale, scaled.scale_sigma * (scale / scaled.scale), unit, factor)
     return [found.to_dict()]
