@@ -39,6 +39,7 @@ from hand_eye_calib.checks.hypotheses import (
 from hand_eye_calib.checks.streams import (
     check_flat,
     check_frozen,
+    check_positions,
     check_sampling,
     check_stamps,
     check_stream,
@@ -144,9 +145,18 @@ def check_streams(
     return _check_agreeing(streams, explanation, correlation, findings, time_offset_s, scale)
 
 
-def check_samplings(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
-    """Findings about the stamps of two streams, whatever they measure."""
-    return _check_each(parent, child, max_gap_s, check_sampling)
+def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
+    """Findings about each of two streams, on one clock, of which one at least has only positions,
+    rotations or rates: what there is to see before a solve.
+    """
+    has_positions = parent.has_positions and child.has_positions
+    check = check_positions if has_positions else check_sampling
+    findings = _check_each(parent, child, max_gap_s, check)
+    if any(finding.severity is Severity.ERROR for finding in findings):
+        return findings
+    if not has_positions:
+        parent, child = parent.scaled(0.0), child.scaled(0.0)
+    return [*findings, *check_frozen(parent, child)]
 
 
 def _check_each(
@@ -195,7 +205,7 @@ def _check_agreeing(
     aligned = _aligned(streams, offset.seconds, fit) if is_sound else None
     findings = [
         *findings,
-        *_check_offset(aligned.refined(offset) if aligned else offset, known_offset_s),
+        *check_offset(aligned.refined(offset) if aligned else offset, known_offset_s),
         *(_check_scale(scale, known_scale) if scale else []),
         *([wording.unit_unseen()] if explanation.same_unit else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
@@ -247,7 +257,8 @@ def _rates_disagree(correlation: Correlation) -> Finding:
     return wording.unrelated_rates(correlation)
 
 
-def _check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
+def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
+    """A finding if the clocks differ by more than ``known_s``, which the child's stamps have."""
     if abs(found.seconds) < max(_OFFSET_NOTE_S, _OFFSET_SIGMAS * found.sigma_s):
         return []
     severity = Severity.NOTE

@@ -267,13 +267,13 @@ def stamp_unit(stream: str, other: str, unit: str, factor: float) -> Finding:
 # ---------------------------------------------------------- of both together
 
 
-def unrelated_rates(correlation: Correlation) -> Finding:
-    """The angular rates do not agree at any clock offset."""
+def unrelated_rates(correlation: Correlation, quantity: str = "angular rates") -> Finding:
+    """The angular rates, or speeds, do not agree at any clock offset."""
     return _error(
         "unrelated",
         "both",
-        "the angular rates of the two streams do not agree at any clock offset: "
-        f"{correlation.doubt()}",
+        f"the {quantity} of the two streams do not agree at any clock offset: "
+        f"{correlation.doubt().replace('angular rates', quantity)}",
         "check that both sensors are on one rigid body, that the topics are of the same recording, "
         "and that neither is derived from another body",
         Confidence.LIKELY,
@@ -474,6 +474,20 @@ def one_axis(direction: FloatArray, hidden: Sequence[str], main: str) -> Finding
         advice=f"rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {main} "
         "and give it",
         options=((f"prior.{main}", "VALUE+/-SIGMA"),),
+    )
+
+
+def unseen_axes(axes: Sequence[str]) -> Finding:
+    """The motion does not show these axes, of those that the streams can show."""
+    return Finding(
+        code="one_axis",
+        stream="both",
+        severity=Severity.NOTE,
+        confidence=Confidence.LIKELY,
+        what=f"this motion does not show {listing(tuple(axes))}, which will be unobservable",
+        advice="rotate about other axes, too (a vehicle: over slopes or kerbs), or measure "
+        f"{'it' if len(axes) == 1 else 'them'} and give a prior",
+        options=tuple((f"prior.{axis}", "VALUE+/-SIGMA") for axis in axes),
     )
 
 

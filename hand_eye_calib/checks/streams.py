@@ -76,18 +76,18 @@ class StreamSummary:
     rate_hz : float
         Of the median interval.
     longest_interval_s : float
-    path_m : float
-        Path length.
-    rotation_rad : float
-        Sum of all rotation angles.
+    path_m : float or None
+        Path length; None without positions.
+    rotation_rad : float or None
+        Sum of all rotation angles; None without orientations.
     """
 
     poses: int
     duration_s: float
     rate_hz: float
     longest_interval_s: float
-    path_m: float
-    rotation_rad: float
+    path_m: float | None
+    rotation_rad: float | None
 
 
 def summarise(trajectory: Trajectory) -> StreamSummary:
@@ -101,8 +101,8 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
         duration_s=trajectory.duration_s,
         rate_hz=float(1.0 / np.median(intervals_s)),
         longest_interval_s=float(intervals_s.max()),
-        path_m=float(steps.sum()),
-        rotation_rad=float(angles.sum()),
+        path_m=float(steps.sum()) if trajectory.has_positions else None,
+        rotation_rad=float(angles.sum()) if trajectory.has_rotations else None,
     )
 
 
@@ -174,19 +174,26 @@ def check_stream(
     -------
     list of Finding
     """
-    findings = check_sampling(trajectory, stream, max_gap_s)
-    if any(finding.severity is wording.Severity.ERROR for finding in findings):
+    findings = check_positions(trajectory, stream, max_gap_s)
+    if any(finding.code != "gaps" for finding in findings):
         return findings
-    if levels := _interleaved(trajectory):
-        return [*findings, wording.interleaved(stream, *levels)]
-    if coarse := _check_grid(trajectory.poses[:, :3, 3], stream):
-        return [*findings, coarse]
     if levels := _mixed(trajectory):
         return [*findings, wording.interleaved(stream, *levels)]
     share = float(_jumps(trajectory).mean())
     if share > _MIN_JUMPS:
         findings.append(wording.jumps(stream, share))
     return findings
+
+
+def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
+    """Findings about the stamps of one stream, and about its positions without its orientations."""
+    findings = check_sampling(trajectory, stream, max_gap_s)
+    if any(finding.severity is wording.Severity.ERROR for finding in findings):
+        return findings
+    if levels := _interleaved(trajectory):
+        return [*findings, wording.interleaved(stream, *levels)]
+    coarse = _check_grid(trajectory.poses[:, :3, 3], stream)
+    return [*findings, coarse] if coarse else findings
 
 
 def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:

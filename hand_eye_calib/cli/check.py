@@ -1,9 +1,10 @@
-"""``check BAG`` or ``check PARENT CHILD``: check both pose streams before any solve."""
+"""``check BAG`` or ``check PARENT CHILD``: check both streams before they are calibrated."""
 
 import argparse
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,8 @@ EXAMPLES = """\
 examples:
   hand_eye_calib check my_bag
   hand_eye_calib check my_bag --parent-topic /lidar/odometry --child-topic /vio --out checked
-  hand_eye_calib check lidar.txt camera.txt"""
+  hand_eye_calib check lidar.txt camera.txt
+  hand_eye_calib check lidar.txt gnss.csv"""
 
 _HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rotation")
 
@@ -55,7 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
-    from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import answered, gravest_first
     from hand_eye_calib.checks.streams import summarise
     from hand_eye_calib.cli.findings import verdict
@@ -66,16 +67,11 @@ def run(arguments: argparse.Namespace) -> int:
     read = _read_bag if len(arguments.inputs) == 1 else _read_files
     trajectories, sources, of_files = read(arguments)
     parent, child = (trajectories[stream] for stream in STREAMS)
-    if {parent.measures, child.measures} != {"poses"}:
-        raise ConfigError(
-            "check looks at two streams of poses; of positions, rotations or rates the command "
-            "that calibrates says what is wrong with them"
-        )
     # What is to be estimated is not known yet: the checks say what it is.
     offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
     scale = config.scale if isinstance(config.scale, float) else 1.0
     with waiting_for("checking the streams"):
-        checked = check_streams(parent, child, offset_s, scale, config.max_gap)
+        checked = _checked(parent, child, (offset_s, scale), arguments)
     findings = gravest_first(answered([*checked.findings, *of_files], config))
     streams = {name: summarise(one) for name, one in trajectories.items() if len(one) > 1}
     if arguments.json:
@@ -91,6 +87,25 @@ def run(arguments: argparse.Namespace) -> int:
         said = (findings, named, verdict(findings))
         write_check(arguments.out, parent, corrected, checked, *said, config.max_gap)
     return fail(str(findings[0]), 1) if findings and findings[0].makes_unusable else 0
+
+
+def _checked(
+    parent: "Trajectory",
+    child: "Trajectory",
+    known: tuple[float, float],
+    arguments: argparse.Namespace,
+) -> "CheckResult":
+    """What the checks say of two streams with a ``known`` time offset and scale."""
+    config = config_from(arguments)
+    if {parent.measures, child.measures} == {"poses"}:
+        from hand_eye_calib.checks.check import check_streams
+
+        return check_streams(parent, child, *known, config.max_gap)
+    from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+    from hand_eye_calib.engine.partial_check import check_partial
+
+    config = offline_config(parent, child, options_from(arguments))
+    return check_partial(whole_snapshot(config, parent, child))
 
 
 def _named(sources: Mapping[str, str], is_bag: bool) -> list[str]:
@@ -118,26 +133,26 @@ def _read_bag(arguments: argparse.Namespace) -> _Read:
     from hand_eye_calib.checks.streams import tidy
     from hand_eye_calib.io.bags import PoseBag
 
-    columns: dict[str, tuple[list[Any], list[Any], list[Any]]] = {
-        stream: ([], [], []) for stream in STREAMS
-    }
+    config = config_from(arguments)
+    columns: dict[str, list[Any]] = {stream: [] for stream in STREAMS}
     with PoseBag(arguments.inputs[0]) as bag:
         sources = bag.select_topics(arguments.parent_topic, arguments.child_topic)
-        poses = bag.poses(*sources)
-        for pose in with_progress(poses, bag.expected(*sources), f"reading {bag}"):
-            values = (pose.stamp_ns, pose.position, pose.quat_xyzw)
-            for column, value in zip(columns[pose.stream], values, strict=True):
-                column.append(value)
+        measures = {
+            stream: bag.measured(source, getattr(config, f"{stream}_measures"))
+            for stream, source in zip(STREAMS, sources, strict=True)
+        }
+        blocks = bag.blocks(*sources, measures=measures)
+        for block in with_progress(blocks, bag.expected(*sources), f"reading {bag}", len):
+            for stream in STREAMS:
+                columns[stream].append(block[block.streams == stream])
         for text in bag.warnings:
             note(text)
     trajectories, findings = {}, []
-    for stream, (stamps_ns, positions, quats_xyzw) in columns.items():
-        trajectories[stream], found = tidy(
-            np.array(stamps_ns, dtype=np.int64),
-            np.reshape(positions, (-1, 3)),
-            np.reshape(quats_xyzw, (-1, 4)),
-            stream,
-        )
+    for stream, parts in columns.items():
+        stamps_ns = np.concatenate([np.empty(0, np.int64), *(part.stamps_ns for part in parts)])
+        poses = np.concatenate([np.empty((0, 7)), *(part.poses for part in parts)])
+        tidied, found = tidy(stamps_ns, poses[:, :3], poses[:, 3:], stream)
+        trajectories[stream] = replace(tidied, measures=measures[stream])
         findings += found
     return trajectories, dict(zip(STREAMS, map(str, sources), strict=True)), findings
 
@@ -173,10 +188,12 @@ def _text(
     lines = [f"{stream} is {printable(source)}" for stream, source in sources.items()]
     lines.append("{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS))
     for name, summary in streams.items():
+        path, rotation = summary.path_m, summary.rotation_rad
         lines.append(
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} "
-            f"{summary.longest_interval_s:10.3f} s {summary.path_m:10.1f} m "
-            f"{math.degrees(summary.rotation_rad):6.0f} deg"
+            f"{summary.longest_interval_s:10.3f} s "
+            f"{'none' if path is None else f'{path:.1f} m':>12} "
+            f"{'none' if rotation is None else f'{math.degrees(rotation):.0f} deg':>10}"
         )
     if checked.rms_rotation:
         turned = "  ".join(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import angular_rates
+from hand_eye_calib.alignment.angular_rates import angular_rates, speeds
 from hand_eye_calib.alignment.scale import child_scaled
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
@@ -102,8 +102,10 @@ class StreamView:
 
     Attributes
     ----------
+    quantity : {"angular rate", "speed"}
+        What is shown over time: the speed if one sensor has positions alone.
     rates : 2 x (times_s, rates)
-        Angular rates, rad/s; NaN in gaps.
+        Angular rates, rad/s, or speeds, m/s; NaN in gaps.
     spans_s : 2 x (M, 2) arrays
         Start and end of the times in which each stream has poses, without longer gaps.
     lag_s : float
@@ -114,14 +116,27 @@ class StreamView:
         Translations along the rotation axis, m, of the motions that have one.
     rms_translation : float
         Root mean square translation of the parent's motions, m.
+    is_whole : bool
+        Whether both sensors have poses. Otherwise no motions are compared.
     """
 
+    quantity: str
     rates: tuple[tuple[FloatArray, FloatArray], ...]
     spans_s: tuple[FloatArray, ...]
     lag_s: float
     angles: FloatArray
     along_axis: FloatArray
     rms_translation: float
+    is_whole: bool
+
+    @property
+    def apart(self) -> float:
+        """Median difference of both rates (rad/s) or speeds (m/s); NaN if they never overlap."""
+        (times, of_parent), (others, of_child) = self.rates
+        shared = (times >= others[0]) & (times <= others[-1]) if len(others) else times < 0
+        apart = np.abs(of_parent - np.interp(times, others, of_child))[shared]
+        known = apart[np.isfinite(apart)]
+        return float(np.median(known)) if len(known) else float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,18 +230,23 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
         child.interval_s,
         max(parent.duration_s, child.duration_s) / _MAX_RATES,
     )
+    has_rates = parent.has_rotations and child.has_rotations
+    is_whole = has_rates and parent.has_positions and child.has_positions
+    sampled = angular_rates if has_rates else speeds
     rates, spans = [], []
     for stream in (parent, child):
-        found = angular_rates(stream, max(3 * step_s, _MIN_WINDOW_S), step_s, max_gap_s)
+        found = sampled(stream, max(3 * step_s, _MIN_WINDOW_S), step_s, max_gap_s)
         steps = np.arange(len(found.values)) * step_s
         rates.append(((found.start_ns - start_ns) * 1e-9 + steps, found.values))
         gaps = np.flatnonzero(are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s))
         edges = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
         spans.append((edges.reshape(-1, 2) - start_ns) * 1e-9)
     lag_s, angles, along_axis, rms_translation = _compared_motions(
-        synchronise(parent, child, max_gap_s)
+        synchronise(parent, child, max_gap_s) if is_whole else PosePairs.empty()
     )
     return StreamView(
+        quantity="angular rate" if has_rates else "speed",
+        is_whole=is_whole,
         rates=tuple(rates),
         spans_s=tuple(spans),
         lag_s=lag_s,
@@ -286,6 +306,8 @@ def _compared_motions(
     """Lag, rotation angles (K, 2) and translations along the axis (L, 2) of motions of both
     sensors, and the root mean square translation of the parent's.
     """
+    if not len(pose_pairs):
+        return _LAGS_S[0], np.empty((0, 2)), np.empty((0, 2)), 0.0
     for lag_s in _LAGS_S:
         start, end = _spans(pose_pairs, lag_s)
         if len(start) >= _MIN_MOTIONS:

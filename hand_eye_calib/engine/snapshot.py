@@ -12,7 +12,7 @@ from hand_eye_calib.alignment.time_offset import (
     time_offset_of_speeds,
 )
 from hand_eye_calib.calibration import Calibration, DofVerdict
-from hand_eye_calib.checks.check import CheckResult, check_samplings, check_streams
+from hand_eye_calib.checks.check import CheckResult, check_parts, check_streams
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
@@ -176,6 +176,13 @@ class Snapshot:
         """Trajectories of the whole session, each on its own clock: as they came in, or at the
         stamps of the pairs if some were made.
         """
+        parent, child = self._whole_streams()
+        return (
+            _measuring(parent, self.config.parent_measures),
+            _measuring(child, self.config.child_measures),
+        )
+
+    def _whole_streams(self) -> tuple[Trajectory, Trajectory]:
         if not len(self.kept):
             return self.parent, self.child
         resolved = self.resolved()
@@ -222,7 +229,9 @@ class Snapshot:
     def _check_parts(self, calibration: Calibration | None) -> list[Finding]:
         found = [Finding.from_dict(each) for each in (calibration.findings if calibration else ())]
         if not len(self.kept):  # pairs may have gaps where the streams have none
-            found += check_samplings(*self.streams, self.config.max_gap)
+            parent, child = self.streams
+            offset_s = fixed_time_offset(self.resolved().config)
+            found += check_parts(parent, child.shifted(offset_s), self.config.max_gap)
         return [*dict.fromkeys(found)]
 
     def _what_is_missing(self, n_pairs: int) -> str:
@@ -253,6 +262,13 @@ def _hides_a_translation(calibration: Calibration) -> bool:
         dof.verdict in (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
         for dof in calibration.observability[:3]
     )
+
+
+def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
+    """The trajectory with what the options say that it measures."""
+    if measures in ("auto", trajectory.measures):
+        return trajectory
+    return replace(trajectory, measures=measures)
 
 
 def _as_trajectory(poses: RawPoses | Trajectory) -> Trajectory:

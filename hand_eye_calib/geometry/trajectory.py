@@ -169,6 +169,16 @@ class Trajectory:
         of = f"{len(self)} {self.measures} over {self.duration_s:.3f} s"
         return f"Trajectory({of}{''.join(frames)})"
 
+    @property
+    def has_positions(self) -> bool:
+        """Whether its positions mean something."""
+        return self.measures in ("poses", "positions")
+
+    @property
+    def has_rotations(self) -> bool:
+        """Whether its orientations mean something."""
+        return self.measures != "positions"
+
     def __len__(self) -> int:
         return len(self.stamps_ns)
 

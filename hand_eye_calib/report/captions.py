@@ -209,6 +209,13 @@ def _judged(apart: FloatArray, joint: FloatArray, names: Sequence[str]) -> str:
 
 def of_streams(seen: StreamView) -> str:
     """Caption of the figure of both streams."""
+    gaps = [counted(len(spans) - 1, "gap") for spans in seen.spans_s]
+    bars = (
+        f"The bars below the curves show when there is data: {gaps[0]} in the parent stream, "
+        f"{gaps[1]} in the child stream."
+    )
+    if not seen.is_whole:
+        return f"{_WHAT_COINCIDES[seen.quantity]} {_half_of_the_time(seen)} {bars}"
     text = (
         "Two sensors on one rigid body have the same angular rate at every moment. Each motion "
         "rotates both by the same angle and moves both equally far along its rotation axis, "
@@ -224,11 +231,22 @@ def of_streams(seen: StreamView) -> str:
     )
     if len(seen.along_axis):
         text += f" and {size(float(np.median(np.abs(np.diff(seen.along_axis, axis=1)))), 'x')}"
-    gaps = [counted(len(spans) - 1, "gap") for spans in seen.spans_s]
-    return (
-        f"{text}. The bars below the curves show when there are poses: {gaps[0]} in the parent "
-        f"stream, {gaps[1]} in the child stream."
-    )
+    return f"{text}. {bars}"
+
+
+_WHAT_COINCIDES = {
+    "angular rate": "Two sensors on one rigid body have the same angular rate at every moment, "
+    "however they are mounted: the two curves must coincide, up to the bias of a gyroscope.",
+    "speed": "Two points of one rigid body have the same speed while it does not rotate: the two "
+    "curves must have the same course.",
+}
+
+
+def _half_of_the_time(seen: StreamView) -> str:
+    if not np.isfinite(seen.apart):
+        return "Here the streams never overlap."
+    apart = length(seen.apart) if seen.quantity == "speed" else size(seen.apart, "yaw")
+    return f"Here they differ by less than {apart}/s half of the time."
 
 
 _CAPTIONS: dict[str, Caption] = {

@@ -77,7 +77,7 @@ def _figure(
     if abs(offset_s) >= _SHOWN_S:
         caption += (
             f" In the figure {offset_s:.3f} s are added to the child's stamps: with that offset "
-            "both have the same angular rate."
+            f"both have the same {seen.quantity}."
         )
     return draw_streams(seen, ("parent", "child")), caption
 

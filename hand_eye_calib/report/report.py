@@ -316,7 +316,7 @@ def _of_whole(stream: Trajectory) -> dict[str, str]:
     whole = summarise(stream)
     return {
         "gap": f"{whole.longest_interval_s:.2f} s",
-        "path": length(whole.path_m),
+        "path": "-" if whole.path_m is None else length(whole.path_m),
         "duration": duration(whole.duration_s),
         "poses": f"{whole.poses:,}",
         "rate": f"{whole.rate_hz:.1f} Hz",

@@ -370,7 +370,7 @@ def _relative_to(
 
 def _streams(seen: StreamView, names: tuple[str, str]) -> Figure:
     factor, unit = time_axis(max(times[-1] if len(times) else 0.0 for times, _ in seen.rates))
-    height = 6.6
+    height = 6.6 if seen.is_whole else 2.95
     figure = Figure(figsize=(WIDTH, height))
 
     def panel(left: float, bottom: float, wide: float, tall: float, **options: Any) -> Axes:
@@ -378,10 +378,12 @@ def _streams(seen: StreamView, names: tuple[str, str]) -> Figure:
         return figure.add_axes(edges, **options)
 
     across = WIDTH - 0.8 - 0.12
-    rate = panel(0.8, 4.6, across, 1.7)
-    strip = panel(0.8, 4.15, across, 0.32, sharex=rate)
+    rate = panel(0.8, height - 2.0, across, 1.7)
+    strip = panel(0.8, height - 2.45, across, 0.32, sharex=rate)
     _draw_rates(rate, strip, seen, names, factor)
     strip.set_xlabel(f"time ({unit})")
+    if not seen.is_whole:
+        return figure
     half = (across - 0.75) / 2
     angles, along_axis = (panel(0.8 + n * (half + 0.75), 0.55, half, 2.9) for n in range(2))
     angles.set(
@@ -405,11 +407,12 @@ def _draw_rates(
     looks = ((PARENT, 2.6), (CHILD, 1.0))
     streams = zip(seen.rates, seen.spans_s, names, looks, strict=True)
     for row, ((times, rates), spans, name, (colour, width)) in enumerate(streams):
-        values = np.degrees(rates)
+        values = rates if seen.quantity == "speed" else np.degrees(rates)
         rate.plot(times * factor, values, "-", color=colour, lw=width, label=_plain(name))
         bars = [(start * factor, (end - start) * factor) for start, end in spans]
         strip.broken_barh(bars, (0.6 - row, 0.8), color=colour, lw=0)
-    rate.set(ylabel="angular rate (deg/s)", ylim=(0, None))
+    in_unit = {"speed": "speed (m/s)", "angular rate": "angular rate (deg/s)"}[seen.quantity]
+    rate.set(ylabel=in_unit, ylim=(0, None))
     rate.tick_params(labelbottom=False)
     rate.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
     strip.set_ylim(-0.6, 1.6)

@@ -6,6 +6,8 @@ from motions import planar_poses, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.engine.partial_check import check_partial
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.positions import simulated_positions
@@ -173,6 +175,24 @@ class TestLeverArm:
         (found,) = hec.calibrate(parent, fixes).findings
         assert (found["code"], found["stream"]) == ("gaps", "child")
 
+    def test_the_check_says_the_same_before(self, streams):
+        parent, child = streams
+
+        def codes(parent, child):
+            snapshot = whole_snapshot(offline_config(parent, child, {}), parent, child)
+            return [each.code for each in check_partial(snapshot).findings]
+
+        assert codes(parent, child) == []
+        assert codes(parent, child.scaled(1000.0)) == ["units"]
+        assert codes(parent, recorded(seed=8)[1]) == ["unrelated"]
+        assert codes(parent, child.shifted(500.0)) == ["unrelated"]
+        assert codes(parent, child[:3]) == ["too_short"]
+        two = child.poses[:, :3, 3] + [0.5, 0.0, 0.0] * (np.arange(300) % 2)[:, None]
+        both = Trajectory.from_positions(child.stamps_ns, two)
+        assert codes(parent, both) == ["interleaved"]
+        flat = recorded(drift_rad=0.0, poses=planar_poses(400, seed=3))
+        assert codes(*flat) == ["one_axis"]
+
     def test_it_survives_a_file(self, result, tmp_path):
         again = hec.load(hec.save(result, tmp_path))
         assert again.out_of_reach == ("roll", "pitch", "yaw")
@@ -195,6 +215,11 @@ def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, caps
     assert code == 0
     assert "roll, pitch and yaw are not estimated" in printed.out
     assert "became metres east and north" in printed.err
+    files = [str(tmp_path / name) for name in ("lidar.tum", "gnss.csv")]
+    assert main(["check", *files, "--out", str(tmp_path)]) == 0
+    page = (tmp_path / "check.html").read_text()
+    assert "speed (m/s)" in page
+    assert "the two curves must have the same course" in page
 
 
 def test_targets_of_single_axes_are_those_of_the_verdict(streams):

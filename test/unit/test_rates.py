@@ -1,5 +1,6 @@
 """Streams without positions: rotations, and the angular rates of a gyroscope."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -10,6 +11,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.engine.partial_check import check_partial
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import RateIntegrator, integrated
@@ -225,6 +228,51 @@ class TestFiles:
         document = json.loads(capsys.readouterr().out)
         assert document["rate_bias"]["rad_per_s"] == pytest.approx(BIAS, abs=3e-3)
         assert document["observability"][0]["sigma"] is None
+        assert main(["check", *files]) == 0
+        out = capsys.readouterr().out
+        assert out.startswith("USE: nothing speaks against")
+        assert "none" in next(line for line in out.splitlines() if line.startswith("child  "))
+
+
+class TestCheck:
+    @staticmethod
+    def codes(parent, child, **options):
+        snapshot = whole_snapshot(offline_config(parent, child, options), parent, child)
+        found = check_partial(snapshot).findings
+        return [(each.code, each.severity.value, dict(each.options)) for each in found]
+
+    def test_an_offset_that_a_solve_finds_is_a_note_and_a_long_one_an_error(self, streams):
+        parent, child = streams
+        (found,) = self.codes(parent, child)
+        assert (found[0], found[1]) == ("time_offset", "note")
+        (found,) = self.codes(parent, child.shifted(-7.0))
+        assert (found[0], found[1]) == ("time_offset", "error")
+        assert found[2]["time_offset"] == pytest.approx(7.0 + OFFSET_S, abs=1e-3)
+        assert self.codes(parent, child.shifted(-7.0), time_offset=7.0 + OFFSET_S) == []
+
+    def test_rates_of_another_body_or_in_another_unit_are_unrelated(self, streams):
+        parent, stamps_ns, rates = smooth_streams(seed=7)
+        other = Trajectory.from_rates(stamps_ns, rates)
+        assert self.codes(streams[0], other)[0][:2] == ("unrelated", "error")
+        tenfold = Trajectory.from_rates(stamps_ns, 10 * rates)
+        assert self.codes(parent, tenfold)[0][:2] == ("unrelated", "error")
+
+    def test_one_axis_is_a_note_and_no_rotation_an_error(self):
+        stamps_ns = START_NS + STEP_NS * np.arange(300)
+        turns = np.c_[np.zeros((300, 5)), np.cumsum(np.sin(np.arange(300) / 9.0)) / 20]
+        noise = 1e-4 * np.random.default_rng(1).normal(size=(2, 300, 6))
+        parent, child = (Trajectory(stamps_ns, se3.exp(turns) @ se3.exp(each)) for each in noise)
+        child = dataclasses.replace(child, measures="rotations")
+        assert self.codes(parent, child) == [("one_axis", "note", {"prior.yaw": "VALUE+/-SIGMA"})]
+        still, also = (Trajectory(stamps_ns, se3.exp(each)) for each in noise)
+        (found,) = self.codes(still, dataclasses.replace(also, measures="rotations"))
+        assert found[:2] == ("no_turning", "error")
+
+    def test_a_frozen_gyroscope_is_named(self, streams):
+        parent, stamps_ns, rates = smooth_streams()
+        rates[400:700] = 0.0
+        found = self.codes(parent, Trajectory.from_rates(stamps_ns, rates))
+        assert ("frozen", "error", {}) in found
 
 
 def message(kind, stamp_ns=12_000_000_005, **fields):
@@ -270,9 +318,12 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     bag = tmp_path / "bag"
     write_bag(bag, {"/odom": (parent, "nav_msgs/msg/Odometry")}, "mcap")
     with Writer(tmp_path / "imu", version=9) as writer:
-        connection = writer.add_connection("/imu", kind, typestore=STORE)
+        connections = [
+            writer.add_connection(topic, kind, typestore=STORE) for topic in ("/imu", "/imu_again")
+        ]
         for stamp_ns, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
-            writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
+            for connection in connections:
+                writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
     parts = [str(tmp_path / name) for name in ("bag", "imu")]
     topics = ["--parent-topic", "/odom", "--child-topic", "/imu"]
     assert main(["replay", *parts, *topics, "--json"]) == 0
@@ -281,6 +332,11 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     assert document["inputs"]["options"]["child_measures"] == "rates"
     assert main(["replay", *parts, *topics, "--child-measures", "positions"]) == 2
     assert "/imu has messages of type" in capsys.readouterr().err
+    with_itself = ["--parent-topic", "/imu", "--child-topic", "/imu_again"]
+    assert main(["check", parts[1], *with_itself, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["streams"]["child"]["path_m"] is None
+    assert document["turning"]["correlation"] == pytest.approx(1.0)
     found = hec.read_trajectory(parts[1], topic="/imu")
     assert (found.measures, len(found)) == ("rates", len(stamps_ns))
 
