@@ -573,7 +573,9 @@ class Calibration:
     def _inverse_dict(self) -> dict[str, Any]:
         covariance = inverse_covariance(self.T_parent_child, self.covariance)
         sigmas_m = sigmas_translation(self.T_child_parent, covariance)
-        if self.unobservable():
+        if {*ROTATIONS} <= {*self.out_of_reach}:
+            sigmas_m = self.sigmas[:3]  # the axes of both sensors are the same by convention
+        elif self.unobservable():
             sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
         return _transform_dict(
             self.T_child_parent,

@@ -75,11 +75,9 @@ def deliver(
     if arguments.out:
         from hand_eye_calib.io.results import keep_earlier_results, save_result
 
-        if snapshot is not None and calibration.measured == "poses":
+        if snapshot is not None:
             with waiting_for("cross-checks with other methods and halves of the recording"):
                 calibration, evidence = with_cross_check(calibration, snapshot)
-        elif snapshot is not None:
-            note("no report.html: its figures are of two streams of poses")
         keep_earlier_results(arguments.out)
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
     print(
@@ -284,7 +282,7 @@ def _observability(calibration: Calibration) -> str:
 
 def _floor_lines(calibration: Calibration) -> Iterator[str]:
     """Errors that nothing in the recording shows."""
-    if calibration.floor is not None:
+    if calibration.floor is not None and np.isfinite(calibration.sigmas).any():
         from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE, FLOOR_TILT
 
         told = [

@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def write(directory: Path, result: "SessionResult") -> None:
-    """Check the streams, cross-check the result, and write the page, if it comes from poses.
+    """Check the streams, cross-check the result, and write the page.
 
     Raises
     ------
@@ -49,8 +49,6 @@ def write(directory: Path, result: "SessionResult") -> None:
     from hand_eye_calib.cli.findings import with_findings
     from hand_eye_calib.cli.reporting import with_cross_check, write_report
 
-    if result.calibration.measured != "poses":
-        return  # the figures are of poses
     calibration, _ = with_findings(result.calibration, result.snapshot)
     calibration, evidence = with_cross_check(calibration, result.snapshot)
     config, inputs = result.snapshot.config, result.inputs

@@ -13,7 +13,7 @@ import numpy as np
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimation import estimate_extrinsic
+from hand_eye_calib.engine.estimators import ESTIMATORS
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -80,7 +80,7 @@ class OtherAnswers:
             config,
             method=calibration.method,
             time_offset=calibration.time_offset_s,
-            scale=calibration.scale,
+            scale="none" if calibration.measured == "rotations" else calibration.scale,
             backend="fast",
         )
         no_prior: dict[str, Any] = {name: "" for name in vars(config) if name.startswith("prior_")}
@@ -111,7 +111,9 @@ class OtherAnswers:
         ]
 
     def other_methods(self) -> tuple[Answer, ...]:
-        """From other methods and references, without priors."""
+        """From other methods and references, without priors: of poses."""
+        if self._calibration.measured != "poses":
+            return ()
         questions = [
             question
             for method in _COMPARED_METHODS
@@ -179,7 +181,7 @@ class OtherAnswers:
         if len(poses) < _MIN_POSES:
             return None
         try:
-            calibration = estimate_extrinsic(poses, question.config)
+            calibration = ESTIMATORS[self._calibration.measured](poses, question.config)
         except HandEyeCalibError:
             return None
         stride = question.part.step or 1

@@ -60,7 +60,7 @@ class ResidualView:
 
 @dataclass(frozen=True)
 class Rotations:
-    """Rotations of the parent sensor over equal times.
+    """Rotations over equal times: of the parent sensor, or of the child if the parent has none.
 
     Attributes
     ----------
@@ -79,15 +79,14 @@ class Rotations:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Paths of the parent sensor in its world.
+    """Paths of the parent sensor in its world, or of the sensor that has positions alone in that
+    of its positions.
 
     Attributes
     ----------
     times_s : (N,) array
-    parent : (N, 3) array
-        Of its own poses, m.
-    child : (N, 3) array
-        Of the child's poses through the result, m.
+    parent, child : (N, 3) arrays
+        m. Of the sensor itself; and from the poses of the other one through the result.
     """
 
     times_s: FloatArray
@@ -160,6 +159,8 @@ class Evidence:
     cross_check : CrossCheck
         Of the result with ``comparison`` and ``halves``.
     streams : StreamView
+    has_positions_of_parent : bool
+        Whether the parent has positions alone.
     as_read : mapping
         "parent" and "child" to the Trajectory before synchronisation; may be empty.
     """
@@ -174,6 +175,7 @@ class Evidence:
     halves: tuple[Answer, ...]
     cross_check: CrossCheck
     streams: StreamView
+    has_positions_of_parent: bool
     as_read: Mapping[str, Trajectory]
 
 
@@ -203,12 +205,16 @@ def gather(
     answers = OtherAnswers(calibration, config, pose_pairs)
     scaled = child_scaled(pose_pairs, calibration.scale)
     comparison, halves = answers.other_methods(), answers.halves()
+    rotating = scaled
+    of_parent = config.parent_measures == "positions"
+    if of_parent:
+        rotating = PosePairs(scaled.stamps_ns, scaled.Ts_cw_c, scaled.Ts_pw_p)
     return Evidence(
         pose_pairs=scaled,
         residuals=_residuals(calibration, scaled),
-        tracks=_tracks(calibration, scaled),
-        rotations=_rotations(scaled),
-        excitation=excitation(scaled),
+        tracks=_tracks(calibration, scaled, of_parent),
+        rotations=_rotations(rotating),
+        excitation=excitation(rotating),
         convergence=answers.growing(),
         comparison=comparison,
         halves=halves,
@@ -218,6 +224,7 @@ def gather(
             [half.calibration for half in halves],
         ),
         streams=_streams(calibration, config, scaled, streams),
+        has_positions_of_parent=of_parent,
         as_read=streams or {},
     )
 
@@ -272,8 +279,10 @@ def _residuals(calibration: Calibration, pose_pairs: PosePairs) -> ResidualView:
     )
 
 
-def _tracks(calibration: Calibration, pose_pairs: PosePairs) -> Tracks:
+def _tracks(calibration: Calibration, pose_pairs: PosePairs, of_parent: bool) -> Tracks:
     """Both paths, the child's world aligned with the parent's by the mean over all poses."""
+    if calibration.measured == "positions":
+        return _tracks_of_positions(calibration, pose_pairs, of_parent)
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     rotations = pose_pairs.Ts_pw_p[:, :3, :3] @ np.swapaxes(Ts_cw_p[:, :3, :3], 1, 2)
     left, _, right = np.linalg.svd(rotations.mean(axis=0))
@@ -282,6 +291,25 @@ def _tracks(calibration: Calibration, pose_pairs: PosePairs) -> Tracks:
     child = Ts_cw_p[:, :3, 3] @ rotation.T
     child = child + np.median(parent - child, axis=0)
     return Tracks(_seconds(pose_pairs, pose_pairs.stamps_ns), parent - parent[0], child - parent[0])
+
+
+def _tracks_of_positions(
+    calibration: Calibration, pose_pairs: PosePairs, of_parent: bool
+) -> Tracks:
+    """The positions of the child or of the parent, and the path of that point from the poses of
+    the other sensor, aligned with them.
+    """
+    poses, measured = pose_pairs.Ts_pw_p @ calibration.T_parent_child, pose_pairs.Ts_cw_c
+    if of_parent:
+        poses, measured = pose_pairs.Ts_cw_c @ calibration.T_child_parent, pose_pairs.Ts_pw_p
+    path, positions = poses[:, :3, 3], measured[:, :3, 3]
+    middle = path.mean(axis=0)
+    left, _, right = np.linalg.svd((positions - positions.mean(axis=0)).T @ (path - middle))
+    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    path = (path - middle) @ rotation.T + positions.mean(axis=0)
+    both = (positions, path) if of_parent else (path, positions)
+    parent, child = (each - positions[0] for each in both)
+    return Tracks(_seconds(pose_pairs, pose_pairs.stamps_ns), parent, child)
 
 
 def _streams(
@@ -294,8 +322,11 @@ def _streams(
         child = streams["child"].shifted(calibration.time_offset_s).scaled(calibration.scale)
         return view_streams(streams["parent"], child, config.max_gap)
     parent, child = (
-        Trajectory(pose_pairs.stamps_ns, poses)
-        for poses in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
+        Trajectory(pose_pairs.stamps_ns, poses, measures=measures.replace("auto", "poses"))
+        for poses, measures in (
+            (pose_pairs.Ts_pw_p, config.parent_measures),
+            (pose_pairs.Ts_cw_c, config.child_measures),
+        )
     )
     return view_streams(parent, child, config.max_gap)
 

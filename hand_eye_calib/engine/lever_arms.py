@@ -17,6 +17,7 @@ from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, Solve
 from hand_eye_calib.checks.check import unit_of
 from hand_eye_calib.checks.findings import units, unrelated_parts
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 
@@ -49,7 +50,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         poses = _scaled(poses, 1.0 if is_child else config.scale)
     positions = measured[:, :3, 3]
     with_scale = config.scale in ("auto", "estimate")
-    solution = lever_arm.solve(pose_pairs.stamps_ns, poses, positions, with_scale)
+    solution = _solved(pose_pairs.stamps_ns, poses, positions, with_scale)
     sign = 1.0 if is_child else -1.0
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
     fused = fuse(T, assess_lever_arm(poses, solution), config.prior())
@@ -72,6 +73,18 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         motion_residuals=_residuals(solution, poses, positions, pose_pairs),
         findings=tuple(findings),
     )
+
+
+def _solved(
+    stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, with_scale: bool
+) -> LeverArmSolution:
+    try:
+        return lever_arm.solve(stamps_ns, poses, positions, with_scale)
+    except np.linalg.LinAlgError:
+        raise NotEnoughDataError(
+            "no lever arm explains the positions; check that both are on one rigid body, the "
+            "units, the scale, and the clocks (time_offset estimate)"
+        ) from None
 
 
 def _scaled(Ts: FloatArray, scale: float) -> FloatArray:
@@ -152,9 +165,12 @@ def _unrelated(
     share = lever_arm.unexplained_share(poses, positions, solution)
     if share < _UNRELATED:
         return []
-    scaled = lever_arm.solve(stamps_ns, poses, positions, with_scale=True)
-    scale = scaled.scale if is_child else 1.0 / scaled.scale
     found = unrelated_parts(share, "motion of the positions", "odometry", "the units, the scale")
+    try:
+        scaled = _solved(stamps_ns, poses, positions, with_scale=True)
+    except NotEnoughDataError:
+        return [found.to_dict()]
+    scale = scaled.scale if is_child else 1.0 / scaled.scale
     explains = lever_arm.unexplained_share(poses, positions, scaled) < _UNRELATED
     if explains and (in_unit := unit_of(scale)):
         factor, unit = in_unit

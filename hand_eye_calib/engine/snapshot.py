@@ -16,9 +16,8 @@ from hand_eye_calib.checks.check import CheckResult, check_parts, check_streams
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
-from hand_eye_calib.engine.lever_arms import estimate_lever_arm
+from hand_eye_calib.engine.estimators import ESTIMATORS
 from hand_eye_calib.engine.pose_buffer import RawPoses
-from hand_eye_calib.engine.rotations import estimate_rotation
 from hand_eye_calib.engine.scatter import quick_cross_check
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -27,10 +26,7 @@ from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
 STREAMS = ("parent", "child")
 
-# What estimates a part of the extrinsic, by what the streams measure.
-_OF_PARTS = {"rotations": estimate_rotation, "positions": estimate_lever_arm}
-
-# Options that have no meaning for them but with these values.
+# Options that have no meaning for streams that are no poses but with these values.
 _OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "backend": ("fast",)}
 
 # A time offset that is closer than this to the one that the poses were paired with stays (s).
@@ -152,7 +148,7 @@ class Snapshot:
         for name in ("method", "reference", "backend"):
             if getattr(self.config, name) not in _OF_PARTS_ALONE[name]:
                 self.config.require_poses(f"{name} {getattr(self.config, name)}")
-        estimate = _OF_PARTS[self.config.measured]
+        estimate = ESTIMATORS[self.config.measured]
         result = estimate(self._pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)
         if len(self.kept) or not _NEGLIGIBLE_S < abs(found_s - given_s) < _BELIEVABLE_S:

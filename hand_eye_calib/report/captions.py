@@ -1,6 +1,6 @@
 """What there is to see in each figure of the report, in words and numbers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -25,6 +25,9 @@ TITLES = {
     "streams": "Both streams before any solve",
 }
 
+# Figures that streams of other kinds do not have.
+_OF_POSES_ALONE = {"methods": ("poses",), "trajectories": ("poses", "positions")}
+
 # Two results disagree when they are this many standard deviations apart.
 _DISAGREE = 3.0
 
@@ -38,9 +41,21 @@ def time_axis(duration_s: float) -> tuple[float, str]:
     return (1.0, "s") if duration_s < 300 else (1 / 60, "min")
 
 
+def figures_of(calibration: Calibration) -> list[str]:
+    """Names of the figures in :data:`TITLES` that a result of its kind has."""
+    kind = calibration.measured
+    return [name for name in TITLES if kind in _OF_POSES_ALONE.get(name, (kind,))]
+
+
+def measured_axes(calibration: Calibration) -> BoolArray:
+    """Mask (6,) of the axes that streams of this kind can show."""
+    silent = {"rotations": "xyz", "positions": AXES[3:]}.get(calibration.measured, ())
+    return np.array([name not in silent for name in AXES])
+
+
 def captions(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
-    """A caption for each figure in :data:`TITLES`."""
-    return {name: _CAPTIONS[name](calibration, evidence) for name in TITLES}
+    """A caption for each figure of a result."""
+    return {name: _CAPTIONS[name](calibration, evidence) for name in figures_of(calibration)}
 
 
 def _of_trajectories(calibration: Calibration, evidence: Evidence) -> str:
@@ -49,45 +64,61 @@ def _of_trajectories(calibration: Calibration, evidence: Evidence) -> str:
     farthest = int(np.argmax(apart))
     path_m = float(np.linalg.norm(np.diff(tracks.parent, axis=0), axis=1).sum())
     factor, unit = time_axis(tracks.times_s[-1])
+    names, drifting = (calibration.parent_frame, calibration.child_frame), "both odometries"
+    if calibration.measured == "positions":
+        names = names if evidence.has_positions_of_parent else names[::-1]
+        drifting = "the odometry"
     return (
-        f"The path of {calibration.parent_frame}, {length(path_m)} long, and the same path "
-        f"computed from the poses of {calibration.child_frame} and the result. Half of the time "
+        f"The path of {names[0]}, {length(path_m)} long, and the same path "
+        f"computed from the poses of {names[1]} and the result. Half of the time "
         f"they are within {length(float(np.median(apart)))} of each other, and at most "
         f"{length(apart[farthest])} apart, at {tracks.times_s[farthest] * factor:.1f} {unit}. "
-        "That includes drift and jumps of both odometries."
+        f"That includes drift and jumps of {drifting}."
     )
 
 
 def _of_residuals(calibration: Calibration, evidence: Evidence) -> str:
     residuals = evidence.residuals
     n_out = int(residuals.is_outlier.sum())
+    what = f"motion pairs ({residuals.reference})"
+    if calibration.measured == "positions":
+        what = "distances from one position to the next"
+    sizes = residual_sizes(calibration, evidence)
     text = (
-        f"Half of the {len(residuals.times_s):,} motion pairs ({residuals.reference}) agree with "
-        f"the result to {_pair(residuals.translation_m, residuals.rotation_rad, np.median)}"
+        f"Half of the {len(residuals.times_s):,} {what} agree with the result to "
+        f"{_each(sizes, np.median)}"
     )
     if not n_out:
-        worst = _pair(residuals.translation_m, residuals.rotation_rad, np.max)
-        return f"{text}, all of them to {worst}. There are no outliers."
-    largest = int(np.argmax(np.where(residuals.is_outlier, residuals.translation_m, -1)))
+        return f"{text}, all of them to {_each(sizes, np.max)}. There are no outliers."
+    axis, values = next(iter(sizes.items()))
+    largest = int(np.argmax(np.where(residuals.is_outlier, values, -1)))
     factor, unit = time_axis(evidence.tracks.times_s[-1])
     return (
         f"{text}; {n_out:,} ({share(n_out / len(residuals.times_s))}) were rejected as outliers, "
-        f"the largest {size(residuals.translation_m[largest], 'x')} at "
+        f"the largest {size(values[largest], axis)} at "
         f"{residuals.times_s[largest] * factor:.1f} {unit}."
     )
 
 
-def _pair(
-    lengths_m: FloatArray, angles_rad: FloatArray, of: Callable[[FloatArray], FloatArray]
-) -> str:
-    return f"{size(float(of(lengths_m)), 'x')} and {size(float(of(angles_rad)), 'yaw')}"
+def residual_sizes(calibration: Calibration, evidence: Evidence) -> dict[str, FloatArray]:
+    """Lengths of the residuals that streams of this kind have: of translations under "x", of
+    rotations under "yaw".
+    """
+    residuals = evidence.residuals
+    both = {"x": residuals.translation_m, "yaw": residuals.rotation_rad}
+    seen = measured_axes(calibration)
+    return {axis: values for axis, values in both.items() if seen[AXES.index(axis)]}
+
+
+def _each(sizes: Mapping[str, FloatArray], of: Callable[[FloatArray], FloatArray]) -> str:
+    return listing([size(float(of(values)), axis) for axis, values in sizes.items()])
 
 
 def _of_convergence(calibration: Calibration, evidence: Evidence) -> str:
     estimates = evidence.convergence
     if len(estimates) < 3:
         return "The recording is too short to be divided into parts."
-    known = np.isfinite(calibration.sigmas)
+    known = np.isfinite(calibration.sigmas) & measured_axes(calibration)
     if not known.any():
         return "No axis is observable, however much of the recording is used."
     last = _last_change(calibration, estimates, known)
@@ -131,9 +162,14 @@ def _of_excitation(calibration: Calibration, evidence: Evidence) -> str:
     over = np.degrees(np.percentile(np.abs(rotations.vectors), 95, axis=0))
     angles = [f"{angle:.1f}° in {name}" for angle, name in zip(over, AXES[3:], strict=True)]
     least = "xyz"[int(np.argmax(np.abs(seen.worst)))]
-    return (
+    text = (
         f"Rotation within {rotations.span_s:.1f} s: up to {listing(angles)} (95 % of the time "
-        f"less). The lever arm along {least} is observed least: an error of 1 cm in it moves a "
+        "less)."
+    )
+    if calibration.measured == "rotations":
+        return f"{text} Only rotations about two axes and more show the whole orientation."
+    return (
+        f"{text} The lever arm along {least} is observed least: an error of 1 cm in it moves a "
         f"motion by "
         f"{seen.worst_gain:.2g} cm, an error of 1 cm along the best observed axis by "
         f"{seen.gain.max():.2g} cm. Rotations inside the grey band say little about a lever arm."
@@ -177,12 +213,12 @@ def _of_halves(calibration: Calibration, evidence: Evidence) -> str:
     if len(evidence.halves) < 2:
         return "The recording is too short to be divided into halves."
     first, second = (half.calibration for half in evidence.halves)
-    known = np.isfinite(first.sigmas) & np.isfinite(second.sigmas)
+    known = np.isfinite(first.sigmas) & np.isfinite(second.sigmas) & measured_axes(calibration)
     if not known.any():
         return "No axis is observable in both halves."
     apart = deviation(first.T_parent_child, second.T_parent_child)
     joint = np.hypot(first.sigmas, second.sigmas)
-    hidden = ~known & np.isfinite(calibration.sigmas)
+    hidden = ~known & np.isfinite(calibration.sigmas) & measured_axes(calibration)
     less = [name for name, is_hidden in zip(AXES, hidden, strict=True) if is_hidden]
     missing = f" Half of the recording does not determine {listing(less)}." if less else ""
     return (

@@ -31,7 +31,7 @@ from hand_eye_calib.report.words import (
     size,
     with_sigma,
 )
-from hand_eye_calib.status import amount
+from hand_eye_calib.status import ROTATIONS, TRANSLATIONS, amount
 from hand_eye_calib.verdict import shown, target_of
 
 Plain = Mapping[str, Any]
@@ -77,11 +77,13 @@ def render(
     str
     """
     inputs = inputs or {}
+    parent, child = printable(calibration.parent_frame), printable(calibration.child_frame)
     return (
         environment()
         .get_template("report.html")
         .render(
             **_result(calibration),
+            rotating=child if evidence.has_positions_of_parent else parent,
             advice=_advice(calibration, evidence),
             command=command,
             figures=_figures(calibration, evidence),
@@ -113,7 +115,10 @@ def _result(calibration: Calibration) -> dict[str, Any]:
         "child": printable(calibration.child_frame),
         "document": document,
         **verdict_of(calibration),
-        "directions": [_direction(document[key]) for key in ("T_parent_child", "T_child_parent")],
+        "kind": _kind(calibration),
+        "directions": [
+            _direction(document[key], calibration) for key in ("T_parent_child", "T_child_parent")
+        ],
         "axes": _axes(calibration),
         "differences": _differences(calibration),
     }
@@ -123,8 +128,8 @@ def _figures(calibration: Calibration, evidence: Evidence) -> list[dict[str, Any
     svgs = draw_all(calibration, evidence)
     texts = captions(calibration, evidence)
     return [
-        {"name": name, "title": title, "said": texts[name], "svg": svgs.get(name)}
-        for name, title in TITLES.items()
+        {"name": name, "title": TITLES[name], "said": said, "svg": svgs.get(name)}
+        for name, said in texts.items()
     ]
 
 
@@ -179,8 +184,15 @@ def _by_hand(calibration: Calibration) -> str:
     return listing(words)
 
 
-def _direction(transform: Plain) -> dict[str, Any]:
+def _kind(calibration: Calibration) -> str:
+    """What the result is, in a word."""
+    unknown = {*calibration.out_of_reach}
+    return "Position" if unknown & {*ROTATIONS} else "Orientation" if unknown else "Pose"
+
+
+def _direction(transform: Plain, calibration: Calibration) -> dict[str, Any]:
     """A transform as rows: each printed number with its standard deviation."""
+    unknown = {*calibration.out_of_reach}
     rows = [
         {"name": name, "value": with_sigma(value, sigma, 3), "unit": " m"}
         for name, value, sigma in zip(
@@ -191,14 +203,19 @@ def _direction(transform: Plain) -> dict[str, Any]:
     kind = "rotation_vector" if is_locked else "rpy"
     names = ("rx", "ry", "rz") if is_locked else ("roll", "pitch", "yaw")
     angles = zip(names, transform[f"{kind}_deg"], transform[f"sigma_{kind}_deg"], strict=True)
-    rows += [
+    turned = [
         {"name": name, "value": with_sigma(value, sigma, 2), "unit": "°"}
         for name, value, sigma in angles
     ]
+    none = {"value": "not shown by these streams", "unit": ""}
+    if unknown & {*TRANSLATIONS}:
+        rows = [none | {"name": "x, y, z"}]
+    if unknown & {*ROTATIONS}:
+        turned = [none | {"name": "roll, pitch, yaw"}]
     return {
         "maps": printable(transform["maps"]),
-        "rows": [row | {"value": row["value"].replace("+/-", "±")} for row in rows],
-        "quat_xyzw": transform["quat_xyzw"],
+        "rows": [row | {"value": row["value"].replace("+/-", "±")} for row in rows + turned],
+        "quat_xyzw": [] if unknown & {*ROTATIONS} else transform["quat_xyzw"],
         "is_locked": is_locked,
     }
 
@@ -208,6 +225,8 @@ def _axes(calibration: Calibration) -> list[dict[str, Any]]:
     rows = []
     for dof in calibration.observability:
         limit = target_of(dof.name, calibration)
+        if dof.name in calibration.out_of_reach:
+            continue
         rows.append(
             {
                 "name": dof.name,
@@ -272,10 +291,15 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
     }
     if noise := calibration.noise:
         rows["Noise"] = _noise(noise)
+    if bias := calibration.rate_bias:
+        rows["Bias of the rates"] = _bias(bias)
     return rows
 
 
 def _noise(noise: Plain) -> str:
+    if "systematic" not in noise:
+        return "; ".join(noise["in_words"])
+
     def levels(kind: str, suffix: str) -> str:
         translation = size(noise[f"translation_{kind}_m{suffix}"], "x")
         return f"{translation} and {size(noise[f'rotation_{kind}_rad{suffix}'], 'yaw')}"
@@ -285,6 +309,15 @@ def _noise(noise: Plain) -> str:
         f"{levels('white', '')} per pose and axis; growing by {levels('drift', '_per_pose')} from "
         f"pose to pose; systematic error: {noise['systematic']}; {jumps}"
     )
+
+
+def _bias(bias: Plain) -> str:
+    values = zip("xyz", bias["rad_per_s"], bias["sigma"], strict=True)
+    told = [
+        f"{axis} {with_sigma(math.degrees(value), math.degrees(sigma), 3).replace('+/-', '±')}"
+        for axis, value, sigma in values
+    ]
+    return f"{', '.join(told)} °/s ({bias['of']})"
 
 
 def _stream(name: str, inputs: Plain, streams: Mapping[str, Trajectory]) -> dict[str, str]:

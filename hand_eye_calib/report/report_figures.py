@@ -20,7 +20,12 @@ from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.errors import printable
-from hand_eye_calib.report.captions import time_axis
+from hand_eye_calib.report.captions import (
+    figures_of,
+    measured_axes,
+    residual_sizes,
+    time_axis,
+)
 from hand_eye_calib.report.style import drawing_style, house_style, plain_decades
 
 # Colours as drawn, each with the name of the page's own colour that replaces it.
@@ -83,8 +88,11 @@ def draw_all(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "methods": _methods,
         "halves": _halves,
     }
+    wanted = figures_of(calibration)
     with page_style():
-        drawn = {name: make(calibration, evidence) for name, make in makers.items()}
+        drawn = {
+            name: make(calibration, evidence) for name, make in makers.items() if name in wanted
+        }
         names = (calibration.parent_frame, calibration.child_frame)
         drawn["streams"] = _streams(evidence.streams, names)
         return {name: as_svg(figure, name) for name, figure in drawn.items() if figure}
@@ -168,9 +176,12 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Figure | None
     factor, unit = time_axis(tracks.times_s[-1])
     first, second, across = _plane_of_motion(tracks.parent)
     figure, (plane, side) = _figure(4.1, 1, 2, left=0.7, bottom=0.85, gap=0.7)
+    names = [calibration.parent_frame, calibration.child_frame]
+    is_reversed = calibration.measured == "positions" and not evidence.has_positions_of_parent
+    names[0 if is_reversed else 1] += ", through the result"
     for points, colour, width, label in (
-        (tracks.parent, PARENT, 3.2, calibration.parent_frame),
-        (tracks.child, CHILD, 1.1, f"{calibration.child_frame}, through the result"),
+        (tracks.parent, PARENT, 3.2, names[0]),
+        (tracks.child, CHILD, 1.1, names[1]),
     ):
         look: dict[str, Any] = {"color": colour, "ls": "-", "lw": width}
         plane.plot(points[shown, first], points[shown, second], label=_plain(label), **look)
@@ -204,28 +215,34 @@ def _plane_of_motion(points: FloatArray) -> tuple[int, int, int]:
 
 
 def _residuals(calibration: Calibration, evidence: Evidence) -> Figure | None:
-    residuals = evidence.residuals
+    residuals, sizes = evidence.residuals, residual_sizes(calibration, evidence)
     factor, unit = time_axis(evidence.tracks.times_s[-1])
-    figure, panels = _figure(4.2, 2, 1, left=0.7, bottom=0.8, between=0.15, top=0.1, sharex=True)
+    figure, panels = _figure(
+        4.2 if len(sizes) == 2 else 2.6, len(sizes), 1,
+        left=0.7, bottom=0.8, between=0.15, top=0.1, sharex=True, squeeze=False,
+    )  # fmt: skip
+    panels = panels[:, 0]
     dots = _sample(np.flatnonzero(~residuals.is_outlier), _MOST_DOTS)
     crosses = np.flatnonzero(residuals.is_outlier)
-    crosses = crosses[np.argsort(-residuals.translation_m[crosses])[:_MOST_OUTLIERS]]
-    kinds = (
-        (panels[0], residuals.translation_m * _TO_CM, "translation (cm)", _SMALLEST_CM),
-        (panels[1], residuals.rotation_rad * _TO_DEG, "rotation (deg)", _SMALLEST_DEG),
-    )
+    largest = next(iter(sizes.values()))
+    crosses = crosses[np.argsort(-largest[crosses])[:_MOST_OUTLIERS]]
+    looks = {
+        "x": (_TO_CM, "translation (cm)", _SMALLEST_CM),
+        "yaw": (_TO_DEG, "rotation (deg)", _SMALLEST_DEG),
+    }
     times = residuals.times_s * factor
     used = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
     rejected = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
-    for panel, values, name, smallest in kinds:
-        values = np.maximum(values, smallest)
+    for panel, (axis, values) in zip(panels, sizes.items(), strict=True):
+        to_unit, name, smallest = looks[axis]
+        values = np.maximum(values * to_unit, smallest)
         panel.plot(times[dots], values[dots], "o", **used)
         panel.plot(times[crosses], values[crosses], "x", **rejected)
         panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
         panel.set_ylabel(name)
         panel.yaxis.set_label_coords(-0.06, 0.5)
         _magnitude_axis(panel, values)
-    panels[1].set_xlabel(f"time ({unit})")
+    panels[-1].set_xlabel(f"time ({unit})")
     figure.legend(
         *panels[0].get_legend_handles_labels(), loc="lower center", ncols=3, borderaxespad=0
     )
@@ -239,16 +256,20 @@ def _convergence(calibration: Calibration, evidence: Evidence) -> Figure | None:
     factor, unit = time_axis(estimates[-1].until_s)
     times = np.array([estimate.until_s for estimate in estimates]) * factor
     moved, sigmas = _relative_to(calibration, [one.calibration for one in estimates])
-    figure, panels = _figure(4.4, 2, 3, left=0.7, bottom=0.5, gap=0.15, between=0.4, sharex=True)
-    for index, panel in enumerate(panels.flat):
+    axes = np.flatnonzero(measured_axes(calibration))
+    figure, panels = _figure(
+        4.4 if len(axes) == 6 else 2.6, len(axes) // 3, 3,
+        left=0.7, bottom=0.5, gap=0.15, between=0.4, sharex=True, squeeze=False,
+    )  # fmt: skip
+    for index, panel in zip(axes.tolist(), panels.flat, strict=True):
         limit = _limit(moved, sigmas, calibration.sigmas * _FACTORS, index)
         _draw_convergence(panel, times, moved[:, index], sigmas[:, index], limit)
         panel.set(ylim=(-limit, limit), title=AXES[index], xlim=(0, times[-1] * 1.04))
         if index % 3:
             panel.set_yticklabels([])
-    for row, name in zip(panels, ("cm", "deg"), strict=True):
-        row[0].set_ylabel(f"{name} from the result")
-    for panel in panels[1]:
+    for row, first in zip(panels, axes[::3].tolist(), strict=True):
+        row[0].set_ylabel(f"{'cm' if first < 3 else 'deg'} from the result")
+    for panel in panels[-1]:
         panel.set_xlabel(f"recording used ({unit})")
         panel.locator_params(axis="x", nbins=5, prune="upper")
     return figure
@@ -312,16 +333,17 @@ def _answers(calibration: Calibration, rows: Sequence[tuple[str, Calibration]]) 
     """A dot with an error bar for each answer (down) and axis (across), relative to the result."""
     labels = [_plain(label) for label, _ in rows]
     moved, sigmas = _relative_to(calibration, [answer for _, answer in rows])
+    axes = np.flatnonzero(measured_axes(calibration))
     figure, panels = _figure(
         0.85 + 0.235 * len(rows),
         1,
-        6,
+        len(axes),
         left=0.25 + 0.068 * max(map(len, labels)),
         bottom=0.5,
         gap=0.1,
         sharey=True,
     )
-    for index, panel in enumerate(panels):
+    for index, panel in zip(axes.tolist(), panels, strict=True):
         limit = _limit(moved, sigmas, sigmas[0], index)
         _draw_answers(panel, moved[:, index], sigmas[:, index], limit)
         panel.set(xlim=(-limit, limit), ylim=(len(rows) - 0.5, -0.5), title=AXES[index])

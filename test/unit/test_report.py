@@ -197,6 +197,57 @@ def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
     assert "z: unknown, unobservable" in {a.get("aria-label") for a in page.all("div")}
 
 
+@pytest.fixture(scope="module")
+def partial():
+    """Snapshots, results and pages of streams that are no poses, by what they measure."""
+    drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=60), NOISE)
+    made = {}
+    for name, of in {"positions": "parent", "rates": "child"}.items():
+        streams = {"parent": drive.parent, "child": drive.child}
+        streams[of] = dataclasses.replace(streams[of], measures=name)
+        options = {"parent_frame": "lidar", "child_frame": "antenna"}
+        config = offline_config(streams["parent"], streams["child"], options)
+        snapshot = whole_snapshot(config, **streams)
+        calibration = snapshot.estimate()
+        made[name] = (calibration, *page_of(snapshot, calibration, streams=streams))
+    return made
+
+
+@pytest.mark.parametrize("name", ["positions", "rates"])
+def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, name):
+    calibration, text, page = partial[name]
+    assert page.errors == []
+    assert len(page.ids) == len(set(page.ids))
+    shown = [figure for figure in FIGURES if figure != "methods"]
+    shown.remove("trajectories") if name == "rates" else None
+    assert [attributes["id"] for attributes in page.all("figure")] == [
+        f"figure-{figure}" for figure in shown
+    ]
+    assert len(page.all("svg")) == len(shown)
+    word, unknown = ("Orientation", "x, y, z") if name == "rates" else ("Position", "roll")
+    assert f"{word} of antenna in lidar" in page.text
+    assert f"{word} of lidar in antenna" in page.text
+    assert f"{unknown}" in page.text[page.text.index("not shown by") - 20 :]
+    bars = [a for a in page.all("div") if a.get("class") == "bar"]
+    assert len(bars) == 3
+    assert "MEASURE_" in page.text
+    assert "nan" not in page.text.lower().replace("provenance", "")
+
+
+def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(partial):
+    calibration, _, page = partial["positions"]
+    assert "Along the axes of antenna: positions have none of their own." in page.text
+    lever_arm = calibration.to_dict()["T_child_parent"]
+    for value, sigma in zip(lever_arm["translation"], lever_arm["sigma_translation"], strict=True):
+        assert sigma < 1.0
+        assert with_sigma(value, sigma, 3).replace("+/-", "±") in page.text
+    assert "The path of lidar" in page.text
+    assert "computed from the poses of antenna and the result" in page.text
+    found = re.search(r"within ([\d.]+) (c?m) of each other", page.text)
+    assert float(found[1]) * {"cm": 0.01, "m": 1.0}[found[2]] < 0.5
+    assert "°/s (child)" in partial["rates"][2].text
+
+
 def test_hostile_names_stay_text():
     hostile = ('<script>alert("x")</script>', "_a$b$ & 'c' id=\"y\" --> ünï 雷")
     snapshot, calibration = simulated(poses=60, frames=hostile)

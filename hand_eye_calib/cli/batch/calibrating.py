@@ -64,9 +64,7 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
         replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
     snapshot = replayed.calibrator.snapshot()
     calibration, snapshot = checked(replayed.calibration, snapshot, task.options)
-    evidence = None
-    if calibration.measured == "poses":
-        calibration, evidence = with_cross_check(calibration, snapshot)
+    calibration, evidence = with_cross_check(calibration, snapshot)
     inputs = replayed.inputs | {"options": snapshot.config.to_options()}
     found: Outcome = {
         "calibration": calibration.to_dict(),
@@ -75,7 +73,7 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
     }
     if calibration.status.failure:
         found["error"] = calibration.status.failure
-    if task.with_report and evidence is not None:
+    if task.with_report:
         found["page"] = rendered(calibration, evidence, snapshot.config, inputs)
     return found
 
