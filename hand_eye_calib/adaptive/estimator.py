@@ -626,8 +626,7 @@ def _n_misjudged(parts: FloatArray, columns: list[int], fit: NormalEquations) ->
     n_parameters = len(columns) - 6
     if n_parameters == 0 or len(parts) < _BLOCKS:
         return n_parameters
-    rows = [*columns, parts.shape[1] - 1]
-    answers = answers_without(parts[np.ix_(range(len(parts)), rows, rows)], _BLOCKS)[:, 6:]
+    answers = answers_without(selected(parts, columns), _BLOCKS)[:, 6:]
     spread = np.atleast_2d(np.cov(answers.T, bias=True)) * (_BLOCKS - 1)
     ratios = np.linalg.eigvals(np.linalg.pinv(fit.covariance[6:, 6:], hermitian=True) @ spread)
     return float(np.maximum(ratios.real / _HARDLY_BY_CHANCE, 1.0).sum())
@@ -707,8 +706,7 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
     if state.with_delays:
         posterior = posterior.with_columns(state.space(with_delays=True).columns)
     all_parts = part_products(posterior)
-    own = [*range(6 + n_columns), all_parts.shape[1] - 1]
-    parts = all_parts[:, own][:, :, own]
+    parts = selected(all_parts, list(range(6 + n_columns)))
     state = state.moved(normal.step)
     solution = AdaptiveSolution(
         T_parent_child=state.T,

@@ -131,7 +131,6 @@ def part_delay(
         return PartDelay(0.0, np.inf, sensitivity)
     variance = max(misfit, 1.0) * float(normal.covariance[-1, -1])
     if len(parts) >= _BLOCKS:
-        chosen = np.array([selected(part, columns) for part in parts])
-        spread = answers_without(chosen, _BLOCKS)[:, -1].var()
+        spread = answers_without(selected(parts, columns), _BLOCKS)[:, -1].var()
         variance = max(variance, (_BLOCKS - 1) * float(spread))
     return PartDelay(float(normal.step[-1]), float(np.sqrt(variance)), sensitivity)

@@ -75,4 +75,4 @@ def answers_without(products: FloatArray, n_blocks: int) -> FloatArray:
     block_of_part = np.arange(len(products)) * n_blocks // len(products)
     total = products.sum(axis=0)
     blocks = [products[block_of_part == block].sum(axis=0) for block in range(n_blocks)]
-    return np.array([NormalEquations(total - block).step for block in blocks])
+    return NormalEquations(total - np.array(blocks)).step

@@ -387,45 +387,60 @@ _RANK_TOLERANCE, _LEAST_INFORMATION = 1e-12, float(np.finfo(float).tiny)
 
 
 class NormalEquations:
-    """Generalised least squares from products (p + 1, p + 1) of derivatives and, last, residuals.
+    """Generalised least squares from products (..., p + 1, p + 1) of derivatives and, last,
+    residuals: of one system, or of several at once.
 
     Attributes
     ----------
-    step : (p,) array
+    step : (..., p) array
         Change of the parameters; zero along directions without any evidence.
-    covariance : (p, p) array
+    covariance : (..., p, p) array
         Zero along these directions, too.
-    unseen : (p, U) array
-        Those directions, of unit length.
-    cost : float
+    is_complete : (...) bool array
+        Whether there are none.
+    cost : (...) array
         Weighted squared residual after the step.
-    log_determinant : float
+    log_determinant : (...) array
         Of the information.
-    mixing : (p + 1, 1 + q) array
-        Residuals after the step, then the columns of a root of the covariance.
     """
 
     def __init__(self, products: FloatArray) -> None:
-        information, gradient = products[:-1, :-1], products[:-1, -1]
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), _LEAST_INFORMATION))
-        values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
-        seen = values > _RANK_TOLERANCE
-        axes = scale[:, None] * vectors
-        root = axes[:, seen] / np.sqrt(values[seen])
-        self.covariance = root @ root.T
-        self.unseen = axes[:, ~seen] / np.linalg.norm(axes[:, ~seen], axis=0)
-        self.step = -self.covariance @ gradient
-        self.cost = float(products[-1, -1] + gradient @ self.step)
-        self.log_determinant = float(np.log(values[seen]).sum() - 2.0 * np.log(scale).sum())
-        self.mixing = np.zeros((len(products), 1 + root.shape[1]))
-        self.mixing[:-1, 0], self.mixing[-1, 0] = self.step, 1.0
-        self.mixing[:-1, 1:] = root
+        information, gradient = products[..., :-1, :-1], products[..., :-1, -1]
+        diagonal = np.einsum("...ii->...i", information)
+        scale = 1.0 / np.sqrt(np.maximum(diagonal, _LEAST_INFORMATION))
+        values, vectors = np.linalg.eigh(scale[..., :, None] * information * scale[..., None, :])
+        self._seen = values > _RANK_TOLERANCE
+        values = np.where(self._seen, values, 1.0)
+        self._axes = scale[..., :, None] * vectors
+        self._root = self._axes * (self._seen / np.sqrt(values))[..., None, :]
+        self.covariance = self._root @ transposed(self._root)
+        self.is_complete = self._seen.all(axis=-1)
+        self.step = -(self.covariance @ gradient[..., None])[..., 0]
+        self.cost = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
+        self.log_determinant = np.log(values).sum(axis=-1) - 2.0 * np.log(scale).sum(axis=-1)
+
+    @property
+    def unseen(self) -> FloatArray:
+        """(p, U) array: the directions without evidence of one system, of unit length."""
+        axes = self._axes[:, ~self._seen]
+        return np.asarray(axes / np.linalg.norm(axes, axis=0))
+
+    @property
+    def mixing(self) -> FloatArray:
+        """(p + 1, 1 + p) array of one system: residuals after the step, then the columns of a root
+        of the covariance.
+        """
+        size = len(self.step)
+        mixing = np.zeros((size + 1, size + 1))
+        mixing[:-1, 0], mixing[-1, 0] = self.step, 1.0
+        mixing[:-1, 1:] = self._root
+        return mixing
 
 
 def selected(products: FloatArray, columns: list[int]) -> FloatArray:
-    """The products of some parameters."""
-    rows = [*columns, len(products) - 1]
-    return products[np.ix_(rows, rows)]
+    """The products (..., p + 1, p + 1) of some parameters."""
+    rows = [*columns, products.shape[-1] - 1]
+    return products[..., rows, :][..., rows]
 
 
 def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:

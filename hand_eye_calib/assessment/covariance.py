@@ -412,13 +412,11 @@ def widened_by_halves(
         Of xi.
     """
     half = len(products) // 2
-    first, second = (
-        NormalEquations(part.sum(axis=0)) for part in (products[:half], products[half:])
-    )
-    if first.unseen.size or second.unseen.size:
+    halves = NormalEquations(np.array([products[:half].sum(axis=0), products[half:].sum(axis=0)]))
+    if not halves.is_complete.all():
         return model
-    difference = (first.step - second.step)[part]
-    joint = misfit * (first.covariance + second.covariance)[part, part]
+    difference = (halves.step[0] - halves.step[1])[part]
+    joint = misfit * halves.covariance.sum(axis=0)[part, part]
     away = np.linalg.solve(joint, difference)
     excess = float(difference @ away) / _HALVES_BY_CHANCE[len(model)]
     if excess <= 1.0:

@@ -351,15 +351,17 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     misfit : float
         Factor of the covariances.
     """
-    cuts = range(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
-    found = {
-        cut: shift
-        for cut in cuts
-        if (shift := _shift_at(products, cut, max(misfit, 1.0))) is not None
-    }
-    if not found:
+    cuts = np.arange(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
+    before = NormalEquations(np.cumsum(products, axis=0)[cuts - 1])
+    after = NormalEquations(np.cumsum(products[::-1], axis=0)[::-1][cuts])
+    known = before.is_complete & after.is_complete
+    if not known.any():
         return None
-    ratios, shifts = (np.array(values) for values in zip(*found.values(), strict=True))
+    joint = (before.covariance + after.covariance)[known, :6, :6]
+    H = np.linalg.inv(max(misfit, 1.0) * joint)
+    S = (H @ (after.step - before.step)[known, :6, None])[:, :, 0]
+    ratios = log_ratio(H, S, 1.0)
+    shifts = np.linalg.solve(H + np.linalg.inv(shift_covariance()), S[:, :, None])[:, :, 0]
     weights = np.exp(ratios - ratios.max())
     log_odds = ratios.max() + np.log(weights.mean() * _MOVES / (1.0 - _MOVES))
     probability = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -_CERTAIN, _CERTAIN))))
@@ -369,23 +371,10 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     best = int(np.argmax(ratios))
     return PossibleShift(
         probability=probability,
-        share=list(found)[best] / len(products),
+        share=int(cuts[known][best]) / len(products),
         xi=shifts[best],
         spread=probability * squared / 4.0,
     )
-
-
-def _shift_at(products: FloatArray, cut: int, misfit: float) -> tuple[float, FloatArray] | None:
-    """Log likelihood ratio of a shift after so many parts, and the shift (6,) that is expected if
-    there is one; None if either side says nothing of some direction.
-    """
-    first, second = (NormalEquations(side.sum(axis=0)) for side in (products[:cut], products[cut:]))
-    if first.unseen.size or second.unseen.size:
-        return None
-    H = np.linalg.inv(misfit * (first.covariance + second.covariance)[:6, :6])
-    S = H @ (second.step - first.step)[:6]
-    expected = np.linalg.solve(H + np.linalg.inv(shift_covariance()), S)
-    return float(log_ratio(H, S, 1.0)), expected
 
 
 def _best_split(found: Information, n_windows: int) -> tuple[int, float]:
