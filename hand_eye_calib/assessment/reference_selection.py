@@ -18,6 +18,7 @@ from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.solvers.solution import Solution
 
 CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 
@@ -50,6 +51,8 @@ class ReferenceChoice:
         The adaptive estimator's answer and its covariance, if it knows all axes.
     shift : PossibleShift or None
         Of the mount within the recording, by that estimator.
+    solution : Solution or None
+        The method's answer with the reference, if it was compared with others.
     """
 
     reference: str
@@ -58,6 +61,7 @@ class ReferenceChoice:
     alike: tuple[str, ...] = ()
     answer: tuple[FloatArray, FloatArray] | None = None
     shift: PossibleShift | None = None
+    solution: Solution | None = None
 
     def joint_errors(self) -> dict[str, float]:
         """Candidate to its predicted error in translation and rotation together: the root mean
@@ -154,8 +158,7 @@ def select_reference(
     joint = choice.joint_errors()
     limit = _NEARLY_AS_GOOD * min(joint.values())
     alike = tuple(reference for reference, expected in joint.items() if expected <= limit)
-    nearest = _nearest(pose_pairs, method, dataclasses.replace(choice, alike=alike), solution)
-    found = dataclasses.replace(choice, reference=nearest, alike=alike)
+    found = _nearest(pose_pairs, method, dataclasses.replace(choice, alike=alike), solution)
     if not solution.converged or solution.unseen.size:
         return found
     answer = solution.T_parent_child, solution.cov_parent_child_in_child
@@ -173,18 +176,22 @@ def _rms(covariances: Mapping[str, FloatArray], part: slice) -> dict[str, float]
 
 def _nearest(
     pose_pairs: PosePairs, method: Method, choice: ReferenceChoice, solution: AdaptiveSolution
-) -> str:
-    """The one of the alike references with which the method's answer is nearest to a solution; of
-    those that are about as near, the one with the smallest predicted error.
+) -> ReferenceChoice:
+    """With the one of the alike references with which the method's answer is nearest to a solution;
+    of those that are about as near, the one with the smallest predicted error.
     """
     if len(choice.alike) == 1:
-        return choice.alike[0]
+        return dataclasses.replace(choice, reference=choice.alike[0])
     fast = dataclasses.replace(method, backend="fast")
-
-    def distance(reference: str) -> float:
-        pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-        return choice.distance(fast.solve(pairs).T_parent_child, solution.T_parent_child)
-
-    distances = {reference: distance(reference) for reference in choice.alike}
+    answers = {
+        reference: fast.solve(motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference))
+        for reference in choice.alike
+    }
+    distances = {
+        reference: choice.distance(answer.T_parent_child, solution.T_parent_child)
+        for reference, answer in answers.items()
+    }
     limit, joint = _NEARLY_AS_NEAR * min(distances.values()), choice.joint_errors()
-    return min((name for name in distances if distances[name] <= limit), key=joint.__getitem__)
+    nearest = min((name for name in distances if distances[name] <= limit), key=joint.__getitem__)
+    answer = answers[nearest] if method == fast else None
+    return dataclasses.replace(choice, reference=nearest, solution=answer)

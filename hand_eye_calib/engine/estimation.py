@@ -279,7 +279,9 @@ def _solve_pairs(
     if config.reference != "auto":
         return _solve_reference(pose_pairs, method, config.reference)
     choice = select_reference(pose_pairs, method, solution=noise_model)
-    chosen = _solve_reference(pose_pairs, method, choice.reference, choice.reason())
+    chosen = _solve_reference(
+        pose_pairs, method, choice.reference, choice.reason(), choice.solution
+    )
     for reference in _LONGER_REFERENCES:
         # The prediction assumes noise without spikes and favours short baselines if there are any.
         # Longer ones may still lift the motion out of the noise.
@@ -299,10 +301,15 @@ def _solve_pairs(
 
 
 def _solve_reference(
-    pose_pairs: PosePairs, method: Method, reference: str, reason: str = ""
+    pose_pairs: PosePairs,
+    method: Method,
+    reference: str,
+    reason: str = "",
+    found: Solution | None = None,
 ) -> _Evaluation:
+    """A method's answer for one reference, which may be known already, assessed."""
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-    solution = method.prove(pairs, method.solve(pairs))
+    solution = method.prove(pairs, found or method.solve(pairs))
     assessment = assess(
         pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)
     )
