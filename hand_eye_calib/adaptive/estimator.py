@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from hand_eye_calib.adaptive.increments import (
     SYSTEMATIC,
     TIME,
     Course,
+    Linearisation,
     Streams,
     course_of,
     linearise,
@@ -130,9 +132,6 @@ _BLOCKS, _CHANCE = 10, 1.63
 # exceeds: of six, once in ten times; of three, once in a hundred.
 _HARDLY_BY_CHANCE = 3.3
 
-# Columns of errors that are looked for beside the model: delays of positions, a moving world.
-_MORE_COLUMNS = range(N_SYSTEMATIC, N_SYSTEMATIC + 2 + N_COLUMNS)
-
 # X is followed until it moves by less than this share of its sigma, at least one round.
 _MAX_ROUNDS = 6
 _SETTLED_SIGMAS, _SETTLED_STEP = 0.1, 1e-9
@@ -195,7 +194,8 @@ def solve(
         )
         return _at_all_poses(fewer, kept, plain.outliers.spikes)
     found = plain if quick else _with_lasting_errors(_with_shape_of_white(plain))
-    solution = _polished(_with_systematic_errors(found, systematic))
+    found, plain = _with_systematic_errors(found, systematic), dataclasses.replace(plain)
+    solution = _polished(found)
     if not solution.converged:
         solution = _polished(_with_systematic_errors(plain, systematic[:1]))
     return solution
@@ -280,41 +280,49 @@ class _State:
     is_clock_free: bool = False
     with_delays: bool = False
 
-    def space(
-        self,
-        kept: IntArray | None = None,
-        model: NoiseModel | None = None,
-        with_delays: bool = False,
-    ) -> StateSpace:
-        """State space of all or some of the poses; with the columns of a clock offset, of delays of
-        positions, and of a world that moves if asked for.
-        """
+    def space(self, kept: IntArray | None = None, model: NoiseModel | None = None) -> StateSpace:
+        """State space of all or some of the poses."""
         poses, course, error, weights = self.poses, self.course, self.error, self.weights
-        outliers, columns = self.outliers, self.columns
+        outliers = self.outliers
         if kept is not None:
             poses, course, error, weights = poses[kept], course[kept], error[kept], weights[kept]
             outliers = outliers.across(kept, LONGEST_GAP)
-        asked = [*columns, TIME] if with_delays else columns
-        linearisation = linearise(poses, course, self.T, self.parameters, asked)
-        if error.any():
-            linearisation = restored(linearisation, error)
-        if with_delays:
-            linearisation = with_delay_columns(linearisation, twists_of(poses), self.T)
-            linearisation = with_world_columns(linearisation, poses)
-            columns = [*dict.fromkeys((*columns, TIME)), *_MORE_COLUMNS]
         return (model or self.model).state_space(
             poses,
-            linearisation,
+            self._linearised(poses, course, error, self.columns),
             course.twists,
             self.T,
-            columns,
             np.where(outliers.spikes, 0.0, weights),
             outliers.jumps,
         )
 
+    def _linearised(
+        self, poses: Streams, course: Course, error: FloatArray, columns: list[int]
+    ) -> Linearisation:
+        linearisation = linearise(poses, course, self.T, self.parameters, columns)
+        return restored(linearisation, error) if error.any() else linearisation
+
+    @cached_property
     def posterior(self) -> Posterior:
-        """Of all poses."""
+        """Of all poses. It is large: a copy of the state does not have it."""
         return Posterior(self.space(), self.levels)
+
+    def posterior_with(self, columns: list[int]) -> Posterior:
+        """Of all poses with other systematic errors in the model."""
+        if "posterior" not in vars(self):
+            return dataclasses.replace(self, columns=columns).posterior
+        linearisation = self._linearised(self.poses, self.course, self.error, columns)
+        return self.posterior.with_columns(linearisation.columns)
+
+    def posterior_with_delays(self) -> Posterior:
+        """Of all poses, with the columns of a clock offset, of delays of positions, and of a world
+        that moves.
+        """
+        columns = [*dict.fromkeys((*self.columns, TIME))]
+        linearisation = self._linearised(self.poses, self.course, self.error, columns)
+        linearisation = with_delay_columns(linearisation, twists_of(self.poses), self.T)
+        linearisation = with_world_columns(linearisation, self.poses)
+        return self.posterior.with_columns(linearisation.columns)
 
     def moved(self, step: FloatArray) -> _State:
         """After a step of xi and of the parameters in the model."""
@@ -455,10 +463,9 @@ def _without_outliers(state: _State, quick: bool) -> _State:
         return found
     elif share > _MOST_SPIKES_IN_TAILS:
         found = _without_mild_spikes(found)
-    state = dataclasses.replace(found, heavy=True)
     for _ in range(2):
-        state = _fitted(_weighed_tails(state), walk)
-    return _outliers_found(state, 2)[0]
+        found = _fitted(_weighed_tails(found), walk)
+    return _outliers_found(found, 2)[0]
 
 
 def _without_mild_spikes(state: _State) -> _State:
@@ -470,7 +477,7 @@ def _without_mild_spikes(state: _State) -> _State:
     errors[left_out] = se3.log(
         se3.inverse(state.poses.Ts_cw_c[left_out]) @ state.streams.Ts_cw_c[left_out]
     )
-    gross = spikes_beyond_tails(state.posterior(), left_out, errors)
+    gross = spikes_beyond_tails(state.posterior, left_out, errors)
     outliers = Outliers(state.outliers.jumps, gross)
     poses = bridged(state.streams, state.T, gross)
     error = np.zeros_like(state.error)
@@ -479,19 +486,21 @@ def _without_mild_spikes(state: _State) -> _State:
 
 def _weighed_tails(state: _State) -> _State:
     """With weights of white errors of Student's t distribution."""
-    space, weights = state.space(), state.weights
-    for _ in range(_TAIL_ROUNDS):
-        weights = student_weights(Posterior(space, state.levels))
-        space = dataclasses.replace(space, weights=np.where(state.outliers.spikes, 0.0, weights))
-    return dataclasses.replace(state, weights=weights)
+    posterior = state.posterior
+    for _ in range(_TAIL_ROUNDS - 1):
+        weights = np.where(state.outliers.spikes, 0.0, student_weights(posterior))
+        space = dataclasses.replace(posterior.space, weights=weights)
+        posterior = Posterior(space, state.levels)
+    return dataclasses.replace(state, weights=student_weights(posterior), heavy=True)
 
 
 def _outliers_found(state: _State, rounds: int) -> tuple[_State, FloatArray]:
     """Jumps and spikes in turn, until they stay; and the last chi-squares (N,) of white errors."""
+    state = dataclasses.replace(state)
     for _ in range(rounds):
         if _is_noisy(state):
             state = _at_freed_poses(state)
-        of_walk, of_white = surprises(state.posterior(), state.outliers.spikes)
+        of_walk, of_white = surprises(state.posterior, state.outliers.spikes)
         outliers = judged(state.outliers, of_walk, of_white, with_spikes=not state.heavy)
         if outliers.same_as(state.outliers):
             break
@@ -514,7 +523,7 @@ def _with_shape_of_white(state: _State) -> _State:
     streams, of_sensors = state.streams, state.model.centre == "sensors"
     if not of_sensors or streams.n_rows < WHITE or _is_noisy(state):
         return state
-    model, levels = state.model.shaped(reml.white_moments(state.posterior()), state.levels)
+    model, levels = state.model.shaped(reml.white_moments(state.posterior), state.levels)
     kept = sample(len(state.streams), _MOST_POSES)
     before = Posterior(state.space(kept), state.levels)
     space = state.space(kept, model)
@@ -571,7 +580,7 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     free, those with a time offset come first, unless it differs from part to part.
     """
     tried = sorted({column for name in systematic for column in parameters_of(name)})
-    posterior = dataclasses.replace(state, columns=tried).posterior()
+    posterior = state.posterior_with(tried)
 
     def columns_of(name: str) -> list[int]:
         return [*range(6), *(6 + tried.index(column) for column in parameters_of(name))]
@@ -608,7 +617,7 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
         rivals = sorted(scales, key=lambda name: criterion(name, fits[name].cost))[:1]
         best = min(
             (best, *rivals),
-            key=lambda name: criterion(name, at_its_own(name).posterior().normal.cost),
+            key=lambda name: criterion(name, at_its_own(name).posterior.normal.cost),
         )
     sigmas = np.zeros(N_SYSTEMATIC)
     for name in {"scale", "time"} & set(fits):
@@ -650,11 +659,8 @@ def _polished(state: _State) -> AdaptiveSolution:
 
 def _polished_once(state: _State, is_last: bool) -> AdaptiveSolution | _State:
     """The solution if the step is small or this round the last one, otherwise the next state."""
-    posterior = state.posterior()
-    converged = _is_settled(posterior.normal)
-    if converged or is_last:
-        return _solution(state, posterior, converged)
-    return _relinearised(state, posterior)
+    converged = _is_settled(state.posterior.normal)
+    return _solution(state, converged) if converged or is_last else _relinearised(state)
 
 
 def _is_settled(normal: NormalEquations) -> bool:
@@ -669,8 +675,9 @@ def _is_settled(normal: NormalEquations) -> bool:
     return bool((np.abs(steps) < np.maximum(_SETTLED_SIGMAS * sigmas, _SETTLED_STEP)).all())
 
 
-def _relinearised(state: _State, posterior: Posterior) -> _State:
+def _relinearised(state: _State) -> _State:
     """After a step, at poses freed of the errors that the posterior knows, tails weighed again."""
+    posterior = state.posterior
     weights = student_weights(posterior) if state.heavy else state.weights
     state = dataclasses.replace(state, weights=weights, n_evaluations=state.n_evaluations + 1)
     return _freed(state.moved(posterior.normal.step), posterior.states_after(posterior.normal.step))
@@ -678,7 +685,7 @@ def _relinearised(state: _State, posterior: Posterior) -> _State:
 
 def _at_freed_poses(state: _State) -> _State:
     """With poses freed of the errors that are known at all poses, X as it is."""
-    posterior = state.posterior()
+    posterior = state.posterior
     return _freed(state, posterior.states_after(posterior.normal.step))
 
 
@@ -693,9 +700,10 @@ def _freed(state: _State, states: FloatArray) -> _State:
     return dataclasses.replace(state, poses=poses, error=error)
 
 
-def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveSolution:
+def _solution(state: _State, converged: bool) -> AdaptiveSolution:
     """The solution one step from where the search stands."""
-    normal, streams = posterior.normal, state.streams
+    posterior, streams = state.posterior, state.streams
+    normal = posterior.normal
     n_columns = len(state.columns)
     n_evidence = int((~state.outliers.jumps).sum()) - int(state.outliers.spikes.sum())
     misfit = normal.cost / max(streams.n_rows * n_evidence - 6 - n_columns, 1)
@@ -704,7 +712,7 @@ def _solution(state: _State, posterior: Posterior, converged: bool) -> AdaptiveS
     covariance[:6, :6] += np.diag(state.mean_variances)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     if state.with_delays:
-        posterior = posterior.with_columns(state.space(with_delays=True).columns)
+        posterior = state.posterior_with_delays()
     all_parts = part_products(posterior)
     parts = selected(all_parts, list(range(6 + n_columns)))
     state = state.moved(normal.step)

@@ -16,6 +16,7 @@ steps are lost in noise would seem to shrink.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -146,7 +147,7 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
     """
     intervals_s = np.diff(streams.stamps_s)
     by_parent, by_child = motions(streams.Ts_pw_p), motions(streams.Ts_cw_c)
-    as_child = se3.inverse(T_parent_child) @ by_parent @ T_parent_child
+    as_child = between(by_parent, T_parent_child)
     step = _cleaned(0.5 * (by_child[:, :3, 3] + as_child[:, :3, 3]), intervals_s, noise_m)
     metres_c = np.linalg.norm(_cleaned(by_child[:, :3, 3], intervals_s, noise_m), axis=1)
     metres_p = np.linalg.norm(_cleaned(by_parent[:, :3, 3], intervals_s, noise_m), axis=1)
@@ -166,7 +167,16 @@ def twists_of(streams: Streams) -> FloatArray:
 
 def motions(Ts_world_sensor: FloatArray) -> FloatArray:
     """Motions (N - 1, 4, 4) from each pose to the next."""
-    return se3.inverse(Ts_world_sensor[:-1]) @ Ts_world_sensor[1:]
+    before, moved = Ts_world_sensor[:-1], Ts_world_sensor[1:].copy()
+    moved[:, :3, 3] -= before[:, :3, 3]
+    moved[:, :3] = np.swapaxes(before[:, :3, :3], 1, 2) @ moved[:, :3]
+    return moved
+
+
+def between(Ts: FloatArray, T_parent_child: FloatArray) -> FloatArray:
+    """Motions (n, 4, 4) of the parent as the child makes them, ``X^-1 A X``."""
+    moved = (Ts.reshape(-1, 4) @ T_parent_child).reshape(Ts.shape)
+    return se3.inverse(T_parent_child) @ moved
 
 
 def turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -209,23 +219,35 @@ class Linearisation:
 
     Attributes
     ----------
-    residuals : (n, 6) array
-        e.
-    jacobian : (n, 6, 6 + 11) array
-        Derivatives by xi in ``X Exp(xi)`` and by the parameters of all systematic errors.
+    columns : (n, 6, 6 + k + 1) array
+        Derivatives by xi in ``X Exp(xi)`` and by k parameters of systematic errors; last, e.
     adjoints : (n, 6, 6) array
         Ad(B^-1).
     by_scale : (n, 6, 1) array
-        Derivative by the scale, as in the jacobian.
+        Derivative by the scale.
     metres : (n,) array
         Path of the child.
     """
 
-    residuals: FloatArray
-    jacobian: FloatArray
+    columns: FloatArray
     adjoints: FloatArray
     by_scale: FloatArray
     metres: FloatArray
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """(n, 6, 6 + k) array: the derivatives."""
+        return self.columns[:, :, :-1]
+
+    @property
+    def residuals(self) -> FloatArray:
+        """(n, 6) array: e."""
+        return self.columns[:, :, -1]
+
+    def with_columns(self, columns: FloatArray) -> Linearisation:
+        """With more derivatives (n, 6, l)."""
+        parts = [self.jacobian, columns, self.columns[:, :, -1:]]
+        return dataclasses.replace(self, columns=np.concatenate(parts, axis=2))
 
 
 def linearise(
@@ -246,9 +268,14 @@ def linearise(
     parameters : (11,) array
         Of all systematic errors, see the module.
     columns : sequence of int
-        Those whose derivatives are asked for; those by others may be zero.
+        Those whose derivatives are asked for. The three of a bias follow each other.
     """
-    used = {*columns, *np.flatnonzero(parameters).tolist()}
+    used, asked = {*columns, *np.flatnonzero(parameters).tolist()}, {*columns}
+
+    def at(first: int, size: int = 3) -> slice:
+        start = 6 + columns.index(first)
+        return slice(start, start + size)
+
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
     back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
     step = turned(back_c, np.diff(course.path, axis=0))
@@ -268,25 +295,26 @@ def linearise(
         metres_p = back_p @ np.diff(course.along_p, axis=0)
         by_parent[:, :3, 3] -= metres_p @ parameters[4:7]
     back = se3.inverse(by_child)
-    as_child = se3.inverse(T_parent_child) @ by_parent @ T_parent_child
     adjoints = se3.adjoint(back)
 
-    jacobian = np.zeros((len(step), 6, 6 + N_SYSTEMATIC))
-    jacobian[:, :, :6] = np.eye(6) - adjoints
-    by = jacobian[:, :, 6:]
-    by[:, :3, SCALE] = -turned(back[:, :3, :3], step)
-    if used & _CHILD_BIASES:
-        by[:, :3, 1:4] = back[:, :3, :3] @ metres_c
-    if used & _PARENT_BIASES:
+    by = np.zeros((len(step), 6, 6 + len(columns) + 1))
+    np.subtract(np.eye(6), adjoints, out=by[:, :, :6])
+    by_scale = np.zeros((len(step), 6, 1))
+    by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
+    if SCALE in asked:
+        by[:, :, at(SCALE, 1)] = by_scale
+    if asked & _CHILD_BIASES:
+        by[:, :3, at(1)] = back[:, :3, :3] @ metres_c
+    if asked & _PARENT_BIASES:
         axes = T_parent_child[:3, :3].T @ np.swapaxes(by_parent[:, :3, :3], 1, 2)
-        by[:, :3, 4:7] = -axes @ metres_p
-    if TIME in used:
-        by[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
-    if used & _RATES:
-        by[:, 3:, RATE] = by_rate
-    residuals = se3.log(back @ as_child)
-    by_scale = by[:, :, SCALE : SCALE + 1].copy()
-    return Linearisation(residuals, jacobian, adjoints, by_scale, np.linalg.norm(step, axis=1))
+        by[:, :3, at(4)] = -axes @ metres_p
+    if TIME in asked:
+        late = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+        by[:, :, at(TIME, 1)] = late[:, :, None]
+    if asked & _RATES:
+        by[:, 3:, at(8)] = by_rate
+    by[:, :, -1] = se3.log(back @ between(by_parent, T_parent_child))
+    return Linearisation(by, adjoints, by_scale, np.linalg.norm(step, axis=1))
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:

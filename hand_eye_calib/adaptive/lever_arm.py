@@ -393,12 +393,12 @@ class _State:
         """State space of all poses."""
         model, X = model or self.model, self.X
         course = self.course
+        columns = self.columns if columns is None else columns
         space = model.state_space(
             self.streams,
-            linearise(self.streams, course, X, self.parameters),
+            linearise(self.streams, course, X, self.parameters, columns),
             course.twists,
             X,
-            self.columns if columns is None else columns,
             np.where(self.outliers.spikes, 0.0, self.weights),
             np.zeros(len(self.boost), dtype=bool),
         )

@@ -130,7 +130,6 @@ class NoiseModel:
         linearisation: Linearisation,
         twists: FloatArray,
         T_parent_child: FloatArray,
-        columns: list[int],
         weights: FloatArray,
         cut: BoolArray,
     ) -> StateSpace:
@@ -143,8 +142,6 @@ class NoiseModel:
         twists : (N, 6) array
             The child's, see :class:`~hand_eye_calib.adaptive.increments.Course`.
         T_parent_child : (4, 4) array
-        columns : list of int
-            Parameters of systematic errors to estimate.
         weights : (N,) array
         cut : (n,) bool array
         """
@@ -154,12 +151,10 @@ class NoiseModel:
         white = (_TRANSLATIONS[None], self._white_rotation(streams, to_child))
         if self.white is not None:
             white = (self.white[0][None], self.white[1][None])
-        used = [*range(6), *(6 + column for column in columns)]
-        jacobian, residuals = linearisation.jacobian[:, :, used], linearisation.residuals
         return StateSpace(
             intervals_s=np.diff(streams.stamps_s),
             relative=self._relative(streams, linearisation),
-            columns=np.concatenate([jacobian, residuals[:, :, None]], axis=2),
+            columns=linearisation.columns,
             ahead=ahead,
             behind=behind,
             white=white,

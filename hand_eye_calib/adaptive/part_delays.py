@@ -10,7 +10,6 @@ orientations alike.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,8 +95,7 @@ def with_delay_columns(
         sign * _column(linearisation, of_sensor)
         for sign, of_sensor in ((1.0, velocities), (-1.0, of_parent))
     ]
-    jacobian = np.concatenate([linearisation.jacobian, *columns], axis=2)
-    return dataclasses.replace(linearisation, jacobian=jacobian)
+    return linearisation.with_columns(np.concatenate(columns, axis=2))
 
 
 def _column(linearisation: Linearisation, velocities: FloatArray) -> FloatArray:

@@ -68,9 +68,7 @@ class ReferencePredictor:
         plain = linearise(streams, course, X, np.zeros(N_SYSTEMATIC), ())
         modelled = linearise(streams, course, X, solution.parameters, ()).residuals
         cut = np.zeros(len(streams) - 1, dtype=bool)
-        space = solution.model.state_space(
-            streams, plain, course.twists, X, [], solution.weights, cut
-        )
+        space = solution.model.state_space(streams, plain, course.twists, X, solution.weights, cut)
         self._increments = Covariance(space, solution.levels)
         left_out = solution.left_out[:, None]
         self._systematic = np.where(left_out, 0.0, plain.residuals - modelled)

@@ -60,5 +60,6 @@ def corrected(
 
 def restored(linearisation: Linearisation, error: FloatArray) -> Linearisation:
     """A linearisation at corrected poses with the error c (N, 6) back in its residuals."""
-    residuals = linearisation.residuals + error[1:] - turned(linearisation.adjoints, error[:-1])
-    return dataclasses.replace(linearisation, residuals=residuals)
+    columns = linearisation.columns.copy()
+    columns[:, :, -1] += error[1:] - turned(linearisation.adjoints, error[:-1])
+    return dataclasses.replace(linearisation, columns=columns)

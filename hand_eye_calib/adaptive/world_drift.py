@@ -9,7 +9,6 @@ travel, and X is taken to be askew.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,8 +59,7 @@ def with_world_columns(linearisation: Linearisation, streams: Streams) -> Linear
     adjoints = se3.adjoint(se3.inverse(streams.Ts_cw_c))
     intervals_s = np.diff(streams.stamps_s)[:, None, None]
     columns = 0.5 * intervals_s * (adjoints[1:] + adjoints[:-1])
-    jacobian = np.concatenate([linearisation.jacobian, columns], axis=2)
-    return dataclasses.replace(linearisation, jacobian=jacobian)
+    return linearisation.with_columns(columns)
 
 
 def world_drift(

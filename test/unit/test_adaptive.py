@@ -172,7 +172,6 @@ def test_white_errors_have_the_covariance_of_the_model(centre):
         linearised(streams),
         np.zeros((6, 6)),
         T_PARENT_CHILD,
-        [],
         np.ones(6),
         np.zeros(5, dtype=bool),
     )
