@@ -58,6 +58,7 @@ from hand_eye_calib.adaptive.state_space import (
     StateSpace,
     selected,
 )
+from hand_eye_calib.adaptive.systematic_choice import Candidates, columns_of
 from hand_eye_calib.adaptive.world_drift import N_COLUMNS, with_world_columns, world_drift
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
@@ -113,24 +114,9 @@ _LEAST_GAIN_OF_SHAPE = 19.0
 # A loss larger by so much leaves no chance.
 _LONGER_SHARE, _NO_CHANCE = 0.5, 100.0
 
-# Systematic errors larger than this (of the length, m/m, s, rad/s) are none: a wrong unit, a clock
-# that was not aligned, or noise. Nor is one assumed that can hardly be told from X: on a road
-# a child that slips sideways looks like one that is mounted askew.
-_LARGEST = np.array([0.5, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.5, 1.0, 1.0, 1.0])
-_MOST_GROWTH = 3.0
-
-# Each parameter of a systematic error must lower the weighted squared residual by so much: one that
-# is not there is chosen once in forty to five hundred recordings. Schwarz's criterion would ask for
-# 7 to 10, as if every increment were evidence of errors that add up over all of them.
-_PENALTY = 5.0
-
 # Blocks of the jackknife of systematic errors, and what chi-square with nine degrees of freedom,
 # per degree, exceeds once in ten times.
 _BLOCKS, _CHANCE = 10, 1.63
-
-# What the largest ratio of variances over ten blocks to those of a model that is right hardly
-# exceeds: of six, once in ten times; of three, once in a hundred.
-_HARDLY_BY_CHANCE = 3.3
 
 # X is followed until it moves by less than this share of its sigma, at least one round.
 _MAX_ROUNDS = 6
@@ -251,8 +237,9 @@ class _State:
         Their values.
     other_sigmas : (11,) array
         Standard deviations of parameters that are not in the model.
-    mean_variances : (6,) array
-        Of X, by errors that last too long to be found.
+    cov_beyond : (6, 6) array
+        Of X, by what is not in the model: errors that last too long to be found, and systematic
+        errors that may be there.
     is_clock_free : bool
         Whether a time offset is in the model if the motion tells it from X.
     with_delays : bool
@@ -275,7 +262,7 @@ class _State:
     columns: list[int] = dataclasses.field(default_factory=list)
     parameters: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
     other_sigmas: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
-    mean_variances: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(6))
+    cov_beyond: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((6, 6)))
     n_evaluations: int = 0
     is_clock_free: bool = False
     with_delays: bool = False
@@ -552,7 +539,7 @@ def _with_lasting_errors(plain: _State) -> _State:
         return dataclasses.replace(plain, n_evaluations=n_evaluations)
     model, levels = model.reduced(fit)
     found = dataclasses.replace(plain, model=model, levels=levels, n_evaluations=n_evaluations)
-    return dataclasses.replace(found, mean_variances=_mean_variances(found, kept))
+    return dataclasses.replace(found, cov_beyond=np.diag(_mean_variances(found, kept)))
 
 
 def _mean_variances(found: _State, kept: IntArray | None) -> FloatArray:
@@ -581,72 +568,31 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     """
     tried = sorted({column for name in systematic for column in parameters_of(name)})
     posterior = state.posterior_with(tried)
-
-    def columns_of(name: str) -> list[int]:
-        return [*range(6), *(6 + tried.index(column) for column in parameters_of(name))]
-
-    def criterion(name: str, cost: float) -> float:
-        return cost + penalties[name]
+    candidates = Candidates.of(tried, posterior, systematic)
+    if state.is_clock_free or candidates.best != systematic[0]:
+        candidates = candidates.judged_by_parts(prefers_time=state.is_clock_free)
 
     def at_its_own(name: str) -> _State:
         return dataclasses.replace(state, systematic=name, columns=parameters_of(name)).moved(
-            fits[name].step
+            candidates.fits[name].step
         )
 
-    fits = {
-        name: NormalEquations(selected(posterior.products, columns_of(name))) for name in systematic
-    }
-    plainest = systematic[0]
-    known = fits[plainest].covariance
-    credible = [
-        name for name, fit in fits.items() if name == plainest or _is_credible(fit, name, known)
-    ]
-    penalties = {name: _PENALTY * len(parameters_of(name)) for name in systematic}
-    best = min(credible, key=lambda name: criterion(name, fits[name].cost))
-    if state.is_clock_free or best != plainest:
-        parts = part_products(posterior)
-        counts = {name: _n_misjudged(parts, columns_of(name), fits[name]) for name in systematic}
-        penalties = {name: _PENALTY * count for name, count in counts.items()}
-        if state.is_clock_free and counts.get("time", np.inf) <= 1.0:
-            credible = [name for name in credible if TIME in parameters_of(name)] or credible
-        best = min(credible, key=lambda name: criterion(name, fits[name].cost))
+    best = candidates.best
     if "bias" in best:
         # A scale is not of first order if it is large, and then a bias along the direction of
         # travel seems to be nearer: both are judged at their own parameters.
-        scales = [name for name in credible if "scale" in name]
-        rivals = sorted(scales, key=lambda name: criterion(name, fits[name].cost))[:1]
+        scales = [name for name in candidates.credible if "scale" in name]
         best = min(
-            (best, *rivals),
-            key=lambda name: criterion(name, at_its_own(name).posterior.normal.cost),
+            (best, *sorted(scales, key=candidates.criterion)[:1]),
+            key=lambda name: at_its_own(name).posterior.normal.cost + candidates.penalties[name],
         )
-    sigmas = np.zeros(N_SYSTEMATIC)
-    for name in {"scale", "time"} & set(fits):
-        sigmas[parameters_of(name)] = np.sqrt(np.diag(fits[name].covariance)[6:])
-    chosen = dataclasses.replace(at_its_own(best), other_sigmas=sigmas)
-    states = posterior.states_after(fits[best].step, columns_of(best))
+    chosen = dataclasses.replace(
+        at_its_own(best),
+        other_sigmas=candidates.sigmas(("scale", "time")),
+        cov_beyond=state.cov_beyond + candidates.spread_about(best),
+    )
+    states = posterior.states_after(candidates.fits[best].step, columns_of(best, tried))
     return _freed(chosen, states)
-
-
-def _n_misjudged(parts: FloatArray, columns: list[int], fit: NormalEquations) -> float:
-    """The number of parameters of systematic errors, each times the factor by which its variance
-    over ten blocks exceeds that of the model beyond chance. By as much a parameter that is not
-    there lowers the weighted squared residual more than the model expects (Takeuchi's criterion).
-    """
-    n_parameters = len(columns) - 6
-    if n_parameters == 0 or len(parts) < _BLOCKS:
-        return n_parameters
-    answers = answers_without(selected(parts, columns), _BLOCKS)[:, 6:]
-    spread = np.atleast_2d(np.cov(answers.T, bias=True)) * (_BLOCKS - 1)
-    ratios = np.linalg.eigvals(np.linalg.pinv(fit.covariance[6:, 6:], hermitian=True) @ spread)
-    return float(np.maximum(ratios.real / _HARDLY_BY_CHANCE, 1.0).sum())
-
-
-def _is_credible(fit: NormalEquations, name: str, known: FloatArray) -> bool:
-    """Whether systematic errors are of a size that sensors have, and X can be told from them."""
-    if (np.abs(fit.step[6:]) > _LARGEST[parameters_of(name)]).any():
-        return False
-    growth = np.linalg.eigvals(np.linalg.pinv(known, hermitian=True) @ fit.covariance[:6, :6])
-    return bool(growth.real.max() < _MOST_GROWTH**2)
 
 
 def _polished(state: _State) -> AdaptiveSolution:
@@ -709,7 +655,7 @@ def _solution(state: _State, converged: bool) -> AdaptiveSolution:
     misfit = normal.cost / max(streams.n_rows * n_evidence - 6 - n_columns, 1)
     # Steps smaller than predicted do not make what was learned over long baselines more certain.
     covariance = max(misfit, 1.0) * normal.covariance
-    covariance[:6, :6] += np.diag(state.mean_variances)
+    covariance[:6, :6] += state.cov_beyond
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     if state.with_delays:
         posterior = state.posterior_with_delays()
