@@ -323,6 +323,57 @@ def unrelated_parts(unexplained: float, what: str, other: str, unit_of: str) -> 
     )
 
 
+def swapped_coordinates(
+    stream: str, factors: FloatArray, unexplained: float, unexplained_mended: float
+) -> Finding:
+    """Latitude and longitude are swapped: x and y need these factors (2,)."""
+    lat = float(np.degrees(np.arccos(min(factors[1], 1.0))))
+    lon = float(np.degrees(np.arccos(min(1.0 / factors[0], 1.0))))
+    found = _error(
+        "swapped_coordinates",
+        stream,
+        f"latitude and longitude of the {stream} seem to be swapped: its distances along x (east) "
+        f"must be multiplied by {factors[0]:.3g} and along y (north) by {factors[1]:.3g}, as if "
+        f"the true latitude were {lat:.0f} deg and the true longitude {lon:.0f} deg, north or "
+        f"south, east or west; then {unexplained_mended:.1%} of the motion stays unexplained "
+        f"instead of {unexplained:.0%}",
+        "swap latitude and longitude at their source, or the names of the columns",
+        Confidence.LIKELY,
+    )
+    return replace(found, evidence=_of_factors(factors, unexplained, unexplained_mended))
+
+
+def longitude_scale(
+    stream: str, factors: FloatArray, unexplained: float, unexplained_mended: float
+) -> Finding:
+    """Degrees of longitude were made metres as if they were as long as those of latitude."""
+    found = _error(
+        "longitude_scale",
+        stream,
+        f"the {stream}'s distances along x (east) must be multiplied by {factors[0]:.3g}, those "
+        f"along y (north) are right; then {unexplained_mended:.1%} of the motion stays "
+        f"unexplained instead of {unexplained:.0%}",
+        "multiply x by the cosine of the latitude, or give latitude and longitude themselves",
+        Confidence.LIKELY,
+    )
+    return replace(
+        found,
+        cause="longitudes that became metres without the cosine of the latitude",
+        evidence=_of_factors(factors, unexplained, unexplained_mended),
+    )
+
+
+def _of_factors(
+    factors: FloatArray, unexplained: float, unexplained_mended: float
+) -> tuple[tuple[str, float], ...]:
+    return (
+        ("factor_x", float(factors[0])),
+        ("factor_y", float(factors[1])),
+        ("unexplained_share", unexplained),
+        ("unexplained_share_mended", unexplained_mended),
+    )
+
+
 def noisy(unexplained: float) -> Finding:
     """The angular rates agree and the motion does not."""
     return Finding(

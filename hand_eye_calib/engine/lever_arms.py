@@ -3,19 +3,27 @@ offset. The rotation is out of reach; by convention the sensor that measures pos
 of the other one.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from hand_eye_calib.adaptive import lever_arm
 from hand_eye_calib.adaptive.lever_arm import LeverArmSolution
+from hand_eye_calib.alignment.horizontal import horizontal_factors
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
 from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.checks.check import unit_of
-from hand_eye_calib.checks.findings import units, unrelated_parts
+from hand_eye_calib.checks.findings import (
+    Finding,
+    longitude_scale,
+    swapped_coordinates,
+    units,
+    unrelated_parts,
+)
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
@@ -23,7 +31,11 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 
 # Two streams of which more than this share of the path stays unexplained are not of one body. Of
 # one body it is 0.05 at most, of two 0.5 and more.
-_UNRELATED = 0.3
+_UNRELATED, _EXPLAINED = 0.3, 0.05
+
+# Factors of x and y differ from 1 by more than this if latitude and longitude are wrong, and leave
+# at most this share of what was unexplained.
+_FACTOR_OFF, _MENDED = 0.03, 0.3
 
 
 def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
@@ -58,7 +70,9 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     status = SolveStatus.CONTRADICTED if fused.contradictions else result.status
     given = config.scale if not isinstance(config.scale, str) else 1.0
     scale = solution.scale if is_child else 1.0 / solution.scale
-    findings = _unrelated(solution, pose_pairs.stamps_ns, poses, positions, is_child)
+    axes = fused.assessment.observability[:3]
+    is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
+    findings = _findings(solution, is_known, pose_pairs.stamps_ns, poses, positions, is_child)
     # What does not explain the positions has no time offset either.
     offset_s = 0.0 if findings else sign * solution.time_offset_s
     return replace(
@@ -154,16 +168,21 @@ def _residuals(
     )
 
 
-def _unrelated(
+def _findings(
     solution: LeverArmSolution,
+    is_known: bool,
     stamps_ns: IntArray,
     poses: FloatArray,
     positions: FloatArray,
     is_child: bool,
 ) -> list[dict[str, object]]:
-    """A finding if the path of the positions is not that of the odometry, or in another unit."""
+    """A finding if the path of the positions is not that of the odometry, or in other units."""
     share = lever_arm.unexplained_share(poses, positions, solution)
-    if share < _UNRELATED:
+    if share < _EXPLAINED:
+        return []
+    if found := _coordinates(share, stamps_ns, poses, positions, "child" if is_child else "parent"):
+        return [found.to_dict()]
+    if is_known and share < _UNRELATED:
         return []
     found = unrelated_parts(share, "motion of the positions", "odometry", "the units, the scale")
     try:
@@ -176,3 +195,35 @@ def _unrelated(
         factor, unit = in_unit
         found = units(scale, scaled.scale_sigma * (scale / scaled.scale), unit, factor)
     return [found.to_dict()]
+
+
+def _coordinates(
+    share: float, stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, stream: str
+) -> Finding | None:
+    """What is wrong with east and north, if that explains the path."""
+    lever_arm_m, left, found = np.zeros(3), share, None
+    for _ in range(2):  # the second time with the lever arm
+        factors = horizontal_factors(poses[:, :3, :3] @ lever_arm_m + poses[:, :3, 3], positions)
+        wording = None if factors is None else _wrong_coordinates(factors)
+        if factors is None or wording is None:
+            return None
+        mended = positions * [*factors, 1.0]
+        if wording is swapped_coordinates:
+            mended = mended[:, [1, 0, 2]]
+        try:
+            solution = _solved(stamps_ns, poses, mended, with_scale=False)
+        except NotEnoughDataError:
+            return None
+        lever_arm_m = solution.lever_arm
+        left = lever_arm.unexplained_share(poses, mended, solution)
+        found = wording(stream, factors, share, left)
+    return found if left < _MENDED * share else None
+
+
+def _wrong_coordinates(factors: FloatArray) -> Callable[..., Finding] | None:
+    """The finding that factors of x and y speak for; None if they speak for none."""
+    east, north = factors
+    off = np.abs(factors - 1.0) > _FACTOR_OFF
+    if east > 1.0 - _FACTOR_OFF and north < 1.0 + _FACTOR_OFF and off.any():
+        return swapped_coordinates
+    return longitude_scale if east < 1.0 and off.tolist() == [True, False] else None

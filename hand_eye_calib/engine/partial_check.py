@@ -78,9 +78,9 @@ def _of_solve(
     if in_units := [each for each in found if each.code == "units" and "scale" not in options]:
         more = {**options, **dict(in_units[0].options)}
         return [*in_units, *_of_solve(snapshot, correlation, known_s, more)]
-    if any(each.code in ("unrelated", "units") for each in found):
-        is_still = result.measured == "rotations" and correlation.variation < MIN_VARIATION
-        return [wording.no_rotation()] if is_still else found
+    if any(each.makes_unusable for each in found):
+        is_still = correlation.overlap_s > 0 and correlation.variation < MIN_VARIATION
+        return [wording.no_rotation()] if is_still and result.measured == "rotations" else found
     return [*found, *_of_result(result, correlation, known_s)]
 
 

@@ -23,7 +23,7 @@ from hand_eye_calib.io.bags.messages import (
     unpack_pose,
     unpack_poses,
 )
-from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
+from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin, wrong_latitude
 
 #: What each type can be read as, the usual first.
 PART_TYPES = {
@@ -32,6 +32,8 @@ PART_TYPES = {
     POINT_TYPE: ("positions",),
 }
 _OF_POSES = ("poses", "positions", "rotations")
+
+_POLE_DEG = 90.0 + 1e-9
 
 _LEVEL = (0.0, 0.0, 0.0, 1.0)
 
@@ -87,6 +89,8 @@ class PartReader:
         ------
         MalformedMessage
             At the first that cannot be unpacked.
+        InputError
+            At the first latitude beyond 90 deg; its attribute ``index`` has the row.
         """
         if self._type in POSE_TYPES:
             columns = unpack_poses(messages, self._type, is_ros1)
@@ -127,6 +131,7 @@ class PartReader:
     ) -> None:
         """Write what was measured into some rows of poses (N, 7)."""
         if self._type == FIX_TYPE:
+            _check_latitudes(values, rows)
             lat, lon = np.radians(values[rows, :2]).T
             poses[rows, :3] = self._origin.local(lat, lon, values[rows, 2])
         elif self._type == POINT_TYPE:
@@ -135,6 +140,15 @@ class PartReader:
             poses[rows, 3:] = self._integrator.quats_xyzw(stamps_ns[rows], values[rows])
         else:
             poses[rows, 3:] = values[rows]
+
+
+def _check_latitudes(values: FloatArray, rows: BoolArray) -> None:
+    """Refuse latitudes (deg) beyond the poles, of some rows of latitude, longitude and height."""
+    beyond = np.flatnonzero(rows & (np.abs(values[:, 0]) > _POLE_DEG))
+    if len(beyond):
+        error = InputError(wrong_latitude(*values[beyond[0], :2]))
+        error.index = int(beyond[0])  # type: ignore[attr-defined]
+        raise error
 
 
 class MessageReader:
@@ -158,6 +172,8 @@ class MessageReader:
             if self._measures == "poses":
                 return unpack_pose(data, self._type, is_ros1=False)
             columns = self._parts.columns([data], is_ros1=False)
+        except InputError:
+            raise
         except MALFORMED as error:
             raise InputError(f"not a message of type {self._type}: {error}") from error
         if not np.isfinite(columns.poses).all():

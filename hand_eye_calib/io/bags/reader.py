@@ -326,6 +326,9 @@ class PoseBag:
             columns = self._columns(kind, [message[2] for message in messages])
         except MalformedMessage as error:
             raise unreadable(kind, first_number + error.index, error) from error
+        except InputError as error:
+            number = first_number + getattr(error, "index", 0)
+            raise InputError(f"{kind.topic}, message {number}: {error}") from None
         message_numbers = first_number + np.arange(len(messages))
         bag_ns = np.array([message[1] for message in messages], dtype=np.int64)
         keep = self._watches[kind.topic].believable(first_number, columns.stamps_ns, bag_ns)

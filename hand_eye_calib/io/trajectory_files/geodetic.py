@@ -76,6 +76,14 @@ class LocalOrigin:
         return np.stack(east_north_up, axis=1)
 
 
+def wrong_latitude(lat: float, lon: float) -> str:
+    """What is wrong with a latitude beyond the pole, beside a longitude that may be a latitude."""
+    return (
+        f"found latitude {lat:.7g} and longitude {lon:.7g}, and no latitude is beyond 90 deg: they "
+        "seem to be swapped; swap them at their source"
+    )
+
+
 def _axes(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
     """East, north and up (N, 3, 3), as columns, along the axes of the earth."""
     sin_lat, cos_lat = np.sin(lat_rad), np.cos(lat_rad)

@@ -12,7 +12,7 @@ from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, ROTATI
 from hand_eye_calib.io.plausibility import check_positions
 from hand_eye_calib.io.trajectory_files.columns import QUATERNION
 from hand_eye_calib.io.trajectory_files.formats import MATRIX, UNNAMED
-from hand_eye_calib.io.trajectory_files.geodetic import local_positions
+from hand_eye_calib.io.trajectory_files.geodetic import local_positions, wrong_latitude
 from hand_eye_calib.io.trajectory_files.motion import fits_better
 from hand_eye_calib.io.trajectory_files.table import Table
 
@@ -133,12 +133,10 @@ def _in_local_frame(table: Table, columns: _Columns) -> Poses:
     named = _checked_unit(table, "lat", _RADIANS) or _checked_unit(table, "lon", _RADIANS)
     factor = _RADIANS[named or ("rad" if is_small else "deg")]
     lat, lon = columns["lat"] * factor, columns["lon"] * factor
+    are_swapped = bool(np.abs(lat).min() > np.pi / 2 >= np.abs(lon).max())
     table.refuse(
         (np.abs(lat) > np.pi / 2 + 1e-9) | (np.abs(lon) > _LARGEST_RAD),
-        lambda index: (
-            f"found latitude {columns['lat'][index]:.7g}, longitude {columns['lon'][index]:.7g}; "
-            "expected degrees or radians"
-        ),
+        lambda index: _wrong_place(columns["lat"][index], columns["lon"][index], are_swapped),
     )
     local = local_positions(lat, lon, _lengths(table, columns, "height"))
     _checked(table, local.positions)
@@ -149,6 +147,13 @@ def _in_local_frame(table: Table, columns: _Columns) -> Poses:
     quats_xyzw = _orientations(table, columns, local.positions)
     rotations = local.rotations @ se3.from_quat_xyzw(local.positions, quats_xyzw)[:, :3, :3]
     return Poses(local.positions, _quats_of(rotations))
+
+
+def _wrong_place(lat: float, lon: float, are_swapped: bool) -> str:
+    """What is wrong with a latitude or longitude."""
+    if are_swapped:
+        return f"{wrong_latitude(lat, lon)}, or the names of the columns"
+    return f"found latitude {lat:.7g}, longitude {lon:.7g}; expected degrees or radians"
 
 
 # ---- orientations
