@@ -1,6 +1,7 @@
 """The clock offset: seconds to add to the child's stamps to get the parent's clock."""
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -51,12 +52,32 @@ class TimeOffset:
         Correlation of the angular rates that gave the coarse offset.
     fit : SimilarityFit or None
         The fit that gave the fine offset; None if no fit held.
+    spread_s : float
+        Largest difference between the offsets from motions over different times; infinite unless
+        there is a fit over each.
     """
 
     seconds: float
     sigma_s: float
     correlation: Correlation
     fit: SimilarityFit | None
+    spread_s: float = np.inf
+
+    @property
+    def is_agreed(self) -> bool:
+        """Whether motions over all times agree that there is an offset."""
+        return self.spread_s < 0.5 * abs(self.seconds)
+
+    def beyond(self, known_s: float) -> Self:
+        """What is left of the offset of streams whose child's stamps were shifted by ``known_s``
+        seconds since.
+        """
+        coarse_s = self.correlation.offset_s - known_s
+        return replace(
+            self,
+            seconds=self.seconds - known_s,
+            correlation=replace(self.correlation, offset_s=coarse_s),
+        )
 
 
 def estimate_time_offset(
@@ -99,6 +120,21 @@ def estimate_time_offset(
         f"the time offset cannot be estimated: {correlation.doubt()}; "
         "drive more varied turns, or give time_offset in seconds"
     )
+
+
+def clear_time_offset(
+    parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
+) -> TimeOffset | None:
+    """The offset that :func:`estimate_time_offset` gives if the angular rates alone show it clearly
+    and a fit holds, otherwise None.
+    """
+    if any(find_leap(stream.stamps_ns) for stream in (parent, child)):
+        return None
+    correlation = correlate_rates(parent, child, max_gap_s)
+    if not correlation.is_clear:
+        return None
+    found = refine_time_offset(parent, child, correlation, max_gap_s)
+    return found if found.fit else None
 
 
 def time_offset_of_speeds(
@@ -148,14 +184,16 @@ def refine_time_offset(
     """
     reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s))
     best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation, None), start
+    held: list[float] = []
     for lag_s in _LAGS_S:
         offset_s, fit = _fine_offset(parent, child, correlation.offset_s, lag_s, max_gap_s, fit)
         if fit is None:
             continue
         holds = fit.explains_translation and abs(offset_s - correlation.offset_s) <= reach_s
+        held += [float(offset_s)] if holds else []
         if holds and fit.offset_sigma_s < best.sigma_s:
             best = TimeOffset(float(offset_s), fit.offset_sigma_s, correlation, fit)
-    return best
+    return replace(best, spread_s=np.ptp(held)) if len(held) == len(_LAGS_S) else best
 
 
 def _fine_offset(

@@ -98,6 +98,7 @@ def check_streams(
     time_offset_s: float = 0.0,
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
+    clock: TimeOffset | None = None,
 ) -> CheckResult:
     """Check two streams.
 
@@ -110,6 +111,9 @@ def check_streams(
         Known scale: factor of the child's lengths.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
+    clock : TimeOffset, optional
+        Offset of the streams as they are, if :func:`~.time_offset.clear_time_offset` has found it:
+        it is not estimated again.
 
     Returns
     -------
@@ -119,7 +123,11 @@ def check_streams(
     if any(finding.severity is Severity.ERROR for finding in findings):
         return CheckResult(gravest_first(findings))
     streams = StreamPair(parent, child.shifted(time_offset_s).scaled(scale), max_gap_s)
-    correlation = correlate_rates(streams.parent, streams.child, max_gap_s)
+    if clock:
+        clock = clock.beyond(time_offset_s)
+        correlation = clock.correlation
+    else:
+        correlation = correlate_rates(streams.parent, streams.child, max_gap_s)
     aligned = streams
     if correlation.is_clear:
         aligned = replace(streams, child=streams.child.shifted(correlation.offset_s))
@@ -142,7 +150,8 @@ def check_streams(
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
     findings += explanation.findings
-    return _check_agreeing(streams, explanation, correlation, findings, time_offset_s, scale)
+    known = time_offset_s, scale
+    return _check_agreeing(streams, explanation, clock, correlation, findings, *known)
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
@@ -185,6 +194,7 @@ def unit_of(scale: float) -> tuple[float, str] | None:
 def _check_agreeing(
     streams: StreamPair,
     explanation: Explanation,
+    clock: TimeOffset | None,
     correlation: Correlation,
     findings: list[Finding],
     known_offset_s: float,
@@ -193,9 +203,12 @@ def _check_agreeing(
     """What else there is to say of streams that agree under a hypothesis."""
     is_sound = not any(finding.makes_unusable for finding in findings)
     corrected = explanation.hypothesis.undo(streams)
-    offset = refine_time_offset(
-        corrected.parent, corrected.child, correlation, corrected.max_gap_s, explanation.fit
-    )
+    # Mistakes that are undone change positions and axes, and so the fit of the offset.
+    offset = None if explanation.hypothesis.code else clock
+    if offset is None:
+        offset = refine_time_offset(
+            corrected.parent, corrected.child, correlation, corrected.max_gap_s, explanation.fit
+        )
     pose_pairs = synchronise(
         corrected.parent, corrected.child.shifted(correlation.offset_s), corrected.max_gap_s
     )

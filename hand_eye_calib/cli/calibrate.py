@@ -168,7 +168,7 @@ def run(arguments: argparse.Namespace) -> int:
         return calibrate_and_deliver(_read_rig(files, arguments), arguments, {"files": files})
     from hand_eye_calib.cli.memory import keep_freed_memory
     from hand_eye_calib.cli.present import deliver
-    from hand_eye_calib.engine.checked import checked
+    from hand_eye_calib.engine.checked import at_clear_offset, checked
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
     keep_freed_memory()
@@ -179,6 +179,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = offline_config(trajectories["parent"], trajectories["child"], options)
     snapshot = whole_snapshot(config, **trajectories)
     with waiting_for("solving"):
+        snapshot = at_clear_offset(snapshot, options)
         calibration = snapshot.estimate()
     with waiting_for("checking the streams"):
         calibration, snapshot = checked(calibration, snapshot, options)

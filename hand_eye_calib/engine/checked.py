@@ -14,6 +14,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import GAP_INTERVALS, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
 
 # Options that a check can be certain of.
@@ -49,6 +50,28 @@ class Mended:
     told: tuple[str, ...] = ()
 
 
+def at_clear_offset(snapshot: Snapshot, given: Collection[str]) -> Snapshot:
+    """The snapshot with an estimated time offset if :func:`mend` would set that after a solve
+    without: the solve without it is left out.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    given : collection of str
+        Names of the options that were set.
+    """
+    config = snapshot.config
+    has_clock = not METHODS[config.method].uses_reference and config.reference == "auto"
+    clock = None if "time_offset" in given or not has_clock else snapshot.clock
+    if clock is None or not clock.is_agreed:
+        return snapshot
+    if abs(clock.seconds) - 0.5 * clock.spread_s < _MOST_MOVED_S:
+        return snapshot
+    moved = replace(snapshot, config=replace(config, time_offset="estimate"), time_offset=clock)
+    can_solve = all(len(each.pose_pairs()) >= config.min_pairs for each in (snapshot, moved))
+    return moved if can_solve else snapshot
+
+
 def checked(
     calibration: Calibration, snapshot: Snapshot, given: Collection[str] | None = None
 ) -> tuple[Calibration, Snapshot]:
@@ -81,10 +104,15 @@ def mend(
     the option was not given, solve again with it, and keep that if there is less to say against it.
     Parameters as of :func:`checked`.
     """
+    ahead = _set_ahead(calibration, snapshot, given)
+    if ahead and _is_sound(ahead) and _is_large(ahead.calibration.time_offset_s, calibration):
+        return replace(ahead, told=_told((), ahead.options, ahead.calibration))
+    if ahead:
+        snapshot = with_options(snapshot, {"time_offset": CalibratorConfig.time_offset})
+        calibration = snapshot.estimate()
     by_model = {} if given is None else _offset_of_model(calibration, snapshot, given)
-    again = _solved_with(snapshot, by_model)
-    if again and _noise_fits(again.calibration) and not _serious(again.calibration):
-        # There cannot be less to say against the first result.
+    again = ahead if by_model and ahead else _solved_with(snapshot, by_model)
+    if again and _is_sound(again):
         return replace(again, told=_told((), by_model, again.calibration))
     check = snapshot.check(calibration)
     found = Mended(_with(calibration, check.findings), snapshot, check)
@@ -98,6 +126,17 @@ def mend(
     ):
         return found
     return replace(again, told=_told(check.findings, options, again.calibration))
+
+
+def _set_ahead(
+    calibration: Calibration, snapshot: Snapshot, given: Collection[str] | None
+) -> Mended | None:
+    """The result as it is if :func:`at_clear_offset` has set its time offset, otherwise None."""
+    options = {"time_offset": snapshot.config.time_offset}
+    if given is None or "time_offset" in given or options["time_offset"] != "estimate":
+        return None
+    check = snapshot.check(calibration)
+    return Mended(_with(calibration, check.findings), snapshot, check, options)
 
 
 def _solved_with(snapshot: Snapshot, options: Mapping[str, Any]) -> Mended | None:
@@ -185,14 +224,24 @@ def _offset_of_model(
 ) -> dict[str, Any]:
     """The option that pairs the poses anew if the model found a large time offset by itself."""
     moved_s = calibration.time_offset_s - fixed_time_offset(snapshot.resolved().config)
+    is_set = "time_offset" not in given and _is_large(moved_s, calibration)
+    return {"time_offset": "estimate"} if is_set else {}
+
+
+def _is_large(moved_s: float, calibration: Calibration) -> bool:
+    """Whether a model should not move poses by so much."""
     most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else _MOST_MOVED_S
-    is_small = "time_offset" in given or abs(moved_s) < most_s
-    return {} if is_small else {"time_offset": "estimate"}
+    return abs(moved_s) >= most_s
 
 
 def _is_grave(finding: Finding, option: str) -> bool:
     least = (Severity.ERROR,) if option == "scale" else (Severity.ERROR, Severity.WARNING)
     return finding.severity in least
+
+
+def _is_sound(found: Mended) -> bool:
+    """Whether there cannot be less to say against another result."""
+    return _noise_fits(found.calibration) and not _serious(found.calibration)
 
 
 def _noise_fits(calibration: Calibration) -> bool:

@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig, Prior, prior_fields
-from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.engine.checked import at_clear_offset, checked
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -82,9 +82,11 @@ def calibrate(
     config = CalibratorConfig(**(of_streams | options | prior_fields(prior or {})))
     snapshot = whole_snapshot(config, parent, child)
     if progress is None:
+        snapshot = at_clear_offset(snapshot, options)
         return checked(snapshot.estimate(), snapshot, options)[0]
     # The snapshot keeps what these steps give.
     progress(0.0, "time offset")
+    snapshot = at_clear_offset(snapshot, options)
     snapshot.resolved()
     progress(0.2, "pairing")
     snapshot.pose_pairs()

@@ -8,6 +8,7 @@ import numpy as np
 
 from hand_eye_calib.alignment.time_offset import (
     TimeOffset,
+    clear_time_offset,
     estimate_time_offset,
     time_offset_of_speeds,
 )
@@ -94,9 +95,23 @@ class Snapshot:
     def _resolved(self) -> "Snapshot":
         if not isinstance(self.config.time_offset, str):
             return self
-        found = self.time_offset or estimated_time_offset(self.config, self.parent, self.child)
+        found = self.clock or self.time_offset
+        if found is None:
+            found = estimated_time_offset(self.config, self.parent, self.child)
         config = replace(self.config, time_offset=found.seconds)
         return replace(self, config=config, time_offset=found)
+
+    @cached_property
+    def clock(self) -> TimeOffset | None:
+        """The time offset of the streams as they came in if the angular rates alone show it
+        clearly; None otherwise, and if pairs were made.
+        """
+        if len(self.kept) or self.config.measured != "poses":
+            return None
+        found = self.time_offset
+        if found is None:
+            return clear_time_offset(self.parent, self.child, self.config.max_gap)
+        return found if found.correlation.is_clear and found.fit else None
 
     def pose_pairs(self) -> PosePairs:
         """Synchronised pose pairs: the kept ones, and those of the buffered poses.
@@ -213,6 +228,7 @@ class Snapshot:
             time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
             scale=1.0 if isinstance(scale, str) else scale,
             max_gap_s=max_gap_s,
+            clock=(self.resolved() if calibration else self).clock,
         )
         obsolete = set()
         if len(self.kept):

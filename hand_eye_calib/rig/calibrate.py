@@ -12,7 +12,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import basis, combined, noise_driven
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.engine.checked import at_clear_offset, checked
 from hand_eye_calib.engine.estimation import estimate_extrinsic
 from hand_eye_calib.engine.offline import Progress, offline_config, whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
@@ -147,7 +147,7 @@ def _pairwise(
     first = dataclasses.replace(first, sensor_frame=name)
     other = dataclasses.replace(other, sensor_frame=of_other)
     config = offline_config(first, other, options)
-    snapshot = whole_snapshot(config, first, other)
+    snapshot = at_clear_offset(whole_snapshot(config, first, other), options)
     return checked(snapshot.estimate(), snapshot, options)[0]
 
 

@@ -1,5 +1,6 @@
 """What a stream check is certain of is used, and said."""
 
+from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
@@ -8,7 +9,8 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.calibration import Verdict
-from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.checks.check import check_streams
+from hand_eye_calib.engine.checked import at_clear_offset, checked, mend
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
 
@@ -68,3 +70,56 @@ def test_a_scale_with_which_the_noise_model_does_not_fit_is_not_used():
     assert {"scale"} == {finding["code"] for finding in result.findings}
     assert (result.method, result.scale) == ("adaptive", 1.0)
     assert result.noise["systematic"] == "bias"
+
+
+@pytest.fixture(scope="module")
+def late():
+    """Snapshot of streams whose clocks are apart."""
+    poses = wandering_poses(300)
+    parent = as_trajectory(poses)
+    child = as_trajectory(disturbed(child_of(poses), 1, 0.002, 0.001)).shifted(-0.05)
+    return whole_snapshot(offline_config(parent, child, {}), parent, child)
+
+
+class TestClearOffset:
+    def test_it_is_estimated_before_the_first_solve(self, late, monkeypatch):
+        ahead = at_clear_offset(late, ())
+        assert ahead.config.time_offset == "estimate"
+        in_turn = mend(late.estimate(), late, ())
+        result = ahead.estimate()
+        found = mend(result, ahead, ())
+        assert found.snapshot.config == in_turn.snapshot.config
+        assert found.told == in_turn.told
+        expected = in_turn.calibration
+        np.testing.assert_array_equal(found.calibration.T_parent_child, expected.T_parent_child)
+        np.testing.assert_array_equal(found.calibration.covariance, expected.covariance)
+        assert found.calibration.findings == expected.findings
+        assert expected.time_offset_s == pytest.approx(0.05, abs=0.003)
+        # If something speaks against it, the streams are solved as they are, too.
+        monkeypatch.setattr("hand_eye_calib.engine.checked._is_sound", lambda found: False)
+        assert (
+            mend(result, ahead, ()).check.findings == mend(late.estimate(), late, ()).check.findings
+        )
+
+    @pytest.mark.parametrize(
+        "options", [{"time_offset": 0.0}, {"method": "dnlo"}, {"reference": "B5"}]
+    )
+    def test_it_stays_as_it_is_if_the_model_would_not_find_it(self, late, options):
+        config = late.config.from_options(late.config.to_options() | options)
+        other = replace(late, config=config)
+        assert at_clear_offset(other, options) is other
+
+    def test_none_is_left_alone(self, late):
+        level = replace(late, buffered_child=late.child.shifted(0.05))
+        assert at_clear_offset(level, ()) is level
+
+    def test_none_is_clear_if_motions_over_other_times_tell_another(self, late):
+        assert late.clock.is_agreed
+        other = replace(late, time_offset=replace(late.clock, spread_s=0.04))
+        assert at_clear_offset(other, ()) is other
+
+    def test_the_check_takes_it_as_it_is(self, late):
+        known = check_streams(*late.streams, 0.02, clock=late.clock)
+        found = check_streams(*late.streams, 0.02)
+        assert [each.code for each in known.findings] == [each.code for each in found.findings]
+        assert known.correlation.offset_s == pytest.approx(found.correlation.offset_s, abs=1e-9)
