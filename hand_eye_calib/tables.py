@@ -1,7 +1,6 @@
 """Tables for notebooks: rows of plain values as a DataFrame or as HTML."""
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.errors import MissingDependencyError
@@ -32,6 +31,8 @@ def data_frame(rows: Sequence[Row], index: str | None = None) -> "pd.DataFrame":
 
 def html_table(title: str, rows: Sequence[Row]) -> str:
     """Rows of texts with equal names as an HTML table below a title."""
+    from html import escape
+
     heads = "".join(f"<th>{escape(name)}</th>" for name in (rows[0] if rows else {}))
     lines = "".join(
         f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row.values())}</tr>"

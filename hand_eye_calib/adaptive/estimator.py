@@ -60,7 +60,7 @@ from hand_eye_calib.adaptive.state_space import (
 )
 from hand_eye_calib.adaptive.systematic_choice import Candidates, columns_of
 from hand_eye_calib.adaptive.world_drift import N_COLUMNS, with_world_columns, world_drift
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, distinct, median
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.registry import Method
@@ -205,7 +205,7 @@ def _strided(state: _State) -> IntArray:
     rotations = state.streams.Ts_pw_p[every, :3, :3]
     for rival in _STRIDES:
         back = np.swapaxes(rotations[:-rival], 1, 2)
-        if noise < _NOISY * np.median(se3.rotation_angle(back @ rotations[rival:])):
+        if noise < _NOISY * median(se3.rotation_angle(back @ rotations[rival:])):
             stride = min(stride, rival)
             break
     return every[::stride]
@@ -331,8 +331,8 @@ def _start(streams: Streams, columns: list[int]) -> _State:
     T = Method("dnlo").solve(pairs).T_parent_child
     course = course_of(streams, T)
     linearisation = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), ())
-    interval_s = float(np.median(np.diff(streams.stamps_s)))
-    metres = max(float(np.median(linearisation.metres)), 1e-9)
+    interval_s = median(np.diff(streams.stamps_s))
+    metres = max(median(linearisation.metres), 1e-9)
     extent = Extent(interval_s, metres, float(streams.stamps_s[-1]))
     outliers = first_outliers(linearisation.residuals)
     poses = bridged(streams, T, outliers.spikes)
@@ -359,11 +359,11 @@ def _start(streams: Streams, columns: list[int]) -> _State:
 def _centre(streams: Streams, T: FloatArray, residuals: FloatArray) -> str:
     """What white rotation noise turns the trajectories about, see ``noise_model.CENTRES``."""
     worlds = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
-    sizes = {"sensors": float(np.median(np.linalg.norm(residuals[:, :3], axis=1)))}
+    sizes = {"sensors": median(np.linalg.norm(residuals[:, :3], axis=1))}
     for centre, poses in worlds.items():
         to_origin = se3.inverse(poses)[:, :3, 3]
         there = residuals[:, :3] + np.cross(residuals[:, 3:], to_origin)
-        sizes[centre] = float(np.median(np.linalg.norm(there, axis=1)))
+        sizes[centre] = median(np.linalg.norm(there, axis=1))
     best = min(CENTRES, key=lambda centre: sizes[centre])
     return best if sizes[best] < _DECISIVE * sizes["sensors"] else "sensors"
 
@@ -396,7 +396,7 @@ def sample(n_poses: int, most: int) -> IntArray | None:
         return None
     offsets = _BURST[2 * len(_BURST) * n_poses // most > _BURST]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], most // len(_BURST)).astype(int)
-    return np.unique((starts[:, None] + offsets).ravel())
+    return distinct((starts[:, None] + offsets).ravel())
 
 
 def _fitted(state: _State, walks: tuple[str, ...] = ("time", "distance")) -> _State:

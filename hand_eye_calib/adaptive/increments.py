@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray, median
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import chained
 
@@ -90,7 +90,7 @@ class Streams:
     @cached_property
     def typical_turn(self) -> float:
         """Median angle (rad) that the parent turns by from pose to pose."""
-        return float(np.median(se3.rotation_angle(motions(self.Ts_pw_p)[:, :3, :3])))
+        return median(se3.rotation_angle(motions(self.Ts_pw_p)[:, :3, :3]))
 
     @cached_property
     def n_rows(self) -> int:
@@ -191,7 +191,7 @@ def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> Floa
     """
     rates = np.pad(steps / intervals_s[:, None], ((2, 2), (0, 0)), mode="edge")
     cleaned = 0.5 * (rates[:-4] + rates[4:]) * intervals_s[:, None]
-    own = float(np.median((steps - cleaned) ** 2))
+    own = median((steps - cleaned) ** 2)
     believed = max(1.0 - _CAUTION * noise_m**2 / max(own, _LEAST_VARIANCE), 0.0)
     return cleaned + believed * (steps - cleaned)
 

@@ -16,7 +16,7 @@ from hand_eye_calib.adaptive.block_tridiagonal import inverse_products, transpos
 from hand_eye_calib.adaptive.increments import Streams
 from hand_eye_calib.adaptive.reml import walk_covariance
 from hand_eye_calib.adaptive.state_space import WHITE, Posterior, chunks
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, median
 from hand_eye_calib.geometry import se3
 
 # False alarms expected in a whole recording.
@@ -123,7 +123,7 @@ def _limits(residuals: FloatArray) -> list[float]:
     limits = []
     for part in (slice(0, 3), slice(3, 6)):
         sizes = np.linalg.norm(residuals[:, part], axis=1)
-        robust = _FIRST_JUMP_SIGMAS * float(np.median(sizes)) / _MEDIAN_OF_CHI_3
+        robust = _FIRST_JUMP_SIGMAS * median(sizes) / _MEDIAN_OF_CHI_3
         limits.append(max(robust, _LEAST_JUMP))
     return limits
 
@@ -220,7 +220,7 @@ def _decisive(of_walk: FloatArray, alarming: float) -> float:
     ordinary = of_walk[of_walk < alarming]
     if len(ordinary) == 0 or np.mean(ordinary**2) > _WALK_KURTOSIS * np.mean(ordinary) ** 2:
         return _DECISIVE * alarming
-    return float(max(np.median(ordinary) / _MEDIAN_OF_CHI_6, 1.0)) * alarming
+    return float(max(median(ordinary) / _MEDIAN_OF_CHI_6, 1.0)) * alarming
 
 
 def _is_peak(values: FloatArray) -> BoolArray:

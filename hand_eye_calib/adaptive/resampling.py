@@ -27,7 +27,7 @@ def part_products(posterior: Posterior) -> FloatArray:
     space = posterior.space
     n, columns = len(space), space.columns
     factor = InOrder(*posterior.precision())
-    ends = np.unique(np.linspace(0, n, min(N_PARTS, n) + 1).astype(int))[1:]
+    ends = np.linspace(0, n, min(N_PARTS, n) + 1).astype(int)[1:]
     weighed = posterior.weighed(columns)
     whitened = factor.whiten(space.gathered(weighed))
     totals = np.array([_up_to(end, posterior, factor, weighed, whitened) for end in ends])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray, quantile
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -238,7 +238,7 @@ def _sampled(
 def _compressed(rates: FloatArray) -> FloatArray:
     """Rates with jumps clipped and large values compressed, less their mean."""
     roots = np.sqrt(rates)
-    roots = np.minimum(roots, np.nanquantile(roots, 1 - _CLIPPED_SHARE))
+    roots = np.minimum(roots, quantile(roots[np.isfinite(roots)], 1 - _CLIPPED_SHARE))
     return roots - np.nanmean(roots)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, median, quantile
 from hand_eye_calib.assessment.covariance import (
     ROTATIONS,
     TRANSLATIONS,
@@ -23,8 +23,8 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 # cost a few milliseconds.
 _MAX_POSES = 500
 
-# The rotation about an axis is this percentile of all motions: one outlier is not a rotation.
-_PERCENTILE = 95
+# The rotation about an axis is this quantile of all motions: one outlier is not a rotation.
+_QUANTILE = 0.95
 
 # Smallest rotation (rad) that reveals anything of a lever arm.
 MIN_ROTATION = float(np.radians(5.0))
@@ -108,13 +108,13 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
     rotation, lever_arms = np.zeros(3), LeverArms.of(np.zeros((1, 3, 3)))
     if n_poses < 2:
         return Excitation(n_poses, rotation, lever_arms, 0.0)
-    rows = np.unique(np.linspace(0, n_poses - 1, min(n_poses, _MAX_POSES)).astype(int))
+    rows = np.linspace(0, n_poses - 1, min(n_poses, _MAX_POSES)).astype(int)
     poses = pose_pairs.Ts_pw_p[rows]
     lag = 1
     while lag < len(poses):
         rotations = np.swapaxes(poses[:-lag, :3, :3], 1, 2) @ poses[lag:, :3, :3]
         angles = np.abs(se3.rotation_log(rotations))
-        rotation = np.maximum(rotation, np.percentile(angles, _PERCENTILE, axis=0))
+        rotation = np.maximum(rotation, [quantile(angle, _QUANTILE) for angle in angles.T])
         at_lag = LeverArms.of(rotations - np.eye(3))
         if np.trace(at_lag.information) > np.trace(lever_arms.information):
             lever_arms = at_lag
@@ -134,7 +134,7 @@ def _drives(poses: FloatArray) -> bool:
 def _share_of_main_direction(poses: FloatArray, lag: int) -> float:
     steps = poses[lag:, :3, 3] - poses[:-lag, :3, 3]
     lengths = np.linalg.norm(steps, axis=1)
-    long = (lengths > _LONG_STEP * np.median(lengths)) & (lengths > 0)
+    long = (lengths > _LONG_STEP * median(lengths)) & (lengths > 0)
     if not long.any():
         return 1.0
     own = np.einsum("nji,nj->ni", poses[:-lag, :3, :3], steps)[long] / lengths[long, None]

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive.state_space import NormalEquations
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, median
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
@@ -160,7 +160,7 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     each: 1 on average, small for jumps.
     """
     lengths = [np.linalg.norm(part, axis=1) for part in (residuals[:, :3], residuals[:, 3:])]
-    sigmas = np.repeat([np.median(length) / _MEDIAN_LENGTH for length in lengths], 3)
+    sigmas = np.repeat([median(length) / _MEDIAN_LENGTH for length in lengths], 3)
     covariance = np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
     for _ in range(_ROUNDS):
         squared = np.einsum("ki,ki->k", residuals @ np.linalg.inv(covariance), residuals)
@@ -191,7 +191,7 @@ def information(
     """
     stamps_ns = pose_pairs.stamps_ns
     duration_s = (stamps_ns[-1] - stamps_ns[0]) * 1e-9
-    lag_s = max(_LAG_S, float(np.median(np.diff(stamps_ns))) * 1e-9)
+    lag_s = max(_LAG_S, median(np.diff(stamps_ns)) * 1e-9)
     pairs = pairs_over(pose_pairs, lag_s, max(int(duration_s * _MOTIONS_PER_S), 2))
     return information_of(pairs, stamps_ns, T_parent_child, covariance, block_s)
 

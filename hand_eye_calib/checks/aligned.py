@@ -11,7 +11,7 @@ from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.adaptive.part_delays import PartDelay
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, median
 from hand_eye_calib.assessment.mount_change import find_change, information
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Finding, Severity
@@ -126,12 +126,12 @@ class Aligned:
     def rms_speed(self) -> float:
         """Root mean square speed of the parent, m/s: without jumps."""
         stamps_s = self.pose_pairs.stamps_ns * 1e-9
-        n = round(_SPEED_SPAN_S / float(np.median(np.diff(stamps_s))))
+        n = round(_SPEED_SPAN_S / median(np.diff(stamps_s)))
         n = min(max(n, 1), len(stamps_s) - 1)
         positions = self.pose_pairs.Ts_pw_p[:, :3, 3]
         steps = np.linalg.norm(positions[n:] - positions[:-n], axis=1)
         speeds = steps / (stamps_s[n:] - stamps_s[:-n])
-        return float(np.sqrt(np.mean(np.minimum(speeds, 3 * np.median(speeds)) ** 2)))
+        return float(np.sqrt(np.mean(np.minimum(speeds, 3 * median(speeds)) ** 2)))
 
 
 def check_aligned(aligned: Aligned) -> list[Finding]:

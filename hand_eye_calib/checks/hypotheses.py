@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, median
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Confidence, Finding
 from hand_eye_calib.checks.streams import coarse_poses
@@ -313,7 +313,7 @@ def _agreed_rotation(streams: StreamPair, lag_s: float) -> FloatArray | None:
     errors = np.linalg.norm(pairs.rotation_residuals(T_rotation), axis=1)
     angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
     rms_rotation = np.sqrt(np.mean(angles**2))
-    return rotation if np.median(errors) < 2 * HOLDS * rms_rotation else None
+    return rotation if median(errors) < 2 * HOLDS * rms_rotation else None
 
 
 def _simplest_of_the_best(explanations: Sequence[Explanation]) -> Explanation:

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray, median
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -109,7 +109,7 @@ def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Biased, ...
     axes = np.linalg.eigh(x.T @ x)[1][:, ::-1]
     columns = np.concatenate([(x @ axes)[:, None, :] * axes[None], -se3.skew(x)], axis=2)
     found = _regress(columns, y - x)
-    variance = np.median(((y - x - columns @ found.values) ** 2).sum(axis=1)) / _MEDIAN_LENGTH**2
+    variance = median(((y - x - columns @ found.values) ** 2).sum(axis=1)) / _MEDIAN_LENGTH**2
     squared = ((x @ axes) ** 2).mean(axis=0)
     # Little rotation beside much may come from an axis that is slightly off.
     biases = np.where(squared < _LITTLE**2 * squared[0], 1.0, variance / (squared + 1e-300))
@@ -165,7 +165,7 @@ class _Stencil:
         """The stencil around as many poses as have others at all distances."""
         if len(stamps_ns) < _MIN_INSTANTS:
             return None
-        interval_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+        interval_s = median(np.diff(stamps_ns)) * 1e-9
         n = max(round(_HALF_SPAN_S / 2 / interval_s), 1)
         reach = _FAR * n
         centres = np.arange(reach, len(stamps_ns) - reach)
@@ -266,7 +266,7 @@ def _positions(
 
 def _rms(vectors: FloatArray) -> float:
     """Robust root mean square length."""
-    return float(np.median(np.linalg.norm(vectors, axis=1)))
+    return median(np.linalg.norm(vectors, axis=1))
 
 
 @dataclass(frozen=True)
@@ -327,7 +327,7 @@ def _regress(columns: FloatArray, target: FloatArray, variance: float = 0.0) -> 
         ridge[:3, :3] -= _of_noise(total[:3, :3], variance * weights.sum())
         values = np.linalg.solve(total[:m, :m] + ridge, total[:m, m])
         lengths = np.linalg.norm(target - columns @ values, axis=1)
-        sigma = max(float(np.median(lengths)) / _MEDIAN_LENGTH, 1e-12)
+        sigma = max(median(lengths) / _MEDIAN_LENGTH, 1e-12)
         weights = 1.0 / (1.0 + (lengths / sigma) ** 2 / (3 * _TUNING**2)) ** 2
     rest = total - blocks
     shares = rest[:, :m, :m] + (1.0 - 1.0 / _BLOCKS) * ridge

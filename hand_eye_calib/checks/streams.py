@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, distinct, median, quantile
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
@@ -93,13 +93,13 @@ class StreamSummary:
 def summarise(trajectory: Trajectory) -> StreamSummary:
     """StreamSummary of a trajectory of at least two poses."""
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    coarse = coarse_poses(trajectory, max(_PATH_STEP_S, float(np.median(intervals_s))))
+    coarse = coarse_poses(trajectory, max(_PATH_STEP_S, median(intervals_s)))
     steps = np.linalg.norm(np.diff(coarse[:, :3, 3], axis=0), axis=1)
     angles = se3.rotation_angle(np.swapaxes(coarse[:-1, :3, :3], 1, 2) @ coarse[1:, :3, :3])
     return StreamSummary(
         poses=len(trajectory),
         duration_s=trajectory.duration_s,
-        rate_hz=float(1.0 / np.median(intervals_s)),
+        rate_hz=float(1.0 / median(intervals_s)),
         longest_interval_s=float(intervals_s.max()),
         path_m=float(steps.sum()) if trajectory.has_positions else None,
         rotation_rad=float(angles.sum()) if trajectory.has_rotations else None,
@@ -154,7 +154,7 @@ def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
     """Which intervals (N,) between poses, s, are gaps: longer than may be interpolated across, and
     than is usual in the stream.
     """
-    usual_s = float(np.median(intervals_s)) if len(intervals_s) else 0.0
+    usual_s = median(intervals_s) if len(intervals_s) else 0.0
     return intervals_s > max(max_gap_s, _GAP_INTERVALS * usual_s)
 
 
@@ -221,7 +221,7 @@ def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
     if repeats.mean() > _MAX_REPEATS:
         return None
     off = [_off_line(positions, stamps_ns, lag) for lag in range(1, _MAX_PERIOD + 1)]
-    rough = [float(np.median(np.linalg.norm(vectors, axis=1))) for vectors in off]
+    rough = [median(np.linalg.norm(vectors, axis=1)) for vectors in off]
     period = 2 + int(np.argmin(rough[1:]))
     smoothest = max(rough[period - 1], 1e-9)
     if rough[0] < max(_ALTERNATES * smoothest, _LEAST_LEVELS_M):
@@ -241,7 +241,7 @@ def _share_of_levels(vectors: FloatArray, period: int) -> float:
     windows = vectors[: n_windows * n_turns * period].reshape(n_windows, n_turns, period, 3)
     levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
     total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
-    return float(np.median(levels / np.maximum(total, 1e-300)))
+    return median(levels / np.maximum(total, 1e-300))
 
 
 def _mixed(trajectory: Trajectory) -> tuple[float, float] | None:
@@ -329,7 +329,7 @@ def _grid_step(values: FloatArray) -> float:
     step = float(differences.min())
     multiples = differences / step
     # Steady motion has equal steps, too, but not many different ones.
-    different = len(np.unique(np.round(multiples)))
+    different = len(distinct(np.round(multiples)))
     if different < _MIN_DIFFERENT and len(differences) > _MAX_MOVING * len(steps):
         return 0.0
     off = np.abs(multiples - np.round(multiples))
@@ -375,12 +375,13 @@ def _jumps(trajectory: Trajectory) -> BoolArray:
     for steps in (translations, rotations):
         velocities = steps / interval_s[:, None]
         padded = np.concatenate([velocities[2:0:-1], velocities, velocities[-2:-4:-1]])
-        around = np.median([padded[shift : shift + len(velocities)] for shift in range(5)], axis=0)
+        shifted = [padded[shift : shift + len(velocities)] for shift in range(5)]
+        around = np.partition(shifted, 2, axis=0)[2]
         excess = np.linalg.norm(velocities - around, axis=1)
         speed = np.linalg.norm(velocities, axis=1)
         jumps |= excess > np.maximum(
-            _JUMP_SIGMAS * (float(np.median(excess)) + 1e-12),
-            _JUMP_STEPS * np.quantile(speed, 0.9),
+            _JUMP_SIGMAS * (median(excess) + 1e-12),
+            _JUMP_STEPS * quantile(speed, 0.9),
         )
     return jumps
 
@@ -425,8 +426,8 @@ def check_stamps(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> list[
     list of Finding
     """
     stamps = {
-        "parent": float(np.median(parent_stamps_ns)),
-        "child": float(np.median(child_stamps_ns)),
+        "parent": median(parent_stamps_ns),
+        "child": median(child_stamps_ns),
     }
     early, late = sorted(stamps, key=lambda name: stamps[name])
     for factor, unit in _STAMP_UNITS.items():

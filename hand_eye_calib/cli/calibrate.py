@@ -166,12 +166,13 @@ def run(arguments: argparse.Namespace) -> int:
 
         files = [arguments.parent, arguments.child, *arguments.others]
         return calibrate_and_deliver(_read_rig(files, arguments), arguments, {"files": files})
-    from hand_eye_calib.cli.memory import keep_freed_memory
+    from hand_eye_calib.cli.memory import prepare_to_solve
+
+    prepare_to_solve()
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.engine.checked import at_clear_offset, checked
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
-    keep_freed_memory()
     options = options_from(arguments)
     trajectories, repairs = read_files(arguments, options)
     for text in repairs:

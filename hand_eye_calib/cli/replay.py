@@ -132,13 +132,14 @@ def run(arguments: argparse.Namespace) -> int:
 
         return calibrate_bag(arguments)
 
-    from hand_eye_calib.cli.memory import keep_freed_memory
+    from hand_eye_calib.cli.memory import prepare_to_solve
+
+    prepare_to_solve()
     from hand_eye_calib.cli.options import options_from
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.cli.replaying import fingerprints
     from hand_eye_calib.engine.checked import checked
 
-    keep_freed_memory()
     replayed = _replayed(arguments)
     if arguments.out:
         replayed.inputs["files"] = fingerprints(replayed.files)

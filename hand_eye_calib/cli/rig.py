@@ -53,10 +53,11 @@ def calibrate_and_deliver(
     inputs : dict
         Where the data came from, in plain values.
     """
-    from hand_eye_calib.cli.memory import keep_freed_memory
+    from hand_eye_calib.cli.memory import prepare_to_solve
+
+    prepare_to_solve()
     from hand_eye_calib.rig.calibrate import solve_rig
 
-    keep_freed_memory()
     _refuse_robot(arguments)
     options = options_from(arguments)
     with waiting_for(f"solving for {len(trajectories)} sensors"):

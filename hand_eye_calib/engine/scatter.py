@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, median
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
@@ -206,12 +206,7 @@ def _over_own(calibration: Calibration, others: Sequence[Calibration]) -> FloatA
 
 def _median(values: FloatArray) -> FloatArray:
     """Median (6,) of the finite values in each column; NaN if there is none."""
-    return np.array(
-        [
-            np.median(column[np.isfinite(column)]) if np.isfinite(column).any() else np.nan
-            for column in values.T
-        ]
-    )
+    return np.array([median(column[np.isfinite(column)]) for column in values.T])
 
 
 def _apart(

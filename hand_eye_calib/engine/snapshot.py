@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,12 +19,14 @@ from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
 from hand_eye_calib.engine.estimators import ESTIMATORS
-from hand_eye_calib.engine.pose_buffer import RawPoses
 from hand_eye_calib.engine.scatter import quick_cross_check
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+
+if TYPE_CHECKING:
+    from hand_eye_calib.engine.pose_buffer import RawPoses
 
 STREAMS = ("parent", "child")
 
@@ -62,8 +65,8 @@ class Snapshot:
 
     config: CalibratorConfig
     kept: PosePairs
-    buffered_parent: RawPoses | Trajectory
-    buffered_child: RawPoses | Trajectory
+    buffered_parent: "RawPoses | Trajectory"
+    buffered_child: "RawPoses | Trajectory"
     paired_at: str | None
     parent_frame: str
     child_frame: str
@@ -283,7 +286,7 @@ def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
     return replace(trajectory, measures=measures)
 
 
-def _as_trajectory(poses: RawPoses | Trajectory) -> Trajectory:
+def _as_trajectory(poses: "RawPoses | Trajectory") -> Trajectory:
     return poses if isinstance(poses, Trajectory) else poses.trajectory
 
 

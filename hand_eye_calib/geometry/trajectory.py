@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray, median
 from hand_eye_calib.config import MEASURES
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
@@ -205,7 +205,7 @@ class Trajectory:
     @property
     def interval_s(self) -> float:
         """Median time between two poses in seconds, of at least two poses."""
-        return float(np.median(np.diff(self.stamps_ns))) * 1e-9
+        return median(np.diff(self.stamps_ns)) * 1e-9
 
     def shifted(self, offset_s: float) -> Self:
         """The same poses with ``offset_s`` seconds added to every stamp."""

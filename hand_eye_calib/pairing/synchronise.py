@@ -6,7 +6,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, median
 from hand_eye_calib.geometry.trajectory import Trajectory
 
 # Streams whose intervals differ by less than this factor count as equally fast: they are paired at
@@ -60,8 +60,8 @@ def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
     """
     if len(parent_stamps_ns) < 2 or len(child_stamps_ns) < 2:
         return "child"
-    interval_parent = np.median(np.diff(parent_stamps_ns))
-    interval_child = np.median(np.diff(child_stamps_ns))
+    interval_parent = median(np.diff(parent_stamps_ns))
+    interval_child = median(np.diff(child_stamps_ns))
     return "parent" if interval_parent > _EQUALLY_FAST * interval_child else "child"
 
 

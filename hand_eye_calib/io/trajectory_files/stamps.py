@@ -4,7 +4,7 @@ from decimal import Decimal
 
 import numpy as np
 
-from hand_eye_calib.arrays import IntArray
+from hand_eye_calib.arrays import IntArray, median
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.trajectory_files.table import Table
@@ -63,7 +63,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
 def _median_interval_s(stamps_ns: IntArray) -> float:
     if len(stamps_ns) < 2:
         return 0.0
-    return float(np.median(np.abs(np.diff(stamps_ns.astype(float))))) * 1e-9
+    return median(np.abs(np.diff(stamps_ns.astype(float)))) * 1e-9
 
 
 def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:

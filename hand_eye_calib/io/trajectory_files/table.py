@@ -1,6 +1,5 @@
 """The numbers of a trajectory file, row by row, before they become poses."""
 
-import csv
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
@@ -99,6 +98,8 @@ def cells_of(text: str) -> list[str]:
     """The cells of a line: separated by commas, semicolons or white space."""
     if "," not in text and ";" not in text:
         return text.split()
+    import csv
+
     reader = csv.reader([text], delimiter="," if "," in text else ";", skipinitialspace=True)
     return [cell.strip() for cell in next(reader)]
 
