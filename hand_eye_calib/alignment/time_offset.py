@@ -1,7 +1,6 @@
 """The clock offset: seconds to add to the child's stamps to get the parent's clock."""
 
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 
@@ -68,17 +67,6 @@ class TimeOffset:
         """Whether motions over all times agree that there is an offset."""
         return self.spread_s < 0.5 * abs(self.seconds)
 
-    def beyond(self, known_s: float) -> Self:
-        """What is left of the offset of streams whose child's stamps were shifted by ``known_s``
-        seconds since.
-        """
-        coarse_s = self.correlation.offset_s - known_s
-        return replace(
-            self,
-            seconds=self.seconds - known_s,
-            correlation=replace(self.correlation, offset_s=coarse_s),
-        )
-
 
 def estimate_time_offset(
     parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
@@ -122,21 +110,6 @@ def estimate_time_offset(
     )
 
 
-def clear_time_offset(
-    parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
-) -> TimeOffset | None:
-    """The offset that :func:`estimate_time_offset` gives if the angular rates alone show it clearly
-    and a fit holds, otherwise None.
-    """
-    if any(find_leap(stream.stamps_ns) for stream in (parent, child)):
-        return None
-    correlation = correlate_rates(parent, child, max_gap_s)
-    if not correlation.is_clear:
-        return None
-    found = refine_time_offset(parent, child, correlation, max_gap_s)
-    return found if found.fit else None
-
-
 def time_offset_of_speeds(
     parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
 ) -> TimeOffset:
@@ -165,6 +138,7 @@ def refine_time_offset(
     correlation: Correlation,
     max_gap_s: float,
     start: SimilarityFit | None = None,
+    least_s: float = 0.0,
 ) -> TimeOffset:
     """Refine a coarse offset.
 
@@ -176,6 +150,8 @@ def refine_time_offset(
     max_gap_s : float
     start : SimilarityFit, optional
         Fit of the same streams to start at; a start is searched for without one.
+    least_s : float
+        A smaller offset of motions over one time need not be compared with those over others.
 
     Returns
     -------
@@ -193,6 +169,8 @@ def refine_time_offset(
         held += [float(offset_s)] if holds else []
         if holds and fit.offset_sigma_s < best.sigma_s:
             best = TimeOffset(float(offset_s), fit.offset_sigma_s, correlation, fit)
+        if abs(offset_s) < least_s:
+            break
     return replace(best, spread_s=np.ptp(held)) if len(held) == len(_LAGS_S) else best
 
 

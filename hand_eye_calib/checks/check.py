@@ -98,7 +98,8 @@ def check_streams(
     time_offset_s: float = 0.0,
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
-    clock: TimeOffset | None = None,
+    correlation: Correlation | None = None,
+    offset_sigma_s: float = 0.0,
 ) -> CheckResult:
     """Check two streams.
 
@@ -111,9 +112,11 @@ def check_streams(
         Known scale: factor of the child's lengths.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
-    clock : TimeOffset, optional
-        Offset of the streams as they are, if :func:`~.time_offset.clear_time_offset` has found it:
-        it is not estimated again.
+    correlation : Correlation, optional
+        Of the angular rates of the streams as they are, if it is known.
+    offset_sigma_s : float
+        Standard deviation of the known offset if a noise model that fits has estimated it: it is
+        not estimated again from motions; zero if not.
 
     Returns
     -------
@@ -123,11 +126,8 @@ def check_streams(
     if any(finding.severity is Severity.ERROR for finding in findings):
         return CheckResult(gravest_first(findings))
     streams = StreamPair(parent, child.shifted(time_offset_s).scaled(scale), max_gap_s)
-    if clock:
-        clock = clock.beyond(time_offset_s)
-        correlation = clock.correlation
-    else:
-        correlation = correlate_rates(streams.parent, streams.child, max_gap_s)
+    correlation = correlation or correlate_rates(parent, child, max_gap_s)
+    correlation = replace(correlation, offset_s=correlation.offset_s - time_offset_s)
     aligned = streams
     if correlation.is_clear:
         aligned = replace(streams, child=streams.child.shifted(correlation.offset_s))
@@ -150,8 +150,8 @@ def check_streams(
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
     findings += explanation.findings
-    known = time_offset_s, scale
-    return _check_agreeing(streams, explanation, clock, correlation, findings, *known)
+    known = TimeOffset(time_offset_s, offset_sigma_s, correlation, None)
+    return _check_agreeing(streams, explanation, correlation, findings, known, scale)
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
@@ -194,18 +194,17 @@ def unit_of(scale: float) -> tuple[float, str] | None:
 def _check_agreeing(
     streams: StreamPair,
     explanation: Explanation,
-    clock: TimeOffset | None,
     correlation: Correlation,
     findings: list[Finding],
-    known_offset_s: float,
+    known: TimeOffset,
     known_scale: float,
 ) -> CheckResult:
     """What else there is to say of streams that agree under a hypothesis."""
     is_sound = not any(finding.makes_unusable for finding in findings)
     corrected = explanation.hypothesis.undo(streams)
-    # Mistakes that are undone change positions and axes, and so the fit of the offset.
-    offset = None if explanation.hypothesis.code else clock
-    if offset is None:
+    if known.sigma_s and is_sound and not explanation.hypothesis.code:
+        offset = replace(known, seconds=0.0)
+    else:
         offset = refine_time_offset(
             corrected.parent, corrected.child, correlation, corrected.max_gap_s, explanation.fit
         )
@@ -218,7 +217,7 @@ def _check_agreeing(
     aligned = _aligned(streams, offset.seconds, fit) if is_sound else None
     findings = [
         *findings,
-        *check_offset(aligned.refined(offset) if aligned else offset, known_offset_s),
+        *check_offset(aligned.refined(offset) if aligned else offset, known.seconds),
         *(_check_scale(scale, known_scale) if scale else []),
         *([wording.unit_unseen()] if explanation.same_unit else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),

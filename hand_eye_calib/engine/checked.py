@@ -6,13 +6,13 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from hand_eye_calib.assessment.model_fit import MAX_MISFIT
+from hand_eye_calib.alignment.time_offset import refine_time_offset
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
-from hand_eye_calib.engine.snapshot import GAP_INTERVALS, Snapshot
+from hand_eye_calib.engine.snapshot import GAP_INTERVALS, Snapshot, noise_fits
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -60,16 +60,25 @@ def at_clear_offset(snapshot: Snapshot, given: Collection[str]) -> Snapshot:
     given : collection of str
         Names of the options that were set.
     """
-    config = snapshot.config
-    has_clock = not METHODS[config.method].uses_reference and config.reference == "auto"
-    clock = None if "time_offset" in given or not has_clock else snapshot.clock
-    if clock is None or not clock.is_agreed:
+    if "time_offset" in given or not _has_clock(snapshot.config):
         return snapshot
-    if abs(clock.seconds) - 0.5 * clock.spread_s < _MOST_MOVED_S:
+    if not snapshot.correlation.is_clear:
+        return snapshot
+    config = snapshot.config
+    clock = refine_time_offset(
+        snapshot.parent, snapshot.child, snapshot.correlation, config.max_gap, least_s=_MOST_MOVED_S
+    )
+    if not clock.is_agreed or abs(clock.seconds) - 0.5 * clock.spread_s < _MOST_MOVED_S:
         return snapshot
     moved = replace(snapshot, config=replace(config, time_offset="estimate"), time_offset=clock)
     can_solve = all(len(each.pose_pairs()) >= config.min_pairs for each in (snapshot, moved))
     return moved if can_solve else snapshot
+
+
+def _has_clock(config: CalibratorConfig) -> bool:
+    """Whether the method may find a time offset of poses by itself."""
+    uses_reference = METHODS[config.method].uses_reference or config.reference != "auto"
+    return config.measured == "poses" and not uses_reference
 
 
 def checked(
@@ -122,7 +131,7 @@ def mend(
         again = _solved_with(snapshot, options)
     if again is None or (
         _serious(again.calibration) > _serious(found.calibration) - bool(certain)
-        or (_noise_fits(calibration) and not _noise_fits(again.calibration))
+        or (noise_fits(calibration) and not noise_fits(again.calibration))
     ):
         return found
     return replace(again, told=_told(check.findings, options, again.calibration))
@@ -241,15 +250,7 @@ def _is_grave(finding: Finding, option: str) -> bool:
 
 def _is_sound(found: Mended) -> bool:
     """Whether there cannot be less to say against another result."""
-    return _noise_fits(found.calibration) and not _serious(found.calibration)
-
-
-def _noise_fits(calibration: Calibration) -> bool:
-    """Whether the result is the noise model's, and its residuals fit: an option after which they no
-    longer do was not what the streams lack.
-    """
-    noise = calibration.noise
-    return noise is not None and noise["misfit"] <= MAX_MISFIT
+    return noise_fits(found.calibration) and not _serious(found.calibration)
 
 
 def _serious(calibration: Calibration) -> int:

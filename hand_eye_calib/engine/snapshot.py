@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
 from hand_eye_calib.alignment.time_offset import (
     TimeOffset,
-    clear_time_offset,
     estimate_time_offset,
     time_offset_of_speeds,
 )
+from hand_eye_calib.assessment.model_fit import MAX_MISFIT
 from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.checks.check import CheckResult, check_parts, check_streams
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
@@ -98,23 +99,21 @@ class Snapshot:
     def _resolved(self) -> "Snapshot":
         if not isinstance(self.config.time_offset, str):
             return self
-        found = self.clock or self.time_offset
-        if found is None:
-            found = estimated_time_offset(self.config, self.parent, self.child)
+        found = self.time_offset or estimated_time_offset(self.config, self.parent, self.child)
         config = replace(self.config, time_offset=found.seconds)
         return replace(self, config=config, time_offset=found)
 
     @cached_property
-    def clock(self) -> TimeOffset | None:
-        """The time offset of the streams as they came in if the angular rates alone show it
-        clearly; None otherwise, and if pairs were made.
-        """
-        if len(self.kept) or self.config.measured != "poses":
-            return None
-        found = self.time_offset
-        if found is None:
-            return clear_time_offset(self.parent, self.child, self.config.max_gap)
-        return found if found.correlation.is_clear and found.fit else None
+    def correlation(self) -> Correlation:
+        """Correlation of the angular rates of the streams, over all time offsets."""
+        return correlate_rates(*self.streams, self.max_gap_s)
+
+    @property
+    def max_gap_s(self) -> float:
+        """Longest time between two poses of the streams that interpolation may bridge, s."""
+        if not len(self.kept):
+            return self.config.max_gap
+        return max(self.config.max_gap, GAP_INTERVALS * self.streams[0].interval_s)
 
     def pose_pairs(self) -> PosePairs:
         """Synchronised pose pairs: the kept ones, and those of the buffered poses.
@@ -223,15 +222,14 @@ class Snapshot:
             return CheckResult(gravest_first(self._check_parts(calibration)))
         offset_s = calibration.time_offset_s if calibration else self.config.time_offset
         scale = calibration.scale if calibration else self.config.scale
-        max_gap_s = self.config.max_gap
-        if len(self.kept):
-            max_gap_s = max(max_gap_s, GAP_INTERVALS * self.streams[0].interval_s)
+        sigma_s = calibration.time_offset_sigma_s if calibration and noise_fits(calibration) else 0
         result = check_streams(
             *self.streams,
             time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
             scale=1.0 if isinstance(scale, str) else scale,
-            max_gap_s=max_gap_s,
-            clock=(self.resolved() if calibration else self).clock,
+            max_gap_s=self.max_gap_s,
+            correlation=self.correlation,
+            offset_sigma_s=sigma_s,
         )
         obsolete = set()
         if len(self.kept):
@@ -270,6 +268,12 @@ class Snapshot:
             f"{needed} from {counts} that overlap for {(end_ns - start_ns) * 1e-9:.2f} s; "
             "record longer, or raise max_gap if a stream is slower than that"
         )
+
+
+def noise_fits(calibration: Calibration) -> bool:
+    """Whether the result is the noise model's, and its residuals fit."""
+    noise = calibration.noise
+    return noise is not None and noise["misfit"] <= MAX_MISFIT
 
 
 def _hides_a_translation(calibration: Calibration) -> bool:

@@ -113,13 +113,23 @@ class TestClearOffset:
         level = replace(late, buffered_child=late.child.shifted(0.05))
         assert at_clear_offset(level, ()) is level
 
-    def test_none_is_clear_if_motions_over_other_times_tell_another(self, late):
-        assert late.clock.is_agreed
-        other = replace(late, time_offset=replace(late.clock, spread_s=0.04))
-        assert at_clear_offset(other, ()) is other
+    def test_none_is_clear_if_motions_over_other_times_tell_another(self, late, monkeypatch):
+        spread = replace(at_clear_offset(late, ()).time_offset, spread_s=0.04)
+        monkeypatch.setattr(
+            "hand_eye_calib.engine.checked.refine_time_offset", lambda *given, **more: spread
+        )
+        assert at_clear_offset(late, ()) is late
 
-    def test_the_check_takes_it_as_it_is(self, late):
-        known = check_streams(*late.streams, 0.02, clock=late.clock)
-        found = check_streams(*late.streams, 0.02)
-        assert [each.code for each in known.findings] == [each.code for each in found.findings]
-        assert known.correlation.offset_s == pytest.approx(found.correlation.offset_s, abs=1e-9)
+
+def test_the_check_takes_the_correlation_and_a_model_s_offset_as_they_are(late):
+    known, child = 0.049, late.child
+    found = check_streams(late.parent, child, known)
+    same = check_streams(late.parent, child, known, correlation=late.correlation)
+    assert same.findings == found.findings
+    assert same.correlation.offset_s == pytest.approx(found.correlation.offset_s, abs=1e-9)
+    sure = check_streams(late.parent, child, known, offset_sigma_s=0.0005)
+    assert [each.code for each in sure.findings] == [each.code for each in found.findings]
+    # An offset that a model has missed is found by the model of the check.
+    (missed,) = check_streams(late.parent, child, 0.0, offset_sigma_s=0.0005).findings
+    assert missed.code == "time_offset"
+    assert dict(missed.options)["time_offset"] == pytest.approx(0.05, abs=0.002)
