@@ -26,6 +26,7 @@ from hand_eye_calib.assessment.lever_arm import (
     MIN_SHARE_WITH_TILT,
     ROUNDING_ANGLE,
     LeverArms,
+    weighted_products,
 )
 from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
@@ -313,10 +314,10 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
     translation_b, moved = pairs.Ts_childi_childj[:, :3, 3], rotation_a - np.eye(3)
     jacobian_t = np.concatenate([moved @ rotation, rotation @ se3.skew(translation_b)], axis=2)
-    information_t = _weighted_products(weights, jacobian_t)
+    information_t = weighted_products(weights, jacobian_t)
     jacobian_r = np.swapaxes(rotation_b, 1, 2) - np.eye(3)
     information_r = np.zeros((6, 6))
-    information_r[3:, 3:] = _weighted_products(weights, jacobian_r)
+    information_r[3:, 3:] = weighted_products(weights, jacobian_r)
 
     hessian = information_t + 2 * information_r
     values, vectors = np.linalg.eigh(hessian)
@@ -326,13 +327,6 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
 
     hidden = _hidden_translations(LeverArms.of(moved @ rotation, weights), cov_r)
     return covariance, basis([*hidden, *vectors[:, ~seen].T])
-
-
-def _weighted_products(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """``sum w J'J`` (p, p) of derivatives J (K, r, p) with weights (K,)."""
-    size = jacobian.shape[2]
-    weighted = weights[:, None, None] * jacobian
-    return weighted.reshape(-1, size).T @ jacobian.reshape(-1, size)
 
 
 def _hidden_translations(

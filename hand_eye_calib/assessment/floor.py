@@ -16,7 +16,7 @@ EuRoC, zxl19, a robot arm): with it, 90 % intervals cover 85 to 89 % of 81 axes;
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.assessment.lever_arm import ROUNDING_ANGLE, LeverArms
+from hand_eye_calib.assessment.lever_arm import ROUNDING_ANGLE, LeverArms, weighted_products
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 
@@ -94,10 +94,10 @@ def _shift_by_scale(
     rotation = T_parent_child[:3, :3]
     moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
     translation_b = pairs.Ts_childi_childj[:, :3, 3]
-    jacobian = np.concatenate([moved @ rotation, rotation @ se3.skew(translation_b)], axis=2)
-    weighted = weights[:, None, None] * jacobian
-    information = np.einsum("kai,kaj->ij", weighted, jacobian)
+    push = (translation_b @ rotation.T)[:, :, None]
+    jacobian = [moved @ rotation, rotation @ se3.skew(translation_b)]
+    products = weighted_products(weights, np.concatenate([*jacobian, push], axis=2))
+    information, pushed = products[:6, :6], products[:6, 6]
     turned = pairs.Ts_childi_childj[:, :3, :3] - np.eye(3)
-    information[3:, 3:] += 2 * np.einsum("k,kai,kaj->ij", weights, turned, turned)
-    pushed = np.einsum("kai,ka->i", weighted, translation_b @ rotation.T)
+    information[3:, 3:] += 2 * weighted_products(weights, turned)
     return (np.linalg.pinv(information, rcond=_MIN_INFORMATION, hermitian=True) @ pushed)[:3]

@@ -61,11 +61,8 @@ class LeverArms:
         weights : (K,) array, optional
             1 for all motions by default.
         """
-        if weights is None:
-            information = np.einsum("kai,kaj->ij", chords, chords) / len(chords)
-        else:
-            total = max(float(weights.sum()), 1.0)
-            information = np.einsum("k,kai,kaj->ij", weights, chords, chords) / total
+        weights = np.ones(len(chords)) if weights is None else weights
+        information = weighted_products(weights, chords) / max(float(weights.sum()), 1.0)
         powers, directions = np.linalg.eigh(information)
         return cls(powers, directions, information)
 
@@ -100,3 +97,10 @@ class LeverArms:
         return tuple(
             axis for axis, share in zip("xyz", shares, strict=True) if share > HIDDEN_SHARE
         )
+
+
+def weighted_products(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """``sum w J'J`` (p, p) of derivatives J (K, r, p) with weights (K,)."""
+    size = jacobian.shape[2]
+    weighted = weights[:, None, None] * jacobian
+    return weighted.reshape(-1, size).T @ jacobian.reshape(-1, size)

@@ -50,7 +50,7 @@ _ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
 
 # Evidence (in logarithms of lengths) from which on streams are called inverted, and likely so.
 _INVERTED, _LIKELY_INVERTED = 0.3, 1.0
-_PATH_STEP_S = 0.3
+_PATH_STEP_S, _LEAST_LEVER_ARM_M = 0.3, 1e-3
 
 # Two frames are one if they are this close to each other (m, rad).
 _SAME_FRAME_M, _SAME_FRAME_RAD = 0.01, 0.01
@@ -377,22 +377,24 @@ def _evidence_for_inverse(
     streams: StreamPair, explanation: Explanation, lag_s: float
 ) -> tuple[float, SimilarityFit]:
     """Sum of logarithms by which paths and lever arm are shorter with both streams inverted, and
-    the fit then.
+    the fit then: the fit as they are if no other lever arm could make the sum matter.
     """
     streams, fit = explanation.hypothesis.undo(streams), explanation.fit
+    by_paths = sum(_log_of_paths(stream) for stream in (streams.parent, streams.child))
+    most = by_paths + 0.5 * float(np.log(_lever_arm(fit) / _LEAST_LEVER_ARM_M))
+    if not explanation.hypothesis.code and most < _INVERTED:
+        return most, fit
     inverted = _fitted(_BOTH_INVERTED, streams, lag_s, same_unit=explanation.same_unit).fit
-    by_paths = sum(
-        np.log(_path_length(stream) / _path_length(_inverted(stream)))
-        for stream in (streams.parent, streams.child)
-    )
     if _is_identity(fit) or _is_identity(inverted):
         # One world for both streams: the lever arm between the worlds says nothing.
-        return float(by_paths), inverted
-    lever_arms = [
-        max(float(np.linalg.norm(f.T_parent_child[:3, 3])), 3 * f.sigma_translation, 1e-3)
-        for f in (fit, inverted)
-    ]
-    return float(by_paths + 0.5 * np.log(lever_arms[0] / lever_arms[1])), inverted
+        return by_paths, inverted
+    return by_paths + 0.5 * float(np.log(_lever_arm(fit) / _lever_arm(inverted))), inverted
+
+
+def _lever_arm(fit: SimilarityFit) -> float:
+    """Length of the lever arm, m, or of what noise may make of it."""
+    length_m = float(np.linalg.norm(fit.T_parent_child[:3, 3]))
+    return max(length_m, 3 * fit.sigma_translation, _LEAST_LEVER_ARM_M)
 
 
 def _is_identity(fit: SimilarityFit) -> bool:
@@ -404,7 +406,12 @@ def _is_identity(fit: SimilarityFit) -> bool:
     return bool(se3.rotation_angle(T[:3, :3]) < max_angle)
 
 
-def _path_length(trajectory: Trajectory) -> float:
-    """Length of the path, in coarse steps so that noise does not add to it."""
-    positions = coarse_poses(trajectory, _PATH_STEP_S)[:, :3, 3]
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()) + 1e-9
+def _log_of_paths(trajectory: Trajectory) -> float:
+    """Logarithm of the path length over that of the inverted poses."""
+    poses = coarse_poses(trajectory, _PATH_STEP_S)
+    return float(np.log(_path_length(poses) / _path_length(se3.inverse(poses))))
+
+
+def _path_length(coarse: FloatArray) -> float:
+    """Path length, m, of poses in steps that are so coarse that noise does not add to it."""
+    return float(np.linalg.norm(np.diff(coarse[:, :3, 3], axis=0), axis=1).sum()) + 1e-9
