@@ -6,6 +6,7 @@ nothing here needs a lock.
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -202,10 +203,17 @@ class CalibratorNode(Node):
         if not self._robot.lacks_base(calibration):
             self._tf.add(calibration, self._checks.faults())
 
+    def _publish_others(self, calibrations: Sequence[Calibration]) -> None:
+        """Publish new results of the further child sensors, in their order."""
+        for each, calibration in zip(self._others, calibrations, strict=False):
+            self._topics.publish_other(each.name, calibration)
+        mounted = [self._robot.in_base(each) for each in calibrations]
+        if mounted:
+            self._tf.add_others([each for each in mounted if not self._robot.lacks_base(each)])
+
     def _publish_diagnostics(self) -> None:
         self._tf.look()
-        for each, calibration in zip(self._others, self._report.take_others(), strict=False):
-            self._topics.publish_other(each.name, calibration)
+        self._publish_others(self._report.take_others())
         if self._mount is not None:
             self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds

@@ -78,6 +78,10 @@ class Robot:
         installed = self.installed(calibration.parent_frame, calibration.child_frame)
         if installed is not None:
             calibration = with_comparison(calibration, installed)
+        return self.in_base(calibration)
+
+    def in_base(self, calibration: Calibration) -> Calibration:
+        """A result with its pose in the base frame, if one was asked for and is known."""
         if not self._base_frame:
             return calibration
         try:

@@ -49,13 +49,8 @@ class SettledRule:
         newest = self._results[-1]
         if faults:
             return f"the streams are faulty: {faults[0]}"
-        if newest.status is not SolveStatus.OK:
-            return f"the result is {newest.status.value}"
-        if newest.verdict is Verdict.DO_NOT_USE:
-            return newest.headline
-        weak = [dof.name for dof in newest.observability if dof.verdict not in _KNOWN]
-        if weak:
-            return f"{', '.join(weak)} only weakly observable"
+        if unknown := what_is_unknown(newest):
+            return unknown
         span_s = (newest.stamp_ns - self._results[0].stamp_ns) * 1e-9
         if len(self._results) < RESULTS or span_s < SPAN_S:
             found = f"{len(self._results)} results over {span_s:.0f} s"
@@ -63,6 +58,16 @@ class SettledRule:
         if not all(_agree(earlier, newest) for earlier in self._results):
             return f"the last {RESULTS} results differ by more than their standard deviations"
         return ""
+
+
+def what_is_unknown(calibration: Calibration) -> str:
+    """What a result lacks to be broadcast, looked at alone; empty if nothing."""
+    if calibration.status is not SolveStatus.OK:
+        return f"the result is {calibration.status.value}"
+    if calibration.verdict is Verdict.DO_NOT_USE:
+        return calibration.headline
+    weak = [dof.name for dof in calibration.observability if dof.verdict not in _KNOWN]
+    return f"{', '.join(weak)} only weakly observable" if weak else ""
 
 
 def _agree(earlier: Calibration, newest: Calibration) -> bool:

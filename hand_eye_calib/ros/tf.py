@@ -2,6 +2,7 @@
 
 import time
 from collections import deque
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -15,7 +16,7 @@ from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.ros.conversions import to_mounting
 from hand_eye_calib.ros.log import NodeLog
-from hand_eye_calib.ros.settled import SettledRule
+from hand_eye_calib.ros.settled import SettledRule, what_is_unknown
 
 STATIC_TOPIC = "/tf_static"
 DYNAMIC_TOPIC = "/tf"
@@ -78,7 +79,8 @@ class FrameTree:
 
 
 class TfBroadcaster:
-    """Broadcasts settled results on ``/tf_static`` while that is switched on.
+    """Broadcasts settled results on ``/tf_static`` while that is switched on, and with them the
+    results of further child sensors.
 
     Parameters
     ----------
@@ -92,6 +94,8 @@ class TfBroadcaster:
         self._newest: Calibration | None = None
         self._waiting_for = "no result yet"
         self._forbidden = ""
+        self._others: list[Calibration] = []
+        self._forbidden_others: dict[str, str] = {}
         self._tree = FrameTree()
         self._own: deque[TransformStamped] = deque(maxlen=_MOST_OWN)
         self._publisher: Publisher | None = None
@@ -105,8 +109,8 @@ class TfBroadcaster:
 
     @property
     def refused(self) -> str:
-        """Why nothing may be broadcast; empty if it may."""
-        return self._forbidden
+        """Why nothing may be broadcast, or a further child sensor may not; empty if all may."""
+        return self._forbidden or "; ".join(self._forbidden_others.values())
 
     @property
     def state(self) -> str:
@@ -116,7 +120,7 @@ class TfBroadcaster:
         if self._forbidden:
             return f"refused: {self._forbidden}"
         if self._publisher is not None:
-            return "broadcast"
+            return "; ".join(["broadcast", *self._forbidden_others.values()])
         return f"not yet: {self._waiting_for}"
 
     def switch(self, on: bool) -> None:
@@ -143,6 +147,17 @@ class TfBroadcaster:
         self._waiting_for = self._rule.what_is_missing(faults)
         self._broadcast()
 
+    def add_others(self, calibrations: Sequence[Calibration]) -> None:
+        """Take the results of all further child sensors, in the frames that they are mounted on."""
+        self._others = []
+        for calibration in calibrations:
+            if unknown := what_is_unknown(calibration):
+                self._log.info(f"{calibration.child_frame} is not on /tf_static: {unknown}")
+            else:
+                self._others.append(calibration)
+        if self._newest is not None:
+            self._broadcast()
+
     def look(self) -> None:
         """Go on if the transform tree has been listened to for long enough; to be called often."""
         if self._newest is not None and self._publisher is None:
@@ -152,6 +167,7 @@ class TfBroadcaster:
         """Begin a new session: what was broadcast is withdrawn."""
         self._rule.restart()
         self._newest, self._waiting_for = None, "no result yet"
+        self._others, self._forbidden_others = [], {}
         self._withdraw()
 
     def _listen(self) -> None:
@@ -162,20 +178,22 @@ class TfBroadcaster:
             for topic, profile in qos.items()
         }
         self._began_s = time.monotonic()
-        self._tree, self._forbidden = FrameTree(), ""
+        self._tree, self._forbidden, self._forbidden_others = FrameTree(), "", {}
 
     def _hear(self, topic: str, message: Any) -> None:
         for transform in message.transforms:
             if not self.is_own(transform):
                 self._tree.add(transform.header.frame_id, transform.child_frame_id, topic)
         if self._publisher is not None and topic == STATIC_TOPIC:
-            self._check()
+            before = {*self._forbidden_others}
+            if self._check() and {*self._forbidden_others} - before:
+                self._broadcast()  # without what is forbidden now
 
     def _check(self) -> bool:
         """Whether the newest result may be broadcast."""
         assert self._newest is not None
-        frames = self._newest.mounting[0], self._newest.child_frame
-        forbidden = self._tree.what_forbids(*frames)
+        self._check_others()
+        forbidden = self._what_forbids(self._newest)
         if forbidden and forbidden != self._forbidden:
             self._log.error(
                 f"publish_tf is refused: {forbidden}. Put the result into the robot's description "
@@ -187,6 +205,21 @@ class TfBroadcaster:
         self._forbidden = forbidden
         return not forbidden
 
+    def _what_forbids(self, calibration: Calibration) -> str:
+        return self._tree.what_forbids(calibration.mounting[0], calibration.child_frame)
+
+    def _check_others(self) -> None:
+        """Find which further child sensors may not be broadcast, and say what is new."""
+        before = self._forbidden_others
+        forbidden = {each.child_frame: self._what_forbids(each) for each in self._others}
+        self._forbidden_others = {frame: why for frame, why in forbidden.items() if why}
+        for frame, why in self._forbidden_others.items():
+            if why != before.get(frame):
+                self._log.error(
+                    f"publish_tf is refused for {frame}: {why}. Put its result into the robot's "
+                    "description; if it was broadcast before, restart the listeners"
+                )
+
     def _broadcast(self) -> None:
         is_looking = time.monotonic() - self._began_s < LOOK_S
         if not self.is_on or is_looking or self._waiting_for or not self._check():
@@ -197,9 +230,11 @@ class TfBroadcaster:
         if self._publisher is None:
             self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, _STATIC_QOS)
             self._log.info("the result has settled: it is broadcast on /tf_static from now on")
-        transform = to_mounting(self._newest)
-        self._own.append(transform)
-        self._publisher.publish(message_type()(transforms=[transform]))
+        others = [each for each in self._others if each.child_frame not in self._forbidden_others]
+        # In one message: new listeners get the last one alone.
+        transforms = [to_mounting(each) for each in (self._newest, *others)]
+        self._own.extend(transforms)
+        self._publisher.publish(message_type()(transforms=transforms))
 
     def _withdraw(self) -> None:
         """Give nothing to new listeners; those who have heard the edge keep it."""

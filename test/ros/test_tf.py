@@ -15,6 +15,8 @@ from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.ros import tf
+from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.settled import RESULTS, SPAN_S, SettledRule
 from hand_eye_calib.ros.tf import FrameTree
 
@@ -205,3 +207,60 @@ class TestNode:
         self.play(peer, lambda: heard, "the edge")
         robot(("base_link", "camera"))
         node.wait_for_log("publish_tf is refused: camera has the parent base_link", "withdrawn")
+
+    @pytest.fixture
+    def broadcaster(self, kind, peer, calibration, monkeypatch):
+        """In the peer's own node, switched on, with a result that has settled."""
+        monkeypatch.setattr(tf, "LOOK_S", 0.0)
+        made = tf.TfBroadcaster(peer.node, NodeLog(peer.node.get_logger()))
+        made.switch(True)
+        yield made
+        made.switch(False)
+
+    @staticmethod
+    def settle(broadcaster, calibration):
+        for k in range(RESULTS):
+            broadcaster.add(TestSettledRule.later(calibration, k), ())
+
+    @staticmethod
+    def frames_of_new_listener(peer, listen, until):
+        heard = listen()
+        peer.spin_until(lambda: until in {each.child_frame_id for each in heard}, until)
+        return {each.child_frame_id for each in heard}
+
+    def test_further_children_are_in_the_same_message(self, peer, listen, broadcaster, calibration):
+        rear, side = (
+            dataclasses.replace(calibration, child_frame=name) for name in ("rear", "side")
+        )
+        weak = dataclasses.replace(calibration.observability[2], verdict=DofVerdict.WEAK)
+        dofs = (*calibration.observability[:2], weak, *calibration.observability[3:])
+        broadcaster.add_others([rear, dataclasses.replace(side, observability=dofs)])
+        assert broadcaster.state == "not yet: no result yet"
+        self.settle(broadcaster, calibration)
+        child = calibration.child_frame
+        assert self.frames_of_new_listener(peer, listen, "rear") == {child, "rear"}
+        assert broadcaster.refused == ""
+        broadcaster.restart()
+        self.settle(broadcaster, calibration)
+        assert self.frames_of_new_listener(peer, listen, child) == {child}
+
+    def test_a_further_child_that_has_a_parent_is_refused_alone(
+        self, peer, listen, robot, broadcaster, calibration
+    ):
+        robot(("base_link", "rear"))
+        self.frames_of_new_listener(peer, listen, "rear")
+        child = calibration.child_frame
+        others = [dataclasses.replace(calibration, child_frame=name) for name in ("rear", "side")]
+        self.settle(broadcaster, calibration)
+        broadcaster.add_others(others)
+        assert broadcaster.refused.startswith("rear has the parent base_link on /tf_static")
+        assert broadcaster.state.startswith("broadcast; rear has the parent")
+        heard = listen()
+        peer.spin_until(lambda: {each.child_frame_id for each in heard} >= {child, "side"}, "both")
+        robot(("base_link", "side"))
+        peer.spin_until(lambda: "side has the parent base_link" in broadcaster.refused, "refusal")
+        late = listen()
+        peer.spin_until(lambda: child in {each.child_frame_id for each in late}, "the child")
+        assert (calibration.parent_frame, "side") not in {
+            (each.header.frame_id, each.child_frame_id) for each in late
+        }
