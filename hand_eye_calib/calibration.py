@@ -226,6 +226,9 @@ class Calibration:
     other_answer : ((4, 4) array, (6, 6) array) or None
         T_parent_child and covariance under other assumptions on the noise: of the adaptive
         estimator beside DNLO, or the reverse. Not part of files.
+    is_steady : bool
+        Whether the noise model, which fits, shows neither a delay of positions nor a world that
+        moves: the stream checks do not look for them again. Not part of files.
     """
 
     T_parent_child: FloatArray
@@ -269,6 +272,7 @@ class Calibration:
     other_answer: tuple[FloatArray, FloatArray] | None = field(
         default=None, repr=False, compare=False
     )
+    is_steady: bool = field(default=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
         frames = f"{self.child_frame} in {self.parent_frame}"

@@ -33,6 +33,9 @@ _WITHIN = 3.0
 # Nearly one: hardly two sensors fit so close.
 _NEARLY_M, _NEARLY_WITHIN = 0.012, 4.0
 
+# Farther apart two frames are no question.
+_APART_M = 0.05
+
 # Gains of rotations, less 1, from which on there is a warning, an error.
 _GAIN_WARNING, _GAIN_ERROR = 0.003, 0.03
 
@@ -64,6 +67,31 @@ _MOVED_ERROR_M, _MOVED_ERROR_RAD = 0.02, float(np.radians(1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
+class ByModel:
+    """What a noise model that fits has found in two streams.
+
+    Attributes
+    ----------
+    T_parent_child : (4, 4) array
+        X.
+    offset_sigma_s : float
+        Standard deviation of the time offset; zero if it was not estimated.
+    is_steady : bool
+        There is neither a delay of positions, nor a world that moves, nor another time offset.
+    """
+
+    T_parent_child: FloatArray
+    offset_sigma_s: float
+    is_steady: bool
+
+    @property
+    def leaves_no_doubt(self) -> bool:
+        """Whether the estimator has nothing to add: the frames are not nearly one either."""
+        distance_m = float(np.linalg.norm(self.T_parent_child[:3, 3]))
+        return self.is_steady and self.offset_sigma_s > 0 and distance_m > _APART_M
+
+
+@dataclass(frozen=True, kw_only=True)
 class Aligned:
     """Two streams that agree.
 
@@ -77,18 +105,22 @@ class Aligned:
         X.
     covariance : (6, 6) array
         Of (rho, phi) in ``X exp(rho, phi)``.
+    model : ByModel or None
     """
 
     pose_pairs: PosePairs
     motions: MotionPairs
     T_parent_child: FloatArray
     covariance: FloatArray
+    model: ByModel | None = None
 
     @cached_property
     def solution(self) -> AdaptiveSolution | None:
         """Answer of the adaptive estimator from some of the poses, with a free clock; None if they
-        are too few or it does not settle.
+        are too few, if it does not settle, or if a model has ruled out what it would be asked for.
         """
+        if self.model and self.model.leaves_no_doubt:
+            return None
         poses = self.pose_pairs[:: -(-len(self.pose_pairs) // _MOST_POSES)]
         if len(poses) < _FEWEST_POSES:
             return None

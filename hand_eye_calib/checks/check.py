@@ -26,7 +26,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.aligned import Aligned, check_aligned
+from hand_eye_calib.checks.aligned import Aligned, ByModel, check_aligned
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
 from hand_eye_calib.checks.hypotheses import (
     LAGS_S,
@@ -99,7 +99,7 @@ def check_streams(
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
     correlation: Correlation | None = None,
-    offset_sigma_s: float = 0.0,
+    model: ByModel | None = None,
 ) -> CheckResult:
     """Check two streams.
 
@@ -114,9 +114,9 @@ def check_streams(
         Longest time between two poses that interpolation may bridge, in seconds.
     correlation : Correlation, optional
         Of the angular rates of the streams as they are, if it is known.
-    offset_sigma_s : float
-        Standard deviation of the known offset if a noise model that fits has estimated it: it is
-        not estimated again from motions; zero if not.
+    model : ByModel, optional
+        What a noise model that fits has found with the known offset and scale: it is not estimated
+        again.
 
     Returns
     -------
@@ -150,8 +150,8 @@ def check_streams(
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
     findings += explanation.findings
-    known = TimeOffset(time_offset_s, offset_sigma_s, correlation, None)
-    return _check_agreeing(streams, explanation, correlation, findings, known, scale)
+    known = time_offset_s, scale
+    return _check_agreeing(streams, explanation, correlation, findings, known, model)
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
@@ -196,14 +196,18 @@ def _check_agreeing(
     explanation: Explanation,
     correlation: Correlation,
     findings: list[Finding],
-    known: TimeOffset,
-    known_scale: float,
+    known: tuple[float, float],
+    model: ByModel | None,
 ) -> CheckResult:
-    """What else there is to say of streams that agree under a hypothesis."""
+    """What else there is to say of streams that agree under a hypothesis, with a known time offset
+    and scale.
+    """
     is_sound = not any(finding.makes_unusable for finding in findings)
+    # A model of streams with a mistake is of no use.
+    model = None if explanation.hypothesis.code or not is_sound else model
     corrected = explanation.hypothesis.undo(streams)
-    if known.sigma_s and is_sound and not explanation.hypothesis.code:
-        offset = replace(known, seconds=0.0)
+    if model and model.offset_sigma_s:
+        offset = TimeOffset(0.0, model.offset_sigma_s, correlation, None)
     else:
         offset = refine_time_offset(
             corrected.parent, corrected.child, correlation, corrected.max_gap_s, explanation.fit
@@ -214,11 +218,11 @@ def _check_agreeing(
     scale = None if explanation.same_unit else _scale(pose_pairs, explanation.fit)
     rotations = _motions(pose_pairs).Ts_parenti_parentj[:, :3, :3]
     fit = scale.fit if scale else explanation.fit
-    aligned = _aligned(streams, offset.seconds, fit) if is_sound else None
+    aligned = _aligned(streams, offset.seconds, fit, model) if is_sound else None
     findings = [
         *findings,
-        *check_offset(aligned.refined(offset) if aligned else offset, known.seconds),
-        *(_check_scale(scale, known_scale) if scale else []),
+        *check_offset(aligned.refined(offset) if aligned else offset, known[0]),
+        *(_check_scale(scale, known[1]) if scale else []),
         *([wording.unit_unseen()] if explanation.same_unit else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
         *(check_aligned(aligned) if aligned else []),
@@ -240,7 +244,9 @@ def _scale(pose_pairs: PosePairs, start: SimilarityFit) -> Scale | None:
         return None
 
 
-def _aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit) -> Aligned:
+def _aligned(
+    streams: StreamPair, offset_s: float, fit: SimilarityFit, model: ByModel | None
+) -> Aligned:
     """Streams that agree without any mistake undone, on one clock and in one unit of length."""
     child = streams.child.shifted(offset_s).scaled(fit.scale)
     pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
@@ -249,6 +255,7 @@ def _aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit) -> Aligne
         motions=_motions(pose_pairs),
         T_parent_child=fit.T_parent_child,
         covariance=fit.covariance[:6, :6],
+        model=model,
     )
 
 

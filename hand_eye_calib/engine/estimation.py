@@ -36,6 +36,9 @@ from hand_eye_calib.solvers.solution import Solution
 # look like motion.
 _SPAN = 10
 
+# Standard deviations below which a delay is none.
+_NO_DELAY = 3.0
+
 _PROVED = {True: "yes", False: "no", None: "not tried"}
 
 # Tried in turn if the reference that auto chose leaves an axis unobservable.
@@ -88,6 +91,13 @@ class _Evaluation:
         if self.drift is not None and self.drift.is_significant:
             spread = spread + np.outer(self.drift.shift, self.drift.shift)
         return spread if self.shift is None else spread + self.shift.spread
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether a noise model shows neither a delay of positions nor a world that moves."""
+        if not self.delays or self.drift is None:
+            return False
+        return not self.drift.is_significant and max(d.sigmas for d in self.delays) < _NO_DELAY
 
 
 @dataclass(frozen=True)
@@ -186,6 +196,7 @@ def _calibration(
         ),
         motion_residuals=residuals,
         other_answer=evaluation.other_answer,
+        is_steady=evaluation.is_steady and not config.prior(),
     )
 
 

@@ -15,6 +15,7 @@ from hand_eye_calib.alignment.time_offset import (
 )
 from hand_eye_calib.assessment.model_fit import MAX_MISFIT
 from hand_eye_calib.calibration import Calibration, DofVerdict
+from hand_eye_calib.checks.aligned import ByModel
 from hand_eye_calib.checks.check import CheckResult, check_parts, check_streams
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
@@ -38,6 +39,9 @@ _OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "back
 _NEGLIGIBLE_S = 0.005
 # One that is farther away is no time offset (s).
 _BELIEVABLE_S = 1.0
+
+# A noise model that moves poses in time by more (s) than this may have missed something.
+_SETTLED_S = 0.0025
 
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
@@ -222,14 +226,13 @@ class Snapshot:
             return CheckResult(gravest_first(self._check_parts(calibration)))
         offset_s = calibration.time_offset_s if calibration else self.config.time_offset
         scale = calibration.scale if calibration else self.config.scale
-        sigma_s = calibration.time_offset_sigma_s if calibration and noise_fits(calibration) else 0
         result = check_streams(
             *self.streams,
             time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
             scale=1.0 if isinstance(scale, str) else scale,
             max_gap_s=self.max_gap_s,
             correlation=self.correlation,
-            offset_sigma_s=sigma_s,
+            model=self._by_model(calibration),
         )
         obsolete = set()
         if len(self.kept):
@@ -238,6 +241,17 @@ class Snapshot:
             obsolete.add("one_axis")  # the result has shown otherwise
         findings = [found for found in result.findings if found.code not in obsolete]
         return replace(result, findings=gravest_first(answered(findings, self.config)))
+
+    def _by_model(self, calibration: Calibration | None) -> ByModel | None:
+        """What the noise model of a result tells the checks; None if it does not fit."""
+        if calibration is None or not noise_fits(calibration):
+            return None
+        moved_s = calibration.time_offset_s - fixed_time_offset(self.resolved().config)
+        return ByModel(
+            T_parent_child=calibration.T_parent_child,
+            offset_sigma_s=calibration.time_offset_sigma_s,
+            is_steady=calibration.is_steady and abs(moved_s) < _SETTLED_S,
+        )
 
     def _check_parts(self, calibration: Calibration | None) -> list[Finding]:
         found = [Finding.from_dict(each) for each in (calibration.findings if calibration else ())]

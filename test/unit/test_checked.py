@@ -9,6 +9,7 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.calibration import Verdict
+from hand_eye_calib.checks.aligned import ByModel
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.engine.checked import at_clear_offset, checked, mend
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
@@ -121,15 +122,23 @@ class TestClearOffset:
         assert at_clear_offset(late, ()) is late
 
 
-def test_the_check_takes_the_correlation_and_a_model_s_offset_as_they_are(late):
+def test_the_check_takes_the_correlation_and_a_model_s_offset_as_they_are(late, monkeypatch):
     known, child = 0.049, late.child
     found = check_streams(late.parent, child, known)
     same = check_streams(late.parent, child, known, correlation=late.correlation)
     assert same.findings == found.findings
     assert same.correlation.offset_s == pytest.approx(found.correlation.offset_s, abs=1e-9)
-    sure = check_streams(late.parent, child, known, offset_sigma_s=0.0005)
-    assert [each.code for each in sure.findings] == [each.code for each in found.findings]
+    apart = se3.from_rotation_translation(np.eye(3), np.array([0.3, 0.0, 0.0]))
+    model = ByModel(T_parent_child=apart, offset_sigma_s=0.0005, is_steady=False)
     # An offset that a model has missed is found by the model of the check.
-    (missed,) = check_streams(late.parent, child, 0.0, offset_sigma_s=0.0005).findings
+    (missed,) = check_streams(late.parent, child, 0.0, model=model).findings
     assert missed.code == "time_offset"
     assert dict(missed.options)["time_offset"] == pytest.approx(0.05, abs=0.002)
+    # Unless the first one leaves no doubt: then there is no second one.
+    monkeypatch.setattr("hand_eye_calib.checks.aligned.estimator", None)
+    steady = replace(model, is_steady=True)
+    sure = check_streams(late.parent, child, known, model=steady)
+    assert [each.code for each in sure.findings] == [each.code for each in found.findings]
+    same = replace(steady, T_parent_child=np.eye(4))
+    given = replace(steady, offset_sigma_s=0.0)
+    assert not any(each.leaves_no_doubt for each in (same, given, model))
