@@ -243,14 +243,18 @@ class Snapshot:
         return replace(result, findings=gravest_first(answered(findings, self.config)))
 
     def _by_model(self, calibration: Calibration | None) -> ByModel | None:
-        """What the noise model of a result tells the checks; None if it does not fit."""
+        """What the noise model of a result tells the checks; None if it does not fit, or has moved
+        the poses by itself.
+        """
         if calibration is None or not noise_fits(calibration):
             return None
         moved_s = calibration.time_offset_s - fixed_time_offset(self.resolved().config)
+        if abs(moved_s) > _SETTLED_S:
+            return None
         return ByModel(
             T_parent_child=calibration.T_parent_child,
             offset_sigma_s=calibration.time_offset_sigma_s,
-            is_steady=calibration.is_steady and abs(moved_s) < _SETTLED_S,
+            is_steady=calibration.is_steady,
         )
 
     def _check_parts(self, calibration: Calibration | None) -> list[Finding]:
