@@ -8,7 +8,7 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,8 @@ def _run(argv: Sequence[str]) -> int:
     if completion.is_asked_for():
         return _complete()
     chosen = next((argument for argument in argv if not argument.startswith("-")), None)
-    parser, of_commands = _parsers()
+    # The other commands matter only if the first word is none, but --help, say.
+    parser, of_commands = _parsers(COMMANDS.keys() & argv[:1] or COMMANDS)
     module: Any = None
     if chosen in of_commands:
         module, command_parser = _with_arguments(chosen, of_commands)
@@ -123,7 +124,7 @@ def _run(argv: Sequence[str]) -> int:
 
 def _complete() -> int:
     """Tell the shell what could be typed next."""
-    parser, of_commands = _parsers()
+    parser, of_commands = _parsers(COMMANDS)
     chosen = completion.command_in_line()
     if chosen in of_commands:
         _with_arguments(chosen, of_commands)
@@ -142,8 +143,8 @@ def _with_arguments(
     return module, command_parser
 
 
-def _parsers() -> tuple[CommandParser, dict[str, CommandParser]]:
-    """The parser of the program, and those of its commands by name, still without arguments."""
+def _parsers(names: Collection[str]) -> tuple[CommandParser, dict[str, CommandParser]]:
+    """The parser of the program, and those of these commands by name, still without arguments."""
     parser = CommandParser(
         prog="hand_eye_calib",
         description="Extrinsic calibration of two sensors on one rigid body from their motion.",
@@ -156,6 +157,7 @@ def _parsers() -> tuple[CommandParser, dict[str, CommandParser]]:
             name, help=summary, description=summary, prog=f"hand_eye_calib {name}"
         )
         for name, summary in COMMANDS.items()
+        if name in names
     }
 
 

@@ -110,6 +110,8 @@ class Snapshot:
     @cached_property
     def correlation(self) -> Correlation:
         """Correlation of the angular rates of the streams, over all time offsets."""
+        if self.time_offset and self.time_offset.correlation.is_clear and not len(self.kept):
+            return self.time_offset.correlation
         return correlate_rates(*self.streams, self.max_gap_s)
 
     @property
