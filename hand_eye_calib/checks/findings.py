@@ -253,6 +253,17 @@ def frozen(stream: str, share: float) -> Finding:
     )
 
 
+def repeated(stream: str, times: int) -> Finding:
+    """Positions are repeated as if they were new."""
+    return _error(
+        "repeated",
+        stream,
+        f"the {stream} stream has each position {times} times in a row under new stamps: its "
+        "source is slower than the stream",
+        "keep the first of each, with the stamp of its measurement",
+    )
+
+
 def stamp_unit(stream: str, other: str, unit: str, factor: float) -> Finding:
     """Stamps are in another unit than nanoseconds."""
     return _error(
@@ -343,6 +354,20 @@ def swapped_coordinates(
     return replace(found, evidence=_of_factors(factors, unexplained, unexplained_mended))
 
 
+def mirrored_positions(stream: str, unexplained: float, unexplained_mended: float) -> Finding:
+    """Positions alone are mirrored."""
+    return replace(
+        left_handed(stream),
+        what=f"the {stream}'s positions are mirrored: with x and y swapped "
+        f"{unexplained_mended:.1%} of the motion stays unexplained instead of {unexplained:.0%}",
+        cause="east and north (or latitude and longitude near the equator) swapped, or z downwards",
+        evidence=(
+            ("unexplained_share", unexplained),
+            ("unexplained_share_mended", unexplained_mended),
+        ),
+    )
+
+
 def longitude_scale(
     stream: str, factors: FloatArray, unexplained: float, unexplained_mended: float
 ) -> Finding:
@@ -371,6 +396,31 @@ def _of_factors(
         ("factor_y", float(factors[1])),
         ("unexplained_share", unexplained),
         ("unexplained_share_mended", unexplained_mended),
+    )
+
+
+def rate_unit(stream: str, ratio: float) -> Finding:
+    """Angular rates are in degrees and read as radians, or the other way round."""
+    units = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
+    found = _error(
+        "rate_unit",
+        stream,
+        f"the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are "
+        f"{units[0]} and were read as {units[1]}",
+        "name the unit in the header, such as wx_deg_s or wx_rad_s; a message has rad/s",
+        Confidence.LIKELY,
+    )
+    return replace(found, evidence=(("ratio", ratio),))
+
+
+def unsolved(what: str) -> Finding:
+    """Nothing can be solved with the streams."""
+    return _error(
+        "unrelated",
+        "both",
+        what,
+        "check that both are on one rigid body, the units, and the clocks (time_offset estimate)",
+        Confidence.POSSIBLE,
     )
 
 

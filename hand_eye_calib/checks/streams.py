@@ -1,6 +1,6 @@
 """Checks of a single stream, and of the stamps of two."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -192,8 +192,20 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
         return findings
     if levels := _interleaved(trajectory):
         return [*findings, wording.interleaved(stream, *levels)]
+    if not trajectory.has_rotations and (times := _repeated(trajectory)) > 1:
+        return [*findings, wording.repeated(stream, times)]
     coarse = _check_grid(trajectory.poses[:, :3, 3], stream)
+    if coarse and coarse.makes_unusable and not trajectory.has_rotations:
+        # Of positions alone, rounding is noise like any other.
+        coarse = replace(coarse, severity=Severity.WARNING)
     return [*findings, coarse] if coarse else findings
+
+
+def _repeated(trajectory: Trajectory) -> int:
+    """How often in a row positions are the same to the last digits: the median."""
+    same = np.abs(np.diff(trajectory.poses[:, :3, 3], axis=0)).max(axis=1) < _SAME_POSE
+    edges = np.r_[0, np.flatnonzero(~same) + 1, len(trajectory)]
+    return int(np.median(np.diff(edges)))
 
 
 def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:

@@ -202,7 +202,9 @@ def next_steps(
         for name, value in reason.options
     ]
     if calibration.verdict is not Verdict.DO_NOT_USE:
-        extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.unobservable()[:3]]
+        reach = calibration.out_of_reach
+        hidden = [axis for axis in calibration.unobservable() if axis not in reach]
+        extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in hidden[:3]]
     if not extra and not arguments.out and calibration.measured == "poses":
         extra = ["--out result"]  # figures that show where the disagreement comes from
     typed = getattr(arguments, "typed", [])

@@ -20,12 +20,13 @@ from hand_eye_calib.checks.check import unit_of
 from hand_eye_calib.checks.findings import (
     Finding,
     longitude_scale,
+    mirrored_positions,
     swapped_coordinates,
     units,
     unrelated_parts,
 )
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 
@@ -95,9 +96,9 @@ def _solved(
     try:
         return lever_arm.solve(stamps_ns, poses, positions, with_scale)
     except np.linalg.LinAlgError:
-        raise NotEnoughDataError(
-            "no lever arm explains the positions; check that both are on one rigid body, the "
-            "units, the scale, and the clocks (time_offset estimate)"
+        raise InputError(
+            "no lever arm explains the positions: they may jump, or be of another body; look at "
+            "both paths"
         ) from None
 
 
@@ -187,7 +188,7 @@ def _findings(
     found = unrelated_parts(share, "motion of the positions", "odometry", "the units, the scale")
     try:
         scaled = _solved(stamps_ns, poses, positions, with_scale=True)
-    except NotEnoughDataError:
+    except InputError:
         return [found.to_dict()]
     scale = scaled.scale if is_child else 1.0 / scaled.scale
     explains = lever_arm.unexplained_share(poses, positions, scaled) < _UNRELATED
@@ -201,23 +202,32 @@ def _coordinates(
     share: float, stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, stream: str
 ) -> Finding | None:
     """What is wrong with east and north, if that explains the path."""
-    lever_arm_m, left, found = np.zeros(3), share, None
+    lever_arm_m, found = np.zeros(3), None
     for _ in range(2):  # the second time with the lever arm
         factors = horizontal_factors(poses[:, :3, :3] @ lever_arm_m + poses[:, :3, 3], positions)
         wording = None if factors is None else _wrong_coordinates(factors)
         if factors is None or wording is None:
-            return None
+            break
         mended = positions * [*factors, 1.0]
         if wording is swapped_coordinates:
             mended = mended[:, [1, 0, 2]]
-        try:
-            solution = _solved(stamps_ns, poses, mended, with_scale=False)
-        except NotEnoughDataError:
-            return None
-        lever_arm_m = solution.lever_arm
-        left = lever_arm.unexplained_share(poses, mended, solution)
-        found = wording(stream, factors, share, left)
-    return found if left < _MENDED * share else None
+        left, lever_arm_m = _left(stamps_ns, poses, mended)
+        found = wording(stream, factors, share, left) if left < _MENDED * share else None
+    if found:
+        return found
+    left, _ = _left(stamps_ns, poses, positions[:, [1, 0, 2]])
+    return mirrored_positions(stream, share, left) if left < _MENDED * share else None
+
+
+def _left(
+    stamps_ns: IntArray, poses: FloatArray, positions: FloatArray
+) -> tuple[float, FloatArray]:
+    """Unexplained share of the path of positions, and the lever arm; 1 if they have none."""
+    try:
+        solution = _solved(stamps_ns, poses, positions, with_scale=False)
+    except InputError:
+        return 1.0, np.zeros(3)
+    return lever_arm.unexplained_share(poses, positions, solution), solution.lever_arm
 
 
 def _wrong_coordinates(factors: FloatArray) -> Callable[..., Finding] | None:

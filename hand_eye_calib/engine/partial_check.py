@@ -16,12 +16,12 @@ from hand_eye_calib.alignment.angular_rates import (
     speeds,
 )
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.check import CheckResult, check_offset
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
 from hand_eye_calib.engine.snapshot import Snapshot
-from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.errors import InputError, NotEnoughDataError
 
 # Smaller offsets (s) are found by every solve; those of half that size are not looked for here.
 _FOUND_S = 0.25
@@ -57,6 +57,8 @@ def check_partial(snapshot: Snapshot) -> CheckResult:
         found = _of_solve(snapshot, correlation, known_s, {"time_offset": offset_s})
     except NotEnoughDataError as error:
         found = [*before.findings, _of_no_solve(config.measured, correlation, error)]
+    except InputError as error:
+        found = [*before.findings, wording.unsolved(str(error))]
     return CheckResult(gravest_first(found), correlation)
 
 
@@ -80,7 +82,10 @@ def _of_solve(
         return [*in_units, *_of_solve(snapshot, correlation, known_s, more)]
     if any(each.makes_unusable for each in found):
         is_still = correlation.overlap_s > 0 and correlation.variation < MIN_VARIATION
-        return [wording.no_rotation()] if is_still and result.measured == "rotations" else found
+        is_in_unit = all(each.code != "rate_unit" for each in found)
+        if is_still and is_in_unit and result.measured == "rotations":
+            return [wording.no_rotation()]
+        return found
     return [*found, *_of_result(result, correlation, known_s)]
 
 
@@ -88,6 +93,8 @@ def _of_result(result: Calibration, correlation: Correlation, known_s: float) ->
     """Findings about motion and clock of streams that agree."""
     within_reach = [dof.name for dof in result.observability if dof.name not in result.out_of_reach]
     hidden = [axis for axis in within_reach if axis in result.unobservable()]
+    if result.status is SolveStatus.NOT_CONVERGED:
+        return [wording.unsolved("the solve of these streams does not converge")]
     if hidden == within_reach:
         return [wording.no_rotation()]
     offset_s, sigma_s = result.time_offset_s - known_s, result.time_offset_sigma_s

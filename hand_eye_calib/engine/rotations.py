@@ -21,7 +21,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
 from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
-from hand_eye_calib.checks.findings import unrelated_parts
+from hand_eye_calib.checks.findings import Finding, rate_unit, unrelated_parts
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
@@ -30,8 +30,12 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 # Two streams of which more than this share of the rotation stays unexplained are not of one body.
 _UNRELATED = 0.5
 
-# Poses between the ends of the motions that tell this.
-_SPAN = 10
+# Poses between the ends of the motions that tell this; the quantile of their angles above which
+# they count.
+_SPAN, _TURNING = 10, 0.75
+
+# Rates in another unit are off by this factor, within a share of it.
+_DEGREES, _UNIT_WITHIN = float(np.degrees(1.0)), 0.2
 
 
 def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
@@ -56,9 +60,14 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
     """
     if config.scale not in ("none", "auto"):
         config.require_poses(f"scale {config.scale}")
-    Ts_pw_p, Ts_cw_c = (_without_positions(Ts) for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c))
+    Ts_pw_p, Ts_as_read = (
+        _without_positions(Ts) for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
+    )
     has_rates = "rates" in (config.parent_measures, config.child_measures)
-    solution, Ts_cw_c = _solved(pose_pairs.stamps_ns, Ts_pw_p, Ts_cw_c, has_rates)
+    solution, Ts_cw_c = _solved(pose_pairs.stamps_ns, Ts_pw_p, Ts_as_read, has_rates)
+    findings = _unrelated(Ts_pw_p, Ts_cw_c, solution)
+    if findings and (found := _rate_unit(motion_pairs(Ts_pw_p, Ts_as_read, "B1"), config)):
+        findings = [found]
     assessment = assess_rotation(Ts_pw_p, solution)
     fused = fuse(solution.T_parent_child, assessment, config.prior())
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
@@ -81,7 +90,7 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         time_offset_sigma_s=solution.time_offset_sigma_s,
         rate_bias=_rate_bias(solution, config) if has_rates else None,
         noise=solution.describe(pose_pairs.stamps_ns),
-        findings=tuple(_unrelated(Ts_pw_p, Ts_cw_c, solution)),
+        findings=tuple(found.to_dict() for found in findings),
         contradictions=fused.contradictions,
         **config.target_fields(),
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
@@ -153,14 +162,28 @@ def _residuals(pairs: MotionPairs, solution: AdaptiveSolution, pose_pairs: PoseP
 
 def _unrelated(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, solution: AdaptiveSolution
-) -> list[dict[str, object]]:
+) -> list[Finding]:
     """A finding if the rotations of one stream do not explain those of the other."""
     span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
     left = np.linalg.norm(pairs.residuals(solution.T_parent_child)[1], axis=1)
     turned = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
-    share = float(np.median(left) / max(float(np.median(turned)), 1e-12))
+    most = turned >= np.quantile(turned, _TURNING)  # a sensor may stand still for long
+    share = float(np.median(left[most]) / max(float(np.median(turned[most])), 1e-12))
     if share < _UNRELATED:
         return []
-    found = unrelated_parts(share, "rotation of one sensor", "other", "the unit of the rates")
-    return [found.to_dict()]
+    return [unrelated_parts(share, "rotation of one sensor", "other", "the unit of the rates")]
+
+
+def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> Finding | None:
+    """A finding if the rates of one stream are in degrees and those of the other in radians."""
+    sizes = {
+        stream: float(np.quantile(se3.rotation_angle(Ts[:, :3, :3]), _TURNING))
+        for stream, Ts in (("parent", steps.Ts_parenti_parentj), ("child", steps.Ts_childi_childj))
+    }
+    stream, other = ("child", "parent") if config.child_measures == "rates" else ("parent", "child")
+    if getattr(config, f"{stream}_measures") != "rates":
+        return None
+    ratio = sizes[stream] / max(sizes[other], 1e-12)
+    is_unit = min(abs(ratio / _DEGREES - 1.0), abs(ratio * _DEGREES - 1.0)) < _UNIT_WITHIN
+    return rate_unit(stream, ratio) if is_unit else None

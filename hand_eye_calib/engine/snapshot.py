@@ -174,7 +174,9 @@ class Snapshot:
         estimate = ESTIMATORS[self.config.measured]
         result = estimate(self._pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)
-        if len(self.kept) or not _NEGLIGIBLE_S < abs(found_s - given_s) < _BELIEVABLE_S:
+        if not abs(found_s - given_s) < _BELIEVABLE_S:
+            return replace(result, time_offset_s=given_s)
+        if len(self.kept) or not abs(found_s - given_s) > _NEGLIGIBLE_S:
             return result
         # Interpolated where the other stream has its poses, rather than moved along its velocity.
         config = replace(self.config, time_offset=found_s)

@@ -290,16 +290,12 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "Scale": given_or_estimated(*scale, ""),
     }
     if noise := calibration.noise:
-        rows["Noise"] = _noise(noise)
-    if bias := calibration.rate_bias:
-        rows["Bias of the rates"] = _bias(bias)
+        is_whole = calibration.measured == "poses"
+        rows["Noise"] = _noise(noise) if is_whole else "; ".join(noise["in_words"])
     return rows
 
 
 def _noise(noise: Plain) -> str:
-    if "systematic" not in noise:
-        return "; ".join(noise["in_words"])
-
     def levels(kind: str, suffix: str) -> str:
         translation = size(noise[f"translation_{kind}_m{suffix}"], "x")
         return f"{translation} and {size(noise[f'rotation_{kind}_rad{suffix}'], 'yaw')}"
@@ -309,15 +305,6 @@ def _noise(noise: Plain) -> str:
         f"{levels('white', '')} per pose and axis; growing by {levels('drift', '_per_pose')} from "
         f"pose to pose; systematic error: {noise['systematic']}; {jumps}"
     )
-
-
-def _bias(bias: Plain) -> str:
-    values = zip("xyz", bias["rad_per_s"], bias["sigma"], strict=True)
-    told = [
-        f"{axis} {with_sigma(math.degrees(value), math.degrees(sigma), 3).replace('+/-', '±')}"
-        for axis, value, sigma in values
-    ]
-    return f"{', '.join(told)} °/s ({bias['of']})"
 
 
 def _stream(name: str, inputs: Plain, streams: Mapping[str, Trajectory]) -> dict[str, str]:
