@@ -158,6 +158,7 @@ class LeverArmSolution:
             "translation_white_m": white,
             "translation_drift_m_per_pose": walk,
             "rotation_drift_rad_per_pose": float(np.radians(turned)),
+            "drift_grows_with": self.model.walk_by,
             "lasting": [],
             "share_of_worse_positions": worse,
             "jumps_before_stamp_ns": stamps_ns[1:][self.jumps].tolist(),
@@ -394,9 +395,12 @@ class _State:
         model, X = model or self.model, self.X
         course = self.course
         columns = self.columns if columns is None else columns
+        linearisation = linearise(self.streams, course, X, self.parameters, columns)
+        # The drift is the odometry's, and grows with its path, not with that of the antenna.
+        path = np.linalg.norm(np.diff(self.streams.Ts_pw_p[:, :3, 3], axis=0), axis=1)
         space = model.state_space(
             self.streams,
-            linearise(self.streams, course, X, self.parameters, columns),
+            dataclasses.replace(linearisation, metres=path),
             course.twists,
             X,
             np.where(self.outliers.spikes, 0.0, self.weights),
@@ -423,9 +427,16 @@ class _State:
         return _Posterior(self.space(), self.levels, self.lever_arm)
 
     def fitted(self) -> _State:
-        """With noise levels fitted."""
-        fit = reml.fit(self.sampled_space(), self.levels, _prior(self.model, self.levels))
-        return dataclasses.replace(self, levels=fit.levels)
+        """With noise levels fitted, for a drift that grows with time or with the path, whichever is
+        more likely.
+        """
+        prior = _prior(self.model, self.levels)
+        fits = []
+        for walk_by in ("time", "distance"):
+            model = dataclasses.replace(self.model, walk_by=walk_by)
+            fits.append((model, reml.fit(self.sampled_space(model), self.levels, prior)))
+        model, fit = min(fits, key=lambda each: each[1].loss)
+        return dataclasses.replace(self, model=model, levels=fit.levels)
 
     def with_lasting_error(self) -> _State:
         """With an error of the positions that lasts, if the data ask for it."""
