@@ -31,7 +31,7 @@ from hand_eye_calib.adaptive.increments import (
     turned,
 )
 from hand_eye_calib.adaptive.noise_model import N_FAST, Extent, NoiseModel, Slow
-from hand_eye_calib.adaptive.outliers import LONGEST_GAP, Outliers, judged, surprises
+from hand_eye_calib.adaptive.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
 from hand_eye_calib.adaptive.resampling import part_products
 from hand_eye_calib.adaptive.state_space import Posterior, StateSpace, multiplied
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
@@ -77,8 +77,9 @@ _JUMP_FACTOR = 10.0
 _PARTS = 10
 
 # The quality of a solution is that of so many positions around; those whose squared errors exceed
-# that of the best quarter of the recording by this factor count less.
-_NEIGHBOURS, _USUAL, _WORSE, _STUDENT = 11, 0.25, 16.0, 4.0
+# that of the best quarter of the recording by this factor are left out: they would hardly count, and
+# their errors last.
+_NEIGHBOURS, _USUAL, _WORSE = 11, 0.25, 16.0
 
 # Errors of odometry that are the same all the time: of the direction of travel (rad) and of the
 # scale, as in the common-mode floor.
@@ -102,8 +103,8 @@ class LeverArmSolution:
         As of an AdaptiveSolution.
     model, levels
         Noise model and its log levels.
-    weights : (N,) array
-        Of the positions: below 1 where their quality is worse.
+    worse : (N,) bool array
+        Positions that are left out, for those around are far less precise than the best.
     jumps : (n,) bool array
     spikes : (N,) bool array
     part_products : (K, p + 1, p + 1) array
@@ -121,7 +122,7 @@ class LeverArmSolution:
     scale_sigma: float
     model: NoiseModel
     levels: FloatArray
-    weights: FloatArray
+    worse: BoolArray
     jumps: BoolArray
     spikes: BoolArray
     part_products: FloatArray
@@ -144,13 +145,13 @@ class LeverArmSolution:
             for level in (noise_model.TRANSLATION, noise_model.WALK_TRANSLATION)
         )
         turned = float(np.degrees(sigmas[noise_model.WALK_ROTATION]))
-        worse = float(np.mean(self.weights < 1.0))
+        worse = float(np.mean(self.worse))
         said = [
             f"each position is off by {100 * white:.2g} cm per axis, and the odometry drifts by "
             f"{100 * walk:.2g} cm and {turned:.2g} deg from one to the next"
         ]
         if worse:
-            said.append(f"{worse:.0%} of the positions are far less precise, and count less")
+            said.append(f"{worse:.0%} of the positions are far less precise, and are left out")
         for what, found in (("jumps", self.jumps), ("positions wrong by themselves", self.spikes)):
             if found.any():
                 said.append(f"{int(found.sum())} {what}")
@@ -312,14 +313,18 @@ class _State:
 
     Attributes
     ----------
+    positions : (N, 3) array
+        As measured.
     streams : Streams
-        The child's poses are its positions with the orientations known so far.
+        The child's poses are its positions, bridged where they are left out, with the orientations
+        known so far.
     columns : list of int
         Parameters of systematic errors in the model, of ``parameters`` (11,).
     boost : (n,) array
         Factors of the walk's variance: above 1 at jumps.
     """
 
+    positions: FloatArray
     streams: Streams
     lever_arm: FloatArray
     columns: list[int]
@@ -328,7 +333,7 @@ class _State:
     levels: FloatArray
     outliers: Outliers
     boost: FloatArray
-    weights: FloatArray
+    worse: BoolArray
 
     @classmethod
     def first(
@@ -346,6 +351,7 @@ class _State:
         extent = Extent(interval_s, max(float(np.median(steps)), 1e-9), float(stamps_s[-1]))
         n = len(steps)
         state = cls(
+            positions=positions,
             streams=streams,
             lever_arm=lever_arm,
             columns=[SCALE, TIME] if with_scale else [TIME],
@@ -354,23 +360,27 @@ class _State:
             levels=np.zeros(0),
             outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
             boost=np.ones(n),
-            weights=np.ones(n + 1),
+            worse=np.zeros(n + 1, dtype=bool),
         )
         residuals = linearise(streams, state.course, state.X, state.parameters).residuals
         squares = (residuals[:, :3] ** 2).sum(axis=1)
-        weights = _quality(
-            np.concatenate([squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]])
-        )
-        is_worse = (weights[1:] < 1.0) | (weights[:-1] < 1.0)
-        white, walk = rough_levels(residuals, is_worse)
+        around = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
+        worse = _worse(np.concatenate(around))
+        white, walk = rough_levels(residuals, worse[1:] | worse[:-1])
         white[1], walk[1] = _ANY_ROTATION, _FIRST_WALK
         levels = state.model.first_levels(white, walk)[:N_FAST]
-        return dataclasses.replace(state, levels=levels, weights=weights)
+        streams = bridged(streams, state.X, worse)
+        return dataclasses.replace(state, streams=streams, levels=levels, worse=worse)
 
     @property
     def X(self) -> FloatArray:
         """The lever arm as a transform (4, 4)."""
         return se3.from_rotation_translation(np.eye(3), self.lever_arm)
+
+    @property
+    def left_out(self) -> BoolArray:
+        """(N,) which positions are no evidence."""
+        return self.outliers.spikes | self.worse
 
     @property
     def course(self) -> Course:
@@ -403,7 +413,7 @@ class _State:
             dataclasses.replace(linearisation, metres=path),
             course.twists,
             X,
-            np.where(self.outliers.spikes, 0.0, self.weights),
+            np.where(self.left_out, 0.0, 1.0),
             np.zeros(len(self.boost), dtype=bool),
         )
         return _of_positions(space, X, self.boost)
@@ -419,7 +429,7 @@ class _State:
             streams=self.streams[kept],
             outliers=Outliers(jumps, self.outliers.spikes[kept]),
             boost=np.where(jumps, self.boost.max(), 1.0),
-            weights=self.weights[kept],
+            worse=self.worse[kept],
         ).space(model)
 
     def posterior(self) -> _Posterior:
@@ -459,16 +469,22 @@ class _State:
 
     def with_outliers(self, posterior: _Posterior) -> _State:
         """With jumps, which are large steps of the walk, and positions wrong by themselves."""
-        of_walk, of_white = surprises(posterior, self.outliers.spikes)
+        of_walk, of_white = surprises(posterior, self.left_out)
         found = judged(self.outliers, of_walk, of_white, with_spikes=True)
         boost = np.where(found.jumps, np.maximum(_JUMP_FACTOR * of_walk, self.boost), 1.0)
         return dataclasses.replace(self, outliers=found, boost=boost)
 
     def with_quality(self, posterior: _Posterior) -> _State:
-        """With weights below 1 where the positions around one are clearly worse than the rest."""
+        """With positions left out if those around are clearly worse than the rest."""
         states = posterior.states_after(posterior.normal.step)[:, :3]
+        Ts_cw_c = self.streams.Ts_cw_c.copy()
+        path = Ts_cw_c[:, :3, 3] + turned(Ts_cw_c[:, :3, :3], states)
         spread = posterior.selected_inverse[0][:, range(3), range(3)]
-        return dataclasses.replace(self, weights=_quality((states**2 + spread).sum(axis=1)))
+        drift = 3.0 * float(np.exp(self.levels[noise_model.WALK_TRANSLATION]))
+        worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
+        Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
+        streams = dataclasses.replace(self.streams, Ts_cw_c=Ts_cw_c)
+        return dataclasses.replace(self, streams=streams, worse=worse)
 
     def moved(self, posterior: _Posterior) -> _State:
         """After a step, with the orientations that the positions ask for."""
@@ -485,16 +501,15 @@ class _State:
         )
 
 
-def _quality(squares: FloatArray) -> FloatArray:
-    """Weights (N,) of positions by their squared errors (N,) and those around: below 1 where these
-    are clearly larger than in the best quarter.
+def _worse(squares: FloatArray, least: float = noise_model.LOWEST_VARIANCE) -> BoolArray:
+    """Which positions (N,) are clearly worse than the best quarter, by their squared errors (N,) and
+    those around. Errors below the least square, that of the odometry's own drift, all count as good.
     """
     window = np.ones(min(_NEIGHBOURS, len(squares)))
     around = np.convolve(squares, window, mode="same")
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
-    usual = max(float(np.quantile(around / counts, _USUAL)), noise_model.LOWEST_VARIANCE)
-    weights = (_STUDENT + 3.0 * counts) / (_STUDENT + 3.0 * around / usual)
-    return np.where(around > _WORSE * usual * counts, np.minimum(weights, 1.0), 1.0)
+    usual = max(float(np.quantile(around / counts, _USUAL)), least)
+    return np.asarray(around > _WORSE * usual * counts)
 
 
 class _Posterior(Posterior):
@@ -553,7 +568,7 @@ def _solution(
     state: _State, posterior: _Posterior, converged: bool, first_scale: float
 ) -> LeverArmSolution:
     normal = posterior.normal
-    n_evidence = len(state.boost) - int(state.outliers.spikes.sum())
+    n_evidence = len(state.boost) - int(state.left_out.sum())
     misfit = normal.cost / max(3 * n_evidence - 3 - len(state.columns), 1)
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
@@ -569,7 +584,7 @@ def _solution(
         scale_sigma=first_scale * float(sigmas[SCALE]),
         model=state.model,
         levels=state.levels,
-        weights=state.weights,
+        worse=state.worse,
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
         part_products=parts + posterior.of_prior / len(parts),
