@@ -77,8 +77,8 @@ _JUMP_FACTOR = 10.0
 _PARTS = 10
 
 # The quality of a solution is that of so many positions around; those whose squared errors exceed
-# that of the best quarter of the recording by this factor are left out: they would hardly count, and
-# their errors last.
+# that of the best quarter of the recording by this factor are left out: they would hardly count,
+# and their errors last.
 _NEIGHBOURS, _USUAL, _WORSE = 11, 0.25, 16.0
 
 # Errors of odometry that are the same all the time: of the direction of travel (rad) and of the
@@ -502,8 +502,9 @@ class _State:
 
 
 def _worse(squares: FloatArray, least: float = noise_model.LOWEST_VARIANCE) -> BoolArray:
-    """Which positions (N,) are clearly worse than the best quarter, by their squared errors (N,) and
-    those around. Errors below the least square, that of the odometry's own drift, all count as good.
+    """Which positions (N,) are clearly worse than the best quarter, by the squared errors (N,) of
+    those around. Errors no larger than the least square, that of the odometry's drift from one
+    position to the next, are never worse.
     """
     window = np.ones(min(_NEIGHBOURS, len(squares)))
     around = np.convolve(squares, window, mode="same")

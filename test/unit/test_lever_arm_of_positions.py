@@ -126,6 +126,26 @@ class TestLeverArm:
         assert found.T_parent_child[:3, 3] == pytest.approx(lever_arm, abs=0.02)
         assert found.sigmas[:2].max() < 0.004
 
+    def test_a_drift_with_the_path_is_told_from_one_with_time(self):
+        parent, child, lever_arm = simulated_positions("car", seed=3)
+        found = hec.calibrate(parent, child)
+        assert found.noise["drift_grows_with"] == "distance"
+        assert np.abs((found.T_parent_child[:3, 3] - lever_arm) / found.sigmas[:3]).max() < 4.0
+
+    def test_positions_that_are_worse_for_a_time_are_as_if_they_were_missing(self, streams):
+        parent, child = streams
+        positions = child.poses[:, :3, 3].copy()
+        positions[120:180] += np.cumsum(np.random.default_rng(3).normal(0.0, 0.2, (60, 3)), axis=0)
+        mixed = Trajectory.from_positions(child.stamps_ns, positions, "antenna")
+        found = hec.calibrate(parent, mixed)
+        good = np.r_[0:115, 185:300]
+        apart = hec.calibrate(
+            parent, Trajectory.from_positions(child.stamps_ns[good], positions[good], "antenna")
+        )
+        assert 0.2 < found.noise["share_of_worse_positions"] < 0.3
+        difference = found.T_parent_child[:3, 3] - apart.T_parent_child[:3, 3]
+        assert np.abs(difference / apart.sigmas[:3]).max() < 0.5
+
     def test_float_solutions_outages_and_a_jump_do_little(self, streams):
         parent, child = streams
         random = np.random.default_rng(1)
