@@ -53,7 +53,8 @@ def test_calibrating_two_files_loads_no_writer_of_results(tmp_path):
         write_trajectory(tmp_path / name, trajectory)
     code = (
         "import atexit, gc, sys; from hand_eye_calib.cli.main import main; "
-        "atexit.register(lambda: print(f'frozen={gc.get_freeze_count() > 10_000}', file=sys.stderr));"
+        "say = lambda: print(f'frozen={gc.get_freeze_count() > 10_000}', file=sys.stderr); "
+        "atexit.register(say); "
         "main(sys.argv[1:]); print('loaded', *sys.modules, file=sys.stderr)"
     )
     loaded = loaded_by(code, "calibrate", str(tmp_path / "parent"), str(tmp_path / "child"))
