@@ -26,7 +26,6 @@ from hand_eye_calib.adaptive.increments import (
     course_of,
     linearise,
     parameters_of,
-    twists_of,
 )
 from hand_eye_calib.adaptive.noise_model import (
     CENTRES,
@@ -307,7 +306,7 @@ class _State:
         """
         columns = [*dict.fromkeys((*self.columns, TIME))]
         linearisation = self._linearised(self.poses, self.course, self.error, columns)
-        linearisation = with_delay_columns(linearisation, twists_of(self.poses), self.T)
+        linearisation = with_delay_columns(linearisation, self.poses.twists, self.T)
         linearisation = with_world_columns(linearisation, self.poses)
         return self.posterior.with_columns(linearisation.columns)
 

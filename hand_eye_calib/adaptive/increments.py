@@ -70,6 +70,37 @@ def parameters_of(systematic: str) -> list[int]:
 
 
 @dataclass(frozen=True)
+class Steps:
+    """Steps (n, 3) in m of a sensor, and what those around make of them.
+
+    Attributes
+    ----------
+    raw : (n, 3) array
+    smooth : (n, 3) array
+        With the mean velocity of the steps two before and two after.
+    variance : float
+        Of what they differ by, as a rule.
+    """
+
+    raw: FloatArray
+    smooth: FloatArray
+    variance: float
+
+    @classmethod
+    def of(cls, raw: FloatArray, intervals_s: FloatArray) -> Steps:
+        """From steps over these intervals."""
+        rates = raw / intervals_s[:, None]
+        around = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
+        smooth = 0.5 * (around[:-4] + around[4:]) * intervals_s[:, None]
+        return cls(raw, smooth, median((raw - smooth) ** 2))
+
+    def cleaned(self, noise_m: float) -> FloatArray:
+        """Smooth steps (n, 3), as far as what they differ by may be noise."""
+        believed = max(1.0 - _CAUTION * noise_m**2 / max(self.variance, _LEAST_VARIANCE), 0.0)
+        return self.smooth + believed * (self.raw - self.smooth)
+
+
+@dataclass(frozen=True)
 class Streams:
     """Poses of both sensors at common stamps.
 
@@ -90,7 +121,7 @@ class Streams:
     @cached_property
     def typical_turn(self) -> float:
         """Median angle (rad) that the parent turns by from pose to pose."""
-        return median(se3.rotation_angle(motions(self.Ts_pw_p)[:, :3, :3]))
+        return median(se3.rotation_angle(self.motions_p[:, :3, :3]))
 
     @cached_property
     def n_rows(self) -> int:
@@ -99,6 +130,23 @@ class Streams:
         """
         positions = np.concatenate([self.Ts_pw_p[:, :3, 3], self.Ts_cw_c[:, :3, 3]], axis=1)
         return 6 if np.ptp(positions, axis=0).any() else 3
+
+    @cached_property
+    def motions_p(self) -> FloatArray:
+        """Motions (N - 1, 4, 4) of the parent."""
+        return motions(self.Ts_pw_p)
+
+    @cached_property
+    def steps(self) -> tuple[Steps, Steps]:
+        """Of parent and child."""
+        by_child, intervals_s = motions(self.Ts_cw_c), np.diff(self.stamps_s)
+        of_parent = Steps.of(self.motions_p[:, :3, 3], intervals_s)
+        return of_parent, Steps.of(by_child[:, :3, 3].copy(), intervals_s)
+
+    @cached_property
+    def twists(self) -> FloatArray:
+        """Velocity (N, 6), m/s and rad/s, of the child in its own frame."""
+        return _twists(motions(self.Ts_cw_c), np.diff(self.stamps_s))
 
     def __getitem__(self, index: IntArray) -> Streams:
         return Streams(self.stamps_s[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
@@ -146,24 +194,20 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
         Standard deviation per axis of the noise of a step. The smaller it is beside what steps
         differ from their neighbours by, the more they are believed themselves.
     """
-    intervals_s = np.diff(streams.stamps_s)
-    by_parent, by_child = motions(streams.Ts_pw_p), motions(streams.Ts_cw_c)
-    as_child = between(by_parent, T_parent_child)
-    step = _cleaned(0.5 * (by_child[:, :3, 3] + as_child[:, :3, 3]), intervals_s, noise_m)
-    metres_c = np.linalg.norm(_cleaned(by_child[:, :3, 3], intervals_s, noise_m), axis=1)
-    metres_p = np.linalg.norm(_cleaned(by_parent[:, :3, 3], intervals_s, noise_m), axis=1)
+    of_parent, of_child = streams.steps
+    rotation, lever_arm = T_parent_child[:3, :3], T_parent_child[:3, 3]
+    chords = streams.motions_p[:, :3, :3] @ lever_arm - lever_arm
+    as_child = (chords + of_parent.raw) @ rotation
+    step = Steps.of(0.5 * (of_child.raw + as_child), np.diff(streams.stamps_s)).cleaned(noise_m)
+    metres_c = np.linalg.norm(of_child.cleaned(noise_m), axis=1)
+    metres_p = np.linalg.norm(of_parent.cleaned(noise_m), axis=1)
     axes_c, axes_p = streams.Ts_cw_c[:-1, :3, :3], streams.Ts_pw_p[:-1, :3, :3]
     return Course(
-        _twists(by_child, intervals_s),
+        streams.twists,
         summed(turned(axes_c, step)),
         summed(axes_c * metres_c[:, None, None]),
         summed(axes_p * metres_p[:, None, None]),
     )
-
-
-def twists_of(streams: Streams) -> FloatArray:
-    """Velocity (N, 6), m/s and rad/s, of the child in its own frame."""
-    return _twists(motions(streams.Ts_cw_c), np.diff(streams.stamps_s))
 
 
 def motions(Ts_world_sensor: FloatArray) -> FloatArray:
@@ -183,17 +227,6 @@ def between(Ts: FloatArray, T_parent_child: FloatArray) -> FloatArray:
 def turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
     """Matrices (n, k, 3) times vectors (n, 3)."""
     return (rotations @ vectors[:, :, None])[:, :, 0]
-
-
-def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> FloatArray:
-    """Steps (n, 3) with the mean velocity of the steps two before and two after, as far as what
-    they differ from it by may be noise.
-    """
-    rates = np.pad(steps / intervals_s[:, None], ((2, 2), (0, 0)), mode="edge")
-    cleaned = 0.5 * (rates[:-4] + rates[4:]) * intervals_s[:, None]
-    own = median((steps - cleaned) ** 2)
-    believed = max(1.0 - _CAUTION * noise_m**2 / max(own, _LEAST_VARIANCE), 0.0)
-    return cleaned + believed * (steps - cleaned)
 
 
 def summed(steps: FloatArray) -> FloatArray:
