@@ -117,6 +117,9 @@ _LONGER_SHARE, _NO_CHANCE = 0.5, 100.0
 # per degree, exceeds once in ten times.
 _BLOCKS, _CHANCE = 10, 1.63
 
+# Half of the freed memory that is kept for the next arrays.
+_KEPT_BYTES = 1 << 24
+
 # X is followed until it moves by less than this share of its sigma, at least one round.
 _MAX_ROUNDS = 6
 _SETTLED_SIGMAS, _SETTLED_STEP = 0.1, 1e-9
@@ -155,6 +158,7 @@ def solve(
     -------
     AdaptiveSolution
     """
+    _keep_freed_memory()
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     streams = Streams(stamps_s, Ts_pw_p, Ts_cw_c)
     start = dataclasses.replace(
@@ -184,6 +188,14 @@ def solve(
     if not solution.converged:
         solution = _polished(_with_systematic_errors(plain, systematic[:1]))
     return solution
+
+
+def _keep_freed_memory() -> None:
+    """Let the C library keep freed memory for what comes next: glibc gives memory back to the
+    system, page by page, when more is free than twice the largest block that was freed so far. This
+    one is never written to, and takes no memory itself.
+    """
+    np.empty(_KEPT_BYTES, dtype=np.uint8)
 
 
 def _while_fitting(systematic: Sequence[str]) -> list[int]:
@@ -475,8 +487,7 @@ def _weighed_tails(state: _State) -> _State:
     posterior = state.posterior
     for _ in range(_TAIL_ROUNDS - 1):
         weights = np.where(state.outliers.spikes, 0.0, student_weights(posterior))
-        space = dataclasses.replace(posterior.space, weights=weights)
-        posterior = Posterior(space, state.levels)
+        posterior = posterior.with_weights(weights)
     return dataclasses.replace(state, weights=student_weights(posterior), heavy=True)
 
 

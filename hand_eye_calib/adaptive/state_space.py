@@ -323,15 +323,20 @@ class Posterior:
         return weighed, self.factor.whiten(self.space.gathered(weighed))
 
     @cached_property
+    def _halves(self) -> tuple[FloatArray, FloatArray]:
+        """``Z' W Z`` (p + 1, p + 1) and Y of the space's columns."""
+        weighed, whitened = self.halves(self.space.columns)
+        return multiplied(self.space.columns, weighed), whitened
+
+    @property
     def whitened(self) -> FloatArray:
         """Y (N, d, p + 1) of the space's columns."""
-        return self.factor.whiten(self.space.gathered(self.weighed(self.space.columns)))
+        return self._halves[1]
 
     @cached_property
     def products(self) -> FloatArray:
         """(p + 1, p + 1) array: products of J and, last, e, weighed with V^-1."""
-        products = multiplied(self.space.columns, self.weighed(self.space.columns))
-        products -= multiplied(self.whitened, self.whitened)
+        products = self._halves[0] - multiplied(self.whitened, self.whitened)
         return 0.5 * (products + products.T)
 
     @cached_property
@@ -355,9 +360,21 @@ class Posterior:
 
     def with_columns(self, columns: FloatArray) -> Posterior:
         """The posterior of the same increments with other columns (n, 6, k)."""
+        return self._with(dataclasses.replace(self.space, columns=columns))
+
+    def with_weights(self, weights: FloatArray) -> Posterior:
+        """The posterior at other weights (N,) of the white errors."""
+        other = self._with(dataclasses.replace(self.space, weights=weights))
+        for name in ("log_determinant", "selected_inverse"):
+            other.__dict__.pop(name, None)
+        other.factor = Factor(*other.precision())
+        return other
+
+    def _with(self, space: StateSpace) -> Posterior:
+        """A copy for another space, without what depends on its columns."""
         other = copy.copy(self)
-        other.space = dataclasses.replace(self.space, columns=columns)
-        for name in ("whitened", "products", "normal", "loss"):
+        other.space = space
+        for name in ("_halves", "products", "normal", "loss"):
             other.__dict__.pop(name, None)
         return other
 
