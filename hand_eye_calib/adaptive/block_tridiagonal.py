@@ -17,9 +17,9 @@ import numpy as np
 from hand_eye_calib.adaptive import lapack
 from hand_eye_calib.arrays import FloatArray
 
-# So few matrices are inverted faster by LAPACK, one by one, than by stacked rows. So many small
-# ones are factored faster entry by entry, all at once.
-_FEW = 32
+# Matrices that are fewer than so many times their size are inverted faster by LAPACK, one by one,
+# than by stacked rows. So many small ones are factored faster entry by entry, all at once.
+_FEW = 3
 _MANY, _SMALL = 200, 8
 
 # Rows that are transposed at a time, so that they stay in the cache.
@@ -48,9 +48,11 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     lower = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
     pivots = np.diagonal(lower, axis1=1, axis2=2)
     log_determinants = 2.0 * np.log(pivots).sum(axis=1)
-    if len(lower) < _FEW:
-        return np.asarray(np.linalg.inv(lower), dtype=np.float64), log_determinants
     inverse: FloatArray = np.zeros_like(lower)
+    if len(lower) < _FEW * lower.shape[1]:
+        for one, of_one in zip(lower, inverse, strict=True):
+            of_one[:] = lapack.dtrtri(one.T)[0].T
+        return inverse, log_determinants
     inverse[:, 0, 0] = 1.0 / pivots[:, 0]
     for row in range(1, lower.shape[1]):
         scaled = lower[:, row : row + 1, :row] / -pivots[:, row, None, None]

@@ -1,5 +1,5 @@
-"""LAPACK's routines for bands and tridiagonals as SciPy wraps them, without importing the package
-``scipy.linalg``.
+"""LAPACK's routines for bands, tridiagonals and triangles as SciPy wraps them, without importing
+the package ``scipy.linalg``.
 
 That package imports much else, and takes twice as long as numpy to import; the wrapper itself takes
 a millisecond or two.
@@ -12,7 +12,7 @@ from importlib.machinery import PathFinder
 from types import ModuleType
 
 _WRAPPER = "scipy.linalg._flapack"
-_USED = ("dpbtrf", "dtbtrs", "dpttrf", "dpttrs")
+_USED = ("dpbtrf", "dtbtrs", "dpttrf", "dpttrs", "dtrtri")
 
 
 def _load_wrapper() -> ModuleType:
@@ -39,4 +39,4 @@ def _load_wrapper() -> ModuleType:
 
 
 _wrapper = _load_wrapper()
-dpbtrf, dtbtrs, dpttrf, dpttrs = (getattr(_wrapper, name) for name in _USED)
+dpbtrf, dtbtrs, dpttrf, dpttrs, dtrtri = (getattr(_wrapper, name) for name in _USED)
