@@ -22,9 +22,6 @@ from hand_eye_calib.arrays import FloatArray
 _FEW = 3
 _MANY, _SMALL = 200, 8
 
-# Rows that are transposed at a time, so that they stay in the cache.
-_TRANSPOSED_ROWS = 2048
-
 # The blocks that are left when they have so few rows together are one dense matrix.
 _DENSE = 64
 
@@ -255,18 +252,20 @@ class InOrder:
         if info != 0:
             raise np.linalg.LinAlgError(f"not positive definite at row {info}")
 
-    def whiten(self, right: FloatArray) -> FloatArray:
-        """``L^-1`` times columns (n, d, k)."""
-        rows = right.reshape(self._n_blocks * self._size, -1)
-        columns = np.empty(rows.shape, order="F")
-        for start in range(0, len(rows), _TRANSPOSED_ROWS):
-            part = slice(start, start + _TRANSPOSED_ROWS)
-            columns[part] = rows[part]
-        shape = right.shape
-        del right, rows  # as large as the answer
-        whitened, _ = lapack.dtbtrs(self._bands, columns, uplo="L", overwrite_b=1)
+    def whiten(
+        self, right: FloatArray, start: int = 0, before: FloatArray | None = None
+    ) -> FloatArray:
+        """``L^-1`` times columns (n, d, k); or a part of that from a block on, from that part of
+        the columns and what is whitened (d, k) of the block before.
+        """
+        n_blocks, size, n_columns = right.shape
+        columns = right.reshape(n_blocks * size, n_columns).copy(order="F")
+        del right  # as large as the answer
+        if before is not None:
+            columns[:size] -= self.below(start - 1) @ before
+        bands = self._bands[:, start * size : (start + n_blocks) * size]
+        whitened, _ = lapack.dtbtrs(bands, columns, uplo="L", overwrite_b=1)
         # A view: rows of one column follow each other in memory.
-        n_blocks, size, n_columns = shape
         return whitened.T.reshape(n_columns, n_blocks, size).transpose(1, 2, 0)
 
     def below(self, block: int) -> FloatArray:

@@ -310,7 +310,7 @@ class _State:
         if "posterior" not in vars(self):
             return dataclasses.replace(self, columns=columns).posterior
         linearisation = self._linearised(self.poses, self.course, self.error, columns)
-        return self.posterior.with_columns(linearisation.columns)
+        return self._taken_posterior().with_columns(linearisation.columns)
 
     def posterior_with_delays(self) -> Posterior:
         """Of all poses, with the columns of a clock offset, of delays of positions, and of a world
@@ -320,7 +320,13 @@ class _State:
         linearisation = self._linearised(self.poses, self.course, self.error, columns)
         linearisation = with_delay_columns(linearisation, self.poses.twists, self.T)
         linearisation = with_world_columns(linearisation, self.poses)
-        return self.posterior.with_columns(linearisation.columns)
+        return self._taken_posterior().with_columns(linearisation.columns)
+
+    def _taken_posterior(self) -> Posterior:
+        """The posterior, which the state forgets: what others do not share of it is freed."""
+        posterior = self.posterior
+        del vars(self)["posterior"]
+        return posterior
 
     def moved(self, step: FloatArray) -> _State:
         """After a step of xi and of the parameters in the model."""
@@ -658,8 +664,7 @@ def _freed(state: _State, states: FloatArray) -> _State:
 
 def _solution(state: _State, converged: bool) -> AdaptiveSolution:
     """The solution one step from where the search stands."""
-    posterior, streams = state.posterior, state.streams
-    normal = posterior.normal
+    normal, streams = state.posterior.normal, state.streams
     n_columns = len(state.columns)
     n_evidence = int((~state.outliers.jumps).sum()) - int(state.outliers.spikes.sum())
     misfit = normal.cost / max(streams.n_rows * n_evidence - 6 - n_columns, 1)
@@ -667,8 +672,7 @@ def _solution(state: _State, converged: bool) -> AdaptiveSolution:
     covariance = max(misfit, 1.0) * normal.covariance
     covariance[:6, :6] += state.cov_beyond
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
-    if state.with_delays:
-        posterior = state.posterior_with_delays()
+    posterior = state.posterior_with_delays() if state.with_delays else state.posterior
     all_parts = part_products(posterior)
     parts = selected(all_parts, list(range(6 + n_columns)))
     state = state.moved(normal.step)

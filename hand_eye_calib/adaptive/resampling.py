@@ -25,29 +25,37 @@ N_PARTS = 20
 def part_products(posterior: Posterior) -> FloatArray:
     """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20."""
     space = posterior.space
-    n, columns = len(space), space.columns
-    factor = InOrder(*posterior.precision())
-    ends = np.linspace(0, n, min(N_PARTS, n) + 1).astype(int)[1:]
-    weighed = posterior.weighed(columns)
-    whitened = factor.whiten(space.gathered(weighed))
-    totals = np.array([_up_to(end, posterior, factor, weighed, whitened) for end in ends])
-    parts = [slice(*part) for part in zip([0, *ends[:-1]], ends, strict=True)]
-    own = [
-        multiplied(columns[part], weighed[part]) - multiplied(whitened[part], whitened[part])
-        for part in parts
-    ]
-    sums = np.cumsum(own, axis=0) - totals
-    return np.diff(sums, axis=0, prepend=0.0 * sums[:1])
+    n, factor = len(space), InOrder(*posterior.precision())
+    ends = np.linspace(0, n, min(N_PARTS, n) + 1).astype(int).tolist()
+    whitened, total, totals = None, np.zeros((space.columns.shape[2],) * 2), []
+    for start, end in zip(ends[:-1], ends[1:], strict=True):
+        # The forces on a pose come from the increments on both sides of it.
+        first = max(start - 1, 0)
+        columns = space.columns[first:end]
+        weighed = posterior.weighed(columns, slice(first, end))
+        forces = space.gathered(weighed, first)[start - first : -1]
+        whitened = factor.whiten(forces, start, None if whitened is None else whitened[-1])
+        own = slice(start - first, None)
+        total = total + multiplied(columns[own], weighed[own]) - multiplied(whitened, whitened)
+        totals.append(total - _at_the_end(end, posterior, factor, weighed[-1], whitened[-1]))
+    return np.diff(np.array(totals), axis=0, prepend=np.zeros_like(totals[:1]))
 
 
-def _up_to(
-    end: int,
-    posterior: Posterior,
-    factor: InOrder,
-    weighed: FloatArray,
-    whitened: FloatArray,
+def _at_the_end(
+    end: int, posterior: Posterior, factor: InOrder, weighed: FloatArray, whitened: FloatArray
 ) -> FloatArray:
-    """Products of the last state's whitened columns if the recording ended at this pose."""
+    """Products of the last state's whitened columns if the recording ended at this pose.
+
+    Parameters
+    ----------
+    end : int
+    posterior : Posterior
+    factor : InOrder
+    weighed : (6, k) array
+        W times the columns of the last increment.
+    whitened : (d, k) array
+        Those of the state before.
+    """
     space = posterior.space
     before = factor.below(end - 1)
     ahead = space.ahead[end - 1]
@@ -58,7 +66,7 @@ def _up_to(
     for process in posterior.markov:
         states = np.arange(process.group.states.start, process.group.states.stop)
         precision[states, states] += 1.0 / (process.variance * process.rest[end - 1])
-    right = ahead.T @ weighed[end - 1] - before @ whitened[end - 1]
+    right = ahead.T @ weighed - before @ whitened
     last = np.linalg.solve(np.linalg.cholesky(precision), right)
     return last.T @ last
 

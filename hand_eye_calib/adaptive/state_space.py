@@ -168,17 +168,20 @@ class StateSpace:
             return blocks[:, :WHITE]
         return blocks[:, :WHITE] + self.slow_ahead[part] @ blocks[:, WHITE:]
 
-    def gathered(self, columns: FloatArray) -> FloatArray:
-        """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
-        states = np.empty((len(self) + 1, self.n_states, columns.shape[2]))
+    def gathered(self, columns: FloatArray, start: int = 0) -> FloatArray:
+        """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k); or of those of n
+        increments from one on.
+        """
+        states = np.empty((len(columns) + 1, self.n_states, columns.shape[2]))
         states[0] = 0.0
-        for part in chunks(len(self)):
+        for part in chunks(len(columns)):
+            own = slice(start + part.start, start + part.stop)
             ahead = states[1:][part]
             ahead[:, :WHITE], ahead[:, WHITE:] = columns[part], 0.0
             if self.slow_ahead is not None:
-                slow = transposed(self.slow_ahead[part])
+                slow = transposed(self.slow_ahead[own])
                 np.matmul(slow, columns[part], out=ahead[:, WHITE:])
-            states[:-1][part] -= transposed(self.behind[part]) @ columns[part]
+            states[:-1][part] -= transposed(self.behind[own]) @ columns[part]
         return states
 
 
@@ -300,9 +303,9 @@ class Posterior:
         diagonal[:, WHITE:, WHITE:] = transposed(slow[part]) @ beside
         below[:, WHITE:] = transposed(slow[part]) @ np.negative(weighed)
 
-    def weighed(self, columns: FloatArray) -> FloatArray:
-        """W times columns (n, 6, k)."""
-        return self._weights @ columns
+    def weighed(self, columns: FloatArray, part: slice = slice(None)) -> FloatArray:
+        """W times columns (n, 6, k) of the increments, or of a part of them."""
+        return self._weights[part] @ columns
 
     @cached_property
     def log_determinant(self) -> float:
@@ -365,16 +368,15 @@ class Posterior:
     def with_weights(self, weights: FloatArray) -> Posterior:
         """The posterior at other weights (N,) of the white errors."""
         other = self._with(dataclasses.replace(self.space, weights=weights))
-        for name in ("log_determinant", "selected_inverse"):
-            other.__dict__.pop(name, None)
+        other.__dict__.pop("log_determinant", None)
         other.factor = Factor(*other.precision())
         return other
 
     def _with(self, space: StateSpace) -> Posterior:
-        """A copy for another space, without what depends on its columns."""
+        """A copy for another space, without what depends on its columns or is large."""
         other = copy.copy(self)
         other.space = space
-        for name in ("_halves", "products", "normal", "loss"):
+        for name in ("_halves", "products", "normal", "loss", "selected_inverse"):
             other.__dict__.pop(name, None)
         return other
 
