@@ -164,6 +164,8 @@ def run(arguments: argparse.Namespace) -> int:
         if data_folder:
             rows = positions.recorded_rows(data_folder)
             tables["recorded"] = markdown_table(positions.RECORDED_HEADER, rows)
+            rows = positions.parts_rows(data_folder)
+            tables["parts"] = markdown_table(positions.PARTS_HEADER, rows)
     for name, table in tables.items():
         print(f"{table}\n")
         if arguments.page:

@@ -15,9 +15,11 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
 from reproduction.coverage import motions
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
+from reproduction.recordings import Recording
 
 _START_NS = 1_700_000_000_000_000_000
 _QUANTILE_90 = 1.645
+_N_PARTS = 3
 
 _LIDAR = SensorErrors(white=sigmas(0.01, 0.03), walk_by_metre=sigmas(0.006, 0.012))
 _VIO = SensorErrors(white=sigmas(0.0008, 0.03), walk=sigmas(0.004, 0.06))
@@ -157,9 +159,9 @@ RECORDED_HEADER = (
 )
 
 
-def recorded_rows(data_folder: Path) -> Iterator[list[object]]:
-    """Rows of the table of recordings; sigmas with the common-mode floor."""
-    pairs = {
+def _recordings() -> dict[str, tuple[str, str, FloatArray, float]]:
+    """Files of odometry and positions, the lever arm and how well it is known (m)."""
+    recordings = {
         f"EuRoC {flight}, {kind} odometry": (
             f"euroc_vio/vio_{kind}_{flight}.tum",
             f"euroc_vio/cam0_truth_{flight}.tum",
@@ -169,7 +171,7 @@ def recorded_rows(data_folder: Path) -> Iterator[list[object]]:
         for kind in ("stereo", "mono")
         for flight in ("mh_03", "mh_05", "v2_01")
     }
-    pairs |= {
+    recordings |= {
         f"KITTI {drive}, lidar odometry": (
             f"simple_kitti/odometry_{drive}.tum",
             f"simple_kitti/truth_{drive}.tum",
@@ -178,8 +180,17 @@ def recorded_rows(data_folder: Path) -> Iterator[list[object]]:
         )
         for drive in ("05", "07")
     }
-    for name, (parent, child, lever_arm, truth_m) in pairs.items():
-        streams = [read_trajectory_file(data_folder / name)[0] for name in (parent, child)]
+    return recordings
+
+
+def _streams(data_folder: Path, *names: str) -> list[Trajectory]:
+    return [read_trajectory_file(data_folder / name)[0] for name in names]
+
+
+def recorded_rows(data_folder: Path) -> Iterator[list[object]]:
+    """Rows of the table of recordings; sigmas with the common-mode floor."""
+    for name, (parent, child, lever_arm, truth_m) in _recordings().items():
+        streams = _streams(data_folder, parent, child)
         result = hec.calibrate(*streams, child_measures="positions")
         whole = hec.calibrate(*streams, time_offset="estimate", scale="auto")
         error = result.T_parent_child[:3, 3] - lever_arm
@@ -197,3 +208,40 @@ def recorded_rows(data_folder: Path) -> Iterator[list[object]]:
 
 def _in_mm(values: FloatArray) -> str:
     return ", ".join(f"{1000 * value:.0f}" if np.isfinite(value) else "-" for value in values)
+
+
+PARTS_HEADER = ("Thirds of", "Scatter x, y, z (mm)", "Sigma x, y, z (mm)", "Chi-square of 6")
+
+
+def parts_rows(data_folder: Path) -> Iterator[list[object]]:
+    """Rows of the table of recordings in three parts: how far their lever arms are apart, against
+    their covariances with the common-mode floor. No truth is needed for that.
+    """
+    total = 0.0
+    recordings = _recordings()
+    for name, (parent, child, *_) in recordings.items():
+        whole = Recording(*_streams(data_folder, parent, child))
+        parts = [
+            hec.calibrate(part.parent, part.child, child_measures="positions")
+            for part in whole.parts(_N_PARTS, 0.0)
+        ]
+        lever_arms = np.array([part.T_parent_child[:3, 3] for part in parts])
+        covariances = np.array([(part.covariance + part.floor)[:3, :3] for part in parts])
+        chi_square = _misfit_of_mean(lever_arms, covariances)
+        total += chi_square
+        variances = np.diagonal(covariances, axis1=1, axis2=2)
+        yield [
+            name,
+            _in_mm(lever_arms.std(axis=0, ddof=1)),
+            _in_mm(np.sqrt(variances.mean(axis=0))),
+            f"{chi_square:.1f}",
+        ]
+    yield ["all, the mean", "", "", f"{total / len(recordings):.1f}"]
+
+
+def _misfit_of_mean(values: FloatArray, covariances: FloatArray) -> float:
+    """Chi-square of values (K, 3) with covariances (K, 3, 3) about their weighted mean."""
+    weights = np.linalg.inv(covariances)
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, values))
+    away = values - mean
+    return float(np.einsum("ki,kij,kj->", away, weights, away))
