@@ -226,7 +226,7 @@ def parts_rows(data_folder: Path) -> Iterator[list[object]]:
             for part in whole.parts(_N_PARTS, 0.0)
         ]
         lever_arms = np.array([part.T_parent_child[:3, 3] for part in parts])
-        covariances = np.array([(part.covariance + part.floor)[:3, :3] for part in parts])
+        covariances = np.array([part.covariance_with_floor[:3, :3] for part in parts])
         chi_square = _misfit_of_mean(lever_arms, covariances)
         total += chi_square
         variances = np.diagonal(covariances, axis1=1, axis2=2)
