@@ -8,23 +8,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from hand_eye_calib.alignment.angular_rates import (
-    MIN_VARIATION,
-    Correlation,
-    angular_rates,
-    correlate_rates,
-    speeds,
-)
+from hand_eye_calib.alignment.angular_rates import MIN_VARIATION, Correlation
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.check import CheckResult, check_offset
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
-from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.engine.snapshot import FOUND_BY_SOLVE_S, Snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
-
-# Smaller offsets (s) are found by every solve; those of half that size are not looked for here.
-_FOUND_S = 0.25
 
 
 def check_partial(snapshot: Snapshot) -> CheckResult:
@@ -47,11 +38,9 @@ def check_partial(snapshot: Snapshot) -> CheckResult:
     before = replace(snapshot, config=replace(config, time_offset=known_s)).check()
     if any(finding.makes_unusable for finding in before.findings):
         return before
-    parent, child = snapshot.streams
-    of = speeds if config.measured == "positions" else angular_rates
-    correlation = correlate_rates(parent, child.shifted(known_s), config.max_gap, of=of)
+    correlation = snapshot.correlated(known_s)
     offset_s = known_s
-    if correlation.is_clear and abs(correlation.offset_s) > _FOUND_S / 2:
+    if correlation.is_clear and abs(correlation.offset_s) > FOUND_BY_SOLVE_S / 2:
         offset_s += correlation.offset_s
     try:
         found = _of_solve(snapshot, correlation, known_s, {"time_offset": offset_s})
@@ -99,7 +88,7 @@ def _of_result(result: Calibration, correlation: Correlation, known_s: float) ->
         return [wording.no_rotation()]
     offset_s, sigma_s = result.time_offset_s - known_s, result.time_offset_sigma_s
     clocks = check_offset(TimeOffset(offset_s, sigma_s, correlation, None), known_s)
-    if abs(offset_s) < _FOUND_S:
+    if abs(offset_s) < FOUND_BY_SOLVE_S:
         clocks = [replace(finding, severity=Severity.NOTE) for finding in clocks]
     return [
         *clocks,

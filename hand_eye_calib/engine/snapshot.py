@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
+from hand_eye_calib.alignment.angular_rates import (
+    Correlation,
+    angular_rates,
+    correlate_rates,
+    speeds,
+)
 from hand_eye_calib.alignment.time_offset import (
     TimeOffset,
     estimate_time_offset,
@@ -16,7 +21,7 @@ from hand_eye_calib.alignment.time_offset import (
 from hand_eye_calib.assessment.model_fit import MAX_MISFIT
 from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.checks.aligned import ByModel
-from hand_eye_calib.checks.check import CheckResult, check_parts, check_streams
+from hand_eye_calib.checks.check import CheckResult, check_offset, check_parts, check_streams
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
@@ -42,6 +47,9 @@ _BELIEVABLE_S = 1.0
 
 # A noise model that moves poses in time by more (s) than this may have missed something.
 _SETTLED_S = 0.0025
+
+# Smaller time offsets (s) of streams that are no poses are found by every solve.
+FOUND_BY_SOLVE_S = 0.25
 
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
@@ -267,7 +275,27 @@ class Snapshot:
             parent, child = self.streams
             offset_s = fixed_time_offset(self.resolved().config)
             found += check_parts(parent, child.shifted(offset_s), self.config.max_gap)
+        if any(each.code == "unrelated" for each in found):
+            found += self._check_clocks()
         return [*dict.fromkeys(found)]
+
+    def _check_clocks(self) -> list[Finding]:
+        """A finding if streams that are no poses agree at another clock offset."""
+        known_s = fixed_time_offset(self.resolved().config)
+        correlation = self.correlated(known_s)
+        if not correlation.is_clear or abs(correlation.offset_s) < FOUND_BY_SOLVE_S:
+            return []
+        sigma_s = max(stream.interval_s for stream in self.streams) / 5
+        offset = TimeOffset(correlation.offset_s, sigma_s, correlation, None)
+        return check_offset(offset, known_s)
+
+    def correlated(self, known_s: float) -> Correlation:
+        """Of the angular rates of both streams or, if one has only positions, of their speeds; the
+        child's stamps are off by ``known_s``.
+        """
+        parent, child = self.streams
+        of = speeds if self.config.measured == "positions" else angular_rates
+        return correlate_rates(parent, child.shifted(known_s), self.config.max_gap, of=of)
 
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
