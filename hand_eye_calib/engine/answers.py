@@ -13,7 +13,8 @@ import numpy as np
 
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimators import ESTIMATORS
+from hand_eye_calib.engine.estimation import estimate_beside
+from hand_eye_calib.engine.estimators import ESTIMATORS, Estimator
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -130,9 +131,10 @@ class OtherAnswers:
         if not METHODS[self._calibration.method].uses_reference or own[0] not in "BC":
             own = f"B{_QUICK_BASELINES[2]}"
         config = replace(self._without_prior, method=_QUICK_METHOD, reference=own)
-        return self._answers(others), self._answers(
+        halves = [
             self._downsampled(half, _MAX_POSES_OF_OTHERS, own) for half in self._halves_with(config)
-        )
+        ]
+        return self._answers(others, estimate_beside), self._answers(halves, estimate_beside)
 
     def _at_baselines(self, method: str, baselines: Sequence[int]) -> list[_Question]:
         """A method at these baselines, with at most so many poses; without the result itself."""
@@ -173,15 +175,20 @@ class OtherAnswers:
         config = replace(question.config, reference=reference)
         return replace(question, part=slice(start, end, stride), config=config)
 
-    def _answers(self, questions: Iterable[_Question]) -> tuple[Answer, ...]:
-        return tuple(filter(None, map(self._answer, questions)))
+    def _answers(
+        self, questions: Iterable[_Question], estimate: Estimator | None = None
+    ) -> tuple[Answer, ...]:
+        """Answers by an estimator: by default the one that gave the result."""
+        estimate = estimate or ESTIMATORS[self._calibration.measured]
+        found = (self._answer(question, estimate) for question in questions)
+        return tuple(filter(None, found))
 
-    def _answer(self, question: _Question) -> Answer | None:
+    def _answer(self, question: _Question, estimate: Estimator) -> Answer | None:
         poses = self._poses[question.part]
         if len(poses) < _MIN_POSES:
             return None
         try:
-            calibration = ESTIMATORS[self._calibration.measured](poses, question.config)
+            calibration = estimate(poses, question.config)
         except HandEyeCalibError:
             return None
         stride = question.part.step or 1

@@ -55,6 +55,8 @@ class _Evaluation:
         Pairs that are long enough to show the motion, and their weights, for the floor.
     shift : PossibleShift or None
         Of the mount within the recording.
+    is_beside : bool
+        It is only to be compared with a result, and has no floor.
     """
 
     solution: Solution | AdaptiveSolution
@@ -78,6 +80,7 @@ class _Evaluation:
     clock: PartDelay | None = None
     drift: WorldDrift | None = None
     shift: PossibleShift | None = None
+    is_beside: bool = False
 
     def spread(self, clock_offset_s: float) -> FloatArray:
         """Covariance (6, 6) of xi by what is not in the model.
@@ -162,19 +165,34 @@ def estimate_extrinsic(
     )
 
 
+def estimate_beside(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
+    """Solve with a method of the paper on one reference, to be compared with a result: without a
+    floor, a proof that the minimum is global, or a prior. Parameters as of
+    :func:`estimate_extrinsic`, with a scale that is given.
+    """
+    scaled = child_scaled(pose_pairs, _settle_scale(pose_pairs, config).value)
+    evaluation = _solve_reference(scaled, _method(config), config.reference, is_beside=True)
+    fused = fuse(evaluation.solution.T_parent_child, evaluation.assessment, {})
+    return _calibration(evaluation, fused, pose_pairs.stamps_ns, config)
+
+
 def _calibration(
     evaluation: _Evaluation, fused: Fused, stamps_ns: IntArray, config: CalibratorConfig
 ) -> Calibration:
     """The result, without frame names, time offset and scale."""
     solution = evaluation.solution
     residuals = _residuals(evaluation, stamps_ns, fused.T_parent_child)
+    floor = None
+    if not evaluation.is_beside:
+        known = _known_by_motion(fused)
+        floor = common_mode_floor(*evaluation.spans, fused.T_parent_child, known)
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
         status=_status(solution.converged, fused),
         observability=fused.assessment.observability,
         T_method=solution.T_parent_child,
-        floor=common_mode_floor(*evaluation.spans, fused.T_parent_child, _known_by_motion(fused)),
+        floor=floor,
         objective=solution.objective,
         proved_global=evaluation.proved_global,
         method=evaluation.method,
@@ -286,7 +304,7 @@ def _solve_pairs(
     pose_pairs: PosePairs, config: CalibratorConfig, noise_model: AdaptiveSolution | None = None
 ) -> _Evaluation:
     """A method of the paper on the motion pairs of one reference."""
-    method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
+    method = _method(config)
     if config.reference != "auto":
         return _solve_reference(pose_pairs, method, config.reference)
     choice = select_reference(pose_pairs, method, solution=noise_model)
@@ -311,16 +329,25 @@ def _solve_pairs(
     return replace(chosen, other_answer=choice.answer, shift=choice.shift)
 
 
+def _method(config: CalibratorConfig) -> Method:
+    return Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
+
+
 def _solve_reference(
     pose_pairs: PosePairs,
     method: Method,
     reference: str,
     reason: str = "",
     found: Solution | None = None,
+    is_beside: bool = False,
 ) -> _Evaluation:
-    """A method's answer for one reference, which may be known already, assessed."""
+    """A method's answer for one reference, which may be known already, assessed; beside another
+    result, without a proof and a floor.
+    """
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-    solution = method.prove(pairs, found or method.solve(pairs))
+    solution = found or method.solve(pairs)
+    if not is_beside:
+        solution = method.prove(pairs, solution)
     assessment = assess(
         pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)
     )
@@ -332,6 +359,7 @@ def _solve_reference(
         pairs=pairs,
         weights=solution.weights,
         spans=(pairs, solution.weights),
+        is_beside=is_beside,
         reference_reason=reason,
         proved_global=_PROVED[solution.is_proved_global],
     )
