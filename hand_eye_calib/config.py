@@ -5,7 +5,6 @@ the documentation are made from these dataclasses or tested against them.
 """
 
 import dataclasses
-import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -95,6 +94,8 @@ def option_name(field: OptionField) -> str:
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """``; did you mean X?`` for a misspelt word; empty if no known word is close."""
+    import difflib
+
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f"; did you mean {close[0]}?" if close else ""
 

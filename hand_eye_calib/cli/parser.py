@@ -1,6 +1,7 @@
 """A parser with a short help, a long one, and a guess at what a misspelt word should be."""
 
 import argparse
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ class CommandParser(argparse.ArgumentParser):
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        options.setdefault("formatter_class", _HelpFormatter)
         options.setdefault("allow_abbrev", False)
         super().__init__(*args, **options)
 
@@ -89,6 +90,24 @@ class CommandParser(argparse.ArgumentParser):
                 f"invalid choice: {value!r}, expected one of {', '.join(choices)}"
                 f"{did_you_mean(str(value), choices)}",
             )
+
+
+class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Knows the width of the terminal without ``shutil``, which takes longer to load."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=_columns() - 2)
+
+
+def _columns() -> int:
+    """Columns of the terminal: as the environment says, or as it is; 80 if there is none."""
+    given = os.environ.get("COLUMNS", "")
+    if given.isdecimal() and int(given):
+        return int(given)
+    try:
+        return os.get_terminal_size(sys.__stdout__.fileno()).columns or 80  # type: ignore[union-attr]
+    except (AttributeError, ValueError, OSError):
+        return 80
 
 
 def advanced(action: argparse.Action) -> None:
