@@ -23,6 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hand_eye_calib.adaptive.state_space import chunks
 from hand_eye_calib.arrays import FloatArray, IntArray, median
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import chained
@@ -148,7 +149,7 @@ class Streams:
         """Velocity (N, 6), m/s and rad/s, of the child in its own frame."""
         return _twists(motions(self.Ts_cw_c), np.diff(self.stamps_s))
 
-    def __getitem__(self, index: IntArray) -> Streams:
+    def __getitem__(self, index: IntArray | slice) -> Streams:
         return Streams(self.stamps_s[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
 
 
@@ -177,7 +178,7 @@ class Course:
         metres = np.linalg.norm(np.diff(self.path, axis=0), axis=1)
         return bool(np.std(metres) > _EVEN * np.mean(metres))
 
-    def __getitem__(self, index: IntArray) -> Course:
+    def __getitem__(self, index: IntArray | slice) -> Course:
         return Course(
             self.twists[index], self.path[index], self.along_c[index], self.along_p[index]
         )
@@ -278,6 +279,11 @@ class Linearisation:
         """(n, 6) array: e."""
         return self.columns[:, :, -1]
 
+    def __getitem__(self, part: slice) -> Linearisation:
+        return Linearisation(
+            self.columns[part], self.adjoints[part], self.by_scale[part], self.metres[part]
+        )
+
     def with_columns(self, columns: FloatArray) -> Linearisation:
         """With more derivatives (n, 6, l)."""
         parts = [self.jacobian, columns, self.columns[:, :, -1:]]
@@ -304,6 +310,28 @@ def linearise(
     columns : sequence of int
         Those whose derivatives are asked for. The three of a bias follow each other.
     """
+    n = len(streams) - 1
+    found = Linearisation(
+        columns=np.zeros((n, 6, 6 + len(columns) + 1)),
+        adjoints=np.empty((n, 6, 6)),
+        by_scale=np.zeros((n, 6, 1)),
+        metres=np.empty(n),
+    )
+    for part in chunks(n):
+        poses = slice(part.start, part.stop + 1)
+        _linearise(streams[poses], course[poses], T_parent_child, parameters, columns, found[part])
+    return found
+
+
+def _linearise(
+    streams: Streams,
+    course: Course,
+    T_parent_child: FloatArray,
+    parameters: FloatArray,
+    columns: Sequence[int],
+    found: Linearisation,
+) -> None:
+    """Fill in the arrays of a part of the increments, whose columns and ``by_scale`` are zero."""
     used, asked = {*columns, *np.flatnonzero(parameters).tolist()}, {*columns}
 
     def at(first: int, size: int = 3) -> slice:
@@ -331,12 +359,11 @@ def linearise(
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
 
-    by = np.zeros((len(step), 6, 6 + len(columns) + 1))
+    by = found.columns
     np.subtract(np.eye(6), adjoints, out=by[:, :, :6])
-    by_scale = np.zeros((len(step), 6, 1))
-    by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
+    found.by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
     if SCALE in asked:
-        by[:, :, at(SCALE, 1)] = by_scale
+        by[:, :, at(SCALE, 1)] = found.by_scale
     if asked & _CHILD_BIASES:
         by[:, :3, at(1)] = back[:, :3, :3] @ metres_c
     if asked & _PARENT_BIASES:
@@ -348,7 +375,7 @@ def linearise(
     if asked & _RATES:
         by[:, 3:, at(8)] = by_rate
     by[:, :, -1] = se3.log(back @ between(by_parent, T_parent_child))
-    return Linearisation(by, adjoints, by_scale, np.linalg.norm(step, axis=1))
+    found.adjoints[:], found.metres[:] = adjoints, np.linalg.norm(step, axis=1)
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive.increments import Linearisation, Streams, turned
+from hand_eye_calib.adaptive.state_space import chunks
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 
@@ -32,6 +33,18 @@ class SensorWhite:
 
     of_parent: FloatArray
     of_child: FloatArray
+
+    def __getitem__(self, part: slice) -> SensorWhite:
+        of_parent, of_child = (
+            of_sensor if len(of_sensor) == 1 else of_sensor[part]
+            for of_sensor in (self.of_parent, self.of_child)
+        )
+        return SensorWhite(of_parent, of_child)
+
+    def share_of_parent(self) -> FloatArray:
+        """Matrices (1 or N, 6, 6) from the white error of both sensors to that of the parent."""
+        both = self.of_parent + self.of_child
+        return np.swapaxes(np.linalg.solve(both, self.of_parent), 1, 2)
 
 
 def corrected(
@@ -44,18 +57,16 @@ def corrected(
     """Streams without the errors c (N, 6): the white ones split by the white covariances of both
     sensors, the others in halves.
     """
-    both = white.of_parent + white.of_child
-    share = np.swapaxes(np.linalg.solve(both, white.of_parent), 1, 2)
-    by_parent = (share @ white_error[:, :, None])[:, :, 0]
-    by_child = by_parent - white_error
-    by_parent = by_parent + 0.5 * other_error
-    by_child = by_child - 0.5 * other_error
-    at_parent = by_parent @ se3.adjoint(T_parent_child).T
-    return Streams(
-        streams.stamps_s,
-        streams.Ts_pw_p @ se3.exp(-at_parent),
-        streams.Ts_cw_c @ se3.exp(-by_child),
-    )
+    Ts_pw_p, Ts_cw_c = np.empty_like(streams.Ts_pw_p), np.empty_like(streams.Ts_cw_c)
+    to_parent = se3.adjoint(T_parent_child).T
+    for part in chunks(len(streams)):
+        by_parent = turned(white[part].share_of_parent(), white_error[part])
+        by_child = by_parent - white_error[part]
+        by_parent = by_parent + 0.5 * other_error[part]
+        by_child = by_child - 0.5 * other_error[part]
+        Ts_pw_p[part] = streams.Ts_pw_p[part] @ se3.exp(-by_parent @ to_parent)
+        Ts_cw_c[part] = streams.Ts_cw_c[part] @ se3.exp(-by_child)
+    return Streams(streams.stamps_s, Ts_pw_p, Ts_cw_c)
 
 
 def restored(linearisation: Linearisation, error: FloatArray) -> Linearisation:
