@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive import lapack
+from hand_eye_calib.adaptive.chunks import chunks
 from hand_eye_calib.arrays import FloatArray
 
 # Matrices that are fewer than so many times their size are inverted faster by LAPACK, one by one,
@@ -114,38 +115,63 @@ class _Level:
 
     def whiten(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened columns of the eliminated blocks, and the columns of the blocks that stay."""
-        n_before, n_behind = len(self.before), len(self.behind)
-        whitened, rest = self.inverse @ right[1::2], right[::2].copy()
-        rest[:n_before] -= transposed(self.before) @ whitened
-        rest[1 : 1 + n_behind] -= transposed(self.behind) @ whitened[:n_behind]
+        odd, rest = right[1::2], right[::2].copy()
+        whitened = np.empty(odd.shape)
+        for part in chunks(len(odd)):
+            np.matmul(self.inverse[part], odd[part], out=whitened[part])
+            rest[part] -= transposed(self.before[part]) @ whitened[part]
+            behind = transposed(self.behind[part])
+            rest[1:][part][: len(behind)] -= behind @ whitened[part][: len(behind)]
         return whitened, rest
 
     def restore(self, whitened: FloatArray, rest: FloatArray) -> FloatArray:
         """Solution of all blocks from that of those that stay."""
-        n_behind = len(self.behind)
-        own = whitened - self.before @ rest[: len(self.before)]
-        own[:n_behind] -= self.behind @ rest[1 : 1 + n_behind]
-        solved = np.empty((len(own) + len(rest), *rest.shape[1:]))
-        solved[::2], solved[1::2] = rest, transposed(self.inverse) @ own
+        solved = np.empty((len(whitened) + len(rest), *rest.shape[1:]))
+        solved[::2] = rest
+        for part in chunks(len(whitened)):
+            own = whitened[part] - self.before[part] @ rest[part]
+            behind = self.behind[part]
+            own[: len(behind)] -= behind @ rest[1:][part][: len(behind)]
+            solved[1::2][part] = transposed(self.inverse[part]) @ own
         return solved
 
     def extend(self, diagonal: FloatArray, below: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Blocks of the inverse on the diagonal and below it from those of the blocks that stay."""
-        n_before, n_behind = len(self.before), len(self.behind)
-        root = transposed(self.inverse)
-        to_before, to_behind = -root @ self.before, -root[:n_behind] @ self.behind
-        with_before = to_before @ diagonal[:n_before]
-        with_before[:n_behind] += to_behind @ below[:n_behind]
-        with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
-        with_behind += below[:n_behind] @ transposed(to_before[:n_behind])
-        own = squared(self.inverse)
-        own += with_before @ transposed(to_before)
-        own[:n_behind] += transposed(to_behind @ with_behind)
-        all_diagonal = np.empty((len(diagonal) + n_before, *diagonal.shape[1:]))
-        all_diagonal[::2], all_diagonal[1::2] = diagonal, own
-        all_below = np.empty((len(all_diagonal) - 1, *diagonal.shape[1:]))
-        all_below[::2], all_below[1::2] = with_before, with_behind
+        n_blocks = len(diagonal) + len(self.inverse)
+        all_diagonal = np.empty((n_blocks, *diagonal.shape[1:]))
+        all_below = np.empty((n_blocks - 1, *diagonal.shape[1:]))
+        all_diagonal[::2] = diagonal
+        for part in chunks(len(self.inverse)):
+            behind, root = self.behind[part], transposed(self.inverse[part])
+            n_behind = len(behind)
+            to_before, to_behind = -root @ self.before[part], -root[:n_behind] @ behind
+            beside = below[part][:n_behind]
+            with_before = to_before @ diagonal[part]
+            with_before[:n_behind] += to_behind @ beside
+            with_behind = diagonal[1:][part][:n_behind] @ transposed(to_behind)
+            with_behind += beside @ transposed(to_before[:n_behind])
+            own = squared(self.inverse[part])
+            own += with_before @ transposed(to_before)
+            own[:n_behind] += transposed(to_behind @ with_behind)
+            all_diagonal[1::2][part] = own
+            all_below[::2][part], all_below[1::2][part] = with_before, with_behind
         return all_diagonal, all_below
+
+    @classmethod
+    def of(cls, diagonal: FloatArray, below: FloatArray, inverse: FloatArray) -> _Level:
+        """From the blocks of a matrix and the inverse roots of those that are eliminated."""
+        n_behind = (len(diagonal) - 1) // 2
+        return cls(inverse, inverse @ below[::2], inverse[:n_behind] @ transposed(below[1::2]))
+
+    def rest(self, diagonal: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The diagonal, and the blocks below it, of the matrix that stays."""
+        diagonal, below = diagonal[::2].copy(), np.empty_like(self.behind)
+        for part in chunks(len(self.before)):
+            before, behind = self.before[part], self.behind[part]
+            diagonal[part] -= squared(before)
+            diagonal[1:][part][: len(behind)] -= squared(behind)
+            np.negative(transposed(behind) @ before[: len(behind)], out=below[part])
+        return diagonal, below
 
 
 def _whole(diagonal: FloatArray, below: FloatArray) -> FloatArray:
@@ -177,15 +203,9 @@ class Factor:
         self._levels: list[_Level] = []
         self._log_determinant = 0.0
         while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _DENSE:
-            inverse = self._inverse_root(diagonal[1::2])
-            n_behind = (len(diagonal) - 1) // 2
-            before = inverse @ below[::2]
-            behind = inverse[:n_behind] @ transposed(below[1::2])
-            diagonal = diagonal[::2].copy()
-            diagonal[: len(before)] -= squared(before)
-            diagonal[1 : 1 + n_behind] -= squared(behind)
-            below = -transposed(behind) @ before[:n_behind]
-            self._levels.append(_Level(inverse, before, behind))
+            level = _Level.of(diagonal, below, self._inverse_root(diagonal[1::2]))
+            diagonal, below = level.rest(diagonal)
+            self._levels.append(level)
         self._n_last, self._size, _ = diagonal.shape
         self._last = self._inverse_root(_whole(diagonal, below)[None])[0]
 

@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.adaptive.state_space import chunks
+from hand_eye_calib.adaptive.chunks import chunks
 from hand_eye_calib.arrays import FloatArray, IntArray, median
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import chained

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive.block_tridiagonal import inverse_products, transposed
+from hand_eye_calib.adaptive.chunks import chunks
 from hand_eye_calib.adaptive.increments import Streams
 from hand_eye_calib.adaptive.reml import walk_covariance
-from hand_eye_calib.adaptive.state_space import WHITE, Posterior, chunks
+from hand_eye_calib.adaptive.state_space import WHITE, Posterior
 from hand_eye_calib.arrays import BoolArray, FloatArray, median
 from hand_eye_calib.geometry import se3
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from hand_eye_calib.adaptive import lapack
 from hand_eye_calib.adaptive.block_tridiagonal import Factor, inverse_roots, squared, transposed
+from hand_eye_calib.adaptive.chunks import chunks
 from hand_eye_calib.arrays import BoolArray, FloatArray
 
 WHITE = 6
@@ -35,16 +36,6 @@ FREE = 1.0
 
 # Diagonals are raised by this share, so that rounding cannot make them negative.
 _ROUNDING = 1e-13
-
-
-# Increments that are computed at a time, so that what is computed of them stays in the cache.
-_CHUNK = 4096
-
-
-def chunks(n_increments: int) -> list[slice]:
-    """Parts of the increments to compute one after the other."""
-    ends = [*range(_CHUNK, n_increments, _CHUNK), n_increments]
-    return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 @dataclass(frozen=True)
