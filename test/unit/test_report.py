@@ -415,6 +415,8 @@ def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
 
 @pytest.mark.parametrize("library", ["jinja2", "matplotlib"])
 def test_without_the_libraries_the_rest_is_written(files, tmp_path, capsys, monkeypatch, library):
+    # Imported anew: afterwards the package has its former module again.
+    monkeypatch.setattr(hec, "report", hec.report)
     for name in [name for name in sys.modules if name.startswith("hand_eye_calib.report")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, library, None)
