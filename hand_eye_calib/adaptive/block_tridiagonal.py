@@ -113,6 +113,11 @@ class _Level:
     before: FloatArray
     behind: FloatArray
 
+    def _behind(self, part: slice) -> tuple[FloatArray, slice]:
+        """``behind`` of a part of the eliminated blocks, and which of those that stay that is."""
+        behind = self.behind[part]
+        return behind, slice(part.start + 1, part.start + 1 + len(behind))
+
     def whiten(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened columns of the eliminated blocks, and the columns of the blocks that stay."""
         odd, rest = right[1::2], right[::2].copy()
@@ -120,8 +125,8 @@ class _Level:
         for part in chunks(len(odd)):
             np.matmul(self.inverse[part], odd[part], out=whitened[part])
             rest[part] -= transposed(self.before[part]) @ whitened[part]
-            behind = transposed(self.behind[part])
-            rest[1:][part][: len(behind)] -= behind @ whitened[part][: len(behind)]
+            behind, after = self._behind(part)
+            rest[after] -= transposed(behind) @ whitened[part][: len(behind)]
         return whitened, rest
 
     def restore(self, whitened: FloatArray, rest: FloatArray) -> FloatArray:
@@ -130,8 +135,8 @@ class _Level:
         solved[::2] = rest
         for part in chunks(len(whitened)):
             own = whitened[part] - self.before[part] @ rest[part]
-            behind = self.behind[part]
-            own[: len(behind)] -= behind @ rest[1:][part][: len(behind)]
+            behind, after = self._behind(part)
+            own[: len(behind)] -= behind @ rest[after]
             solved[1::2][part] = transposed(self.inverse[part]) @ own
         return solved
 
@@ -142,13 +147,13 @@ class _Level:
         all_below = np.empty((n_blocks - 1, *diagonal.shape[1:]))
         all_diagonal[::2] = diagonal
         for part in chunks(len(self.inverse)):
-            behind, root = self.behind[part], transposed(self.inverse[part])
+            (behind, after), root = self._behind(part), transposed(self.inverse[part])
             n_behind = len(behind)
             to_before, to_behind = -root @ self.before[part], -root[:n_behind] @ behind
             beside = below[part][:n_behind]
             with_before = to_before @ diagonal[part]
             with_before[:n_behind] += to_behind @ beside
-            with_behind = diagonal[1:][part][:n_behind] @ transposed(to_behind)
+            with_behind = diagonal[after] @ transposed(to_behind)
             with_behind += beside @ transposed(to_before[:n_behind])
             own = squared(self.inverse[part])
             own += with_before @ transposed(to_before)
@@ -167,9 +172,9 @@ class _Level:
         """The diagonal, and the blocks below it, of the matrix that stays."""
         diagonal, below = diagonal[::2].copy(), np.empty_like(self.behind)
         for part in chunks(len(self.before)):
-            before, behind = self.before[part], self.behind[part]
+            before, (behind, after) = self.before[part], self._behind(part)
             diagonal[part] -= squared(before)
-            diagonal[1:][part][: len(behind)] -= squared(behind)
+            diagonal[after] -= squared(behind)
             np.negative(transposed(behind) @ before[: len(behind)], out=below[part])
         return diagonal, below
 
