@@ -66,7 +66,9 @@ class ReferencePredictor:
         course = course_of(streams, X)
         # As the method sees them: systematic errors are part of the residual, not taken out.
         plain = linearise(streams, course, X, np.zeros(N_SYSTEMATIC), ())
-        modelled = linearise(streams, course, X, solution.parameters, ()).residuals
+        modelled = plain.residuals
+        if solution.parameters.any():
+            modelled = linearise(streams, course, X, solution.parameters, ()).residuals
         cut = np.zeros(len(streams) - 1, dtype=bool)
         space = solution.model.state_space(streams, plain, course.twists, X, solution.weights, cut)
         self._increments = Covariance(space, solution.levels)
@@ -78,6 +80,7 @@ class ReferencePredictor:
         self._into_world = Ts_pw_p[:, :3, :3] @ X[:3, :3]
         steps = turned(self._into_world[:-1], motions(Ts_cw_c)[:, :3, 3])
         self._path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._arms = se3.skew(self._path[1:])
 
     def covariance(self, reference: str) -> FloatArray | None:
         """(6, 6) mean squared error of xi = (rho, phi) expected with a reference; None where it
@@ -140,10 +143,12 @@ class ReferencePredictor:
         np.matmul(se3.skew(path[j]), weighted[:, 3:], out=weighted[:, :3])
         weighted[:, :3, 3:] += 2.0 * weighted[:, 3:, :3]
         pushes = _sum_over_spans(weighted, i, j, len(path) - 1)
-        pushes[:, :3] -= se3.skew(path[1:]) @ pushes[:, 3:]
+        pushes[:, :3] -= self._arms @ pushes[:, 3:]
         # Increments are translation before rotation, along the child's axes at their ends.
-        back = np.swapaxes(self._into_world[1:], 1, 2)
-        return hessian, np.concatenate([back @ pushes[:, 3:], back @ pushes[:, :3]], axis=1)
+        back, found = np.swapaxes(self._into_world[1:], 1, 2), np.empty_like(pushes)
+        np.matmul(back, pushes[:, 3:], out=found[:, :3])
+        np.matmul(back, pushes[:, :3], out=found[:, 3:])
+        return hessian, found
 
 
 def _sum_over_spans(values: FloatArray, i: IntArray, j: IntArray, n_increments: int) -> FloatArray:
@@ -153,7 +158,6 @@ def _sum_over_spans(values: FloatArray, i: IntArray, j: IntArray, n_increments: 
     sums = np.zeros((len(values) + 1, *values.shape[1:]))
     np.cumsum(values, axis=0, out=sums[1:])
     increments = np.arange(n_increments)
-    return (
-        sums[np.searchsorted(i, increments, side="right")]
-        - sums[np.searchsorted(j, increments, side="right")]
-    )
+    spans = sums.take(np.searchsorted(i, increments, side="right"), axis=0)
+    spans -= sums.take(np.searchsorted(j, increments, side="right"), axis=0)
+    return spans
