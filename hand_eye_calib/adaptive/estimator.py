@@ -698,15 +698,16 @@ def _solution(state: _State, converged: bool) -> AdaptiveSolution:
     )
     if not state.with_delays:
         return solution
-    return _with_more(solution, state.columns, posterior.products, all_parts)
+    return _with_more(solution, state.columns, all_parts)
 
 
 def _with_more(
-    solution: AdaptiveSolution, columns: list[int], products: FloatArray, parts: FloatArray
+    solution: AdaptiveSolution, columns: list[int], parts: FloatArray
 ) -> AdaptiveSolution:
     """With errors that are not in the model, as they would be with each alone in it: from the
-    products of all columns, whole and by parts.
+    products of all columns, by parts.
     """
+    products = parts.sum(axis=0)
     known = list(range(6 + len(columns)))
     *with_clock, child, parent = range(len(products) - 1 - N_COLUMNS)
     world = list(range(parent + 1, parent + 1 + N_COLUMNS))
