@@ -181,7 +181,9 @@ def _kitti_case(
 ) -> Case:
     # As in the paper: the parent's poses at the child's stamps, extrapolated along its end segments
     # if the child's stamps reach further.
-    parent_at_child = Trajectory(child.stamps_ns, parent.at(child.stamps_ns, extrapolate=True))
+    parent_at_child = Trajectory(
+        child.stamps_ns, parent.at(child.stamps_ns, extrapolate=True, straight=True)
+    )
     results = {key: rows[0] for key, rows in _read_results(results_file, None)[None].items()}
     return Case(
         dataset,

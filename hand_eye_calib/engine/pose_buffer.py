@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.geometry.interpolation import REACH
 from hand_eye_calib.geometry.trajectory import Trajectory
 
 
@@ -221,19 +222,21 @@ class PoseBuffer:
         return int(self._stamps_ns[min(index, self._count - 1)])
 
     def poses(self, until_ns: int | None = None) -> RawPoses:
-        """The poses, copied: all, or those up to a stamp and the next one."""
+        """The poses, copied: all, or those up to a stamp and the ones after it that interpolation
+        up to it looks at.
+        """
         end = self._count
         if until_ns is not None:
             after = int(np.searchsorted(self.stamps_ns, until_ns, side="right"))
-            end = min(after + 1, self._count)
+            end = min(after + REACH, self._count)
         return RawPoses(self._stamps_ns[:end].copy(), self._poses[:end].copy())
 
     def drop(self, until_ns: int, unpaired: bool = False) -> None:
-        """Drop poses up to and including a stamp, except the last of them: interpolation up to the
-        next pose starts from it.
+        """Drop poses up to and including a stamp, except the last of them that interpolation up to
+        the next pose looks at.
         """
         after = int(np.searchsorted(self.stamps_ns, until_ns, side="right"))
-        split = max(after - 1, 0)
+        split = max(after - REACH, 0)
         if unpaired:
             self._dropped_unpaired += split
         rest = self._count - split

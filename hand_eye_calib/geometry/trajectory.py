@@ -11,6 +11,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray, median
 from hand_eye_calib.config import MEASURES
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.interpolation import corners
 from hand_eye_calib.geometry.rates import integrated
 
 # A quaternion further from unit length than this is wrong and not just rounded (tf2 has the same
@@ -221,8 +222,10 @@ class Trajectory:
         object.__setattr__(scaled, "poses", poses)
         return scaled
 
-    def at(self, stamps_ns: IntArray, extrapolate: bool = False) -> FloatArray:
-        """Interpolate poses at other stamps along the geodesic of SE(3) between neighbours.
+    def at(
+        self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
+    ) -> FloatArray:
+        """Interpolate poses at other stamps, see :mod:`~hand_eye_calib.geometry.interpolation`.
 
         Parameters
         ----------
@@ -230,6 +233,8 @@ class Trajectory:
         extrapolate : bool
             Extend the twist of the first and last segment beyond the ends, as the paper's KITTI
             experiments do. Without it a stamp outside the trajectory is an error.
+        straight : bool
+            Along the geodesic of SE(3) between neighbours, as in the paper.
 
         Returns
         -------
@@ -261,6 +266,10 @@ class Trajectory:
             poses[between] = se3.interpolate(
                 self.poses[before[between]], self.poses[after[between]], fraction[between]
             )
+        bent = between & ~outside
+        if bent.any() and not straight:
+            twists = corners(self.stamps_ns, self.poses, before[bent], fraction[bent])
+            poses[bent] = poses[bent] @ se3.exp(twists)
         return poses
 
 

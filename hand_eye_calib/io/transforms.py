@@ -234,9 +234,11 @@ class TransformTree:
 
 
 def _at(trajectory: Trajectory, stamps_ns: IntArray) -> FloatArray:
-    """(N, 4, 4): poses at stamps that are known to be within the trajectory."""
+    """(N, 4, 4): poses at stamps that are known to be within the trajectory, as tf2 and the node
+    have them.
+    """
     if len(trajectory) > 1:
-        return trajectory.at(stamps_ns)
+        return trajectory.at(stamps_ns, straight=True)
     return np.repeat(trajectory.poses, len(stamps_ns), axis=0)
 
 

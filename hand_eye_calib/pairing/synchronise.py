@@ -70,9 +70,8 @@ def synchronise(
 ) -> PosePairs:
     """Interpolate the faster stream at the slower stream's stamps.
 
-    Interpolation is along the geodesic of SE(3). An instant outside the faster stream, or between
-    two of its poses that are more than ``max_gap_s`` apart, is left out. An instant at which it has
-    a pose of its own is always kept.
+    An instant outside the faster stream, or between two of its poses that are more than
+    ``max_gap_s`` apart, is left out. An instant at which it has a pose of its own is always kept.
 
     Parameters
     ----------

@@ -15,9 +15,9 @@ def test_poses_at_their_own_stamps_come_back_bit_by_bit():
     assert np.array_equal(trajectory.at(trajectory.stamps_ns), trajectory.poses)
 
 
-def test_interpolation_lies_on_the_geodesic():
+def test_straight_interpolation_lies_on_the_geodesic():
     trajectory = Trajectory(STAMPS, POSES)
-    quarter = trajectory.at(np.array([15]))[0]
+    quarter = trajectory.at(np.array([15]), straight=True)[0]
     expected = POSES[1] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[1]) @ POSES[2]))
     np.testing.assert_allclose(quarter, expected, atol=1e-14)
 
