@@ -48,7 +48,7 @@ from hand_eye_calib.adaptive.outliers import (
 )
 from hand_eye_calib.adaptive.part_delays import part_delay, with_delay_columns
 from hand_eye_calib.adaptive.relinearise import corrected, restored
-from hand_eye_calib.adaptive.resampling import answers_without, part_products
+from hand_eye_calib.adaptive.resampling import N_BLOCKS, answers_without, part_products
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.adaptive.state_space import (
     WHITE,
@@ -113,9 +113,9 @@ _LEAST_GAIN_OF_SHAPE = 19.0
 # A loss larger by so much leaves no chance.
 _LONGER_SHARE, _NO_CHANCE = 0.5, 100.0
 
-# Blocks of the jackknife of systematic errors, and what chi-square with nine degrees of freedom,
-# per degree, exceeds once in ten times.
-_BLOCKS, _CHANCE = 10, 1.63
+# What chi-square with the degrees of freedom of the jackknife, nine, exceeds per degree once in ten
+# times.
+_CHANCE = 1.63
 
 # Half of the freed memory that is kept for the next arrays.
 _KEPT_BYTES = 1 << 24
@@ -730,8 +730,8 @@ def _sigmas(state: _State, covariance: FloatArray, parts: FloatArray) -> FloatAr
     """
     sigmas = state.other_sigmas.copy()
     variances = np.diag(covariance)
-    if len(parts) >= _BLOCKS:
-        spread = answers_without(parts, _BLOCKS)[:, 6:].var(axis=0) * (_BLOCKS - 1)
+    if len(parts) >= N_BLOCKS:
+        spread = answers_without(parts, N_BLOCKS)[:, 6:].var(axis=0) * (N_BLOCKS - 1)
         variances = np.maximum(variances, spread / _CHANCE)
     sigmas[state.columns] = np.sqrt(variances)
     return sigmas

@@ -62,7 +62,7 @@ _EVEN = 0.2
 
 SCALE, TIME, RATE = 0, 7, slice(8, 11)
 _CHILD_BIASES, _PARENT_BIASES, _RATES = {1, 2, 3}, {4, 5, 6}, {8, 9, 10}
-DRIFT = [1, 2, 3, 4, 5, 6]
+DRIFT = sorted(_CHILD_BIASES | _PARENT_BIASES)
 
 
 def parameters_of(systematic: str) -> list[int]:

@@ -286,9 +286,7 @@ def _centred(windows: FloatArray) -> FloatArray:
 
 def _rotations(measured: FloatArray, predicted: FloatArray) -> FloatArray:
     """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of windows, centred."""
-    left, _, right = np.linalg.svd(np.einsum("nki,nkj->nij", measured, predicted))
-    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-    return np.asarray(left @ right)
+    return se3.nearest_rotation(np.einsum("nki,nkj->nij", measured, predicted))
 
 
 def _aligned(Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray) -> FloatArray:

@@ -15,12 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive.increments import Linearisation, turned
-from hand_eye_calib.adaptive.resampling import answers_without
+from hand_eye_calib.adaptive.resampling import N_BLOCKS, answers_without
 from hand_eye_calib.adaptive.state_space import NormalEquations, selected
 from hand_eye_calib.arrays import FloatArray
-
-# Blocks of the jackknife.
-_BLOCKS = 10
 
 # Delays from so many standard deviations on are likely; a clock is more often right.
 _LIKELY, _LIKELY_OF_CLOCK = 2.0, 3.0
@@ -128,7 +125,7 @@ def part_delay(
     if np.abs(normal.unseen[-1]).max(initial=0.0) > _UNSEEN:
         return PartDelay(0.0, np.inf, sensitivity)
     variance = max(misfit, 1.0) * float(normal.covariance[-1, -1])
-    if len(parts) >= _BLOCKS:
-        spread = answers_without(selected(parts, columns), _BLOCKS)[:, -1].var()
-        variance = max(variance, (_BLOCKS - 1) * float(spread))
+    if len(parts) >= N_BLOCKS:
+        spread = answers_without(selected(parts, columns), N_BLOCKS)[:, -1].var()
+        variance = max(variance, (N_BLOCKS - 1) * float(spread))
     return PartDelay(float(normal.step[-1]), float(np.sqrt(variance)), sensitivity)

@@ -19,7 +19,8 @@ from hand_eye_calib.adaptive.state_space import (
 )
 from hand_eye_calib.arrays import FloatArray
 
-N_PARTS = 20
+# Parts of a recording, and blocks of them that a jackknife leaves out.
+N_PARTS, N_BLOCKS = 20, 10
 
 
 def part_products(posterior: Posterior) -> FloatArray:

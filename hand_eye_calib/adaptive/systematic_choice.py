@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from hand_eye_calib.adaptive.increments import DRIFT, N_SYSTEMATIC, TIME, parameters_of
-from hand_eye_calib.adaptive.resampling import answers_without, part_products
+from hand_eye_calib.adaptive.resampling import N_BLOCKS, answers_without, part_products
 from hand_eye_calib.adaptive.state_space import NormalEquations, Posterior, selected
 from hand_eye_calib.arrays import FloatArray
 
@@ -30,9 +30,6 @@ _LEAST_DRIFT, _MOST_DRIFT = 0.005, 0.06
 # is not there is chosen once in forty to five hundred recordings. Schwarz's criterion would ask for
 # 7 to 10, as if every increment were evidence of errors that add up over all of them.
 _PENALTY = 5.0
-
-# Blocks of the jackknife of systematic errors.
-_BLOCKS = 10
 
 # What the largest ratio of variances over ten blocks to those of a model that is right hardly
 # exceeds: of six, once in ten times; of three, once in a hundred.
@@ -131,10 +128,10 @@ def _n_misjudged(parts: FloatArray, columns: list[int], fit: NormalEquations) ->
     there lowers the weighted squared residual more than the model expects (Takeuchi's criterion).
     """
     n_parameters = len(columns) - 6
-    if n_parameters == 0 or len(parts) < _BLOCKS:
+    if n_parameters == 0 or len(parts) < N_BLOCKS:
         return n_parameters
-    answers = answers_without(selected(parts, columns), _BLOCKS)[:, 6:]
-    spread = np.atleast_2d(np.cov(answers.T, bias=True)) * (_BLOCKS - 1)
+    answers = answers_without(selected(parts, columns), N_BLOCKS)[:, 6:]
+    spread = np.atleast_2d(np.cov(answers.T, bias=True)) * (N_BLOCKS - 1)
     ratios = np.linalg.eigvals(np.linalg.pinv(fit.covariance[6:, 6:], hermitian=True) @ spread)
     return float(np.maximum(ratios.real / _HARDLY_BY_CHANCE, 1.0).sum())
 

@@ -4,7 +4,7 @@ swapped, or made metres of wrongly.
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, median
 
 # Distances are compared between positions that are so many parts of the recording apart: far more
 # than a lever arm is long.
@@ -37,7 +37,7 @@ def horizontal_factors(path: FloatArray, positions: FloatArray) -> FloatArray | 
     steps = np.concatenate([positions[lag:] - positions[:-lag] for lag in lags])
     chords = np.concatenate([path[lag:] - path[:-lag] for lag in lags])
     flat2 = (steps[:, :2] ** 2).sum(axis=1)
-    used = flat2 > _SHORT**2 * np.median(flat2)
+    used = flat2 > _SHORT**2 * median(flat2)
     if not used.any():
         return None
     across, along = (steps[used, :2] / np.sqrt(flat2[used])[:, None]).T
@@ -50,6 +50,6 @@ def horizontal_factors(path: FloatArray, positions: FloatArray) -> FloatArray | 
             return None
         found = np.linalg.solve(normal, (columns * weights[:, None]).T @ gains)
         off = np.abs(gains - columns @ found)
-        weights = 1.0 / (1.0 + (off / (np.median(off) + 1e-12)) ** 2)
+        weights = 1.0 / (1.0 + (off / (median(off) + 1e-12)) ** 2)
     factors: FloatArray = np.sqrt(np.maximum(found[[0, 2]], 0.0))
     return factors

@@ -231,9 +231,7 @@ def _relaxed_rotations(forms: FloatArray) -> FloatArray:
     left = forms[:, :12, :12]
     left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
     matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
-    u, _, vt = np.linalg.svd(matrices)
-    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    return u @ vt
+    return se3.nearest_rotation(matrices)
 
 
 def _with_translation(form: FloatArray, rotation: FloatArray) -> tuple[FloatArray, float]:

@@ -105,7 +105,8 @@ def _columns() -> int:
     if given.isdecimal() and int(given):
         return int(given)
     try:
-        return os.get_terminal_size(sys.__stdout__.fileno()).columns or 80  # type: ignore[union-attr]
+        output = sys.__stdout__.fileno()  # type: ignore[union-attr]
+        return os.get_terminal_size(output).columns or 80
     except (AttributeError, ValueError, OSError):
         return 80
 

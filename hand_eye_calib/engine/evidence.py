@@ -9,7 +9,7 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import angular_rates, speeds
 from hand_eye_calib.alignment.scale import child_scaled
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, median
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.streams import are_gaps
@@ -134,8 +134,7 @@ class StreamView:
         (times, of_parent), (others, of_child) = self.rates
         shared = (times >= others[0]) & (times <= others[-1]) if len(others) else times < 0
         apart = np.abs(of_parent - np.interp(times, others, of_child))[shared]
-        known = apart[np.isfinite(apart)]
-        return float(np.median(known)) if len(known) else float("nan")
+        return median(apart[np.isfinite(apart)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,8 +284,7 @@ def _tracks(calibration: Calibration, pose_pairs: PosePairs, of_parent: bool) ->
         return _tracks_of_positions(calibration, pose_pairs, of_parent)
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     rotations = pose_pairs.Ts_pw_p[:, :3, :3] @ np.swapaxes(Ts_cw_p[:, :3, :3], 1, 2)
-    left, _, right = np.linalg.svd(rotations.mean(axis=0))
-    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    rotation = se3.nearest_rotation(rotations.mean(axis=0))
     parent = pose_pairs.Ts_pw_p[:, :3, 3]
     child = Ts_cw_p[:, :3, 3] @ rotation.T
     child = child + np.median(parent - child, axis=0)
@@ -304,8 +302,7 @@ def _tracks_of_positions(
         poses, measured = pose_pairs.Ts_cw_c @ calibration.T_child_parent, pose_pairs.Ts_pw_p
     path, positions = poses[:, :3, 3], measured[:, :3, 3]
     middle = path.mean(axis=0)
-    left, _, right = np.linalg.svd((positions - positions.mean(axis=0)).T @ (path - middle))
-    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    rotation = se3.nearest_rotation((positions - positions.mean(axis=0)).T @ (path - middle))
     path = (path - middle) @ rotation.T + positions.mean(axis=0)
     both = (positions, path) if of_parent else (path, positions)
     parent, child = (each - positions[0] for each in both)

@@ -114,6 +114,17 @@ def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
     return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
 
 
+def nearest_rotation(matrices: FloatArray) -> FloatArray:
+    """Rotations (..., 3, 3) nearest to matrices in the Frobenius norm.
+
+    The sign of the direction with the smallest singular value, which motion in a plane leaves open,
+    makes them rotations.
+    """
+    left, _, right = np.linalg.svd(matrices)
+    left[..., :, 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return np.asarray(left @ right)
+
+
 def rotation_log(rotation: ArrayLike) -> FloatArray:
     """Rotation vectors (..., 3), rad, of length at most pi, of rotation matrices (..., 3, 3)."""
     rotation = np.asarray(rotation, dtype=float)

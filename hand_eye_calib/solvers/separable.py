@@ -23,8 +23,7 @@ def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:
     """
     rotvecs_parent = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
     rotvecs_child = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])
-    left, _, right = np.linalg.svd(rotvecs_parent.T @ rotvecs_child)
-    return left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    return se3.nearest_rotation(rotvecs_parent.T @ rotvecs_child)
 
 
 def translation_given_rotation(pairs: MotionPairs, rotation: FloatArray) -> FloatArray:
