@@ -100,9 +100,11 @@ setup(
     zip_safe=False,
     python_requires=">=3.11",
     install_requires=[
+        "backports.zstd>=1.0; python_version < '3.14'",
         "casadi>=3.7",
         "jinja2>=3.1.2",
         "matplotlib>=3.6",
+        "mcap>=1.1",
         "numpy>=1.26",
         "PyYAML>=6.0",
         "rich>=13.7",
@@ -113,8 +115,7 @@ setup(
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         "cluster": ["distributed>=2024.1"],
         "completion": ["argcomplete>=2.0"],
-        "fleet": ["fsspec[http]>=2024.2", "pyarrow>=14.0"],
-        "gnss": ["pymap3d>=3.0"],
+        "fleet": ["fsspec[http]>=2024.2"],
         "notebook": ["ipykernel>=6.29", "pandas>=2.1"],
         "test": [
             "colcon-common-extensions",

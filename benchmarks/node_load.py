@@ -573,11 +573,10 @@ def kill(folder, kills):
         stop.set()
         feeding.join()
         first = (publisher.last_stamp_ns - START_NS) // round(1e9 / rate_hz) + 1
-        checkpoint, events, _ = read_journal(output / "journal")
+        journal = read_journal(output / "journal")
         whole += 1
-        count = sum(event[0] == "pose" for event in events)
-        count += sum(int(checkpoint[f"{stream}.statistics"][0]) for stream in STREAMS)
-        lost_s.append((newest_ns - min(newest(events, stream) for stream in STREAMS)) * 1e-9)
+        count = len(journal.stamps_ns)
+        lost_s.append((newest_ns - min(newest(journal, stream) for stream in STREAMS)) * 1e-9)
         unchanged += (
             before.items() <= fingerprints(output).items()
         )  # the node adds files of its own
@@ -602,18 +601,18 @@ def kill(folder, kills):
     ]
 
 
-def newest(events, stream):
-    """Newest stamp of a stream among a journal's events; 0 without any."""
-    return max((event[2] for event in events if event[:2] == ("pose", stream)), default=0)
+def newest(journal, stream):
+    """Newest stamp of a stream in a journal; 0 without any."""
+    return int(journal.stamps_ns[journal.streams == stream].max(initial=0))
 
 
 def has_poses_since(directory, stamp_ns):
     """Whether the node has noted poses of both streams from this stamp on."""
     try:
-        _, events, _ = read_journal(directory)
+        journal = read_journal(directory)
     except InputError:  # not there yet
         return False
-    return all(newest(events, stream) >= stamp_ns for stream in STREAMS)
+    return all(newest(journal, stream) >= stamp_ns for stream in STREAMS)
 
 
 def earlier_result():

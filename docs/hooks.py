@@ -41,8 +41,12 @@ def on_page_content(html, **_):
     return re.sub(r":\w+:<code>~?(?:[\w.]+\.)?(\w+)</code>", r"<code>\1</code>", html)
 
 
-def on_page_markdown(markdown, page, **_):
-    """Links between this folder and the root, which are neighbours on the site."""
+def on_page_markdown(markdown, page, config, **_):
+    """Links between this folder and the root, which are neighbours on the site; tables of studies
+    are not searched.
+    """
+    if config.not_in_nav.match_file(page.file.src_uri):
+        page.meta["search"] = {"exclude": True}
     if page.file.src_uri in ROOT_PAGES:
         return markdown.replace("](docs/", "](")
     out = "../" * (page.file.src_uri.count("/") + 1)

@@ -1,14 +1,24 @@
 """The result of a calibration: the extrinsic, its covariance, and what to know before using it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.documents import (
+    PLAIN,
+    PLAIN_LATER,
+    base_parent,
+    check_values,
+    covariance_of,
+    floor_of,
+    numbers,
+    transform_of,
+)
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.printed_angles import (
@@ -18,7 +28,8 @@ from hand_eye_calib.geometry.printed_angles import (
     sigmas_rpy,
     sigmas_translation,
 )
-from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE, Trajectory
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.plain import plain
 from hand_eye_calib.status import (
     ROTATIONS,
     TRANSLATIONS,
@@ -46,48 +57,6 @@ __all__ = [
 # Format and version of to_dict. A change that an older reader cannot understand raises the version.
 _FORMAT = "hand_eye_calib/extrinsic"
 _VERSION = 1
-
-# Attributes that to_dict holds as they are: those that every file has, and those added later.
-_PLAIN = (
-    "objective",
-    "method",
-    "reference",
-    "backend",
-    "n_poses",
-    "n_pairs",
-    "n_inliers",
-    "time_offset_s",
-    "scale",
-    "stamp_ns",
-    "parent_frame",
-    "child_frame",
-)
-_PLAIN_LATER = (
-    "time_offset_sigma_s",
-    "scale_sigma",
-    "proved_global",
-    "method_reason",
-    "reference_reason",
-    "noise",
-    "cross_check",
-    "contradictions",
-    "target_translation",
-    "target_rotation",
-    "target_axes",
-    "comparison",
-    "goal",
-    "measured",
-    "rate_bias",
-)
-
-# Of other values than numbers.
-_KINDS: dict[str, Any] = (
-    dict.fromkeys(("method", "reference", "backend", "parent_frame", "child_frame"), str)
-    | dict.fromkeys(("n_poses", "n_pairs", "n_inliers", "stamp_ns"), int)
-    | dict.fromkeys(("method_reason", "reference_reason", "proved_global", "measured"), str)
-    | dict.fromkeys(("noise", "cross_check", "comparison", "goal", "rate_bias"), (dict, type(None)))
-    | {"contradictions": dict, "target_axes": dict}
-)
 
 # Motion pairs with more weight than this count as inliers.
 INLIER_WEIGHT = 0.5
@@ -226,9 +195,6 @@ class Calibration:
     other_answer : ((4, 4) array, (6, 6) array) or None
         T_parent_child and covariance under other assumptions on the noise: of the adaptive
         estimator beside DNLO, or the reverse. Not part of files.
-    is_steady : bool
-        Whether the noise model, which fits, shows neither a delay of positions nor a world that
-        moves: the stream checks do not look for them again. Not part of files.
     """
 
     T_parent_child: FloatArray
@@ -272,7 +238,6 @@ class Calibration:
     other_answer: tuple[FloatArray, FloatArray] | None = field(
         default=None, repr=False, compare=False
     )
-    is_steady: bool = field(default=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
         frames = f"{self.child_frame} in {self.parent_frame}"
@@ -463,7 +428,7 @@ class Calibration:
         -------
         dict
             x, y, z in m and qx, qy, qz, qw; if an angle is unknown, roll, pitch and yaw in rad
-            instead of the quaternion. An axis that the motion does not show is a text that no
+            instead of the quaternion. An axis that cannot be determined is a text that no
             parser takes, such as MEASURE_Z_BY_HAND. Empty under DO NOT USE.
         """
         if self.verdict is Verdict.DO_NOT_USE:
@@ -481,7 +446,7 @@ class Calibration:
 
     def usable_angles(self) -> dict[str, float | str]:
         """Roll, pitch and yaw of :attr:`mounting`, rad, about fixed axes, as in URDF; a text for an
-        angle that the motion does not show.
+        angle that cannot be determined.
         """
         T = self.mounting[1]
         known = np.full(3, True)  # near gimbal lock roll and yaw have no sigma and are known
@@ -504,7 +469,8 @@ class Calibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the residuals as plain numbers, strings, lists and mappings, ready for
-        JSON or YAML (infinite sigmas as None).
+        JSON or YAML. None for what is infinite, and for each printed number of an axis that is
+        not known; only a ``matrix`` has a number there, so that it can be read back.
         """
         document: dict[str, Any] = {
             "verdict": self.verdict.value,
@@ -522,14 +488,14 @@ class Calibration:
                 "order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"],
                 "frame": self.child_frame,
                 "units": "m, rad",
-                "matrix": [[_finite(value) for value in row] for row in self.covariance.tolist()],
+                "matrix": self.covariance,
             },
             "observability": [
                 {
                     "name": dof.name,
                     "frame": self.parent_frame,
                     "verdict": dof.verdict.value,
-                    "sigma": _finite(dof.sigma),
+                    "sigma": dof.sigma,
                 }
                 for dof in self.observability
             ],
@@ -540,39 +506,33 @@ class Calibration:
         if self.T_method is not None:
             document["T_method"] = {
                 "of": "T_parent_child as the method solved it: nothing set, no prior added",
-                "matrix": self.T_method.tolist(),
+                "matrix": self.T_method,
             }
         if self.floor is not None:
             document["floor"] = {
                 "of": "errors of a whole recording, the same in every part; not in the covariance",
                 "frame": self.child_frame,
                 "units": "m, rad",
-                "matrix": self.floor.tolist(),
+                "matrix": self.floor,
             }
-        plain = {
+        document |= {
             name: getattr(self, name)
             for name in self.__dataclass_fields__
-            if name in _PLAIN or name in _PLAIN_LATER
+            if name in PLAIN or name in PLAIN_LATER
         }
-        plain["objective"] = float(self.objective)
-        findings = [dict(finding) for finding in self.findings]
-        return document | plain | {"findings": findings, "warnings": list(self.warnings)}
+        document |= {"findings": self.findings, "warnings": self.warnings}
+        return cast(dict[str, Any], plain(document))
 
     def _transform_dict(self) -> dict[str, Any]:
-        return _transform_dict(
-            self.T_parent_child,
-            self.parent_frame,
-            self.child_frame,
-            self.sigmas[:3],
-            self.covariance,
-        )
+        frames = self.parent_frame, self.child_frame
+        return self._printed_dict(self.T_parent_child, *frames, self.sigmas[:3], self.covariance)
 
     def _base_dict(self, T_base_child: FloatArray) -> dict[str, Any]:
         sigmas_m = sigmas_translation(T_base_child, self.covariance)
         if self.unobservable():
             sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
         frames = self.base_frame, self.child_frame
-        return _transform_dict(T_base_child, *frames, sigmas_m, self.covariance)
+        return self._printed_dict(T_base_child, *frames, sigmas_m, self.covariance)
 
     def _inverse_dict(self) -> dict[str, Any]:
         covariance = inverse_covariance(self.T_parent_child, self.covariance)
@@ -581,13 +541,42 @@ class Calibration:
             sigmas_m = self.sigmas[:3]  # the axes of both sensors are the same by convention
         elif self.unobservable():
             sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
-        return _transform_dict(
-            self.T_child_parent,
-            self.child_frame,
-            self.parent_frame,
-            sigmas_m,
-            covariance,
-        )
+        frames = self.child_frame, self.parent_frame
+        return self._printed_dict(self.T_child_parent, *frames, sigmas_m, covariance)
+
+    def _printed_dict(
+        self,
+        T_target_source: FloatArray,
+        target: str,
+        source: str,
+        sigmas_m: FloatArray,
+        covariance: FloatArray,
+    ) -> dict[str, Any]:
+        """A transform in the notations people and programs use, with the standard deviation of each
+        number that is printed; infinite, and no number, for what is unknown.
+        """
+        rotation = T_target_source[:3, :3]
+        is_turn_known = not {*ROTATIONS} & {*self.unobservable()}
+        rpy, sigmas = se3.rotation_to_rpy(rotation), sigmas_rpy(T_target_source, covariance)
+        # Near gimbal lock roll and yaw have no standard deviation and are known.
+        known = np.isfinite(sigmas) | is_turn_known
+        document: dict[str, Any] = {
+            "maps": f"coordinates of {source} into {target}",
+            "translation": np.where(np.isfinite(sigmas_m), T_target_source[:3, 3], np.nan),
+            "sigma_translation": sigmas_m,
+            "quat_xyzw": se3.to_quat_xyzw(T_target_source) if is_turn_known else None,
+            "rpy_deg": np.degrees(np.where(known, rpy, np.nan)),
+            "sigma_rpy_deg": np.degrees(sigmas),
+            "matrix": T_target_source,
+        }
+        if is_near_gimbal_lock(rotation, covariance):
+            # Roll and yaw have no meaning of their own here.
+            printed = printed_rotation(T_target_source, covariance)
+            known = np.isfinite(printed.sigmas) | is_turn_known
+            vector = np.where(known, printed.values, np.nan)
+            document["rotation_vector_deg"] = np.degrees(vector)
+            document["sigma_rotation_vector_deg"] = np.degrees(printed.sigmas)
+        return document
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -609,25 +598,25 @@ class Calibration:
         # Version 0.1 had another name for it.
         later: dict[str, Any] = {"cross_check": data.get("consistency")} | dict(data)
         try:
-            _check_values(later)
+            check_values(later)
             return cls(
-                T_parent_child=_transform(data["T_parent_child"]),
-                T_method=_transform(data["T_method"]) if "T_method" in data else None,
+                T_parent_child=transform_of(data["T_parent_child"]),
+                T_method=transform_of(data["T_method"]) if "T_method" in data else None,
                 base_frame=str(data.get("base_frame", "")),
-                T_base_parent=_base_parent(data) if "T_base_child" in data else None,
-                floor=_matrix(data["floor"], 6) if "floor" in data else None,
-                covariance=_matrix(data["covariance"], 6),
+                T_base_parent=base_parent(data) if "T_base_child" in data else None,
+                floor=floor_of(data["floor"]) if "floor" in data else None,
+                covariance=covariance_of(data["covariance"]),
                 status=SolveStatus(data["status"]),
                 observability=tuple(
                     DofObservability(
-                        dof["name"], DofVerdict(dof["verdict"]), *_infinite([dof["sigma"]])
+                        dof["name"], DofVerdict(dof["verdict"]), *numbers([dof["sigma"]])
                     )
                     for dof in data["observability"]
                 ),
                 warnings=tuple(data["warnings"]),
                 findings=tuple(data.get("findings", ())),
-                **{name: data[name] for name in _PLAIN},
-                **{name: later[name] for name in _PLAIN_LATER if name in later},
+                **{name: data[name] for name in PLAIN},
+                **{name: later[name] for name in PLAIN_LATER if name in later},
             )
         except KeyError as error:
             raise InputError(f"the calibration has no {error}: restore or repeat it") from None
@@ -635,98 +624,3 @@ class Calibration:
             raise InputError(
                 f"the calibration was changed after it was written: {error}; restore or repeat it"
             ) from None
-
-
-def _check_values(data: Mapping[str, Any]) -> None:
-    """Refuse values of a document that are not of the kind that was written.
-
-    Raises
-    ------
-    TypeError
-    """
-    for name in (*_PLAIN, *_PLAIN_LATER):
-        kind = _KINDS.get(name, (int, float))
-        value = data.get(name)
-        if name in data and (not isinstance(value, kind) or isinstance(value, bool)):
-            raise TypeError(f"{name} is {type(value).__name__}")
-    if len(data["observability"]) != 6:
-        raise TypeError(f"observability has {len(data['observability'])} axes, not 6")
-    words = (data.get("noise") or {}).get("in_words", [])
-    texts = [dof["name"] for dof in data["observability"]]
-    for name, values in (("noise", words), ("warnings", data["warnings"]), ("an axis", texts)):
-        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-            raise TypeError(f"{name} is not text")
-    for finding in data.get("findings", ()):
-        values = [finding[name] for name in ("code", "severity", "what", "advice")]
-        if not all(isinstance(value, str) for value in values):
-            raise TypeError("a finding is not text")
-        dict(finding.get("options", {}))
-    _infinite(data.get("contradictions", {}).values())
-    for row in (data["cross_check"] or {}).values():
-        if not {*row} >= {"sigma", "of_methods", "of_halves"}:
-            raise TypeError("cross_check lacks values")
-        _infinite(row.values())
-    for name in ("comparison", "goal"):
-        if not isinstance((data.get(name) or {"sentence": ""}).get("sentence"), str):
-            raise TypeError(f"{name} has no sentence")
-
-
-def _transform(data: Mapping[str, Any]) -> FloatArray:
-    """Transform of a document."""
-    matrix = _matrix(data, 4)
-    rotation = matrix[:3, :3]
-    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE)
-    if not (is_rotation and np.isfinite(matrix).all() and np.linalg.det(rotation) > 0):
-        raise ValueError("a matrix is not a transform")
-    return matrix
-
-
-def _base_parent(data: Mapping[str, Any]) -> FloatArray:
-    """Pose of the parent sensor in the base frame of a document."""
-    return _transform(data["T_base_child"]) @ se3.inverse(_transform(data["T_parent_child"]))
-
-
-def _matrix(data: Mapping[str, Any], size: int) -> FloatArray:
-    """Square matrix of a document; None there is infinite."""
-    rows = [_infinite(row) for row in data["matrix"]]
-    return np.array(rows, dtype=float).reshape(size, size)
-
-
-def _infinite(values: Iterable[float | None]) -> list[float]:
-    return [np.inf if value is None else float(value) for value in values]
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _transform_dict(
-    T_target_source: FloatArray,
-    target: str,
-    source: str,
-    sigmas_m: FloatArray,
-    covariance: FloatArray,
-) -> dict[str, Any]:
-    """A transform in the notations people and programs use, with the standard deviation of each
-    number that is printed (None for unknown).
-    """
-    rotation = T_target_source[:3, :3]
-    document: dict[str, Any] = {
-        "maps": f"coordinates of {source} into {target}",
-        "translation": T_target_source[:3, 3].tolist(),
-        "sigma_translation": [_finite(value) for value in sigmas_m],
-        "quat_xyzw": se3.to_quat_xyzw(T_target_source).tolist(),
-        "rpy_deg": np.degrees(se3.rotation_to_rpy(rotation)).tolist(),
-        "sigma_rpy_deg": _degrees(sigmas_rpy(T_target_source, covariance)),
-        "matrix": T_target_source.tolist(),
-    }
-    if is_near_gimbal_lock(rotation, covariance):
-        # Roll and yaw have no meaning of their own here.
-        printed = printed_rotation(T_target_source, covariance)
-        document["rotation_vector_deg"] = np.degrees(printed.values).tolist()
-        document["sigma_rotation_vector_deg"] = _degrees(printed.sigmas)
-    return document
-
-
-def _degrees(values: FloatArray) -> list[float | None]:
-    return [_finite(value) for value in np.degrees(values)]

@@ -7,8 +7,8 @@ the documentation are made from these dataclasses or tested against them.
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import InitVar, dataclass
 from typing import Any, Self, TypeAlias
 
 from hand_eye_calib.errors import ConfigError
@@ -169,6 +169,8 @@ def _allowed(name: str, value: str, meta: Mapping[str, Any]) -> str:
 class OptionSet:
     """Base of dataclasses made of options: checks every value and knows the public names."""
 
+    given: frozenset[str]
+
     def __post_init__(self) -> None:
         for field in _fields(self):
             object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
@@ -204,35 +206,13 @@ AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch
 _IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
 _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
 
+# Lengths (m) and angles (rad) that a person gives are smaller: no square of one overflows.
+_LARGEST_QUANTITY = 1e6
 
 # Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
 # pitch, yaw (rad): value and standard deviation, or both as the text of the option
 # ``prior.<axis>``. "transform" takes the text of ``prior.transform``.
 Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
-
-
-def prior_fields(prior: Prior) -> dict[str, str]:
-    """The same prior as options of a CalibratorConfig, attribute to text.
-
-    Raises
-    ------
-    ConfigError
-        If an axis is unknown or its value is not a text or a pair of numbers.
-    """
-    fields = {}
-    for axis, known in prior.items():
-        if axis not in (*AXIS_UNITS, "transform"):
-            raise ConfigError(f"prior takes {', '.join(AXIS_UNITS)} or transform; got {axis!r}")
-        if not isinstance(known, str):
-            try:
-                value, sigma = map(float, known)
-            except (TypeError, ValueError):
-                raise ConfigError(
-                    f"prior {axis} must be (value, standard deviation) or a text; got {known!r}"
-                ) from None
-            known = f"{value!r}+/-{sigma!r}"
-        fields[f"prior_{axis}"] = known
-    return fields
 
 
 def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
@@ -261,15 +241,11 @@ def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
         return {}
     axis = name.removeprefix("prior.")
     axes = tuple(AXIS_UNITS) if axis == "transform" else (axis,)
-    expected = (
-        "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
-        if axis == "transform"
-        else "VALUE+/-SIGMA"
-    )
     before, plus_minus, after = text.replace("±", "+/-").partition("+/-")
-    values, sigmas = before.split(), after.split()
-    if axis == "transform" and len(sigmas) == 2:
-        sigmas = [sigmas[0]] * 3 + [sigmas[1]] * 3
+    values, sigmas, expected = before.split(), after.split(), "VALUE+/-SIGMA"
+    if axis == "transform":
+        expected = "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
+        sigmas = sigmas[:1] * 3 + sigmas[1:] * 3 if len(sigmas) == 2 else sigmas
     if not plus_minus or len(values) != len(axes) or len(sigmas) != len(axes):
         raise ConfigError(f"{name} must be {expected}, with its standard deviation; got {text!r}")
     prior = {}
@@ -347,17 +323,10 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
 def parse_targets(name: str, text: str) -> dict[str, float]:
     """Targets of single axes: ``z=10cm yaw=0.5deg``, metres and radians without a unit.
 
-    Parameters
-    ----------
-    name : str
-        Of the option.
-    text : str
-        Empty for none.
-
     Returns
     -------
     dict
-        Axis name to standard deviation, in m or rad.
+        Axis name to standard deviation, in m or rad; empty for an empty text.
 
     Raises
     ------
@@ -383,8 +352,12 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
 def _quantity(name: str, text: str, unit: str) -> float:
     match = _QUANTITY.fullmatch(text)
     if not match or (match[2] or unit) not in _IN_SI[unit]:
-        raise ConfigError(f"{name} must be numbers in {' or '.join(_IN_SI[unit])}; got {text!r}")
-    return float(match[1]) * _IN_SI[unit][match[2] or unit]
+        units = " or ".join(_IN_SI[unit])
+        raise ConfigError(f"{name} must be numbers in {units}; got {_shown(text)}")
+    value = float(match[1]) * _IN_SI[unit][match[2] or unit]
+    if abs(value) > _LARGEST_QUANTITY:
+        raise ConfigError(f"{name} must be at most {_LARGEST_QUANTITY:g} {unit}; got {text[:20]!r}")
+    return value
 
 
 def _prior(axis: str) -> Any:
@@ -402,11 +375,29 @@ def _prior(axis: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratorConfig(OptionSet):
-    """Options of the engine: the same for the node, the replay of bags, files and Python."""
+    """Options of the engine: the same for the node, the replay of bags, files and Python.
+
+    Attributes
+    ----------
+    given : frozenset of str
+        Those that the user set, at their defaults or not; ``dataclasses.replace`` keeps them.
+    """
+
+    given: InitVar[Collection[str] | None] = None
+
+    def __new__(cls, **values: Any) -> Self:
+        """Note which options are passed."""
+        config = super().__new__(cls)
+        given = values if values.get("given") is None else values["given"]
+        object.__setattr__(config, "given", frozenset(given) - {"given"})
+        return config
+
+    def __post_init__(self, given: object) -> None:
+        super().__post_init__()
 
     method: str = option(
         "auto",
-        "How the extrinsic is solved; auto: adaptive if its noise model fits, otherwise dnlo, and "
+        "How the extrinsic is solved; auto: adaptive, dnlo where its noise model cannot work, and "
         "dnlo if a reference is given; dnlo rejects outliers, adaptive estimates the noise and "
         "uses no reference, the others use all motion pairs.",
         choices=tuple(METHODS),
@@ -414,8 +405,8 @@ class CalibratorConfig(OptionSet):
     reference: str = option(
         "auto",
         "Which poses form motion pairs: A (each with the first), B<n> (each with the n-th before "
-        "it), C<n> (each with the first of its segment of n), or auto (chosen by the error that "
-        "the noise of these trajectories predicts).",
+        "it), C<n> (each with the first of its segment of n), or auto (lowest error predicted "
+        "from the estimated noise).",
         pattern=REFERENCE_PATTERN,
         form="auto, A, B<n> such as B5, or C<n> such as C20",
     )
@@ -547,6 +538,10 @@ class CalibratorConfig(OptionSet):
         "", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True
     )
 
+    def is_known(self, name: str) -> bool:
+        """Whether the user set ``time_offset`` or ``scale`` to what it is: not to be estimated."""
+        return name in self.given and getattr(self, name) not in ("auto", "estimate")
+
     @property
     def measured(self) -> str:
         """What both sensors measure together: poses, rotations or positions.
@@ -666,7 +661,7 @@ class NodeConfig(OptionSet):
     )
     publish_tf: bool = option(
         False,
-        "Broadcast the result on /tf_static once all of it is observable; leave it off if the "
+        "Broadcast the result on /tf_static once the targets are reached; leave it off if the "
         "robot description has this transform.",
     )
     installed: str = option(

@@ -1,13 +1,9 @@
 """How a solve ended, and how well each degree of freedom is known."""
 
-import math
 from dataclasses import dataclass
 from enum import Enum
 
 TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
-
-# Shorter lengths (m) are told in mm, longer ones in m.
-_MM_BELOW, _M_FROM = 0.01, 1.0
 
 
 class SolveStatus(str, Enum):
@@ -65,24 +61,3 @@ class DofObservability:
 def by_hand(axis: str) -> str:
     """What stands in files and commands for an axis that is not known; no parser takes it."""
     return f"MEASURE_{axis.upper()}_BY_HAND"
-
-
-def amount(axis: str, value: float) -> str:
-    """A length (m) or an angle (rad) in words with two digits; which of them, the axis says."""
-    if axis in ROTATIONS:
-        return f"{_two_digits(math.degrees(value))} deg"
-    size = abs(value)
-    if size < _MM_BELOW:
-        return f"{_two_digits(1000 * value)} mm"
-    return f"{_two_digits(value)} m" if size >= _M_FROM else f"{_two_digits(100 * value)} cm"
-
-
-def _two_digits(value: float) -> str:
-    if abs(value) < 1e-3:
-        return "0" if value == 0 else "less than 0.001"
-    return f"{value:.{max(1 - math.floor(math.log10(abs(value))), 0)}f}"
-
-
-def listing(words: list[str] | tuple[str, ...]) -> str:
-    """One, two and three."""
-    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

@@ -17,9 +17,8 @@ from hand_eye_calib.status import (
     DofObservability,
     DofVerdict,
     SolveStatus,
-    amount,
-    listing,
 )
+from hand_eye_calib.text import amount, axes_in_words, listing
 
 
 class Verdict(str, Enum):
@@ -253,15 +252,16 @@ def _contradiction(kind: str, is_hopeless: bool) -> Callable[[Judged], Iterator[
             if (scatter > HOPELESS_TARGETS * target_of(axis, result)) == is_hopeless
         }
         if far:
-            told = [f"{axis} by {amount(axis, scatter)}" for axis, scatter in far.items()]
-            sigmas = [
-                amount(dof.name, dof.sigma) for dof in result.observability if dof.name in far
+            told = [
+                f"about {axes_in_words([axis])} by {amount(axis, scatter)}"
+                for axis, scatter in far.items()
             ]
-            what = "differ" if kind == "model" else "scatter"
-            text = (
-                f"{_OTHERS[kind]} {what} in {listing(told)}, and this result states "
-                f"{listing(sigmas)}"
-            )
+            sigmas = [
+                f"+/- {amount(dof.name, dof.sigma)}"
+                for dof in result.observability
+                if dof.name in far
+            ]
+            text = f"{_OTHERS[kind]} disagree {listing(told)}; this result claims {listing(sigmas)}"
             yield text, _WHAT_TO_DO[kind], tuple(far), ()
 
     return find
@@ -293,7 +293,7 @@ def _hidden(result: Judged) -> Iterator[_Found]:
     if axes and len(axes) < _n_within_reach(result):
         priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
         it = "it" if len(axes) == 1 else "them"
-        text = f"the motion does not show {listing(axes)}"
+        text = f"{axes_in_words(axes)} cannot be determined from this motion"
         yield text, f"measure {it} by hand and give {priors}", axes, ()
 
 
@@ -326,16 +326,17 @@ def _floor(result: Judged) -> Iterator[_Found]:
         if dof.sigma <= min(target, float(floor)) and target < math.hypot(dof.sigma, float(floor)):
             rough[dof.name] = float(floor)
     if rough:
-        told = listing([f"{axis} by {amount(axis, floor)}" for axis, floor in rough.items()])
+        told = [f"{axes_in_words([axis])} by {amount(axis, far)}" for axis, far in rough.items()]
+        targets = dict.fromkeys(amount(axis, target_of(axis, result)) for axis in rough)
         text = (
-            "an odometry that is off by 1% in scale and 0.15 deg all the time, or tilts the axis "
-            f"of rotation, which no recording shows, moves {told}: more than the target"
+            f"a constant odometry error (1 % in scale, 0.15 deg) would change {listing(told)}. No "
+            f"recording can show it, and it is above your target of {listing(list(targets))}"
         )
         yield text, "check the scale of both odometries on a known distance", tuple(rough), ()
 
 
 def _unobservable(result: Judged) -> tuple[str, ...]:
-    """Axes that the motion does not show, of those that the streams can show."""
+    """Axes that this motion does not determine, of those that the streams can determine."""
     return tuple(
         dof.name
         for dof in result.observability
@@ -409,7 +410,7 @@ RULES = (
         )
         for kind in _OTHERS
     ),
-    Rule("unobservable", _CARE, "the motion does not show an axis", _hidden),
+    Rule("unobservable", _CARE, "an axis cannot be determined from the motion", _hidden),
     Rule("warning_finding", _CARE, "a stream check gave a warning", _findings_of("warning")),
     *(
         Rule(

@@ -12,8 +12,6 @@ over q and t from the identity, and q is normalised only afterwards, so the rota
 the one that was fitted (lengths between 0.5 and 1 are common with noise).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

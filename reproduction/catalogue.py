@@ -1,11 +1,8 @@
 """Experiments by name: the cells each needs and the files it writes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hand_eye_calib.errors import ConfigError, InputError
 from reproduction import (
@@ -21,33 +18,23 @@ from reproduction import (
 )
 from reproduction.published import KITTI, METHODS, SIMULATED
 from reproduction.results import SIMULATION_METHODS, Results
-from reproduction.rows import Cell, cells
-
-if TYPE_CHECKING:
-    from reproduction.sources import PublishedSource, Source
+from reproduction.rows import Cell, Row, cells, solve_plain
+from reproduction.sources import PublishedSource, Source
 
 Files = dict[str, list[Path]]
 
 
 @dataclass(frozen=True)
 class Artefact:
-    """A figure, a table or a text, with its comparison.
+    """A figure, a table or a text, with its comparison."""
 
-    Attributes
-    ----------
-    name : str
-        Files begin with it.
-    cells : list of Cell
-        What must be solved for it.
-    write : callable
-        Given the name and :class:`Results`, writes the files and returns their paths.
-    data : tuple of str
-        The kinds of source it can be made from.
-    """
-
+    # Files begin with it.
     name: str
+    # What must be solved for it.
     cells: list[Cell]
+    # Given the name and :class:`Results`, writes the files and returns their paths.
     write: Callable[[str, Results], list[Path]]
+    # The kinds of source it can be made from.
     data: tuple[str, ...] = ("published", "simulated")
 
     def fits(self, source: Source) -> bool:
@@ -94,34 +81,15 @@ EXPERIMENTS = {
     "unlike": ("unlike",),
     "certificate": ("certificate",),
     "all": (
-        "fig3",
-        "fig4",
-        "fig5",
-        *_S_FIGURES,
-        "table1",
-        "table2",
-        *tables.VARIANT_TABLES,
-        "conclusions",
-        "findings",
+        *("fig3", "fig4", "fig5", *_S_FIGURES, "table1", "table2", *tables.VARIANT_TABLES),
+        *("conclusions", "findings"),
     ),
 }
 
 
 class Experiment:
-    """An experiment on a source of cases.
-
-    Parameters
-    ----------
-    name : str
-        A key of :data:`EXPERIMENTS`.
-    source : PublishedSource or SimulatedSource
-    theirs_source : PublishedSource, optional
-        Source of the published results to compare with.
-
-    Raises
-    ------
-    ConfigError
-        If the source has no cases of this experiment.
+    """An experiment of :data:`EXPERIMENTS` on a source of cases, compared with a published source
+    if there is one. Raises ConfigError if the source has no cases of it.
     """
 
     def __init__(
@@ -147,43 +115,22 @@ class Experiment:
         self,
         out: Path,
         jobs: int,
-        on_solved: Callable[[Cell], object] = lambda cell: None,
-        on_written: Callable[[str], object] = lambda name: None,
+        on_done: Callable[[str], object] = lambda name: None,
     ) -> tuple[Results, Files]:
-        """Solve what is not solved yet, and write the files.
-
-        Parameters
-        ----------
-        out : pathlib.Path
-            Directory for the files; the solved cells are kept in its folder ``solved``.
-        jobs : int
-            Number of processes.
-        on_solved, on_written : callable
-            Called with every Cell, then with every artefact's name.
-
-        Returns
-        -------
-        Results
-        dict
-            Artefact's name to list of paths.
-
-        Raises
-        ------
-        InputError
-            If data cannot be read or files cannot be written.
+        """Solve what is not solved yet, and write the files into a directory; the solved cells are
+        kept in ``solved.jsonl`` there. ``on_done`` is called with every cell's, then with every
+        artefact's name. Gives the results, and the paths of the files of every artefact. Raises
+        InputError if data cannot be read or files cannot be written.
         """
         if any(artefact.name.startswith("fig") for artefact in self.artefacts):
             # If Matplotlib is missing, say so before minutes of solving, not after.
             from reproduction import paper_figures  # noqa: F401
-        store = runner.Store(out / "solved", self._source.configuration())
-        solved = runner.run(self._source, self.cells, store, jobs, on_solved)
-        results = Results(
-            self._source,
-            self._theirs_source,
-            [row for rows in solved.values() for row in rows],
-            out,
-            jobs,
-        )
+        configuration = {**self._source.configuration(), **runner.versions()}
+        store = runner.Store(out / "solved.jsonl", configuration)
+        tasks = {cell.name: (self._source, cell) for cell in self.cells}
+        solved = runner.solve(solve_plain, tasks, jobs, store, on_done)
+        rows = [Row.from_plain(row) for rows in solved.values() for row in rows]
+        results = Results(self._source, self._theirs_source, rows, out, jobs)
         files = {}
         for artefact in self.artefacts:
             try:
@@ -193,5 +140,5 @@ class Experiment:
                     f"cannot write {error.filename}: {error.strerror}; choose another "
                     "directory with --out"
                 ) from None
-            on_written(artefact.name)
+            on_done(artefact.name)
         return results, files

@@ -1,34 +1,23 @@
 """``python -m reproduction certificate``: which answers are proved to be global minima."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.solvers import quadratic_form
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.solvers import dnl, quadratic_form
 from hand_eye_calib.solvers.certificate import certify
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
 from reproduction.published import KITTI, LEVELS, REFERENCES, SIMULATED
+from reproduction.results import Results
 from reproduction.runner import in_parallel
+from reproduction.sources import Source
 from reproduction.writing import markdown_table, write_csv, write_text
-
-if TYPE_CHECKING:
-    from reproduction.published import Case
-    from reproduction.results import Results
-    from reproduction.sources import Source
-
-_COLUMNS = (
-    *("data set", "answer", "answers", "proved", "better found", "no proof"),
-    *("false minima near", "of them proved", "median (ms)", "largest (ms)"),
-)
 
 _HALF_TURNS = np.array([np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
 
@@ -64,9 +53,12 @@ def write(name: str, results: Results) -> list[Path]:
         for level in LEVELS.get(dataset, (None,))
     ]
     proofs = [proof for found in in_parallel(prove_level, tasks, results.jobs) for proof in found]
-    rows = list(_rows(proofs))
+    groups: dict[tuple[str, str], list[Proof]] = {}
+    for proof in proofs:
+        groups.setdefault((proof.dataset, proof.answer), []).append(proof)
+    rows = [_row(group) for group in groups.values()]
     return [
-        write_csv(results.out / f"{name}.csv", _COLUMNS, rows),
+        write_csv(results.out / f"{name}.csv", rows),
         write_text(
             results.out / f"{name}.md",
             "# Proofs of global minima",
@@ -74,7 +66,7 @@ def write(name: str, results: Results) -> list[Path]:
             "Park: the local minimum of DNL's cost from Park's rotation. False minima are other "
             "local minima of the same cost, found from rotations by pi beside the answer. "
             "Processor time of one certificate.",
-            markdown_table(_COLUMNS, rows),
+            markdown_table(rows),
         ),
     ]
 
@@ -84,19 +76,12 @@ def prove_level(source: Source, dataset: str, level: float | None) -> list[Proof
     return [
         _proof(dataset, answer, pairs, solution, method)
         for case in source.cases(dataset, level)
-        for pairs in _pairs(case)
+        for pairs in map(case.pairs, REFERENCES)
         for answer, method, solution in _answers(pairs)
     ]
 
 
-def _pairs(case: Case) -> Iterator[MotionPairs]:
-    for reference in REFERENCES:
-        yield motion_pairs(case.parent.poses, case.child.poses, reference)
-
-
 def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Method, Solution]]:
-    from hand_eye_calib.solvers import dnl
-
     for name in ("dnl", "dnlo"):
         yield name, Method(name), Method(name).solve(pairs)
     park = Method("park").solve(pairs).T_parent_child
@@ -132,19 +117,17 @@ def _false_minima(Q: FloatArray, T_parent_child: FloatArray) -> Iterator[FloatAr
             yield T
 
 
-def _rows(proofs: list[Proof]) -> Iterator[list[object]]:
-    for dataset, answer in dict.fromkeys((proof.dataset, proof.answer) for proof in proofs):
-        some = [proof for proof in proofs if (proof.dataset, proof.answer) == (dataset, answer)]
-        milliseconds = [1e3 * proof.seconds for proof in some]
-        yield [
-            dataset,
-            answer,
-            len(some),
-            sum(proof.at_once for proof in some),
-            sum(proof.is_better_found and proof.in_the_end for proof in some),
-            sum(not proof.in_the_end for proof in some),
-            sum(proof.n_false for proof in some),
-            sum(proof.n_false_proved for proof in some),
-            f"{np.median(milliseconds):.2f}",
-            f"{max(milliseconds):.1f}",
-        ]
+def _row(proofs: list[Proof]) -> dict[str, object]:
+    milliseconds = [1e3 * proof.seconds for proof in proofs]
+    return {
+        "data set": proofs[0].dataset,
+        "answer": proofs[0].answer,
+        "answers": len(proofs),
+        "proved": sum(proof.at_once for proof in proofs),
+        "better found": sum(proof.is_better_found and proof.in_the_end for proof in proofs),
+        "no proof": sum(not proof.in_the_end for proof in proofs),
+        "false minima near": sum(proof.n_false for proof in proofs),
+        "of them proved": sum(proof.n_false_proved for proof in proofs),
+        "median (ms)": f"{np.median(milliseconds):.2f}",
+        "largest (ms)": f"{max(milliseconds):.1f}",
+    }

@@ -4,8 +4,6 @@ real ones with the options that they need.
 The limits of the checks were set with the first seeds of each kind. The seeds here are others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
@@ -14,10 +12,10 @@ from typing import Any
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.drive import SimulatedDrive, simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
-from reproduction.coverage.classes import CLASSES, make
-from reproduction.coverage.real_sets import Rig, real_rigs
+from reproduction.coverage.classes import CLASSES, Simulated, make
+from reproduction.recordings import Rig, real_rigs
 
 SEEDS = range(60, 65)
 
@@ -30,29 +28,20 @@ _KNOWN = {
     "primesense": frozenset({"jumps", "time_offset"}),
     "robot_arm": frozenset({"time_offset"}),
     "kitti_long": frozenset({"scale"}),
+    "boreas": frozenset({"not_independent"}),
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clean:
-    """A clean recording.
-
-    Attributes
-    ----------
-    name : str
-        Its kind, and which one of it it is.
-    parent, child : Trajectory
-    T_parent_child : (4, 4) array or None
-        The truth, if it is known.
-    options : dict
-        Options of the calibration.
-    is_real : bool
-    """
+    """A clean recording; its name is its kind, and which one of it it is."""
 
     name: str
     parent: Trajectory
     child: Trajectory
+    # The truth, if it is known.
     T_parent_child: FloatArray | None = None
+    # Of the calibration.
     options: dict[str, Any] = field(default_factory=dict)
     is_real: bool = False
 
@@ -78,23 +67,16 @@ def known_in(name: str, folder: Path | None) -> frozenset[str]:
 def recording(name: str, folder: Path | None) -> Clean:
     """The recording of this name."""
     kind, seed = kind_of(name), name.rpartition(" ")[2]
-    if kind in _HILLY:
-        drive = simulate_drive(int(seed), HILLY_DRIVE, NoiseConfig(gaussian=_HILLY[kind]))
-        return Clean(
-            name=name,
-            parent=drive.parent,
-            child=drive.child,
-            T_parent_child=drive.T_parent_child,
-        )
+    if kind not in CLASSES and kind not in _HILLY:
+        return _real(folder)[name]
+    made: Simulated | SimulatedDrive
     if kind in CLASSES:
         made = make(kind, int(seed))
-        return Clean(
-            name=name,
-            parent=made.parent,
-            child=made.child,
-            T_parent_child=made.T_parent_child,
-        )
-    return _real(folder)[name]
+    else:
+        made = simulate_drive(int(seed), HILLY_DRIVE, NoiseConfig(gaussian=_HILLY[kind]))
+    return Clean(
+        name=name, parent=made.parent, child=made.child, T_parent_child=made.T_parent_child
+    )
 
 
 @cache

@@ -8,7 +8,6 @@ import argparse
 import json
 import os
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,14 +19,12 @@ from hand_eye_calib.cli.main import exit_code_of
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import ConfigError
 from reproduction.rows import Row
-from reproduction.writing import put_into_page
+from reproduction.writing import data_folder, put_into_page
 
 if TYPE_CHECKING:
     from reproduction.catalogue import Files
     from reproduction.results import Results
     from reproduction.sources import PublishedSource, Source
-
-_SILENT_S = 2.0
 
 EXPERIMENTS = {
     "fig3": "errors of DNLO for every reference: noise, outliers, drift, mixture",
@@ -53,7 +50,7 @@ _EPILOG = (
 
 Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV. Beside each,
 *_comparison.csv and *_comparison.md compare it with the published results, cell by cell.
-Solved calibrations are kept in DIR/solved: an interrupted run continues from there.
+Solved calibrations are kept in DIR/solved.jsonl: an interrupted run continues from there.
 
 repeats reads zxl19 and asl_tango_easy too, if they lie beside the published data.
 
@@ -144,17 +141,13 @@ def run(arguments: argparse.Namespace) -> int:
     if experiment.left_out:
         note(f"left out, since they need the published data: {', '.join(experiment.left_out)}")
     with _progress(len(experiment.cells) + len(experiment.artefacts)) as advance:
-        results, files = experiment.run(arguments.out, jobs, advance, advance)
+        results, files = experiment.run(arguments.out, jobs, advance)
     if arguments.page is not None:
-        put_into_page(
-            arguments.page, arguments.id, (arguments.out / f"{arguments.id}.md").read_text()
-        )
+        text = (arguments.out / f"{arguments.id}.md").read_text(encoding="utf-8")
+        put_into_page(arguments.page, arguments.id, text)
     document = _document(arguments, results, files)
-    print(
-        json.dumps(document, indent=2, allow_nan=False)
-        if arguments.json
-        else _text(document, files)
-    )
+    as_json = arguments.json and json.dumps(document, indent=2, allow_nan=False)
+    print(as_json or _text(document, files))
     return 0
 
 
@@ -162,8 +155,7 @@ def _run_faults(arguments: argparse.Namespace, jobs: int) -> int:
     """Run the study of faults, which has recordings of its own; returns the exit code."""
     from reproduction import faults
 
-    folder = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
-    folder = Path(folder) if folder else None
+    folder = data_folder(arguments.data_folder)
     todo = faults.clean_cases(folder) if arguments.clean else faults.cases(folder)
     with _progress(len(todo)) as advance:
         print(faults.run(todo, folder, arguments.out, arguments.page, jobs, advance))
@@ -174,8 +166,10 @@ def _sources(arguments: argparse.Namespace) -> tuple[Source, PublishedSource | N
     """The source of the cases, and the published source to compare with or None."""
     from reproduction import sources
 
-    folder = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
+    folder = data_folder(arguments.data_folder)
     published = sources.PublishedSource(sources.find_folder(folder)) if folder else None
+    given = {name: getattr(arguments, name) for name in ("seed", "runs")}
+    given = {name: value for name, value in given.items() if value is not None}
     if arguments.data == "published":
         if published is None:
             raise ConfigError(
@@ -183,18 +177,12 @@ def _sources(arguments: argparse.Namespace) -> tuple[Source, PublishedSource | N
                 "github.com/tau-alma/trajectory_calibration_experiments and name its "
                 "folder with --data-folder or $HAND_EYE_CALIB_DATA, or use --data simulated"
             )
-        if arguments.seed is not None or arguments.runs is not None:
+        if given:
             raise ConfigError(
                 "--seed and --runs are for --data simulated; the published trajectories are given"
             )
         return published, published
-    simulated = sources.SimulatedSource(
-        **{
-            name: value
-            for name in ("seed", "runs")
-            if (value := getattr(arguments, name)) is not None
-        }
-    )
+    simulated = sources.SimulatedSource(**given)
     if simulated.seed < 0 or simulated.runs < 2:
         raise ConfigError(
             f"--seed must be at least 0 and --runs at least 2; got {simulated.seed} and "
@@ -208,34 +196,18 @@ def _cores() -> int:
 
 
 @contextmanager
-def _progress(total: int) -> Iterator[Callable[[Any], None]]:
-    """A function that advances the progress bar by one; the bar appears after two seconds, on a
-    terminal only.
-    """
+def _progress(total: int) -> Iterator[Callable[[str], None]]:
+    """A function that advances the progress bar by one; there is a bar on a terminal only."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress
 
-    bar = Progress(
-        TextColumn("{task.description:<24}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total}"),
-        TimeRemainingColumn(),
-        console=Console(file=sys.stderr),
-        transient=True,
-    )
-    task = bar.add_task("", total=total)
-    appears_at = time.monotonic() + _SILENT_S
-
-    def advance(what: Any) -> None:
-        if not bar.live.is_started and sys.stderr.isatty() and time.monotonic() >= appears_at:
-            bar.start()
-        bar.update(task, advance=1, description=getattr(what, "name", what))
-
-    try:
-        yield advance
-    finally:
-        if bar.live.is_started:
-            bar.stop()
+    console = Console(file=sys.stderr)
+    if not console.is_terminal:  # older releases of rich end with an empty line there
+        yield lambda what: None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda what: bar.update(task, advance=1, description=what)
 
 
 def _document(arguments: argparse.Namespace, results: Results, files: Files) -> dict[str, Any]:
@@ -260,9 +232,7 @@ def _agreement(rows: Sequence[Row], method: str) -> dict[str, Any]:
     found["differing"] = dict(Counter(row.why() for row in chosen if not row.agrees))
     if method == "dnlo":
         verdicts = Counter(row.objective_verdict for row in chosen)
-        found["objective"] = {
-            verdict: verdicts[verdict] for verdict in ("lower", "equal", "higher")
-        }
+        found["objective"] = {each: verdicts[each] for each in ("lower", "equal", "higher")}
     return found
 
 
@@ -272,12 +242,9 @@ def _text(document: dict[str, Any], files: Files) -> str:
     lines = []
     if len(files) == 1:
         # A single artefact: print its text.
-        lines += [
-            path.read_text(encoding="utf-8")
-            for name, paths in files.items()
-            for path in paths
-            if path.name == f"{name}.md"
-        ]
+        ((name, paths),) = files.items()
+        texts = [path for path in paths if path.name == f"{name}.md"]
+        lines += [path.read_text(encoding="utf-8") for path in texts]
     for agreement in document.get("agreement", ()):
         reasons = "; ".join(f"{count} {why}" for why, count in agreement["differing"].items())
         lines.append(
@@ -285,10 +252,5 @@ def _text(document: dict[str, Any], files: Files) -> str:
             f"{agreement['rows']:>5} rows as published" + (f"; {reasons}" if reasons else "")
         )
     n_files = sum(len(paths) for paths in files.values())
-    return "\n".join(
-        [
-            *lines,
-            f"{n_files} files written to {next(iter(files.values()))[0].parent}: "
-            f"{', '.join(files)}",
-        ]
-    )
+    folder = next(iter(files.values()))[0].parent
+    return "\n".join([*lines, f"{n_files} files written to {folder}: {', '.join(files)}"])

@@ -1,23 +1,19 @@
 """The paper's conclusions, one by one: whether our run shows them, and by which figures."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from reproduction.figures import components
 from reproduction.published import METHODS, REFERENCES, SIMULATED
-from reproduction.rows import ALI_AS_PUBLISHED, TITLES, Row
+from reproduction.results import Results
+from reproduction.rows import ALI_AS_PUBLISHED, METRICS, TITLES, UNITS, Row
 from reproduction.statistics import Table
-from reproduction.tables import rectified_errors
+from reproduction.tables import best_variant, rectified_errors
 from reproduction.writing import write_csv, write_text
-
-if TYPE_CHECKING:
-    from reproduction.results import Results
 
 _AS_PUBLISHED = (ALI_AS_PUBLISHED, "dnl", "dnlo", "park", "taylor", "zhuang")
 _KITTI_TITLES = {"kitti_short": "short", "kitti_long": "long"}
@@ -37,19 +33,13 @@ class Conclusion:
 def write(name: str, results: Results) -> list[Path]:
     """Write ``NAME.md`` and ``NAME.csv``; returns the paths."""
     found = check(results)
-    blocks = []
-    for number, conclusion in enumerate(found, start=1):
-        blocks.append(
-            f"**{number}. {conclusion.claim}** (section "
-            f"{conclusion.section})\n\n*{conclusion.verdict}.* {conclusion.evidence}"
-        )
+    blocks = [
+        f"**{number}. {each.claim}** (section {each.section})\n\n*{each.verdict}.* {each.evidence}"
+        for number, each in enumerate(found, start=1)
+    ]
     return [
         write_text(results.out / f"{name}.md", "# The paper's conclusions, checked", *blocks),
-        write_csv(
-            results.out / f"{name}.csv",
-            ["section", "claim", "verdict", "evidence"],
-            ([item.section, item.claim, item.verdict, item.evidence] for item in found),
-        ),
+        write_csv(results.out / f"{name}.csv", map(asdict, found)),
     ]
 
 
@@ -59,6 +49,7 @@ def check(results: Results) -> list[Conclusion]:
     """
     table = results.ours
     return [
+        _without_noise(table),
         *_on_references(table),
         _on_components(results),
         *_on_relative_errors(results, table),
@@ -72,60 +63,52 @@ def _verdict(holds: Any, in_part: Any = False) -> str:
     return "Holds" if holds else "Holds in part" if in_part else "Does not hold"
 
 
-def _named(method: str) -> str:
-    return "Ali with a normalised quaternion" if method == "ali" else TITLES[method]
-
-
 def _scores(
-    table: Table,
-    dataset: str,
-    method: str,
-    metric: str = "e_at",
-    references: Sequence[str] = REFERENCES,
+    table: Table, dataset: str, metric: str = "e_at", references: Iterable[str] = REFERENCES
 ) -> str:
-    unit = "m" if metric.endswith("t") else "deg"
-    return (
-        ", ".join(
-            f"{reference} {table.score(dataset, method, reference, metric):.4f}"
-            for reference in references
-        )
-        + f" {unit}"
+    """Of DNLO, by reference."""
+    scores = (f"{name} {table.score(dataset, 'dnlo', name, metric):.4f}" for name in references)
+    return f"{', '.join(scores)} {UNITS[metric]}"
+
+
+def _joined(values: Mapping[str, object], form: str = "", name: Any = TITLES.get) -> str:
+    """Methods with their values."""
+    return ", ".join(f"{name(method)} {value:{form}}" for method, value in values.items())
+
+
+def _without_noise(table: Table) -> Conclusion:
+    counts, n_rows = {}, 0
+    for method in (*_AS_PUBLISHED, "ali"):
+        by_dataset = [
+            table.values(dataset, 0.0, method, reference, "e_at")
+            for dataset in ("noise", "outliers", "drift")
+            for reference in REFERENCES
+        ]
+        errors = np.concatenate(by_dataset)
+        counts[method], n_rows = int((errors > _NOISE_FREE).sum()), len(errors)
+    exact = sum(counts[method] == 0 for method in _AS_PUBLISHED)
+    names = {**TITLES, "ali": "Ali with a normalised quaternion"}
+    return Conclusion(
+        "4.2.1",
+        "Without noise, the reference makes no difference.",
+        _verdict(exact == len(_AS_PUBLISHED), exact > 0),
+        f"Of {n_rows} rows at level 0, e_at exceeds 1e-6 m in: {_joined(counts, name=names.get)}.",
     )
 
 
 def _on_references(table: Table) -> Iterator[Conclusion]:
-    counts, n_rows = {}, 0
-    for method in (*_AS_PUBLISHED, "ali"):
-        errors = np.concatenate(
-            [
-                table.values(dataset, 0.0, method, reference, "e_at")
-                for dataset in ("noise", "outliers", "drift")
-                for reference in REFERENCES
-            ]
-        )
-        counts[method], n_rows = int((errors > _NOISE_FREE).sum()), len(errors)
-    exact = sum(counts[method] == 0 for method in _AS_PUBLISHED)
-    yield Conclusion(
-        "4.2.1",
-        "Without noise, the reference makes no difference.",
-        _verdict(exact == len(_AS_PUBLISHED), exact > 0),
-        f"Of {n_rows} rows at level 0, e_at exceeds 1e-6 m in: "
-        + ", ".join(f"{_named(method)} {count}" for method, count in counts.items())
-        + ".",
-    )
     score = {name: table.score("noise", "dnlo", name) for name in REFERENCES}
+    b_rises = score["B10"] < score["B5"] < score["B1"]
     yield Conclusion(
         "4.2.1",
         "Longer reference distances are better with Gaussian noise (DNLO).",
-        _verdict(
-            score["B10"] < score["B5"] < score["B1"] and score["C10"] < score["C5"] < score["B1"]
-        ),
-        f"Mean e_at over the levels: {_scores(table, 'noise', 'dnlo')}.",
+        _verdict(b_rises and score["C10"] < score["C5"] < score["B1"]),
+        f"Mean e_at over the levels: {_scores(table, 'noise')}.",
     )
-    others = {dataset: table.score(dataset, "dnlo", "A") for dataset in ("outliers", "drift")}
     ratio = {
-        dataset: value / min(table.score(dataset, "dnlo", name) for name in REFERENCES[1:])
-        for dataset, value in others.items()
+        dataset: table.score(dataset, "dnlo", "A")
+        / min(table.score(dataset, "dnlo", name) for name in REFERENCES[1:])
+        for dataset in ("outliers", "drift")
     }
     noise_ratio = score["A"] / min(score.values())
     rank = sorted(score, key=lambda name: score[name]).index("A") + 1
@@ -138,118 +121,99 @@ def _on_references(table: Table) -> Iterator[Conclusion]:
         f"with outliers {ratio['outliers']:.1f} times, with drift {ratio['drift']:.1f} times.",
     )
     orders = {dataset: table.ranking(dataset, "dnlo") for dataset in ("outliers", "drift")}
-    monotone = {
-        dataset: order.index("B1") < order.index("B5") < order.index("B10") < order.index("A")
+    monotone = [
+        order.index("B1") < order.index("B5") < order.index("B10") < order.index("A")
         and order.index("C5") < order.index("C10")
+        for order in orders.values()
+    ]
+    ranked = (
+        f"{dataset}: {' < '.join(order)} ({_scores(table, dataset, references=order)})"
         for dataset, order in orders.items()
-    }
+    )
     yield Conclusion(
         "4.2.1",
         "With outliers and drift the references rank from the smallest motions to the "
         "largest, B1 first (DNLO).",
         _verdict(
-            all(monotone.values()) and all(order[0] == "B1" for order in orders.values()),
-            any(monotone.values()),
+            all(monotone) and all(order[0] == "B1" for order in orders.values()), any(monotone)
         ),
-        "; ".join(
-            f"{dataset}: {' < '.join(order)} ({_scores(table, dataset, 'dnlo', references=order)})"
-            for dataset, order in orders.items()
-        )
-        + ". The size of the motions grows in the order B1, C5, B5 or C10, B10, A.",
+        f"{'; '.join(ranked)}. The size of the motions grows in the order B1, C5, B5 or C10, B10, "
+        "A.",
     )
-    drift = {name: table.summary("drift", 0.05, "dnlo", name, "e_at").centre for name in REFERENCES}
-    without_a = [drift[name] for name in REFERENCES if name != "A"]
+    a, *others = _drift_errors(table, "dnlo")
     yield Conclusion(
         "4.2.1, 4.2.2",
         "With drift the differences between the references are minute, apart from A (DNLO).",
-        _verdict(max(without_a) < 2 * min(without_a) and drift["A"] > 3 * max(without_a)),
-        "At rate 0.05 the worst of the other five has "
-        f"{max(without_a) / min(without_a):.2f} times the e_at of the best, A has "
-        f"{drift['A'] / min(without_a):.1f} times.",
+        _verdict(max(others) < 2 * min(others) and a > 3 * max(others)),
+        f"At rate 0.05 the worst of the other five has {max(others) / min(others):.2f} times the "
+        f"e_at of the best, A has {a / min(others):.1f} times.",
     )
+
+
+def _drift_errors(table: Table, method: str) -> list[float]:
+    """Mean e_at with the largest drift, by reference, that of A first."""
+    return [table.summary("drift", 0.05, method, name, "e_at").centre for name in REFERENCES]
 
 
 def _on_components(results: Results) -> Conclusion:
     found = components(results.source.cases("noise", 0.0))
-    worst_z = max(
-        found["z"][name].centre / min(found["x"][name].centre, found["y"][name].centre)
-        for name in REFERENCES
-    )
-    tilt = max(
-        max(found["roll"][name].centre, found["pitch"][name].centre) / found["yaw"][name].centre
-        for name in REFERENCES
-    )
-    at_a = max(found["roll"]["A"].centre, found["pitch"]["A"].centre) / found["yaw"]["A"].centre
+
+    def centre(component: str, name: str) -> float:
+        return found[component][name].centre
+
+    def tilt(name: str) -> float:
+        return max(centre("roll", name), centre("pitch", name)) / centre("yaw", name)
+
+    worst_z = max(centre("z", x) / min(centre("x", x), centre("y", x)) for x in REFERENCES)
+    worst_tilt = max(map(tilt, REFERENCES))
     return Conclusion(
         "4.2.1, Figure 4",
         "The motions are heavily partial to x, y and yaw.",
-        _verdict(worst_z < 0.5 and tilt < 0.5),
+        _verdict(worst_z < 0.5 and worst_tilt < 0.5),
         f"Medians over all references: |z| is at most {worst_z:.2f} of the smaller of |x| "
         "and |y|; the larger of |roll| and |pitch| is at most "
-        f"{tilt:.2f} of |yaw| ({at_a:.2f} for A).",
+        f"{worst_tilt:.2f} of |yaw| ({tilt('A'):.2f} for A).",
     )
 
 
 def _on_relative_errors(results: Results, table: Table) -> Iterator[Conclusion]:
-    relative = {
-        metric: table.best_reference("mixture", "dnlo", metric)
-        for metric in ("e_rt", "e_rR", "e_at", "e_aR")
-    }
+    best = {metric: table.best_reference("mixture", "dnlo", metric) for metric in METRICS}
+    medians = [_scores(table, "mixture", metric) for metric in ("e_rt", "e_rR", "e_at")]
     yield Conclusion(
         "4.2.1",
         "With mixed noise B1 is clearly best by the relative errors, but not by the "
         "absolute ones (DNLO).",
         _verdict(
-            relative["e_rt"] == "B1" and relative["e_rR"] == "B1" and relative["e_at"] != "B1",
-            relative["e_at"] != "B1",
+            best["e_rt"] == "B1" and best["e_rR"] == "B1" and best["e_at"] != "B1",
+            best["e_at"] != "B1",
         ),
-        "Smallest median: "
-        f"{', '.join(f'{metric} {name}' for metric, name in relative.items())}. Medians "
-        "of e_rt: "
-        f"{_scores(table, 'mixture', 'dnlo', 'e_rt')}; of e_rR: "
-        f"{_scores(table, 'mixture', 'dnlo', 'e_rR')}; of e_at: "
-        f"{_scores(table, 'mixture', 'dnlo')}.",
+        f"Smallest median: {_joined(best, name=str)}. Medians of e_rt: {medians[0]}; of e_rR: "
+        f"{medians[1]}; of e_at: {medians[2]}.",
     )
     picks = {
-        method: (
-            table.best_reference("mixture", method, "e_rt"),
-            table.best_reference("mixture", method),
-        )
+        method: [table.best_reference("mixture", method, metric) for metric in ("e_rt", "e_at")]
         for method in _AS_PUBLISHED
     }
-    hits = {method: _picked_right(results.rows, method) for method in _AS_PUBLISHED}
+    hits = {method: _picked_right(results.of("mixture", method)) for method in _AS_PUBLISHED}
+    picked = {method: " / ".join(names) for method, names in picks.items()}
     yield Conclusion(
         "4.2.1, 6",
         "Relative errors are no criterion for choosing the reference.",
         _verdict(all(by_relative != by_absolute for by_relative, by_absolute in picks.values())),
         "With mixed noise, reference with the smallest median e_rt against that with the "
-        "smallest e_at: "
-        + ", ".join(
-            f"{TITLES[method]} {first} / {second}" for method, (first, second) in picks.items()
-        )
-        + ". Choosing by e_rt in every single run picks the reference with the smallest e_at in "
-        + ", ".join(f"{TITLES[method]} {share:.0%}" for method, share in hits.items())
-        + " of the runs; by chance it would be 17 %.",
+        f"smallest e_at: {_joined(picked)}. Choosing by e_rt in every single run picks the "
+        f"reference with the smallest e_at in {_joined(hits, '.0%')} of the runs; by chance it "
+        "would be 17 %.",
     )
 
 
-def _picked_right(rows: Sequence[Row], method: str) -> float:
-    """Share of the mixture's runs in which the reference with the smallest e_rt has the smallest
-    e_at too.
-    """
+def _picked_right(rows: Iterable[Row]) -> float:
+    """Share of the runs in which the reference with the smallest e_rt has the smallest e_at too."""
     runs: dict[str, list[Row]] = {}
     for row in rows:
-        if (row.dataset, row.method) == ("mixture", method):
-            runs.setdefault(row.run, []).append(row)
-    return float(
-        np.mean(
-            [
-                min(of_run, key=lambda row: row.errors[0])
-                is min(of_run, key=lambda row: row.errors[2])
-                for of_run in runs.values()
-            ]
-        )
-    )
+        runs.setdefault(row.run, []).append(row)
+    picked = (best_variant(run, lambda row: row.errors[0]) for run in runs.values())
+    return float(np.mean([x is best_variant(runs[x.run]) for x in picked]))
 
 
 def _on_methods(table: Table) -> Iterator[Conclusion]:
@@ -257,59 +221,64 @@ def _on_methods(table: Table) -> Iterator[Conclusion]:
         dataset: {method: table.best_reference(dataset, method) for method in _AS_PUBLISHED}
         for dataset in SIMULATED
     }
-    yield _best_with_noise(best["noise"])
-    yield _best_with_outliers(best["outliers"])
-    yield _dnlo_with_outliers(table, best["outliers"])
-    yield _ali_with_outliers(table, best["outliers"])
+    noise, outliers, mixture = (best[name] for name in ("noise", "outliers", "mixture"))
+    yield Conclusion(
+        "4.2.2",
+        "With Gaussian noise B10 is the best variant of all methods but Zhuang.",
+        _verdict(all((name == "B10") == (method != "zhuang") for method, name in noise.items())),
+        f"{_joined(noise)}.",
+    )
+    yield Conclusion(
+        "4.2.2",
+        "With outliers B1 is the best variant of most methods.",
+        _verdict(sum(name == "B1" for name in outliers.values()) > 3),
+        f"{_joined(outliers)}.",
+    )
+    yield _dnlo_with_outliers(table, outliers)
+    yield _ali_with_outliers(table, outliers)
     yield _separable_rotation(table)
-    yield _references_with_drift(table)
-    yield _best_with_mixture(table, best["mixture"])
+    drift = {method: _drift_errors(table, method)[1:] for method in _AS_PUBLISHED}
+    factors = {method: max(errors) / min(errors) for method, errors in drift.items()}
+    yield Conclusion(
+        "4.2.2",
+        "With drift there is very little difference between the references, apart from A, "
+        "for any of the methods.",
+        _verdict(max(factors.values()) < 2, min(factors.values()) < 2),
+        "At rate 0.05, e_at of the worst of the other five over that of the best: "
+        f"{_joined(factors, '.1f')}.",
+    )
+    by_mean = {method: _best_by_mean(table, method) for method in _AS_PUBLISHED}
+    yield Conclusion(
+        "4.2.2",
+        "With mixed noise B5 is the best variant of all methods.",
+        _verdict(set(mixture.values()) == {"B5"}, "B5" in mixture.values()),
+        f"By the median e_at: {_joined(mixture)}. By the mean e_at: {_joined(by_mean)}.",
+    )
     yield _dnlo_against_others(table, best)
 
 
-def _variants(best: Mapping[str, str]) -> str:
-    return ", ".join(f"{TITLES[method]} {reference}" for method, reference in best.items())
-
-
-def _best_with_noise(best: Mapping[str, str]) -> Conclusion:
-    return Conclusion(
-        "4.2.2",
-        "With Gaussian noise B10 is the best variant of all methods but Zhuang.",
-        _verdict(all((name == "B10") == (method != "zhuang") for method, name in best.items())),
-        f"{_variants(best)}.",
-    )
-
-
-def _best_with_outliers(best: Mapping[str, str]) -> Conclusion:
-    return Conclusion(
-        "4.2.2",
-        "With outliers B1 is the best variant of most methods.",
-        _verdict(sum(name == "B1" for name in best.values()) > 3),
-        f"{_variants(best)}.",
+def _best_by_mean(table: Table, method: str) -> str:
+    return min(
+        REFERENCES, key=lambda name: table.values("mixture", None, method, name, "e_at").mean()
     )
 
 
 def _dnlo_with_outliers(table: Table, best: Mapping[str, str]) -> Conclusion:
     scores = {method: table.score("outliers", method, best[method]) for method in _AS_PUBLISHED}
-    rival = min(
-        (method for method in scores if method != "dnlo"), key=lambda method: scores[method]
-    )
+    dnlo = scores.pop("dnlo")
+    rival = min(scores, key=lambda method: scores[method])
     return Conclusion(
         "4.2.2",
         "With outliers DNLO clearly outperforms the others.",
-        _verdict(scores["dnlo"] < 0.5 * scores[rival]),
-        f"Mean e_at of the best variants: DNLO {scores['dnlo']:.4f} m, next is "
-        f"{TITLES[rival]} with {scores[rival]:.4f} m, "
-        f"{scores[rival] / scores['dnlo']:.0f} times as much.",
+        _verdict(dnlo < 0.5 * scores[rival]),
+        f"Mean e_at of the best variants: DNLO {dnlo:.4f} m, next is {TITLES[rival]} with "
+        f"{scores[rival]:.4f} m, {scores[rival] / dnlo:.0f} times as much.",
     )
 
 
 def _ali_with_outliers(table: Table, best: Mapping[str, str]) -> Conclusion:
-    def errors(method: str, reference: str) -> dict[str, float]:
-        return {
-            metric: table.score("outliers", method, reference, metric)
-            for metric in ("e_at", "e_aR")
-        }
+    def errors(method: str, reference: str) -> list[float]:
+        return [table.score("outliers", method, reference, metric) for metric in ("e_at", "e_aR")]
 
     proper = errors("ali", table.best_reference("outliers", "ali"))
     published = errors(ALI_AS_PUBLISHED, best[ALI_AS_PUBLISHED])
@@ -319,92 +288,63 @@ def _ali_with_outliers(table: Table, best: Mapping[str, str]) -> Conclusion:
         "The poor performance of Ali with outliers is explained by the rotation error not "
         "entering its cost.",
         _verdict(
-            all(proper[metric] > 0.8 * published[metric] for metric in proper),
-            any(proper[metric] > 1.2 * dnl[metric] for metric in proper),
+            all(ours > 0.8 * theirs for ours, theirs in zip(proper, published, strict=True)),
+            any(ours > 1.2 * other for ours, other in zip(proper, dnl, strict=True)),
         ),
-        f"Mean errors of the best variants: as published {published['e_at']:.3f} m, "
-        f"{published['e_aR']:.1f} deg; with the same cost and a normalised quaternion "
-        f"{proper['e_at']:.3f} m, {proper['e_aR']:.1f} deg; DNL, whose cost has the "
-        f"rotation, {dnl['e_at']:.3f} m, {dnl['e_aR']:.1f} deg.",
+        f"Mean errors of the best variants: as published {published[0]:.3f} m, "
+        f"{published[1]:.1f} deg; with the same cost and a normalised quaternion "
+        f"{proper[0]:.3f} m, {proper[1]:.1f} deg; DNL, whose cost has the "
+        f"rotation, {dnl[0]:.3f} m, {dnl[1]:.1f} deg.",
     )
 
 
 def _separable_rotation(table: Table) -> Conclusion:
-    rotation = {
-        dataset: max(
+    outliers, drift = (
+        max(
             table.values(dataset, level, method, reference, "e_aR").max()
             for level in table.levels(dataset, "park")
             for method in ("park", "taylor")
             for reference in REFERENCES
         )
         for dataset in ("outliers", "drift")
-    }
+    )
     return Conclusion(
         "4.2.2",
         "The separable methods have very small rotation errors with outliers and drift.",
-        _verdict(max(rotation.values()) < 1e-3),
-        f"Largest e_aR of Park and Taylor in any run: {rotation['outliers']:.1e} deg with "
-        f"outliers, {rotation['drift']:.1e} deg with drift.",
-    )
-
-
-def _references_with_drift(table: Table) -> Conclusion:
-    factors = {}
-    for method in _AS_PUBLISHED:
-        values = [
-            table.summary("drift", 0.05, method, name, "e_at").centre
-            for name in REFERENCES
-            if name != "A"
-        ]
-        factors[method] = max(values) / min(values)
-    return Conclusion(
-        "4.2.2",
-        "With drift there is very little difference between the references, apart from A, "
-        "for any of the methods.",
-        _verdict(max(factors.values()) < 2, min(factors.values()) < 2),
-        "At rate 0.05, e_at of the worst of the other five over that of the best: "
-        + ", ".join(f"{TITLES[method]} {factor:.1f}" for method, factor in factors.items())
-        + ".",
-    )
-
-
-def _best_with_mixture(table: Table, best: Mapping[str, str]) -> Conclusion:
-    by_mean = {method: _best_by_mean(table, method) for method in _AS_PUBLISHED}
-    return Conclusion(
-        "4.2.2",
-        "With mixed noise B5 is the best variant of all methods.",
-        _verdict(set(best.values()) == {"B5"}, "B5" in best.values()),
-        f"By the median e_at: {_variants(best)}. By the mean e_at: {_variants(by_mean)}.",
+        _verdict(max(outliers, drift) < 1e-3),
+        f"Largest e_aR of Park and Taylor in any run: {outliers:.1e} deg with outliers, "
+        f"{drift:.1e} deg with drift.",
     )
 
 
 def _dnlo_against_others(table: Table, best: Mapping[str, Mapping[str, str]]) -> Conclusion:
-    ranks = {}
-    for dataset in SIMULATED:
-        scores = {
-            method: table.score(dataset, method, best[dataset][method]) for method in _AS_PUBLISHED
-        }
+    ratios, said = [], []
+    for dataset, variants in best.items():
+        scores = {method: table.score(dataset, method, name) for method, name in variants.items()}
         order = sorted(scores, key=lambda method: scores[method])
-        ratio = scores["dnlo"] / scores[order[0]]
-        ranks[dataset] = (order.index("dnlo") + 1, order[0], ratio)
-    matched = sum(ratio < 1.05 for *_, ratio in ranks.values())
+        ratios.append(scores["dnlo"] / scores[order[0]])
+        rank = f"number {order.index('dnlo') + 1}, first {TITLES[order[0]]}"
+        said.append(f"{dataset} {ratios[-1]:.2f} ({rank})")
+    matched = sum(ratio < 1.05 for ratio in ratios)
     return Conclusion(
         "6",
         "DNLO either matched or outperformed the other methods in most noise conditions.",
         _verdict(matched >= 3, matched >= 2),
-        "e_at of DNLO's best variant over that of the best method: "
-        + ", ".join(
-            f"{dataset} {ratio:.2f} (number {rank}, first {TITLES[first]})"
-            for dataset, (rank, first, ratio) in ranks.items()
-        )
-        + ".",
+        f"e_at of DNLO's best variant over that of the best method: {', '.join(said)}.",
     )
 
 
-def _best_by_mean(table: Table, method: str) -> str:
-    return min(
-        REFERENCES, key=lambda name: table.values("mixture", None, method, name, "e_at").mean()
-    )
+def _named(chosen: Mapping[str, Row], error: Callable[[Row], float]) -> str:
+    said = {method: f"{row.reference} ({error(row):.3f} m)" for method, row in chosen.items()}
+    return _joined(said)
+
+
+def _rectified_e_at(row: Row) -> float:
+    return rectified_errors(row)[0]
+
+
+def _e_at(row: Row) -> float:
+    return row.errors[2]
 
 
 def _on_kitti(results: Results) -> Iterator[Conclusion]:
@@ -415,39 +355,23 @@ def _on_kitti(results: Results) -> Iterator[Conclusion]:
         }
         for dataset in _KITTI_TITLES
     }
-    best = {
-        dataset: {
-            method: min(by.values(), key=lambda row: row.errors[2])
-            for method, by in of_dataset.items()
+    best, rectified = (
+        {
+            dataset: {name: best_variant(by.values(), error) for name, by in of_dataset.items()}
+            for dataset, of_dataset in rows.items()
         }
-        for dataset, of_dataset in rows.items()
-    }
-    against_rectified = {
-        dataset: {
-            method: min(by.values(), key=lambda row: rectified_errors(row)[0])
-            for method, by in of_dataset.items()
-        }
-        for dataset, of_dataset in rows.items()
-    }
-
-    def named(chosen: Mapping[str, Row], error: Callable[[Row], float]) -> str:
-        return ", ".join(
-            f"{TITLES[method]} {row.reference} ({error(row):.3f} m)"
-            for method, row in chosen.items()
-        )
-
+        for error in (_e_at, _rectified_e_at)
+    )
     short, long = best["kitti_short"], best["kitti_long"]
-    lowest = min(short.values(), key=lambda row: row.errors[0])
+    zhuang = short["zhuang"]
+    lowest = best_variant(short.values(), lambda row: row.errors[0])
     yield Conclusion(
         "5.2, Table 1",
         "On the short drive Zhuang has the lowest relative errors and converges to a "
         "wrong solution.",
-        _verdict(
-            lowest.method == "zhuang"
-            and max(short.values(), key=lambda row: row.errors[2]).method == "zhuang"
-        ),
-        f"Zhuang {short['zhuang'].reference}: e_rt {short['zhuang'].errors[0]:.3f} m, "
-        f"e_at {short['zhuang'].errors[2]:.3f} m. It is compared in its B1 variant, and "
+        _verdict(lowest is zhuang and max(short.values(), key=_e_at) is zhuang),
+        f"Zhuang {zhuang.reference}: e_rt {zhuang.errors[0]:.3f} m, "
+        f"e_at {_e_at(zhuang):.3f} m. It is compared in its B1 variant, and "
         "relative errors over short steps are small for every method: DNL with B1 has "
         f"e_rt {rows['kitti_short']['dnl']['B1'].errors[0]:.3f} m.",
     )
@@ -456,63 +380,43 @@ def _on_kitti(results: Results) -> Iterator[Conclusion]:
         "5.2, Table 1",
         "On the short drive all other methods are best with B5 or B10.",
         _verdict(references <= {"B5", "B10"}),
-        f"{named(short, lambda row: row.errors[2])}. Against the rectified truth: "
-        f"{named(against_rectified['kitti_short'], lambda row: rectified_errors(row)[0])}.",
+        f"{_named(short, _e_at)}. Against the rectified truth: "
+        f"{_named(rectified['kitti_short'], _rectified_e_at)}.",
     )
     dnlo = rows["kitti_long"]["dnlo"]
     middle = all(row.reference in ("B5", "C5", "C10") for row in long.values())
-    marginally = long["dnlo"].reference == "C5" and dnlo["B5"].errors[2] > dnlo["C5"].errors[2]
+    marginally = long["dnlo"].reference == "C5" and _e_at(dnlo["B5"]) > _e_at(dnlo["C5"])
     yield Conclusion(
         "5.2, Table 2",
         "On the long drive the middle step lengths are best: B5, and for DNLO C5, "
         "marginally better than B5.",
         _verdict(middle and marginally, middle),
-        f"Published truth: {named(long, lambda row: row.errors[2])}; DNLO with B5 "
-        f"{dnlo['B5'].errors[2]:.3f} m. Against the rectified truth: "
-        f"{named(against_rectified['kitti_long'], lambda row: rectified_errors(row)[0])}.",
+        f"Published truth: {_named(long, _e_at)}; DNLO with B5 {_e_at(dnlo['B5']):.3f} m. Against "
+        f"the rectified truth: {_named(rectified['kitti_long'], _rectified_e_at)}.",
     )
-    n_b1 = {
-        title: sum(row.reference == "B1" for dataset in chosen for row in chosen[dataset].values())
-        for title, chosen in (("published", best), ("rectified", against_rectified))
-    }
-    mixture = [
-        method
-        for method in _AS_PUBLISHED
-        if results.ours.ranking("mixture", method).index("B1") >= 3
-    ]
+    published_b1, rectified_b1 = (
+        sum(row.reference == "B1" for by_method in chosen.values() for row in by_method.values())
+        for chosen in (best, rectified)
+    )
+    ranks = [results.ours.ranking("mixture", method).index("B1") for method in _AS_PUBLISHED]
     yield Conclusion(
         "5.2, 6",
         "The usual reference B1 is worse than others on realistic data.",
-        _verdict(n_b1["published"] <= 1),
-        f"On the two KITTI drives B1 is the best variant of {n_b1['published']} of 12 "
-        f"(method, drive) against the published truth and of {n_b1['rectified']} "
+        _verdict(published_b1 <= 1),
+        f"On the two KITTI drives B1 is the best variant of {published_b1} of 12 "
+        f"(method, drive) against the published truth and of {rectified_b1} "
         "against the rectified one. With mixed noise B1 is in the worse half of the six "
-        f"references for {len(mixture)} of {len(_AS_PUBLISHED)} methods.",
+        f"references for {sum(rank >= 3 for rank in ranks)} of {len(ranks)} methods.",
     )
 
 
 def _reference_against_method(results: Results, table: Table) -> Conclusion:
     evidence, holds = [], []
     for dataset in (*SIMULATED, *_KITTI_TITLES):
-        errors = {
-            (method, name): _score(results, table, dataset, method, name)
-            for method in (_AS_PUBLISHED if dataset in SIMULATED else METHODS)
-            for name in REFERENCES
-        }
-        methods = {method for method, _ in errors}
-        by_reference = np.median(
-            [
-                max(errors[method, name] for name in REFERENCES)
-                / min(errors[method, name] for name in REFERENCES)
-                for method in methods
-            ]
-        )
-        by_method = np.median(
-            [
-                max(errors[method, name] for method in methods)
-                / min(errors[method, name] for method in methods)
-                for name in REFERENCES
-            ]
+        methods = _AS_PUBLISHED if dataset in SIMULATED else METHODS
+        errors = np.array([_by_reference(results, table, dataset, method) for method in methods])
+        by_reference, by_method = (
+            np.median(errors.max(axis=axis) / errors.min(axis=axis)) for axis in (1, 0)
         )
         holds.append(by_reference > by_method)
         evidence.append(f"{dataset} {by_reference:.1f} against {by_method:.1f}")
@@ -525,7 +429,9 @@ def _reference_against_method(results: Results, table: Table) -> Conclusion:
     )
 
 
-def _score(results: Results, table: Table, dataset: str, method: str, reference: str) -> float:
+def _by_reference(results: Results, table: Table, dataset: str, method: str) -> list[float]:
+    """e_at of a method with every reference."""
     if dataset in SIMULATED:
-        return table.score(dataset, method, reference)
-    return next(row.errors[2] for row in results.of(dataset, method) if row.reference == reference)
+        return [table.score(dataset, method, name) for name in REFERENCES]
+    by_name = {row.reference: _e_at(row) for row in results.of(dataset, method)}
+    return [by_name[name] for name in REFERENCES]

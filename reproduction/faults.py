@@ -5,14 +5,11 @@ names it, what the verdict is, and how wrong the answer is, in its own standard 
 that was interrupted goes on from ``faults.jsonl``. ``--clean`` solves the clean recordings alone.
 """
 
-from __future__ import annotations
-
-import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +27,12 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction import clean_recordings
-from reproduction.coverage.real_sets import Rig, real_rigs
-from reproduction.fault_cases import FAULTS, UNSEEN, UNTUNED, Fault
-from reproduction.unseen_faults import LAST
-from reproduction.writing import markdown_table, put_into_page
+from reproduction.fault_cases import FAULTS, UNTUNED
+from reproduction.fault_parts import Fault
+from reproduction.recordings import Rig, real_rigs
+from reproduction.runner import Store, solve
+from reproduction.unseen_faults import LAST, UNSEEN
+from reproduction.writing import counted, markdown_table, put_into_page
 
 METHODS = ("dnlo", "auto")
 _SEEDS = (0, 1, 2)
@@ -55,7 +54,7 @@ _LATER = {
     "Ten faults that were built after those": UNSEEN,
     "Ten faults that were built when all was done, as they came": LAST,
 }
-_OF_LATER = tuple(fault for faults in _LATER.values() for fault in faults)
+_FAULTS = {fault.code: fault for fault in chain(FAULTS, *_LATER.values())}
 
 # Rules of the verdict that state how a recording is, not that something is wrong.
 _PHYSICAL = frozenset(
@@ -81,29 +80,19 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How a case ended.
-
-    Attributes
-    ----------
-    key : str
-    verdict : str
-    findings : list of str
-        Codes of errors and warnings, ``note:`` before those of notes.
-    metres, degrees : float
-        Error of the answer.
-    z : float
-        Largest error of an axis in its stated standard deviations; axes that are stated as
-        unobservable do not count.
-    rules : list of str
-        Of the verdict's reasons.
-    """
+    """How a case ended."""
 
     key: str
     verdict: str
+    # Codes of errors and warnings, ``note:`` before those of notes.
     findings: list[str]
+    # Error of the answer.
     metres: float = math.nan
     degrees: float = math.nan
+    # Largest error of an axis in its stated standard deviations; axes that are stated as
+    # unobservable do not count.
     z: float = math.nan
+    # Of the verdict's reasons.
     rules: list[str] = field(default_factory=list)
 
 
@@ -113,35 +102,22 @@ def run(
     out: Path,
     page: Path | None,
     jobs: int,
-    advance: Callable[[str], None],
+    advance: Callable[[str], object] = lambda name: None,
 ) -> str:
     """Solve cases, and write the text about them and those solved before into the page; returns the
     text.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    store = out / "faults.jsonl"
-    known = _stored(store)
-    todo = [case for case in todo if case.key not in known]
-    with ProcessPoolExecutor(jobs) as pool, open(store, "a", encoding="utf-8") as file:
-        solving = [pool.submit(outcome, case, folder) for case in todo]
-        for solved in as_completed(solving):
-            found = solved.result()
-            known[found.key] = found
-            file.write(json.dumps(asdict(found)) + "\n")
-            file.flush()
-            advance(found.key)
-    text = report(list(known.values()), folder)
+    store = Store(out / "faults.jsonl", {"study": "faults"})
+    solve(_plain_outcome, {case.key: (case, folder) for case in todo}, jobs, store, advance)
+    text = report([Outcome(**found) for found in store.found.values()], folder)
     (out / "faults.md").write_text(text, encoding="utf-8")
     if page is not None:
         put_into_page(page, "faults", text)
     return text
 
 
-def _stored(store: Path) -> dict[str, Outcome]:
-    if not store.exists():
-        return {}
-    lines = store.read_text(encoding="utf-8").splitlines()
-    return {found.key: found for found in (Outcome(**json.loads(line)) for line in lines)}
+def _plain_outcome(case: Case, folder: Path | None) -> dict[str, Any]:
+    return asdict(outcome(case, folder))
 
 
 def recordings(folder: Path | None) -> list[str]:
@@ -152,15 +128,8 @@ def recordings(folder: Path | None) -> list[str]:
 def cases(folder: Path | None) -> list[Case]:
     """All cases of the study: faults, those that were built later, clean recordings."""
     names = recordings(folder)
-    return [
-        *_cases(_SOUND, 1, names),
-        *(
-            case
-            for fault in (*FAULTS, *_OF_LATER)
-            for case in _cases(fault.code, len(fault.severities), names)
-        ),
-        *clean_cases(folder),
-    ]
+    faulty = (_cases(code, len(fault.severities), names) for code, fault in _FAULTS.items())
+    return [*_cases(_SOUND, 1, names), *chain.from_iterable(faulty), *clean_cases(folder)]
 
 
 def clean_cases(folder: Path | None) -> list[Case]:
@@ -202,9 +171,6 @@ def _of_clean(case: Case, folder: Path | None) -> Outcome:
     options = clean.options if clean.is_real else {"max_pairs": _MAX_PAIRS}
     result = calibrate(clean.parent, clean.child, method=case.method, **options)
     return _judged(case.key, result, clean.T_parent_child)
-
-
-_FAULTS: dict[str, Fault] = {fault.code: fault for fault in (*FAULTS, *_OF_LATER)}
 
 
 def _codes(parent: Trajectory, child: Trajectory) -> list[str]:
@@ -271,10 +237,11 @@ def _rigs(folder: Path | None) -> tuple[Rig, ...]:
 
 def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     """Text of the page."""
-    by_key = {found.key: found for found in outcomes}
-    clean = [found for found in outcomes if _fault_of(found) == _CLEAN]
-    faulty = [found for found in outcomes if _fault_of(found) not in (_CLEAN, _SOUND)]
-    sound = [found for found in outcomes if _fault_of(found) == _SOUND]
+    by_fault: dict[str, list[Outcome]] = {}
+    for found in outcomes:
+        by_fault.setdefault(found.key.split()[0], []).append(found)
+    clean, sound = by_fault.pop(_CLEAN, []), by_fault.pop(_SOUND, [])
+    faulty = list(chain.from_iterable(by_fault.values()))
     parts = []
     if faulty:
         parts += [
@@ -285,20 +252,16 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
             "and methods. Findings and verdicts are counted over recordings and methods, so that "
             "the verdicts say how many there are.",
             _unsafe_text(faulty),
-            "### Faults\n\n" + _table(FAULTS, by_key),
-            f"Without a fault, these recordings end in {_counted(f.verdict for f in sound)}; z is "
+            "### Faults\n\n" + _table(FAULTS, by_fault),
+            f"Without a fault, these recordings end in {counted(f.verdict for f in sound)}; z is "
             f"at most {max((f.z for f in sound), default=0.0):.1f}.",
         ]
     for title, faults in _LATER.items():
-        if any(_fault_of(found) == faults[0].code for found in faulty):
-            parts.append(f"### {title}\n\n" + _table(faults, by_key))
+        if faults[0].code in by_fault:
+            parts.append(f"### {title}\n\n" + _table(faults, by_fault))
     if clean:
         parts.append("### No false alarms\n\n" + _clean_text(clean, folder))
     return "\n\n".join(parts)
-
-
-def _fault_of(found: Outcome) -> str:
-    return found.key.split()[0]
 
 
 def _unsafe_text(faulty: Sequence[Outcome]) -> str:
@@ -313,39 +276,36 @@ def _unsafe_text(faulty: Sequence[Outcome]) -> str:
     )
 
 
-def _table(faults: Sequence[Fault], by_key: dict[str, Outcome]) -> str:
-    header = ["", "fault", "severity", "recordings", "findings", "verdict", "error", "largest z"]
-    rows = [row for fault in faults for row in _rows(fault, by_key)]
-    return markdown_table(header, rows)
+def _table(faults: Sequence[Fault], by_fault: Mapping[str, Sequence[Outcome]]) -> str:
+    rows = []
+    for fault in faults:
+        for index, severity in enumerate(fault.severities):
+            for group in ("hilly", "tango"):
+                start = f"{fault.code} {index} {group}"
+                found = [one for one in by_fault.get(fault.code, ()) if one.key.startswith(start)]
+                if found:
+                    rows.append(_row(fault, severity, group, found))
+    return markdown_table(rows)
 
 
-def _rows(fault: Fault, by_key: dict[str, Outcome]) -> Iterator[list[str]]:
-    for index, severity in enumerate(fault.severities):
-        for group in ("hilly", "tango"):
-            found = [
-                one
-                for key, one in by_key.items()
-                if key.startswith(f"{fault.code} {index} {group}")
-            ]
-            if not found:
-                continue
-            named = _counted(
-                code.removeprefix("note:")
-                for one in found
-                for code in dict.fromkeys(one.findings)
-                if not code.endswith(("gaps", "one_axis"))
-            )
-            answered = [one for one in found if math.isfinite(one.z)]
-            yield [
-                fault.code,
-                fault.what,
-                f"{severity:g} {fault.unit}".strip(),
-                group,
-                named or "none",
-                _counted(one.verdict for one in found),
-                _largest(answered),
-                f"{max(one.z for one in answered):.1f}" if answered else "",
-            ]
+def _row(fault: Fault, severity: float, group: str, found: Sequence[Outcome]) -> dict[str, str]:
+    named = (
+        code.removeprefix("note:")
+        for one in found
+        for code in dict.fromkeys(one.findings)
+        if not code.endswith(("gaps", "one_axis"))
+    )
+    answered = [one for one in found if math.isfinite(one.z)]
+    return {
+        "": fault.code,
+        "fault": fault.what,
+        "severity": f"{severity:g} {fault.unit}".strip(),
+        "recordings": group,
+        "findings": counted(named) or "none",
+        "verdict": counted(one.verdict for one in found),
+        "error": _largest(answered),
+        "largest z": f"{max(one.z for one in answered):.1f}" if answered else "",
+    }
 
 
 def _largest(found: Sequence[Outcome]) -> str:
@@ -353,15 +313,6 @@ def _largest(found: Sequence[Outcome]) -> str:
         return ""
     metres, degrees = (max(getattr(one, name) for one in found) for name in ("metres", "degrees"))
     return f"{1e3 * metres:.0f} mm, {degrees:.2g} deg"
-
-
-def _counted(words: Iterable[str]) -> str:
-    """Words with how often they occur, the most frequent first."""
-    counts: dict[str, int] = {}
-    for word in words:
-        counts[word] = counts.get(word, 0) + 1
-    ranked = sorted(counts.items(), key=lambda item: -item[1])
-    return ", ".join(f"{word} {count}" for word, count in ranked)
 
 
 def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
@@ -376,10 +327,7 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
         wrong.setdefault(name, set()).update(codes)
     n_wrong = sum(map(bool, wrong.values()))
     unexplained = [found for found in outcomes if set(found.rules) - _PHYSICAL]
-    table = markdown_table(
-        ["clean recordings", "solved", "wrong findings", "verdict", "reasons", "largest z"],
-        [_clean_row(kind, of_kind) for kind, of_kind in rows.items()],
-    )
+    table = markdown_table(_clean_row(kind, of_kind) for kind, of_kind in rows.items())
     return (
         f"Wrong findings in {n_wrong} of {len(wrong)} clean recordings ({n_wrong / len(wrong):.1%})"
         f", solved with the default method. {len(outcomes) - len(unexplained)} of "
@@ -393,7 +341,7 @@ def _contradicted_text(outcomes: Sequence[Outcome]) -> str:
     """Of clean recordings in which answers contradict each other."""
     if not outcomes:
         return ""
-    kinds = _counted(clean_recordings.kind_of(_recording_of(found)) for found in outcomes)
+    kinds = counted(clean_recordings.kind_of(_recording_of(found)) for found in outcomes)
     return f" In the others answers contradict each other (`halves`, `methods`, `model`): {kinds}."
 
 
@@ -401,13 +349,13 @@ def _recording_of(found: Outcome) -> str:
     return found.key.split(" ", 2)[2].rpartition(" ")[0]
 
 
-def _clean_row(kind: str, found: Sequence[tuple[Outcome, set[str]]]) -> list[object]:
+def _clean_row(kind: str, found: Sequence[tuple[Outcome, set[str]]]) -> dict[str, object]:
     largest = [one.z for one, _ in found if math.isfinite(one.z)]
-    return [
-        kind,
-        len(found),
-        _counted(code for _, codes in found for code in sorted(codes)) or "none",
-        _counted(one.verdict for one, _ in found),
-        _counted(rule for one, _ in found for rule in dict.fromkeys(one.rules)),
-        f"{max(largest):.1f}" if largest else "",
-    ]
+    return {
+        "clean recordings": kind,
+        "solved": len(found),
+        "wrong findings": counted(c for _, codes in found for c in sorted(codes)) or "none",
+        "verdict": counted(one.verdict for one, _ in found),
+        "reasons": counted(rule for one, _ in found for rule in dict.fromkeys(one.rules)),
+        "largest z": f"{max(largest):.1f}" if largest else "",
+    }

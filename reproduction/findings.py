@@ -2,11 +2,8 @@
 ground truth.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -19,28 +16,25 @@ from hand_eye_calib.solvers.solution import Solution
 from reproduction import comparison
 from reproduction.kitti_truth import RECTIFIED
 from reproduction.published import KITTI, LEVELS, REFERENCES, SIMULATED, Case
-from reproduction.rows import ALI_AS_PUBLISHED, TITLES, Row, agree
+from reproduction.results import Results
+from reproduction.rows import ALI_AS_PUBLISHED, TITLES, Row
+from reproduction.sources import Source
 from reproduction.statistics import Table
-from reproduction.writing import markdown_table, percent, write_text
-
-if TYPE_CHECKING:
-    from reproduction.results import Results
-    from reproduction.sources import Source
+from reproduction.writing import markdown_table, percent, triple, write_text
 
 _WRONG_DEG = 90.0
 
 
 def write(name: str, results: Results) -> list[Path]:
     """Write ``NAME.md`` and rows.csv; returns the paths."""
+    paired = [row for row in results.rows if row.method != "ali" or row.dataset in KITTI]
     return [
         write_text(
             results.out / f"{name}.md",
             "# What the run says about the published results",
             "## Row by row",
-            _agreement(results.rows),
-            comparison.describe_rows(
-                [row for row in results.rows if row.method != "ali" or row.dataset in KITTI]
-            ),
+            _agreement(paired),
+            comparison.describe_rows(paired),
             "## DNLO",
             comparison.describe_dnlo(results.rows),
             _dnlo_by_dataset(results.rows),
@@ -64,15 +58,9 @@ def _agreement(rows: Sequence[Row]) -> str:
         ("Park, Taylor, Zhuang, DNL", ("park", "taylor", "zhuang", "dnl")),
         ("Ali", (ALI_AS_PUBLISHED, "ali")),
     ):
-        chosen = [
-            row
-            for row in rows
-            if row.method in methods and not (row.method == "ali" and row.dataset in SIMULATED)
-        ]
-        lines.append(
-            f"{title}: {percent(sum(row.agrees for row in chosen), len(chosen))} of the "
-            "published rows are reproduced."
-        )
+        agreeing = [row.agrees for row in rows if row.method in methods]
+        share = percent(sum(agreeing), len(agreeing))
+        lines.append(f"{title}: {share} of the published rows are reproduced.")
     return "\n".join(lines)
 
 
@@ -81,58 +69,43 @@ def _dnlo_by_dataset(rows: Sequence[Row]) -> str:
     for dataset in (*SIMULATED, *KITTI):
         chosen = [row for row in rows if (row.dataset, row.method) == (dataset, "dnlo")]
         verdicts = [row.objective_verdict for row in chosen]
-        same = sum(agree(row.errors[2], row.theirs[2]) for row in chosen)
-        counts = [verdicts.count(verdict) for verdict in ("lower", "equal", "higher")]
-        medians = [
-            f"{np.median([getattr(row, name)[2] for row in chosen]):.4f}"
-            for name in ("errors", "published")
-        ]
-        lines.append([dataset, len(chosen), *counts, percent(same, len(chosen)), *medians])
-    header = [
-        "data set",
-        "rows",
-        "objective lower",
-        "equal",
-        "higher",
-        "e_at agrees",
-        "median e_at (m)",
-        "published (m)",
-    ]
-    return markdown_table(header, lines)
+        lines.append(
+            {
+                "data set": dataset,
+                "rows": len(chosen),
+                "objective lower": verdicts.count("lower"),
+                "equal": verdicts.count("equal"),
+                "higher": verdicts.count("higher"),
+                "e_at agrees": percent(sum(row.is_e_at_the_same for row in chosen), len(chosen)),
+                "median e_at (m)": f"{np.median([row.errors[2] for row in chosen]):.4f}",
+                "published (m)": f"{np.median([row.theirs[2] for row in chosen]):.4f}",
+            }
+        )
+    return markdown_table(lines)
 
 
 def _ali(table: Table) -> str:
+    methods = (ALI_AS_PUBLISHED, "ali", "dnl")
+    titles = "reference | e_at (m): published | proper | DNL | e_aR (deg): published | proper | DNL"
     blocks = []
     for dataset in SIMULATED:
         level = LEVELS[dataset][-1]
-        lines = []
-        for reference in REFERENCES:
-            line = [reference]
-            for metric in ("e_at", "e_aR"):
-                values = [
-                    np.median(table.values(dataset, level, method, reference, metric))
-                    for method in (ALI_AS_PUBLISHED, "ali", "dnl")
-                ]
-                line += [f"{value:.4g}" for value in values]
-            lines.append(line)
-        header = [
-            "reference",
-            "e_at (m): published",
-            "proper",
-            "DNL",
-            "e_aR (deg): published",
-            "proper",
-            "DNL",
+        lines = [
+            {"reference": reference}
+            | {
+                f"{metric} {method}": f"{np.median(values):.4g}"
+                for metric in ("e_at", "e_aR")
+                for method in methods
+                if len(values := table.values(dataset, level, method, reference, metric))
+            }
+            for reference in REFERENCES
         ]
         where = "mixture" if level is None else f"{dataset} at {level:g}"
-        best = {
-            method: table.best_reference(dataset, method) for method in (ALI_AS_PUBLISHED, "ali")
-        }
-        choice = (
-            f"Best variant over all levels: {best[ALI_AS_PUBLISHED]} as published, "
-            f"{best['ali']} properly."
+        published, proper = (table.best_reference(dataset, method) for method in methods[:2])
+        blocks.append(
+            f"Medians, {where}. Best variant over all levels: {published} as published, {proper} "
+            f"properly.\n\n{markdown_table(lines, titles)}"
         )
-        blocks.append(f"Medians, {where}. {choice}\n\n{markdown_table(header, lines)}")
     return "\n\n".join(blocks)
 
 
@@ -142,20 +115,18 @@ def _zhuang(rows: Sequence[Row]) -> str:
     free = [row for row in chosen if row.level == 0.0 and row.theirs[3] > _WRONG_DEG]
     runs = sorted({row.run for row in free})
     wrong = sum(row.theirs[3] > _WRONG_DEG for row in chosen)
-    angles = sorted(
-        {
-            round(_angle_deg(np.eye(3), row.transform[:3, :3]), 1)
-            for row in rows
-            if row.run in runs and row.method == "dnl" and row.level == 0.0
-        }
-    )
+    angles = {
+        round(_angle_deg(np.eye(3), row.transform[:3, :3]), 1)
+        for row in rows
+        if row.run in runs and row.method == "dnl" and row.level == 0.0
+    }
     return (
         f"The published answer is more than {_WRONG_DEG:.0f} deg wrong in "
         f"{percent(wrong, len(chosen))} simulated rows, {len(free)} of them without any noise: "
-        f"{', '.join(runs) or 'none'}, whose extrinsic is a turn by {', '.join(map(str, angles))} "
-        "deg. Zhuang's parameters, the axis times the tangent of half the angle, grow without "
-        "bound near 180 deg. Our iteration does the same steps and says so: it has not converged "
-        f"in {unsettled} rows."
+        f"{', '.join(runs) or 'none'}, whose extrinsic is a turn by "
+        f"{', '.join(map(str, sorted(angles)))} deg. Zhuang's parameters, the axis times the "
+        "tangent of half the angle, grow without bound near 180 deg. Our iteration does the same "
+        f"steps and says so: it has not converged in {unsettled} rows."
     )
 
 
@@ -164,26 +135,24 @@ def _truths(source: Source) -> str:
     for dataset in KITTI:
         (case,) = source.cases(dataset, None)
         published, rectified = case.T_parent_child, RECTIFIED[dataset]
-        angle = _angle_deg(published[:3, :3], rectified[:3, :3])
         lines.append(
-            [
-                dataset,
-                _vector(published[:3, 3]),
-                _vector(rectified[:3, 3]),
-                f"{np.linalg.norm(published[:3, 3] - rectified[:3, 3]):.3f}",
-                f"{angle:.3f}",
-            ]
+            {
+                "drive": dataset,
+                "published t (m)": f"({triple(published[:3, 3], form='.4f')})",
+                "rectified t (m)": f"({triple(rectified[:3, 3], form='.4f')})",
+                "apart (m)": f"{_distance(published, rectified):.3f}",
+                "apart (deg)": f"{_angle_deg(published[:3, :3], rectified[:3, :3]):.3f}",
+            }
         )
-    header = ["drive", "published t (m)", "rectified t (m)", "apart (m)", "apart (deg)"]
-    return markdown_table(header, lines)
+    return markdown_table(lines)
 
 
 def _angle_deg(first: FloatArray, second: FloatArray) -> float:
     return float(np.degrees(se3.rotation_angle(first.T @ second)))
 
 
-def _vector(values: Iterable[float]) -> str:
-    return "(" + ", ".join(f"{value:.4f}" for value in values) + ")"
+def _distance(first: FloatArray, second: FloatArray) -> float:
+    return float(np.linalg.norm(first[:3, 3] - second[:3, 3]))
 
 
 def _scale(case: Case) -> str:
@@ -192,36 +161,29 @@ def _scale(case: Case) -> str:
     for method in ("dnl", "dnlo"):
         for reference in ("B5", "B10"):
             scaled = minimize_scalar(
-                lambda scale, method=method, reference=reference: (
-                    _solve_scaled(case, method, reference, scale).objective
+                lambda scale, name, reference: (
+                    _solve_scaled(case, name, reference, scale).objective
                 ),
+                args=(method, reference),
                 bounds=(0.9, 1.1),
                 method="bounded",
                 options={"xatol": 1e-5},
             )
-            line = [f"{TITLES[method]} {reference}"]
-            for scale in (1.0, float(scaled.x)):
+            line = {"method": f"{TITLES[method]} {reference}"}
+            for which, scale in (("given", 1.0), ("estimated", float(scaled.x))):
                 T = _solve_scaled(case, method, reference, scale).T_parent_child
-                e_at = np.linalg.norm(T[:3, 3] - case.T_parent_child[:3, 3])
-                lines_rectified = np.linalg.norm(T[:3, 3] - RECTIFIED["kitti_long"][:3, 3])
-                line += [f"{scale:.4f}", f"{e_at:.3f}", f"{lines_rectified:.3f}"]
+                line[f"scale {which}"] = f"{scale:.4f}"
+                line[f"e_at {which}"] = f"{_distance(T, case.T_parent_child):.3f}"
+                line[f"rectified {which}"] = f"{_distance(T, RECTIFIED['kitti_long']):.3f}"
             lines.append(line)
-    header = [
-        "method",
-        "scale",
-        "e_at (m)",
-        "rectified: e_at (m)",
-        "scale estimated",
-        "e_at (m)",
-        "rectified: e_at (m)",
-    ]
-    return (
-        "The child's lengths times the scale that gives the smallest objective:\n\n"
-        + markdown_table(header, lines)
+    titles = (
+        "method | scale | e_at (m) | rectified: e_at (m) | scale estimated | e_at (m) | rectified: "
+        "e_at (m)"
     )
+    about = "The child's lengths times the scale that gives the smallest objective:"
+    return f"{about}\n\n{markdown_table(lines, titles)}"
 
 
 def _solve_scaled(case: Case, method: str, reference: str, scale: float) -> Solution:
-    poses = case.child.poses.copy()
-    poses[:, :3, 3] *= scale
-    return Method(method).solve(motion_pairs(case.parent.poses, poses, reference))
+    child = case.child.scaled(scale).poses
+    return Method(method).solve(motion_pairs(case.parent.poses, child, reference))

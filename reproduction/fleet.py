@@ -6,8 +6,6 @@ killed.
 Twenty vehicles drive ten times each. On one the mount moves, on another one recording is off.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import multiprocessing
@@ -23,19 +21,18 @@ import numpy as np
 import yaml
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.cli.batch.calibrating import Outcome, work
-from hand_eye_calib.cli.batch.rows import COLUMNS, row_of
-from hand_eye_calib.cli.batch.summary import Vehicle, vehicles_of, write_summary
+from hand_eye_calib.cli.batch.results import write_rows
+from hand_eye_calib.cli.batch.run import write_summary
 from hand_eye_calib.cli.batch.tasks import Task, read_batch
-from hand_eye_calib.cli.batch.workers import Workers, on_cores, on_dask
+from hand_eye_calib.cli.batch.vehicles import Vehicle, vehicles_of
+from hand_eye_calib.cli.batch.workers import Outcome, Workers, on_cores, on_dask, work
 from hand_eye_calib.cli.console import with_progress
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
-from hand_eye_calib.io.tables import write_table
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
-from reproduction.writing import markdown_table, put_into_page
+from reproduction.writing import markdown_table, show
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TOPICS = ("/lidar/odometry", "/camera/odometry")
@@ -122,7 +119,7 @@ def run_on(
                 kill()
                 killed += 1
     outcomes = [found[task.name] for task in tasks]
-    write_table(out, name, COLUMNS, [row_of(outcome) for outcome in outcomes])
+    write_rows(out / f"{name}.csv", outcomes)
     rows = (out / f"{name}.csv").read_text(encoding="utf-8")
     return Run(name, time.monotonic() - started, _cpu_s() - cpu_s, killed, rows, outcomes)
 
@@ -163,22 +160,17 @@ def runs_of(tasks: Sequence[Task], out: Path) -> Iterator[Run]:
 
 def page_text(runs: Sequence[Run], vehicles: Sequence[Vehicle]) -> str:
     """The tables of the page."""
-    first = runs[0]
-    failed = [sum(bool(outcome["error"]) for outcome in run.outcomes) for run in runs]
     ways = markdown_table(
-        ("Run", "Workers killed", "Recordings", "Failed", "Rows as with one worker", "s", "CPU s"),
-        [
-            (
-                run.name,
-                run.killed,
-                len(run.outcomes),
-                n_failed,
-                "all" if run.rows == first.rows else "not all",
-                f"{run.seconds:.0f}",
-                f"{run.cpu_s:.0f}",
-            )
-            for run, n_failed in zip(runs, failed, strict=True)
-        ],
+        {
+            "Run": run.name,
+            "Workers killed": run.killed,
+            "Recordings": len(run.outcomes),
+            "Failed": sum(bool(outcome["error"]) for outcome in run.outcomes),
+            "Rows as with one worker": "all" if run.rows == runs[0].rows else "not all",
+            "s": f"{run.seconds:.0f}",
+            "CPU s": f"{run.cpu_s:.0f}",
+        }
+        for run in runs
     )
     said = [vehicle for vehicle in vehicles if vehicle.agreement.kind.value != "agree"]
     lines = [f"- {vehicle.name}: {vehicle.sentence}" for vehicle in said]
@@ -199,10 +191,7 @@ def main() -> None:
     runs = list(runs_of(tasks, arguments.out))
     vehicles = vehicles_of(runs[0].outcomes)
     write_summary(arguments.out / "summary", str(batch), runs[0].outcomes, vehicles)
-    text = page_text(runs, vehicles)
-    print(text)
-    if arguments.page:
-        put_into_page(arguments.page, "fleet", text)
+    show(arguments.page, {"fleet": page_text(runs, vehicles)})
 
 
 if __name__ == "__main__":

@@ -2,8 +2,6 @@
 alone give, against the truth and against whole poses.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,24 +10,19 @@ from pathlib import Path
 import numpy as np
 
 import hand_eye_calib as hec
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.cli.main import exit_code_of
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction import positions
 from reproduction.coverage import motions
-from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, draw, sigmas
-from reproduction.recordings import recorded_sets
-from reproduction.writing import markdown_table, put_into_page
+from reproduction.coverage.classes import VIO, slam, stamps_ns
+from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
+from reproduction.positions import covers
+from reproduction.repeats import recorded_sets
+from reproduction.writing import markdown_table, show, study_parser
 
-_START_NS = 1_700_000_000_000_000_000
-_QUANTILE_90 = 1.645
-
-_VIO = SensorErrors(white=sigmas(0.0008, 0.03), walk=sigmas(0.004, 0.06))
 _WHITE = SensorErrors(white=sigmas(0.003, 0.2))
-_SLAM = SensorErrors(
-    white=sigmas(0.008, 0.03), slow=(GaussMarkov(10.0, sigmas(0.05, 0.1), in_world=True),)
-)
 
 
 @dataclass(frozen=True)
@@ -46,10 +39,10 @@ class Gyroscope:
 
 
 _RATES: dict[str, tuple[Callable[..., motions.Motion], SensorErrors]] = {
-    "hand-held, visual-inertial odometry": (motions.hand_held, _VIO),
+    "hand-held, visual-inertial odometry": (motions.hand_held, VIO),
     "hand-held, white noise of 0.2 deg": (motions.hand_held, _WHITE),
-    "drone, visual-inertial odometry": (motions.drone, _VIO),
-    "drone, SLAM": (motions.drone, _SLAM),
+    "drone, visual-inertial odometry": (motions.drone, VIO),
+    "drone, SLAM": (motions.drone, slam(10.0, 0.05, 0.1)),
 }
 
 
@@ -73,18 +66,14 @@ def simulated_rates(
     steps = child_rng.standard_normal(rates.shape) / np.sqrt(gyroscope.rate_hz)
     rates += gyroscope.walk * np.cumsum(steps, axis=0)
     return (
-        Trajectory(_stamps_ns(times_s), poses),
-        Trajectory.from_rates(_stamps_ns(fine_s - gyroscope.late_s), rates),
+        Trajectory(stamps_ns(times_s), poses),
+        Trajectory.from_rates(stamps_ns(fine_s - gyroscope.late_s), rates),
         rotation,
         gyroscope.late_s,
     )
 
 
-def _stamps_ns(times_s: FloatArray) -> IntArray:
-    return _START_NS + np.round(times_s * 1e9).astype(np.int64)
-
-
-def rate_rows(n_seeds: int) -> Iterator[list[object]]:
+def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
     """Rows of the table of simulated gyroscopes."""
     pooled = []
     for name in _RATES:
@@ -97,91 +86,68 @@ def rate_rows(n_seeds: int) -> Iterator[list[object]]:
             ratios.append(error / result.sigmas[3:])
             offsets.append(abs(result.time_offset_s - late_s))
         pooled += ratios
-        yield [
-            name,
-            n_seeds,
-            f"{np.median(angles):.3f}",
-            f"{np.max(angles):.3f}",
-            f"{_covers(ratios):.0%}",
-            f"{1e3 * np.median(offsets):.2f}",
-        ]
-    yield ["all", len(pooled), "", "", f"{_covers(pooled):.0%}", ""]
+        yield {
+            "Motion, poses from": name,
+            "Recordings": n_seeds,
+            "Median error (deg)": f"{np.median(angles):.3f}",
+            "Largest (deg)": f"{np.max(angles):.3f}",
+            "Covers": covers(ratios),
+            "Offset, median error (ms)": f"{1e3 * np.median(offsets):.2f}",
+        }
+    together = dict.fromkeys(("Median error (deg)", "Largest (deg)"), "")
+    yield {"": "all", "Recordings": len(pooled), **together, "Covers": covers(pooled), "Offset": ""}
 
 
-def _covers(ratios: Sequence[FloatArray]) -> float:
-    return float(np.mean(np.abs(ratios) < _QUANTILE_90))
-
-
-def tango_rows(data_folder: Path) -> Iterator[list[object]]:
+def tango_rows(data_folder: Path) -> Iterator[dict[str, object]]:
     """Rows of the table of recorded devices; none if the recordings are absent."""
-    for recorded in recorded_sets(data_folder)[0]:
-        if not recorded.name.startswith("tango"):
+    for name, rig in recorded_sets(data_folder)[0].items():
+        if not name.startswith("tango"):
             continue
-        recording = recorded.drives[0]
+        (recording,) = rig.recordings.values()
         whole = hec.calibrate(recording.parent, recording.child, time_offset="estimate")
         rates = differenced(recording.child)
         found = hec.calibrate(recording.parent, rates, time_offset="estimate")
         apart = whole.T_parent_child[:3, :3].T @ found.T_parent_child[:3, :3]
-        yield [
-            recorded.name,
-            f"{np.degrees(se3.rotation_angle(apart)):.2f}",
-            f"{np.degrees(whole.sigmas[3:].max()):.2f}",
-            f"{np.degrees(found.sigmas[3:].max()):.2f}",
-            f"{1e3 * (found.time_offset_s - whole.time_offset_s):.1f}",
-        ]
+        yield {
+            "Parent <- child": name,
+            "Apart (deg)": f"{np.degrees(se3.rotation_angle(apart)):.2f}",
+            "Sigma, poses (deg)": f"{np.degrees(whole.sigmas[3:].max()):.2f}",
+            "Sigma, rates (deg)": f"{np.degrees(found.sigmas[3:].max()):.2f}",
+            "Offsets apart (ms)": f"{1e3 * (found.time_offset_s - whole.time_offset_s):.1f}",
+        }
 
 
 def differenced(trajectory: Trajectory) -> Trajectory:
     """The angular rates between the poses of a trajectory."""
-    rotations, stamps_ns = trajectory.poses[:, :3, :3], trajectory.stamps_ns
+    rotations, at_ns = trajectory.poses[:, :3, :3], trajectory.stamps_ns
     steps = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
-    intervals_ns = np.diff(stamps_ns)
-    return Trajectory.from_rates(
-        stamps_ns[:-1] + intervals_ns // 2, steps / (1e-9 * intervals_ns[:, None])
-    )
-
-
-_RATE_HEADER = (
-    *("Motion, poses from", "Recordings", "Median error (deg)", "Largest (deg)", "Covers"),
-    "Offset, median error (ms)",
-)
-_TANGO_HEADER = (
-    *("Parent <- child", "Apart (deg)", "Sigma, poses (deg)", "Sigma, rates (deg)"),
-    "Offsets apart (ms)",
-)
+    intervals_ns = np.diff(at_ns)
+    middle_ns = at_ns[:-1] + intervals_ns // 2
+    return Trajectory.from_rates(middle_ns, steps / (1e-9 * intervals_ns[:, None]))
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Make the tables; returns the exit code."""
     seeds, data_folder = arguments.seeds, arguments.data_folder
-    if arguments.what == "rates":
-        tables = {"rates": markdown_table(_RATE_HEADER, rate_rows(seeds))}
-        if data_folder:
-            tables["tango"] = markdown_table(_TANGO_HEADER, tango_rows(data_folder))
-    else:
-        rows = positions.simulated_rows(seeds)
-        tables = {"receivers": markdown_table(positions.SIMULATED_HEADER, rows)}
-        if data_folder:
-            rows = positions.recorded_rows(data_folder)
-            tables["recorded"] = markdown_table(positions.RECORDED_HEADER, rows)
-            rows = positions.parts_rows(data_folder)
-            tables["parts"] = markdown_table(positions.PARTS_HEADER, rows)
-    for name, table in tables.items():
-        print(f"{table}\n")
-        if arguments.page:
-            put_into_page(arguments.page, name, table)
+    rows = {"rates": rate_rows} if arguments.what == "rates" else {}
+    recorded = {"tango": tango_rows}
+    if arguments.what == "positions":
+        rows = {"receivers": positions.simulated_rows}
+        recorded = {"recorded": positions.recorded_rows, "parts": positions.parts_rows}
+    tables = {name: markdown_table(of(seeds)) for name, of in rows.items()}
+    if data_folder:
+        tables |= {name: markdown_table(of(data_folder)) for name, of in recorded.items()}
+    show(arguments.page, tables)
     return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m reproduction.partial", description=__doc__)
+    parser = study_parser("reproduction.partial", __doc__)
     parser.add_argument("what", choices=("rates", "positions"))
     parser.add_argument(
         "--seeds", type=int, default=40, help="recordings of each kind. Default: 40"
     )
-    parser.add_argument("--data-folder", type=Path, help="folder of recordings with known answers")
-    parser.add_argument("--page", type=Path, help="put the tables into this Markdown page")
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 

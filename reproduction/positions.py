@@ -1,7 +1,5 @@
 """Streams of positions: simulated RTK receivers, and recordings with a known lever arm."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,17 +10,15 @@ import hand_eye_calib as hec
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import read_trajectory_file
 from reproduction.coverage import motions
-from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
-from reproduction.recordings import Recording
+from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, stamps_ns
+from reproduction.coverage.sensor_errors import SensorErrors, draw
+from reproduction.recordings import Recording, Rig, real_rigs
+from reproduction.writing import triple
 
-_START_NS = 1_700_000_000_000_000_000
-_QUANTILE_90 = 1.645
+# Normal errors are within so many sigmas in nine cases of ten.
+QUANTILE_90 = 1.645
 _N_PARTS = 3
-
-_LIDAR = SensorErrors(white=sigmas(0.01, 0.03), walk_by_metre=sigmas(0.006, 0.012))
-_VIO = SensorErrors(white=sigmas(0.0008, 0.03), walk=sigmas(0.004, 0.06))
 
 
 @dataclass(frozen=True)
@@ -39,9 +35,9 @@ class Machine:
 
 
 MACHINES = {
-    "car": Machine(motions.car, _LIDAR, 10.0, 240.0, 2.0),
-    "excavator": Machine(motions.excavator, _LIDAR, 10.0, 240.0, 2.0),
-    "hand-held": Machine(motions.hand_held, _VIO, 30.0, 120.0, 0.3),
+    "car": Machine(motions.car, LIDAR_ODOMETRY, 10.0, 240.0, 2.0),
+    "excavator": Machine(motions.excavator, LIDAR_ODOMETRY, 10.0, 240.0, 2.0),
+    "hand-held": Machine(motions.hand_held, VIO, 30.0, 120.0, 0.3),
 }
 
 
@@ -83,14 +79,10 @@ def simulated_positions(name: str, seed: int) -> tuple[Trajectory, Trajectory, F
     positions += _float_errors(receiver, fixes_s, rng)
     kept = _received(receiver, len(fixes_s), rng)
     return (
-        Trajectory(_stamps_ns(times_s), poses),
-        Trajectory.from_positions(_stamps_ns(fixes_s[kept]), positions[kept]),
+        Trajectory(stamps_ns(times_s), poses),
+        Trajectory.from_positions(stamps_ns(fixes_s[kept]), positions[kept]),
         lever_arm,
     )
-
-
-def _stamps_ns(times_s: FloatArray) -> np.ndarray:
-    return _START_NS + np.round(times_s * 1e9).astype(np.int64)
 
 
 def _float_errors(receiver: Receiver, times_s: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -115,13 +107,12 @@ def _received(receiver: Receiver, count: int, rng: np.random.Generator) -> BoolA
     return received
 
 
-SIMULATED_HEADER = (
-    *("Machine", "Recordings", "Median error x, y, z (cm)", "Median sigma x, y, z (cm)"),
-    *("Covers", "Told unobservable"),
-)
+def covers(ratios: FloatArray | list[FloatArray]) -> str:
+    """Share of errors over their sigmas that the 90 % interval covers."""
+    return f"{np.mean(np.abs(ratios) < QUANTILE_90):.0%}"
 
 
-def simulated_rows(n_seeds: int) -> Iterator[list[object]]:
+def simulated_rows(n_seeds: int) -> Iterator[dict[str, object]]:
     """Rows of the table of simulated receivers."""
     pooled: list[FloatArray] = []
     for name in MACHINES:
@@ -134,109 +125,80 @@ def simulated_rows(n_seeds: int) -> Iterator[list[object]]:
         ratios = np.abs(errors) / np.array(stated)
         known = np.isfinite(stated)
         pooled.append(ratios[known])
-        yield [
-            name,
-            n_seeds,
-            _in_cm(np.median(np.abs(errors), axis=0)),
-            _in_cm(np.median(stated, axis=0)),
-            f"{np.mean(ratios[known] < _QUANTILE_90):.0%}",
-            int((~known).sum()),
-        ]
-    together = np.concatenate(pooled)
-    yield ["all", 3 * n_seeds, "", "", f"{np.mean(together < _QUANTILE_90):.0%}", ""]
+        yield {
+            "Machine": name,
+            "Recordings": n_seeds,
+            "Median error x, y, z (cm)": triple(np.median(np.abs(errors), axis=0), 100.0),
+            "Median sigma x, y, z (cm)": triple(np.median(stated, axis=0), 100.0),
+            "Covers": covers(ratios[known]),
+            "Told unobservable": int((~known).sum()),
+        }
+    empty = dict.fromkeys(("error", "sigma"), "")
+    together = covers(np.concatenate(pooled))
+    yield {"Machine": "all", "Recordings": 3 * n_seeds, **empty, "Covers": together, "Told": ""}
 
 
-def _in_cm(values: FloatArray) -> str:
-    return ", ".join(f"{100 * value:.1f}" for value in values)
-
-
-_EUROC_LEVER = np.array([-0.0216401, -0.0646770, 0.0098107])
-_KITTI_LEVER = np.array([0.8, -0.3, 0.5])
-RECORDED_HEADER = (
-    *("Positions against odometry", "Error x, y, z (mm)", "In all (mm)", "Sigma x, y, z (mm)"),
-    *("Largest error / sigma", "The same with the truth's sigma"),
-    "Error of whole poses x, y, z (mm)",
-)
-
-
-def _recordings() -> dict[str, tuple[str, str, FloatArray, float]]:
-    """Files of odometry and positions, the lever arm and how well it is known (m)."""
-    recordings = {
-        f"EuRoC {flight}, {kind} odometry": (
-            f"euroc_vio/vio_{kind}_{flight}.tum",
-            f"euroc_vio/cam0_truth_{flight}.tum",
-            _EUROC_LEVER,
-            0.01,
-        )
-        for kind in ("stereo", "mono")
-        for flight in ("mh_03", "mh_05", "v2_01")
+def _recordings(data_folder: Path) -> Iterator[tuple[str, Rig, Recording]]:
+    """Recordings with a known lever arm by their names on the page."""
+    titles = {
+        "euroc_stereo": "EuRoC {}, stereo odometry",
+        "euroc_mono": "EuRoC {}, mono odometry",
+        "simple_kitti": "KITTI {}, lidar odometry",
     }
-    recordings |= {
-        f"KITTI {drive}, lidar odometry": (
-            f"simple_kitti/odometry_{drive}.tum",
-            f"simple_kitti/truth_{drive}.tum",
-            _KITTI_LEVER,
-            0.0,
-        )
-        for drive in ("05", "07")
-    }
-    return recordings
+    rigs = {rig.name: rig for rig in real_rigs(data_folder)[0]}
+    for which in (name for name in titles if name in rigs):
+        for name, recording in rigs[which].recordings.items():
+            yield titles[which].format(name), rigs[which], recording
 
 
-def _streams(data_folder: Path, *names: str) -> list[Trajectory]:
-    return [read_trajectory_file(data_folder / name)[0] for name in names]
-
-
-def recorded_rows(data_folder: Path) -> Iterator[list[object]]:
+def recorded_rows(data_folder: Path) -> Iterator[dict[str, object]]:
     """Rows of the table of recordings; sigmas with the common-mode floor."""
-    for name, (parent, child, lever_arm, truth_m) in _recordings().items():
-        streams = _streams(data_folder, parent, child)
+    for name, rig, recording in _recordings(data_folder):
+        streams = recording.parent, recording.child
+        assert rig.truth is not None
+        lever_arm, truth_m = rig.truth.T_parent_child[:3, 3], rig.truth.sigmas[0]
         result = hec.calibrate(*streams, child_measures="positions")
         whole = hec.calibrate(*streams, time_offset="estimate", scale="auto")
         error = result.T_parent_child[:3, 3] - lever_arm
         stated = result.sigmas_with_floor[:3]
-        yield [
-            name,
-            _in_mm(error),
-            f"{1e3 * np.linalg.norm(error):.0f}",
-            _in_mm(stated),
-            f"{np.abs(error / stated).max():.1f}",
-            f"{np.abs(error / np.hypot(stated, truth_m)).max():.1f}",
-            _in_mm(whole.T_parent_child[:3, 3] - lever_arm),
-        ]
+        yield {
+            "Positions against odometry": name,
+            "Error x, y, z (mm)": _in_mm(error),
+            "In all (mm)": f"{1e3 * np.linalg.norm(error):.0f}",
+            "Sigma x, y, z (mm)": _in_mm(stated),
+            "Largest error / sigma": f"{np.abs(error / stated).max():.1f}",
+            "The same with the truth's sigma": (
+                f"{np.abs(error / np.hypot(stated, truth_m)).max():.1f}"
+            ),
+            "Error of whole poses x, y, z (mm)": _in_mm(whole.T_parent_child[:3, 3] - lever_arm),
+        }
 
 
 def _in_mm(values: FloatArray) -> str:
     return ", ".join(f"{1000 * value:.0f}" if np.isfinite(value) else "-" for value in values)
 
 
-PARTS_HEADER = ("Thirds of", "Scatter x, y, z (mm)", "Sigma x, y, z (mm)", "Chi-square of 6")
-
-
-def parts_rows(data_folder: Path) -> Iterator[list[object]]:
+def parts_rows(data_folder: Path) -> Iterator[dict[str, object]]:
     """Rows of the table of recordings in three parts: how far their lever arms are apart, against
     their covariances with the common-mode floor. No truth is needed for that.
     """
-    total = 0.0
-    recordings = _recordings()
-    for name, (parent, child, *_) in recordings.items():
-        whole = Recording(*_streams(data_folder, parent, child))
+    misfits = []
+    for name, _, whole in _recordings(data_folder):
         parts = [
             hec.calibrate(part.parent, part.child, child_measures="positions")
             for part in whole.parts(_N_PARTS, 0.0)
         ]
         lever_arms = np.array([part.T_parent_child[:3, 3] for part in parts])
         covariances = np.array([part.covariance_with_floor[:3, :3] for part in parts])
-        chi_square = _misfit_of_mean(lever_arms, covariances)
-        total += chi_square
+        misfits.append(_misfit_of_mean(lever_arms, covariances))
         variances = np.diagonal(covariances, axis1=1, axis2=2)
-        yield [
-            name,
-            _in_mm(lever_arms.std(axis=0, ddof=1)),
-            _in_mm(np.sqrt(variances.mean(axis=0))),
-            f"{chi_square:.1f}",
-        ]
-    yield ["all, the mean", "", "", f"{total / len(recordings):.1f}"]
+        yield {
+            "Thirds of": name,
+            "Scatter x, y, z (mm)": _in_mm(lever_arms.std(axis=0, ddof=1)),
+            "Sigma x, y, z (mm)": _in_mm(np.sqrt(variances.mean(axis=0))),
+            "Chi-square of 6": f"{misfits[-1]:.1f}",
+        }
+    yield {"": "all, the mean", "scatter": "", "sigma": "", "chi2": f"{np.mean(misfits):.1f}"}
 
 
 def _misfit_of_mean(values: FloatArray, covariances: FloatArray) -> float:

@@ -5,8 +5,6 @@ The folder is a clone of that repository: ``kitti_tests`` and ``simulation_tests
 in TUM format, ``calib`` (or ``published``) one CSV of results per test set.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -44,6 +42,8 @@ SIMULATED = tuple(_LEVELS)
 KITTI = ("kitti_short", "kitti_long")
 LEVELS = {dataset: tuple(folders.values()) for dataset, folders in _LEVELS.items()}
 _RESULTS_FOLDERS = ("published", "calib")
+KEYFRAMES = "KeyFrameTrajectory_TUM_Format.txt"
+KITTI_DRIVES = ("2011_09_30_drive_0027", "2011_10_03_drive_0027")
 
 # The answers of a closed-form method agree to the eight digits that are printed.
 _SAME_ANSWER = 1e-6
@@ -61,38 +61,27 @@ class PublishedResult:
 
 @dataclass(frozen=True)
 class Case:
-    """A pair of synchronised trajectories with ground truth and published results.
+    """A pair of synchronised trajectories with ground truth and published results."""
 
-    Attributes
-    ----------
-    dataset : str
-        noise, outliers, drift, mixture, kitti_short or kitti_long.
-    level : float or None
-        noise: standard deviation per pose, m (twice that in rad). outliers: per cent of the poses.
-        drift: m per m. None for the others.
-    run : str
-        Name of the trajectory within its data set.
-    parent, child : Trajectory
-        Poses at the same stamps.
-    T_parent_child : (4, 4) array
-        Ground truth as published, metres.
-    results : dict
-        (method, reference) to :class:`PublishedResult`.
-    """
-
+    # noise, outliers, drift, mixture, kitti_short or kitti_long.
     dataset: str
+    # noise: standard deviation per pose, m (twice that in rad). outliers: per cent of the poses.
+    # drift: m per m. None for the others.
     level: float | None
+    # Name of the trajectory within its data set.
     run: str
+    # Poses at the same stamps.
     parent: Trajectory
     child: Trajectory
+    # Ground truth as published, metres; (4, 4) array.
     T_parent_child: FloatArray
+    # (method, reference) to :class:`PublishedResult`.
     results: Mapping[tuple[str, str], PublishedResult]
 
     @property
     def name(self) -> str:
         """Such as noise/0.002/run_12."""
-        level = [] if self.level is None else [f"{self.level:g}"]
-        return "/".join([self.dataset, *level, self.run])
+        return "/".join([*path_to(self.dataset, self.level), self.run])
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -104,6 +93,11 @@ class Case:
         return motion_pairs(self.parent.poses, self.child.poses, reference)
 
 
+def path_to(dataset: str, level: float | None) -> list[str]:
+    """The data set and, if it has one, the level."""
+    return [dataset] if level is None else [dataset, f"{level:g}"]
+
+
 # Name, parent, child, truth.
 Run = tuple[str, Trajectory, Trajectory, FloatArray]
 # By level (None without one), then by method and reference, in the order of the file.
@@ -111,13 +105,7 @@ PublishedResults = dict[float | None, dict[tuple[str, str], list[PublishedResult
 
 
 def check_folder(folder: str | Path) -> Path:
-    """The folder as a path.
-
-    Raises
-    ------
-    InputError
-        If it is not the folder of the published data.
-    """
+    """The folder as a path. Raises InputError if it is not the folder of the published data."""
     folder = Path(folder)
     missing = [name for name in ("kitti_tests", "simulation_tests") if not (folder / name).is_dir()]
     if not any((folder / name).is_dir() for name in _RESULTS_FOLDERS):
@@ -139,86 +127,63 @@ def results_folder(folder: Path) -> Path:
 
 def load_kitti_short(folder: str | Path) -> Case:
     """Drive 2011_09_30_drive_0027: parent lidar, child grey stereo camera without its first pose,
-    which precedes the lidar's first.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or cannot be used.
+    which precedes the lidar's first. Raises InputError if a file is missing or cannot be used.
     """
-    folder = check_folder(folder)
-    drive = folder / "kitti_tests" / "2011_09_30_drive_0027"
     return _kitti_case(
+        check_folder(folder),
         "kitti_short",
-        read_trajectory(drive / "LIDAR_HDL64E" / "traj_HDL_aft_opt.csv"),
-        read_trajectory(drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt")[1:],
-        drive / "camera_gray_left_in_velo_link.txt",
-        results_folder(folder) / "kitti_tests_keyframe.csv",
+        KITTI_DRIVES[0],
+        ("LIDAR_HDL64E/traj_HDL_aft_opt.csv", f"cam01/{KEYFRAMES}"),
+        "camera_gray_left_in_velo_link.txt",
+        "kitti_tests_keyframe.csv",
+        first=1,
     )
 
 
 def load_kitti_long(folder: str | Path) -> Case:
-    """Drive 2011_10_03_drive_0027: parent grey stereo camera, child colour stereo camera.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or cannot be used.
+    """Drive 2011_10_03_drive_0027: parent grey stereo camera, child colour stereo camera. Raises
+    InputError if a file is missing or cannot be used.
     """
-    folder = check_folder(folder)
-    drive = folder / "kitti_tests" / "2011_10_03_drive_0027"
     return _kitti_case(
+        check_folder(folder),
         "kitti_long",
-        read_trajectory(drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt"),
-        read_trajectory(drive / "cam23" / "KeyFrameTrajectory_TUM_Format.txt"),
-        drive / "camera_color_left_in_camera_gray_left.txt",
-        results_folder(folder) / "kitti_tests_long_cam.csv",
+        KITTI_DRIVES[1],
+        (f"cam01/{KEYFRAMES}", f"cam23/{KEYFRAMES}"),
+        "camera_color_left_in_camera_gray_left.txt",
+        "kitti_tests_long_cam.csv",
     )
 
 
 def _kitti_case(
-    dataset: str, parent: Trajectory, child: Trajectory, truth_file: Path, results_file: Path
+    folder: Path,
+    dataset: str,
+    name: str,
+    streams: Sequence[str],
+    truth: str,
+    results_file: str,
+    first: int = 0,
 ) -> Case:
+    """A drive from its files; of the child from pose ``first`` on."""
+    drive = folder / "kitti_tests" / name
+    parent, child = (read_trajectory(drive / stream) for stream in streams)
+    child = child[first:]
     # As in the paper: the parent's poses at the child's stamps, extrapolated along its end segments
     # if the child's stamps reach further.
     parent_at_child = Trajectory(
         child.stamps_ns, parent.at(child.stamps_ns, extrapolate=True, straight=True)
     )
-    results = {key: rows[0] for key, rows in _read_results(results_file, None)[None].items()}
-    return Case(
-        dataset,
-        None,
-        truth_file.parent.name,
-        parent_at_child,
-        child,
-        read_trajectory(truth_file).poses[0],
-        results,
-    )
+    published = _read_results(results_folder(folder) / results_file, None)[None]
+    T_parent_child = read_trajectory(drive / truth).poses[0]
+    results = {key: rows[0] for key, rows in published.items()}
+    return Case(dataset, None, name, parent_at_child, child, T_parent_child, results)
 
 
 def load_simulated(
     folder: str | Path, datasets: Sequence[str] = SIMULATED, levels: Sequence[float] | None = None
 ) -> list[Case]:
-    """The simulated cases: 38 trajectories at each of six levels of noise, outliers and drift, and
-    in the mixture.
-
-    Parameters
-    ----------
-    folder : path
-    datasets : sequence of str
-        Which of noise, outliers, drift, mixture.
-    levels : sequence of float, optional
-        Only these levels; the mixture has none and is always loaded.
-
-    Returns
-    -------
-    list of Case
-        By data set, level and the order of the published results.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or cannot be used.
+    """The simulated cases by data set, level and the order of the published results: 38
+    trajectories at each of six levels of noise, outliers and drift, or only at ``levels``; and in
+    the mixture, which has none. Raises InputError if a file is missing or cannot be used.
     """
     folder = check_folder(folder)
     cases = []
@@ -310,12 +275,7 @@ def _read_results(path: Path, level_column: str | None) -> PublishedResults:
 
 
 def _result(row: Mapping[str, str]) -> PublishedResult:
-    matrix = np.array(row["T"].replace("[", " ").replace("]", " ").split(), dtype=float).reshape(
-        4, 4
-    )
-    e_rt, e_rR_deg, e_at, e_aR_deg = (
-        float(row[column]) for column in ("err_tr", "err_R", "abs_tr", "abs_R")
-    )
-    return PublishedResult(
-        matrix, Errors(e_rt, float(np.radians(e_rR_deg)), e_at, float(np.radians(e_aR_deg)))
-    )
+    numbers = np.array(row["T"].replace("[", " ").replace("]", " ").split(), dtype=float)
+    e_rt, e_at = float(row["err_tr"]), float(row["abs_tr"])
+    e_rR, e_aR = (float(np.radians(float(row[column]))) for column in ("err_R", "abs_R"))
+    return PublishedResult(numbers.reshape(4, 4), Errors(e_rt, e_rR, e_at, e_aR))

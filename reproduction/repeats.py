@@ -8,12 +8,10 @@ systematic errors (a miscalibrated sensor, scan distortion in every turn); only 
 ground truth, the second table, shows those.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -23,13 +21,11 @@ from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.engine.offline import calibrate
-from reproduction.recordings import PARTS, RecordedSet, Recording, recorded_sets
+from reproduction.recordings import PARTS, Recording, Rig, real_rigs
+from reproduction.results import Results
 from reproduction.runner import in_parallel
 from reproduction.sources import PublishedSource
 from reproduction.writing import markdown_table, write_csv, write_text
-
-if TYPE_CHECKING:
-    from reproduction.results import Results
 
 METHODS = {
     "adaptive": {"method": "adaptive"},
@@ -37,8 +33,16 @@ METHODS = {
     "dnlo B10": {"method": "dnlo", "reference": "B10"},
 }
 
-# Options of a user who knows neither clock offset nor scale.
-_OPTIONS = {"time_offset": "estimate", "scale": "auto"}
+# Rigs and their names here.
+_SETS = {
+    "kitti_short": "kitti_short",
+    "kitti_long": "kitti_long",
+    "zxl19_lidar": "zxl19",
+    "tango_caligula_mars": "tango C<-M",
+    "tango_mars_nero": "tango M<-N",
+    "tango_nero_caligula": "tango N<-C",
+}
+_FOLDERS = ("valimaki2023", "zxl19", "asl_tango_easy")
 
 # The references among which the error on KITTI is followed.
 _OTHER_REFERENCES = ("B1", "B2", "B5", "B10", "B20")
@@ -54,24 +58,16 @@ _UNIT_NAMES = ("m",) * 3 + ("deg",) * 3
 
 @dataclass(frozen=True)
 class AxisRatio:
-    """Scatter of repeats over their stated standard deviation, on one axis.
-
-    Attributes
-    ----------
-    dataset, method, axis : str
-    spread, sigma : float
-        Standard deviation of the answers, and root mean square of the stated ones; m or deg.
-    ratio : float
-    freedom : int
-        Degrees of freedom of the ratio.
-    """
+    """Scatter of repeats over their stated standard deviation, on one axis."""
 
     dataset: str
     method: str
     axis: str
+    # Standard deviation of the answers, and root mean square of the stated ones; m or deg.
     spread: float
     sigma: float
     ratio: float
+    # Degrees of freedom of the ratio.
     freedom: int
 
     @property
@@ -83,20 +79,25 @@ class AxisRatio:
 Truth = dict[str, Any]
 
 
+def recorded_sets(folder: Path) -> tuple[dict[str, Rig], list[str]]:
+    """The rigs of this study whose files are there, by name, and the folders that are not."""
+    rigs, absent = real_rigs(folder)
+    sets = {_SETS[rig.name]: rig for rig in rigs if rig.name in _SETS}
+    return sets, [name for name in _FOLDERS if name in absent]
+
+
 def write(name: str, results: Results) -> list[Path]:
     """Calibrate all repeats and write ``NAME.csv``, ``NAME_truth.csv``, ``NAME.md`` and the figure;
     returns their paths.
     """
+    from reproduction import paper_figures
+
     assert isinstance(results.source, PublishedSource)
     sets, absent = recorded_sets(Path(results.source.folder).parent)
-    tasks = [(found, method) for found in sets for method in METHODS]
-    ratios: list[AxisRatio] = sum(in_parallel(_set_ratios, tasks, results.jobs), [])
-    truths: list[Truth] = sum(
-        in_parallel(
-            _against_truth, [task for task in tasks if task[0].truth is not None], results.jobs
-        ),
-        [],
-    )
+    tasks = [(dataset, rig, method) for dataset, rig in sets.items() for method in METHODS]
+    ratios: list[AxisRatio] = sum(in_parallel(axis_ratios, tasks, results.jobs), [])
+    on_kitti = [task for task in tasks if task[0].startswith("kitti")]
+    truths: list[Truth] = sum(in_parallel(_against_truth, on_kitti, results.jobs), [])
     text = [
         "# Does the stated sigma predict the spread between repeats?",
         f"Left out, since their folders are absent: {', '.join(absent)}." if absent else "",
@@ -111,35 +112,20 @@ def write(name: str, results: Results) -> list[Path]:
         "### Against the rectified ground truth of KITTI",
         f"Every axis whose error is above {_SUSPICIOUS:g} sigma, with a reason from the scatter of "
         f"the thirds and from other references (DNLO). {name}_truth.csv has every axis.",
-        _truth_table(truths),
+        markdown_table(_printed(row) for row in truths if row["why"]),
     ]
-    paths = [
-        write_csv(
-            results.out / f"{name}.csv", _RATIO_HEADER, [_ratio_row(ratio) for ratio in ratios]
-        ),
-        write_csv(
-            results.out / f"{name}_truth.csv",
-            list(truths[0]),
-            [list(row.values()) for row in truths],
-        )
-        if truths
-        else None,
-        write_text(results.out / f"{name}.md", *text),
-        *_draw(results.out / name, ratios),
-    ]
-    return [path for path in paths if path is not None]
-
-
-def _draw(stem: Path, ratios: Sequence[AxisRatio]) -> list[Path]:
-    # Imported here: the numbers need no Matplotlib.
-    from reproduction import repeat_figures
-
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    by_axis: dict[str, dict[str, dict[str, float]]] = {}
     for ratio in ratios:
-        found.setdefault(ratio.method, {}).setdefault(ratio.dataset, {})[ratio.axis] = ratio.ratio
-    return repeat_figures.draw_ratios(
-        "Spread between repeats over stated sigma", found, band(3), stem
-    )
+        of_method = by_axis.setdefault(ratio.method, {})
+        of_method.setdefault(ratio.dataset, {})[ratio.axis] = ratio.ratio
+    return [
+        write_csv(results.out / f"{name}.csv", map(_ratio_row, ratios)),
+        *([write_csv(results.out / f"{name}_truth.csv", truths)] if truths else []),
+        write_text(results.out / f"{name}.md", *text),
+        *paper_figures.draw_ratios(
+            "Spread between repeats over stated sigma", by_axis, band(3), results.out / name
+        ),
+    ]
 
 
 def band(freedom: int) -> tuple[float, float]:
@@ -162,148 +148,111 @@ def spread_and_sigma(
     sigmas = np.array([answer.sigmas for answer in calibrations])
     are_known = [[dof.verdict in _KNOWN for dof in answer.observability] for answer in calibrations]
     known: BoolArray = np.logical_and.reduce(are_known)
-    deviations = np.array(
-        [
-            deviation(answer.T_parent_child, calibrations[0].T_parent_child)
-            for answer in calibrations
-        ]
-    )
+    first = calibrations[0].T_parent_child
+    deviations = np.array([deviation(answer.T_parent_child, first) for answer in calibrations])
     stated = np.where(known, (np.where(known, sigmas, 0.0) ** 2).mean(axis=0), np.inf)
     return deviations.var(axis=0, ddof=1), stated, known
 
 
-def _answer(recording: Recording, found: RecordedSet, method: str, **options: Any) -> Calibration:
-    return calibrate(
-        recording.parent,
-        recording.child,
-        **{**_OPTIONS, **found.options, **METHODS[method], **options},
-    )
+def _answer(recording: Recording, rig: Rig, method: str, **options: Any) -> Calibration:
+    options = {**rig.options, **METHODS[method], **options}
+    return calibrate(recording.parent, recording.child, **options)
 
 
-def _groups(found: RecordedSet, method: str) -> list[list[Calibration]]:
+def _groups(rig: Rig, method: str) -> list[list[Calibration]]:
     """Lists of answers that repeat each other."""
-    if len(found.drives) > 1:
-        return [[_answer(drive, found, method) for drive in found.drives]]
-    whole = found.drives[0]
-    offset_s = _answer(whole, found, method).time_offset_s
+    whole, *others = rig.recordings.values()
+    if others:
+        return [[_answer(drive, rig, method) for drive in (whole, *others)]]
+    offset_s = _answer(whole, rig, method).time_offset_s
     return [
-        [_answer(part, found, method) for part in whole.parts(count, offset_s)] for count in PARTS
+        [_answer(part, rig, method) for part in whole.parts(count, offset_s)] for count in PARTS
     ]
 
 
-def _set_ratios(found: RecordedSet, method: str) -> list[AxisRatio]:
-    """AxisRatio of every axis that all repeats of a set observe."""
-    groups = [(len(answers) - 1, *spread_and_sigma(answers)) for answers in _groups(found, method)]
+def axis_ratios(dataset: str, rig: Rig, method: str) -> list[AxisRatio]:
+    """AxisRatio of every axis that all repeats of a rig observe."""
+    groups = [(len(answers) - 1, *spread_and_sigma(answers)) for answers in _groups(rig, method)]
     freedom = sum(degrees for degrees, *_ in groups)
     known = np.logical_and.reduce([known for *_, known in groups])
-    summed = sum(degrees * spread / stated for degrees, spread, stated, _ in groups)
-    squared = np.asarray(summed) / freedom
-    spread = np.sqrt(sum(degrees * spread for degrees, spread, _, _ in groups) / freedom) * _UNITS
     with np.errstate(invalid="ignore"):
-        sigma = (
-            np.sqrt(sum(degrees * stated for degrees, _, stated, _ in groups) / freedom) * _UNITS
+        squared, spread, sigma = (
+            np.asarray(sum(degrees * values for degrees, values in terms)) / freedom
+            for terms in (
+                [(degrees, spread / stated) for degrees, spread, stated, _ in groups],
+                [(degrees, spread) for degrees, spread, _, _ in groups],
+                [(degrees, stated) for degrees, _, stated, _ in groups],
+            )
         )
-    return [
-        AxisRatio(
-            found.name,
-            method,
-            axis,
-            float(spread[index]),
-            float(sigma[index]),
-            float(np.sqrt(squared[index])),
-            freedom,
-        )
-        for index, axis in enumerate(AXES)
-        if known[index]
-    ]
+    found = []
+    for k in np.flatnonzero(known):
+        spread_k, sigma_k = (float(np.sqrt(each[k]) * _UNITS[k]) for each in (spread, sigma))
+        ratio = float(np.sqrt(squared[k]))
+        found.append(AxisRatio(dataset, method, AXES[k], spread_k, sigma_k, ratio, freedom))
+    return found
 
 
-_RATIO_HEADER = [
-    "set",
-    "method",
-    "axis",
-    "spread (m or deg)",
-    "stated sigma (m or deg)",
-    "ratio",
-    "degrees of freedom",
-    "95 % from",
-    "95 % to",
-    "within a factor of two",
-]
-
-
-def _ratio_row(ratio: AxisRatio) -> list[object]:
-    return [
-        ratio.dataset,
-        ratio.method,
-        ratio.axis,
-        ratio.spread,
-        ratio.sigma,
-        ratio.ratio,
-        ratio.freedom,
-        *band(ratio.freedom),
-        ratio.is_within_two,
-    ]
+def _ratio_row(ratio: AxisRatio) -> dict[str, object]:
+    low, high = band(ratio.freedom)
+    return {
+        "set": ratio.dataset,
+        "method": ratio.method,
+        "axis": ratio.axis,
+        "spread (m or deg)": ratio.spread,
+        "stated sigma (m or deg)": ratio.sigma,
+        "ratio": ratio.ratio,
+        "degrees of freedom": ratio.freedom,
+        "95 % from": low,
+        "95 % to": high,
+        "within a factor of two": ratio.is_within_two,
+    }
 
 
 def _ratio_table(ratios: Sequence[AxisRatio]) -> str:
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for ratio in ratios:
-        rows.setdefault((ratio.dataset, ratio.method), {})[ratio.axis] = f"{ratio.ratio:.2f}"
-    cells = [
-        [*names, *(found.get(axis, "not observed") for axis in AXES)]
-        for names, found in rows.items()
-    ]
-    return markdown_table(["set", "method", *AXES], cells)
+        row = {"set": ratio.dataset, "method": ratio.method, **dict.fromkeys(AXES, "not observed")}
+        rows.setdefault((ratio.dataset, ratio.method), row)[ratio.axis] = f"{ratio.ratio:.2f}"
+    return markdown_table(rows.values())
 
 
 def _pooled_table(ratios: Sequence[AxisRatio]) -> str:
     rows = []
     for method in METHODS:
         chosen = [ratio for ratio in ratios if ratio.method == method]
-        if chosen:
-            freedom = sum(ratio.freedom for ratio in chosen)
-            pooled = np.sqrt(sum(ratio.freedom * ratio.ratio**2 for ratio in chosen) / freedom)
-            above = sum(ratio.ratio > 2 for ratio in chosen)
-            below = sum(ratio.ratio < 0.5 for ratio in chosen)
-            too_small = sum(chi2.sf(4.0 * ratio.freedom, ratio.freedom) for ratio in chosen)
-            too_large = sum(chi2.cdf(0.25 * ratio.freedom, ratio.freedom) for ratio in chosen)
-            rows.append(
-                [
-                    method,
-                    len(chosen),
-                    f"{pooled:.2f}",
-                    f"{np.median([ratio.ratio for ratio in chosen]):.2f}",
-                    sum(ratio.is_within_two for ratio in chosen),
-                    f"{above} ({too_small:.1f} by chance)",
-                    f"{below} ({too_large:.1f} by chance)",
-                ]
-            )
-    header = [
-        "method",
-        "ratios",
-        "pooled ratio",
-        "median",
-        "within a factor of two",
-        "sigma too small by more",
-        "too large by more",
-    ]
-    return markdown_table(header, rows)
+        if not chosen:
+            continue
+        freedom = sum(ratio.freedom for ratio in chosen)
+        pooled = np.sqrt(sum(ratio.freedom * ratio.ratio**2 for ratio in chosen) / freedom)
+        above = sum(ratio.ratio > 2 for ratio in chosen)
+        below = sum(ratio.ratio < 0.5 for ratio in chosen)
+        too_small = sum(chi2.sf(4.0 * ratio.freedom, ratio.freedom) for ratio in chosen)
+        too_large = sum(chi2.cdf(0.25 * ratio.freedom, ratio.freedom) for ratio in chosen)
+        rows.append(
+            {
+                "method": method,
+                "ratios": len(chosen),
+                "pooled ratio": f"{pooled:.2f}",
+                "median": f"{np.median([ratio.ratio for ratio in chosen]):.2f}",
+                "within a factor of two": sum(ratio.is_within_two for ratio in chosen),
+                "sigma too small by more": f"{above} ({too_small:.1f} by chance)",
+                "too large by more": f"{below} ({too_large:.1f} by chance)",
+            }
+        )
+    return markdown_table(rows)
 
 
-def _against_truth(found: RecordedSet, method: str) -> list[Truth]:
+def _against_truth(dataset: str, rig: Rig, method: str) -> list[Truth]:
     """A dict per axis: error, sigma, z, and possible causes."""
-    whole = found.drives[0]
-    answer = _answer(whole, found, method)
-    as_given = _answer(whole, found, method, time_offset=0.0)
-    unscaled = _answer(whole, found, method, scale="none")
-    thirds = [_answer(part, found, method) for part in whole.parts(3, answer.time_offset_s)]
-    others = [
-        _answer(whole, found, "dnlo auto", reference=reference) for reference in _OTHER_REFERENCES
-    ]
+    (whole,) = rig.recordings.values()
+    answer = _answer(whole, rig, method)
+    as_given = _answer(whole, rig, method, time_offset=0.0)
+    unscaled = _answer(whole, rig, method, scale="none")
+    thirds = [_answer(part, rig, method) for part in whole.parts(3, answer.time_offset_s)]
+    others = [_answer(whole, rig, "dnlo auto", reference=name) for name in _OTHER_REFERENCES]
 
-    assert found.truth is not None
-    truth = found.truth
+    assert rig.truth is not None
+    truth = rig.truth.T_parent_child
 
     def errors(answers: Sequence[Calibration]) -> FloatArray:
         return np.array([deviation(one.T_parent_child, truth) * _UNITS for one in answers])
@@ -313,7 +262,7 @@ def _against_truth(found: RecordedSet, method: str) -> list[Truth]:
     sigma = answer.sigmas * _UNITS
     return [
         {
-            "drive": found.name,
+            "drive": dataset,
             "method": method,
             "axis": axis,
             "unit": unit,
@@ -325,23 +274,21 @@ def _against_truth(found: RecordedSet, method: str) -> list[Truth]:
             "scatter of thirds": float(of_thirds[:, k].std(ddof=1)),
             "least error of a reference": float(of_others[:, k].min()),
             "largest error of a reference": float(of_others[:, k].max()),
-            "why": _reason(error[k], sigma[k], of_thirds[:, k], of_others[:, k]),
+            "why": reason(error[k], sigma[k], of_thirds[:, k], of_others[:, k]),
         }
         for k, (axis, unit) in enumerate(zip(AXES, _UNIT_NAMES, strict=True))
     ]
 
 
-def _reason(error: float, sigma: float, of_thirds: FloatArray, of_others: FloatArray) -> str:
+def reason(error: float, sigma: float, of_thirds: FloatArray, of_others: FloatArray) -> str:
     """Why a z-score is large; empty if it is not."""
     if not abs(error) > _SUSPICIOUS * sigma:
         return ""
-    reach = of_others.max() - of_others.min()
     if abs(error) < _SUSPICIOUS * of_thirds.std(ddof=1) / np.sqrt(3):
         return "sigma too small: the scatter of the thirds explains it"
-    if (
-        abs(error) < _SUSPICIOUS * reach / np.sqrt(len(of_others))
-        or of_others.min() * of_others.max() < 0
-    ):
+    reach = of_others.max() - of_others.min()
+    is_within = abs(error) < _SUSPICIOUS * reach / np.sqrt(len(of_others))
+    if is_within or of_others.min() * of_others.max() < 0:
         return "depends on the reference: errors correlated for longer than the noise model assumes"
     return (
         "the same in all thirds and with all references: an error of the whole recording or of "
@@ -349,35 +296,18 @@ def _reason(error: float, sigma: float, of_thirds: FloatArray, of_others: FloatA
     )
 
 
-def _truth_table(truths: Sequence[Truth]) -> str:
-    header = [
-        "drive",
-        "method",
-        "axis",
-        "error",
-        "sigma",
-        "z",
-        "clock as given",
-        "scale as given",
-        "scatter of thirds",
-        "other references",
-        "why",
-    ]
-    rows = [
-        [
-            row["drive"],
-            row["method"],
-            f"{row['axis']} ({row['unit']})",
-            f"{row['error']:.3f}",
-            f"{row['sigma']:.3f}",
-            f"{row['z']:.1f}",
-            f"{row['error, clock as given']:.3f}",
-            f"{row['error, scale as given']:.3f}",
-            f"{row['scatter of thirds']:.3f}",
-            f"{row['least error of a reference']:.3f} to {row['largest error of a reference']:.3f}",
-            row["why"],
-        ]
-        for row in truths
-        if row["why"]
-    ]
-    return markdown_table(header, rows)
+def _printed(row: Truth) -> dict[str, str]:
+    least, largest = row["least error of a reference"], row["largest error of a reference"]
+    return {
+        "drive": row["drive"],
+        "method": row["method"],
+        "axis": f"{row['axis']} ({row['unit']})",
+        "error": f"{row['error']:.3f}",
+        "sigma": f"{row['sigma']:.3f}",
+        "z": f"{row['z']:.1f}",
+        "clock as given": f"{row['error, clock as given']:.3f}",
+        "scale as given": f"{row['error, scale as given']:.3f}",
+        "scatter of thirds": f"{row['scatter of thirds']:.3f}",
+        "other references": f"{least:.3f} to {largest:.3f}",
+        "why": row["why"],
+    }

@@ -1,42 +1,28 @@
 """What an experiment has solved, for those who write its files."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from reproduction import statistics
 from reproduction.published import LEVELS, METHODS, SIMULATED
 from reproduction.rows import ALI_AS_PUBLISHED, Row
+from reproduction.sources import PublishedSource, Source
 from reproduction.statistics import Table
-
-if TYPE_CHECKING:
-    from reproduction.sources import PublishedSource, Source
 
 SIMULATION_METHODS = (*METHODS, ALI_AS_PUBLISHED)
 
 
 @dataclass(frozen=True)
 class Results:
-    """Solved rows and the output directory.
-
-    Attributes
-    ----------
-    source : PublishedSource or SimulatedSource
-    theirs_source : PublishedSource or None
-        Source of the published results to compare with.
-    rows : list of Row
-    out : pathlib.Path
-    jobs : int
-        Number of processes of the studies, which are not solved cell by cell.
-    """
+    """Solved rows and the output directory."""
 
     source: Source
+    # Source of the published results to compare with.
     theirs_source: PublishedSource | None
     rows: list[Row]
     out: Path
+    # Number of processes of the studies, which are not solved cell by cell.
     jobs: int = 1
 
     @property
@@ -52,13 +38,13 @@ class Results:
     @cached_property
     def ours(self) -> Table:
         """:class:`~reproduction.statistics.Table` of our errors."""
-        return statistics.ours(self.rows)
+        return statistics.of_rows(self.rows)
 
     @cached_property
     def theirs(self) -> Table | None:
         """Table of the published errors; None without published data."""
         if self.same_cases:
-            return statistics.theirs(self.rows)
+            return statistics.of_rows(self.rows, "published")
         if self.theirs_source is None:
             return None
         cases = (

@@ -4,14 +4,11 @@ Simulated rigs drive over hills. Every pose of every sensor has an error of its 
 motion one that stays. Their sizes and the extrinsics are known.
 """
 
-from __future__ import annotations
-
-import argparse
 import dataclasses
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,27 +16,18 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import read_trajectory_file
 from hand_eye_calib.rig import solution as joint
 from hand_eye_calib.rig.calibrate import calibrate_rig, solve_rig
 from hand_eye_calib.rig.result import RigCalibration
 from hand_eye_calib.rig.table import Table, synchronised
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE
-from reproduction.writing import markdown_table, put_into_page
-
-_TANGO = {
-    "caligula": "CALIGULA_2017-04-06-18-21-33",
-    "mars": "MARS_2017-04-06-18-23-37",
-    "nero": "NERO_2017-04-06-18-25-25",
-}
-_ASL_COLUMNS, _ZXL19_COLUMNS = "t,x,y,z,qx,qy,qz,qw", "t,x,y,z,qw,qx,qy,qz"
+from reproduction.positions import QUANTILE_90
+from reproduction.recordings import tango_devices, zxl19_sensors
+from reproduction.writing import markdown_table, show, study_parser
 
 # Errors per axis of the first sensor: white m and rad, walk m and rad from pose to pose.
 _ERRORS = np.array([4e-3, 2e-3, 1e-3, 5e-4])
-
-# Normal errors are within so many sigmas in nine cases of ten.
-_NINE_IN_TEN = 1.645
 
 
 class Rig(NamedTuple):
@@ -153,36 +141,29 @@ def simulated_table(repeats: int, n_poses: int) -> str:
     rows = []
     for name, errors_of in (("alike", alike), ("unequal", unequal), ("unlike", unlike)):
         for n_sensors in (3, 5, 8):
-            all_of = [
-                outcome(simulated(seed, n_poses, errors_of(n_sensors))) for seed in range(repeats)
-            ]
-            rows.append((name, n_sensors, *_row(all_of, n_sensors)))
-    return markdown_table(
-        (
-            *("Sensors", "S", "White error: worst sensor", "Walk: worst sensor"),
-            *("Error / pairwise", "Sigma / pairwise", "sqrt(2/S)", "Within 90 % interval"),
-            *("Closes to (mm)", "Pairwise to (mm)"),
-        ),
-        rows,
-    )
+            errors = errors_of(n_sensors)
+            found = [outcome(simulated(seed, n_poses, errors)) for seed in range(repeats)]
+            rows.append({"Sensors": name, "S": n_sensors, **_row(found, n_sensors)})
+    return markdown_table(rows)
 
 
-def _row(all_of: Sequence[Outcome], n_sensors: int) -> tuple[object, ...]:
-    squares = np.array([each.squares for each in all_of]).mean(axis=0)
-    pairwise = np.array([each.pairwise_squares for each in all_of]).mean(axis=0)
-    noise = np.median([each.noise for each in all_of], axis=0)
-    inside = np.mean([np.abs(each.in_sigmas) < _NINE_IN_TEN for each in all_of])
-    closes = 1e3 * max(each.closes_m for each in all_of)
-    return (
-        _worst(noise[:, :2]),
-        _worst(noise[:, 2:]),
-        f"{np.sqrt(np.mean(squares / pairwise)):.3f}",
-        f"{np.sqrt(np.mean([each.variances for each in all_of])):.3f}",
-        f"{np.sqrt(2 / n_sensors):.2f}",
-        f"{100 * inside:.0f} %",
-        "0" if closes < 1e-6 else f"{closes:.2g}",
-        f"{1e3 * np.median([each.pairwise_closes_m for each in all_of]):.2f}",
-    )
+def _row(found: Sequence[Outcome], n_sensors: int) -> dict[str, str]:
+    squares = np.array([each.squares for each in found]).mean(axis=0)
+    pairwise = np.array([each.pairwise_squares for each in found]).mean(axis=0)
+    noise = np.median([each.noise for each in found], axis=0)
+    inside = np.mean([np.abs(each.in_sigmas) < QUANTILE_90 for each in found])
+    closes = 1e3 * max(each.closes_m for each in found)
+    variances = np.mean([each.variances for each in found])
+    return {
+        "White error: worst sensor": _worst(noise[:, :2]),
+        "Walk: worst sensor": _worst(noise[:, 2:]),
+        "Error / pairwise": f"{np.sqrt(np.mean(squares / pairwise)):.3f}",
+        "Sigma / pairwise": f"{np.sqrt(variances):.3f}",
+        "sqrt(2/S)": f"{np.sqrt(2 / n_sensors):.2f}",
+        "Within 90 % interval": f"{100 * inside:.0f} %",
+        "Closes to (mm)": "0" if closes < 1e-6 else f"{closes:.2g}",
+        "Pairwise to (mm)": f"{1e3 * np.median([each.pairwise_closes_m for each in found]):.2f}",
+    }
 
 
 def _worst(ratios: FloatArray) -> str:
@@ -202,34 +183,28 @@ def time_table() -> str:
         }
         started = time.process_time()
         found = calibrate_rig(trajectories)
-        whole_s = time.process_time() - started
-        started = time.process_time()
+        solved = time.process_time()
         joint.solve(rig.table, found.solution.Xs)
-        rows.append((n_sensors, f"{n_poses:,}", f"{whole_s:.1f}", f"{_since(started):.1f}"))
-    return markdown_table(("Sensors", "Poses", "Whole calibration (s)", "Joint solve (s)"), rows)
-
-
-def _since(started: float) -> float:
-    return time.process_time() - started
+        rows.append(
+            {
+                "Sensors": n_sensors,
+                "Poses": f"{n_poses:,}",
+                "Whole calibration (s)": f"{solved - started:.1f}",
+                "Joint solve (s)": f"{time.process_time() - solved:.1f}",
+            }
+        )
+    return markdown_table(rows)
 
 
 def real_rigs(folder: Path) -> Iterator[tuple[str, Mapping[str, Trajectory], RigCalibration]]:
     """The three devices of tango, and the three sensors of zxl19's vehicle in three recordings."""
-    tango = folder / "asl_tango_easy"
+    tango, zxl19 = folder / "asl_tango_easy", folder / "zxl19"
     if tango.is_dir():
-        devices = {
-            name: _read(tango / f"{file}.csv", _ASL_COLUMNS) for name, file in _TANGO.items()
-        }
+        devices = tango_devices(tango)
         yield "tango", devices, solve_rig(devices, {"time_offset": "estimate", "scale": "auto"})
-    for bag in (1, 2, 3) if (folder / "zxl19").is_dir() else ():
-        files = {name: folder / f"zxl19/bag{bag}/{name}_FCPE.mat" for name in ("INS", "LO", "VO")}
-        sensors = {name: _read(file, _ZXL19_COLUMNS) for name, file in files.items()}
-        options: Mapping[str, Any] = {"time_offset": "estimate", "scale": "estimate"}
-        yield f"zxl19 bag{bag}", sensors, solve_rig(sensors, options)
-
-
-def _read(path: Path, columns: str) -> Trajectory:
-    return read_trajectory_file(path, "csv", columns=columns, repair=True)[0]
+    for number, sensors in enumerate(zxl19_sensors(zxl19) if zxl19.is_dir() else (), start=1):
+        options = {"time_offset": "estimate", "scale": "estimate"}
+        yield f"zxl19 bag{number}", sensors, solve_rig(sensors, options)
 
 
 def real_table(folder: Path) -> str:
@@ -245,17 +220,32 @@ def real_table(folder: Path) -> str:
         for own, pairwise, ratios in zip(
             found.calibrations, found.pairwise, same_model, strict=True
         ):
-            cells = *_edge(own.sigmas, pairwise.sigmas), f"{ratios.mean():.2f}, {ratios.max():.2f}"
-            rows.append((name, own.child_frame, *cells, miss))
+            both = np.isfinite(own.sigmas) & np.isfinite(pairwise.sigmas)
+            shrinks = np.exp(np.mean(np.log(own.sigmas[both] / pairwise.sigmas[both])))
+            rows.append(
+                {
+                    "Rig": name,
+                    "Sensor": own.child_frame,
+                    "Sigma x y z (mm)": _listed(1e3 * own.sigmas[:3]),
+                    "of pairs": _listed(1e3 * pairwise.sigmas[:3]),
+                    "roll pitch yaw (deg)": _listed(np.degrees(own.sigmas[3:])),
+                    "of pairs (deg)": _listed(np.degrees(pairwise.sigmas[3:])),
+                    "Joint / pairwise": f"{shrinks:.2f}",
+                    "same model": f"{ratios.mean():.2f}, {ratios.max():.2f}",
+                    "misses": miss,
+                }
+            )
             miss = ""
-    return markdown_table(
-        (
-            *("Rig", "Sensor", "Sigma x y z (mm)", "Pairwise", "roll pitch yaw (deg)", "Pairwise"),
-            *("Joint / pairwise", "The same noise model: mean, largest axis"),
-            "Pairwise answers miss closing by, chi-square of degrees",
-        ),
-        rows,
+    titles = (
+        "Rig | Sensor | Sigma x y z (mm) | Pairwise | roll pitch yaw (deg) | Pairwise | Joint / "
+        "pairwise | The same noise model: mean, largest axis | Pairwise answers miss closing by, "
+        "chi-square of degrees"
     )
+    return markdown_table(rows, titles)
+
+
+def _listed(values: FloatArray) -> str:
+    return " ".join(f"{value:.2g}" for value in values)
 
 
 def _same_model(streams: Mapping[str, Trajectory], found: RigCalibration) -> list[FloatArray]:
@@ -276,33 +266,16 @@ def _same_model(streams: Mapping[str, Trajectory], found: RigCalibration) -> lis
     return ratios
 
 
-def _edge(own: FloatArray, pairwise: FloatArray) -> list[str]:
-    cells = []
-    for part, factor in ((slice(0, 3), 1e3), (slice(3, 6), np.degrees(1.0))):
-        cells += [" ".join(f"{factor * x:.2g}" for x in each[part]) for each in (own, pairwise)]
-    both = np.isfinite(own) & np.isfinite(pairwise)
-    ratio = float(np.exp(np.mean(np.log(own[both] / pairwise[both]))))
-    return [*cells, f"{ratio:.2f}"]
-
-
 def main() -> None:
     """Simulate, calibrate and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data-folder", type=Path, help="folder of real recordings")
+    parser = study_parser("reproduction.rig", __doc__)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--poses", type=int, default=1200)
-    parser.add_argument("--page", type=Path, help="Markdown page to put the tables into")
     arguments = parser.parse_args()
-    tables = {"simulated": simulated_table(arguments.repeats, arguments.poses)}
-    print(tables["simulated"], flush=True)
-    tables["time"] = time_table()
-    print(tables["time"], flush=True)
+    show(arguments.page, {"simulated": simulated_table(arguments.repeats, arguments.poses)})
+    show(arguments.page, {"time": time_table()})
     if arguments.data_folder:
-        tables["real"] = real_table(arguments.data_folder)
-        print(tables["real"])
-    if arguments.page:
-        for name, text in tables.items():
-            put_into_page(arguments.page, name, text)
+        show(arguments.page, {"real": real_table(arguments.data_folder)})
 
 
 if __name__ == "__main__":

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -17,10 +17,8 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, dnlo
 from hand_eye_calib.solvers.registry import Method
 from reproduction import ali_as_published
-from reproduction.published import KITTI, LEVELS, REFERENCES, Case
-
-if TYPE_CHECKING:
-    from reproduction.sources import Source
+from reproduction.published import KITTI, LEVELS, REFERENCES, Case, path_to
+from reproduction.sources import Source
 
 METRICS = ("e_rt", "e_rR", "e_at", "e_aR")
 UNITS = {"e_rt": "m", "e_rR": "deg", "e_at": "m", "e_aR": "deg"}
@@ -57,49 +55,43 @@ class Cell:
     @property
     def name(self) -> str:
         """Such as noise_0.002_dnlo."""
-        level = [] if self.level is None else [f"{self.level:g}"]
-        return "_".join([self.dataset, *level, self.method])
+        return "_".join([*path_to(self.dataset, self.level), self.method])
 
 
 @dataclass(frozen=True)
 class Row:
-    """A solved case.
+    """A solved case."""
 
-    Attributes
-    ----------
-    dataset, level, run, method, reference
-        What was solved, and how.
-    errors : tuple of 4 float
-        e_rt (m), e_rR (deg), e_at (m), e_aR (deg).
-    objective : float
-        The method's own cost.
-    converged : bool
-    T_parent_child : tuple of 16 float
-        Row by row.
-    published : tuple of 4 float or None
-        As ``errors``; None where nothing is published.
-    published_objective : float or None
-        Our formula at the published answer; dnl and dnlo only.
-    """
-
+    # What was solved, and how.
     dataset: str
     level: float | None
     run: str
     method: str
     reference: str
+    # e_rt (m), e_rR (deg), e_at (m), e_aR (deg).
     errors: tuple[float, ...]
+    # The method's own cost.
     objective: float
     converged: bool
+    # Row by row.
     T_parent_child: tuple[float, ...]
+    # As ``errors``; None where nothing is published.
     published: tuple[float, ...] | None
+    # Our formula at the published answer; dnl and dnlo only.
     published_objective: float | None
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> Row:
+        """The row of these attributes; lists stand for tuples."""
+        frozen: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in plain.items()
+        }
+        return cls(**frozen)
 
     @property
     def name(self) -> str:
         """Such as noise/0.002/run_12."""
-        return "/".join(
-            [self.dataset, *([] if self.level is None else [f"{self.level:g}"]), self.run]
-        )
+        return "/".join([*path_to(self.dataset, self.level), self.run])
 
     @property
     def transform(self) -> FloatArray:
@@ -116,9 +108,12 @@ class Row:
     @property
     def agrees(self) -> bool:
         """Whether all four errors are the published ones."""
-        return all(
-            agree(ours, theirs) for ours, theirs in zip(self.errors, self.theirs, strict=True)
-        )
+        return all(map(agree, self.errors, self.theirs))
+
+    @property
+    def is_e_at_the_same(self) -> bool:
+        """Whether e_at is the published one."""
+        return agree(self.errors[2], self.theirs[2])
 
     @property
     def objective_verdict(self) -> str:
@@ -169,6 +164,11 @@ def cells(datasets: Sequence[str], methods: Sequence[str]) -> list[Cell]:
     ]
 
 
+def solve_plain(source: Source, cell: Cell) -> list[dict[str, Any]]:
+    """The attributes of every Row of a cell."""
+    return [vars(row) for row in solve_cell(source, cell)]
+
+
 def solve_cell(source: Source, cell: Cell) -> list[Row]:
     """List of Row of a cell, by run and reference."""
     return [
@@ -180,12 +180,8 @@ def solve_cell(source: Source, cell: Cell) -> list[Row]:
 
 def in_m_and_deg(errors: Errors) -> tuple[float, float, float, float]:
     """The four metrics as a tuple, rotations in degrees."""
-    return (
-        errors.e_rt,
-        float(np.degrees(errors.e_rR)),
-        errors.e_at,
-        float(np.degrees(errors.e_aR)),
-    )
+    e_rR, e_aR = (float(np.degrees(angle)) for angle in (errors.e_rR, errors.e_aR))
+    return errors.e_rt, e_rR, errors.e_at, e_aR
 
 
 def published_name(method: str) -> str:

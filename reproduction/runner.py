@@ -1,34 +1,26 @@
-"""Solves the cells of an experiment on several cores and stores them, so that an interrupted run
-continues.
+"""Tasks on several processes. What is solved can be kept in a file, so that an interrupted run goes
+on.
 """
-
-from __future__ import annotations
 
 import hashlib
 import importlib.metadata
 import json
 import multiprocessing
 import os
-import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from reproduction.rows import Cell, Row, solve_cell
-
-if TYPE_CHECKING:
-    from reproduction.sources import Source
 
 _HERE = Path(__file__).parent
 _PACKAGE = Path(se3.__file__).parents[1]
-# The code that results depend on: if it changes, stored results are discarded.
+# The code that the paper's results depend on: if it changes, stored results are discarded.
 _CODE = (
     *(_HERE / f"{name}.py" for name in ("published", "ali_as_published", "sources", "rows")),
     _PACKAGE / "assessment" / "metrics.py",
@@ -37,122 +29,108 @@ _CODE = (
 
 # One thread each: the processes share the cores, and sums are taken in one order whatever the
 # number of cores.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Store:
-    """Solved cells in a folder, one file each.
+    """Results by name in a file, one line of JSON each, under a line with what they depend on.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Created if absent. Results that an earlier run stored for another configuration are
-        removed.
-    configuration : dict
-        Settings that the results depend on, besides the code.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be made.
+    Results that were stored for another configuration are removed; lines that are cut off are left
+    out. Raises InputError if the file cannot be made, or is no such file.
     """
 
-    def __init__(self, folder: Path, configuration: Mapping[str, Any]) -> None:
-        self._folder = folder
-        manifest = folder / "configuration.json"
-        wanted = json.loads(json.dumps({**configuration, **_versions()}))
+    def __init__(self, path: Path, configuration: Mapping[str, Any]) -> None:
+        self._path = path
+        self.found: dict[str, Any] = {}
+        first = json.dumps({"configuration": configuration})
         try:
-            if manifest.exists() and _read(manifest) != wanted:
-                shutil.rmtree(folder)
-            folder.mkdir(parents=True, exist_ok=True)
-            _write(manifest, wanted)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+            if lines and not lines[0].startswith('{"configuration"'):
+                raise InputError(f"{path} has no stored results: move it, or choose another --out")
+            if not lines or lines[0] != first:
+                path.write_text(first + "\n", encoding="utf-8")
+                return
+            if not path.read_text(encoding="utf-8").endswith("\n"):
+                self._append("")
         except OSError as error:
             raise InputError(
-                f"cannot keep results in {folder}: {error.strerror}; choose another "
-                "directory with --out"
+                f"cannot keep results in {path}: {error.strerror}; choose another directory with "
+                "--out"
             ) from None
+        for line in lines[1:]:
+            try:
+                document = json.loads(line)
+            except ValueError:
+                continue
+            self.found[document["name"]] = document["result"]
 
-    def load(self, cell: Cell) -> list[Row] | None:
-        """Rows of a cell; None if it is not solved yet."""
-        rows = _read(self._path(cell))
-        return (
-            None
-            if rows is None
-            else [Row(**{name: _frozen(value) for name, value in row.items()}) for row in rows]
-        )
+    def keep(self, name: str, result: object) -> None:
+        """Add a result of plain values."""
+        self.found[name] = result
+        self._append(json.dumps({"name": name, "result": result}))
 
-    def save(self, cell: Cell, rows: Sequence[Row]) -> None:
-        """Store the rows of a cell."""
-        _write(self._path(cell), [vars(row) for row in rows])
-
-    def _path(self, cell: Cell) -> Path:
-        return self._folder / f"{cell.name}.json"
+    def _append(self, line: str) -> None:
+        with open(self._path, "a", encoding="utf-8") as file:
+            file.write(line + "\n")
 
 
-def run(
-    source: Source,
-    cells: Sequence[Cell],
-    store: Store,
+def solve(
+    function: Callable[..., Any],
+    tasks: Mapping[str, tuple[Any, ...]],
     jobs: int,
-    on_done: Callable[[Cell], object] = lambda cell: None,
-) -> dict[Cell, list[Row]]:
-    """Solve the cells that are not in the store yet.
-
-    Parameters
-    ----------
-    source : PublishedSource or SimulatedSource
-    cells : sequence of Cell
-    store : Store
-    jobs : int
-        Number of processes.
-    on_done : callable, optional
-        Called with every cell as it becomes available, in any order.
-
-    Returns
-    -------
-    dict
-        Cell to list of Row, in the order of ``cells``.
+    store: Store,
+    on_done: Callable[[str], object] = lambda name: None,
+) -> dict[str, Any]:
+    """``function(*task)`` of every named task that is not in the store yet; its results are plain
+    values. ``on_done`` is called with every name as its result becomes available, in any order.
+    Gives name to result, in the order of ``tasks``.
     """
-    found = {}
-    for cell in cells:
-        rows = store.load(cell)
-        if rows is not None:
-            found[cell] = rows
-            on_done(cell)
-    missing = [cell for cell in cells if cell not in found]
-    if missing:
-        with _workers(min(jobs, len(missing))) as executor:
-            with _interrupts_held():
-                futures = {executor.submit(solve_cell, source, cell): cell for cell in missing}
-            for future in as_completed(futures):
-                cell, rows = futures[future], future.result()
-                store.save(cell, rows)
-                found[cell] = rows
-                on_done(cell)
-    return {cell: found[cell] for cell in cells}
+    missing = [name for name in tasks if name not in store.found]
+    for name in tasks.keys() - set(missing):
+        on_done(name)
+
+    def keep(number: int, result: Any) -> None:
+        store.keep(missing[number], result)
+        on_done(missing[number])
+
+    _on_processes(function, [tasks[name] for name in missing], jobs, keep)
+    return {name: store.found[name] for name in tasks}
 
 
 def in_parallel(
-    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int
+    function: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], jobs: int
 ) -> list[Any]:
     """``function(*task)`` of every task on ``jobs`` processes; a list in the order of tasks."""
-    with _workers(min(jobs, len(tasks))) as executor:
-        with _interrupts_held():
-            futures = [executor.submit(function, *task) for task in tasks]
-        return [future.result() for future in futures]
+    tasks, found = list(tasks), dict[int, Any]()
+    _on_processes(function, tasks, jobs, found.__setitem__)
+    return [found[number] for number in range(len(tasks))]
 
 
-@contextmanager
-def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes that are killed if the block raises: one that waits to hand over a result
-    which nobody takes would not see a signal that Python handles.
+def _on_processes(
+    function: Callable[..., Any],
+    tasks: Sequence[tuple[Any, ...]],
+    jobs: int,
+    on_result: Callable[[int, Any], object],
+) -> None:
+    """Call ``on_result(number, result)`` for every task as it ends. If that raises, the processes
+    are killed: one that waits to hand over a result which nobody takes would not see a signal that
+    Python handles.
     """
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    if not tasks:
+        return
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
     others = set(multiprocessing.active_children())
-    os.environ.update(_ONE_THREAD)
-    executor = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _start_worker)
+    spawning = multiprocessing.get_context("spawn")
+    executor = ProcessPoolExecutor(min(jobs, len(tasks)), spawning, _start_worker)
     try:
-        yield executor
+        # Processes that are started now inherit that SIGINT is blocked: their parent ends them.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        futures = {executor.submit(function, *task): number for number, task in enumerate(tasks)}
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for future in as_completed(futures):
+            on_result(futures[future], future.result())
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         ours = set(multiprocessing.active_children()) - others
@@ -163,24 +141,7 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
         while ours.intersection(multiprocessing.active_children()):
             time.sleep(0.01)
         raise
-    else:
-        executor.shutdown()
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Block SIGINT: processes started in this block inherit that and are ended by their parent."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    executor.shutdown()
 
 
 def _start_worker() -> None:
@@ -195,7 +156,8 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Of the code and the libraries that the paper's results depend on."""
     code = hashlib.sha256()
     for entry in _CODE:
         for path in sorted(entry.rglob("*.py")) or [entry]:
@@ -203,21 +165,3 @@ def _versions() -> dict[str, str]:
     return {"code": code.hexdigest()} | {
         name: importlib.metadata.version(name) for name in ("numpy", "scipy")
     }
-
-
-def _frozen(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _read(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
-        return None
-
-
-def _write(path: Path, document: object) -> None:
-    """Write atomically: an interrupted run leaves no partial file."""
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(json.dumps(document), encoding="utf-8")
-    os.replace(unfinished, path)

@@ -1,7 +1,5 @@
 """Sources of the cases of an experiment: the published trajectories, or simulated drives."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -2,8 +2,6 @@
 and quartiles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,25 +17,17 @@ from reproduction.rows import METRICS, Row, in_m_and_deg, published_name
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of one error over the runs of a level.
+    """Statistics of one error over the runs of a level."""
 
-    Attributes
-    ----------
-    centre, low, high : float
-        Mean and its 95 % confidence interval (Student's t), or median and quartiles.
-    whiskers : (float, float)
-        The farthest values within 1.5 times the interquartile range of the quartiles.
-    n : int
-        Number of runs.
-    is_median : bool
-        Median and quartiles, not mean and interval.
-    """
-
+    # Mean and its 95 % confidence interval (Student's t), or median and quartiles.
     centre: float
     low: float
     high: float
+    # The farthest values within 1.5 times the interquartile range of the quartiles.
     whiskers: tuple[float, float]
+    # Number of runs.
     n: int
+    # Median and quartiles, not mean and interval.
     is_median: bool
 
 
@@ -46,14 +36,8 @@ def mean_summary(values: ArrayLike) -> Summary:
     values = np.asarray(values)
     mean, n = values.mean(), len(values)
     half = stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
-    return Summary(
-        float(mean),
-        float(mean - half),
-        float(mean + half),
-        (float(values.min()), float(values.max())),
-        n,
-        False,
-    )
+    whiskers = float(values.min()), float(values.max())
+    return Summary(float(mean), float(mean - half), float(mean + half), whiskers, n, False)
 
 
 def quartile_summary(values: ArrayLike) -> Summary:
@@ -61,14 +45,8 @@ def quartile_summary(values: ArrayLike) -> Summary:
     values = np.sort(values)
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
     inside = values[(values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))]
-    return Summary(
-        float(median),
-        float(low),
-        float(high),
-        (float(inside[0]), float(inside[-1])),
-        len(values),
-        True,
-    )
+    whiskers = float(inside[0]), float(inside[-1])
+    return Summary(float(median), float(low), float(high), whiskers, len(values), True)
 
 
 def summarise(dataset: str, values: ArrayLike) -> Summary:
@@ -81,13 +59,7 @@ Entry = tuple[str, float | None, str, str, tuple[float, ...]]
 
 
 class Table:
-    """Errors of many rows by data set, level, method and reference.
-
-    Parameters
-    ----------
-    entries : iterable of (dataset, level, method, reference, errors)
-        ``errors``: the four metrics, m and deg.
-    """
+    """Errors of many rows: data set, level, method, reference, the four metrics (m and deg)."""
 
     def __init__(self, entries: Iterable[Entry]) -> None:
         collected: dict[tuple[Any, ...], list[tuple[float, ...]]] = {}
@@ -116,35 +88,27 @@ class Table:
         """The value that variants are compared by: the mean over levels of the mean over runs; of
         the mixture, the median.
         """
-        levels = self.levels(dataset, method)
-        return float(
-            np.mean(
-                [self.summary(dataset, level, method, reference, metric).centre for level in levels]
-            )
+        summaries = (
+            self.summary(dataset, level, method, reference, metric)
+            for level in self.levels(dataset, method)
         )
+        return float(np.mean([summary.centre for summary in summaries]))
 
     def best_reference(self, dataset: str, method: str, metric: str = "e_at") -> str:
         """The reference with the smallest score."""
-        return min(REFERENCES, key=lambda reference: self.score(dataset, method, reference, metric))
+        return self.ranking(dataset, method, metric)[0]
 
     def ranking(self, dataset: str, method: str, metric: str = "e_at") -> list[str]:
         """References from the smallest score to the largest."""
-        return sorted(
-            REFERENCES, key=lambda reference: self.score(dataset, method, reference, metric)
-        )
+        return sorted(REFERENCES, key=lambda name: self.score(dataset, method, name, metric))
 
 
-def ours(rows: Sequence[Row]) -> Table:
-    """:class:`Table` of our errors."""
-    return Table((row.dataset, row.level, row.method, row.reference, row.errors) for row in rows)
-
-
-def theirs(rows: Sequence[Row]) -> Table:
-    """:class:`Table` of the published errors of the same rows."""
+def of_rows(rows: Sequence[Row], which: str = "errors") -> Table:
+    """:class:`Table` of our errors, or of the ``published`` ones of the same rows."""
     return Table(
-        (row.dataset, row.level, row.method, row.reference, row.published)
+        (row.dataset, row.level, row.method, row.reference, getattr(row, which))
         for row in rows
-        if row.published
+        if getattr(row, which)
     )
 
 

@@ -2,11 +2,9 @@
 the rectified ground truth.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +12,9 @@ from hand_eye_calib.assessment.metrics import absolute_errors
 from reproduction import comparison
 from reproduction.kitti_truth import RECTIFIED
 from reproduction.published import METHODS, REFERENCES
+from reproduction.results import Results
 from reproduction.rows import TITLES, Row, agree
 from reproduction.writing import markdown_table, percent, write_csv, write_text
-
-if TYPE_CHECKING:
-    from reproduction.results import Results
 
 SUMMARY_TABLES = {"table1": "kitti_short", "table2": "kitti_long"}
 _DRIVES = {
@@ -52,16 +48,9 @@ PRINTED: dict[str, dict[str, tuple[Any, ...]]] = {
         "zhuang": ("B5", 0.155, 0.181, 0.074, 0.400, 0.106, -0.081),
     },
 }
-_COLUMNS = (
-    "e_rt (m)",
-    "e_rR (deg)",
-    "e_at (m)",
-    "e_aR (deg)",
-    "e_at gain over B1 (m)",
-    "e_aR gain over B1 (deg)",
-)
-_ERROR_COLUMNS = (0, 1, 2, 3, 6, 7)
-_RECTIFIED_COLUMNS = tuple(f"rectified: {column}" for column in _COLUMNS[2:])
+_ERRORS = ("e_rt (m)", "e_rR (deg)", "e_at (m)", "e_aR (deg)")
+_GAINS = ("e_at gain over B1 (m)", "e_aR gain over B1 (deg)")
+_RECTIFIED = ("rectified: e_at (m)", "rectified: e_aR (deg)")
 _NOTE = (
     "Columns 'rectified' are against the calibration of the rectified images that the SLAM saw; "
     "the others against the ground truth as published. Gain: error of the method's B1 variant "
@@ -69,10 +58,13 @@ _NOTE = (
 )
 
 
+# Printed numbers are the same to three decimals.
+_SAME_PRINT = 0.00051
+
 # By method and reference.
 Variants = Mapping[str, Mapping[str, Row]]
-# Variant and its values; None without a gain.
-Line = tuple[str, tuple[float | None, ...]]
+# Column to value; None without a gain.
+Values = dict[str, float | None]
 
 
 def rectified_errors(row: Row) -> tuple[float, float]:
@@ -94,46 +86,44 @@ def write_summary_table(name: str, results: Results) -> list[Path]:
     rows = {
         method: {row.reference: row for row in results.of(dataset, method)} for method in METHODS
     }
-    lines = {
-        method: _line(best_variant(rows[method].values()), rows[method]["B1"]) for method in METHODS
-    }
+    best = {method: best_variant(rows[method].values()) for method in METHODS}
+    values = {method: _values(best[method], rows[method]["B1"]) for method in METHODS}
     smallest = {
-        column: min(value for _, values in lines.values() if (value := values[column]) is not None)
-        for column in _ERROR_COLUMNS
+        column: min(each[column] for each in values.values()) for column in (*_ERRORS, *_RECTIFIED)
     }
-    header = ["method", *_COLUMNS, *_RECTIFIED_COLUMNS]
-    body = [
-        [
-            f"{TITLES[method]} {variant}",
-            *(_print(value, smallest.get(column)) for column, value in enumerate(values)),
-        ]
-        for method, (variant, values) in lines.items()
-    ]
-    table = [
-        [TITLES[method], variant, *("" if value is None else value for value in values)]
-        for method, (variant, values) in lines.items()
-    ]
+    printed = (
+        {"method": f"{TITLES[method]} {best[method].reference}"}
+        | {column: _print(value, smallest.get(column)) for column, value in each.items()}
+        for method, each in values.items()
+    )
+    table = (
+        {"method": TITLES[method], "variant": best[method].reference, **_blank(each)}
+        for method, each in values.items()
+    )
     return [
         write_text(
             results.out / f"{name}.md",
             f"# Table {name[-1]}. {_DRIVES[dataset]}",
-            markdown_table(header, body),
+            markdown_table(printed),
             f"Best variant of each method by e_at; the smallest error of a column is bold. {_NOTE}",
             _best_against_rectified(rows),
         ),
-        write_csv(results.out / f"{name}.csv", ["method", "variant", *header[1:]], table),
-        *_compare_with_print(name, rows, lines, results),
+        write_csv(results.out / f"{name}.csv", table),
+        *_compare_with_print(name, rows, best, results),
     ]
 
 
-def _line(row: Row, b1: Row) -> Line:
-    """Variant and the ten numbers of a method."""
-    rectified = rectified_errors(row)
-    if row.reference == "B1":
-        return "B1", (*row.errors, None, None, *rectified, None, None)
-    gains = (b1.errors[2] - row.errors[2], b1.errors[3] - row.errors[3])
-    rectified_gains = tuple(np.subtract(rectified_errors(b1), rectified).tolist())
-    return row.reference, (*row.errors, *gains, *rectified, *rectified_gains)
+def _values(row: Row, b1: Row) -> Any:
+    """The ten numbers of a variant by column."""
+    own, base = ((*x.errors[2:], *rectified_errors(x)) for x in (row, b1))
+    gains = [None if row.reference == "B1" else y - x for x, y in zip(own, base, strict=True)]
+    values = (*row.errors, *gains[:2], *own[2:], *gains[2:])
+    columns = (*_ERRORS, *_GAINS, *_RECTIFIED, *(f"rectified: {gain}" for gain in _GAINS))
+    return dict(zip(columns, values, strict=True))
+
+
+def _blank(values: Values) -> dict[str, float | str]:
+    return {column: "" if value is None else value for column, value in values.items()}
 
 
 def _print(value: float | None, bold: float | None = None) -> str:
@@ -149,107 +139,89 @@ def _best_against_rectified(rows: Variants) -> str:
     for method, by_reference in rows.items():
         row = best_variant(by_reference.values(), lambda row: rectified_errors(row)[0])
         e_at, e_aR = rectified_errors(row)
-        b1 = rectified_errors(by_reference["B1"])
+        b1_e_at, b1_e_aR = rectified_errors(by_reference["B1"])
         lines.append(
-            [
-                f"{TITLES[method]} {row.reference}",
-                f"{e_at:.3f}",
-                f"{e_aR:.3f}",
-                f"{b1[0]:.3f}",
-                f"{b1[1]:.3f}",
-            ]
+            {
+                "best against the rectified truth": f"{TITLES[method]} {row.reference}",
+                "e_at (m)": f"{e_at:.3f}",
+                "e_aR (deg)": f"{e_aR:.3f}",
+                "B1: e_at (m)": f"{b1_e_at:.3f}",
+                "B1: e_aR (deg)": f"{b1_e_aR:.3f}",
+            }
         )
-    header = [
-        "best against the rectified truth",
-        "e_at (m)",
-        "e_aR (deg)",
-        "B1: e_at (m)",
-        "B1: e_aR (deg)",
-    ]
-    return markdown_table(header, lines)
+    return markdown_table(lines)
 
 
 def _compare_with_print(
-    name: str, rows: Variants, lines: Mapping[str, Line], results: Results
+    name: str, rows: Variants, best: Mapping[str, Row], results: Results
 ) -> list[Path]:
     """Cell by cell: ours (of our best variant, and of the paper's), the published file's, and as
     printed.
     """
-    dataset = SUMMARY_TABLES[name]
-    compared: list[list[Any]] = []
-    for method, (variant, values) in lines.items():
-        printed_variant, *printed = PRINTED[dataset][method]
-        there = rows[method][printed_variant]
-        same_variant = _line(there, rows[method]["B1"])[1]
-        why = "; ".join(
-            dict.fromkeys(
-                f"{row.reference}: {row.why()}"
-                for row in (there, rows[method]["B1"])
-                if not row.agrees
-            )
+    compared = [
+        line
+        for method in METHODS
+        for line in _printed_cells(
+            rows[method], best[method], PRINTED[SUMMARY_TABLES[name]][method]
         )
-        for column, ours, ours_there, theirs in zip(
-            _COLUMNS, values[:6], same_variant[:6], printed, strict=True
-        ):
-            same = (ours is theirs) or (
-                ours is not None and theirs is not None and abs(ours - theirs) <= 0.00051
-            )
-            there_same = (ours_there is theirs) or abs(ours_there - theirs) <= 0.00051
-            note = "" if same else f"best variant is {variant} here" if there_same else why
-            compared.append(
-                [
-                    TITLES[method],
-                    variant,
-                    printed_variant,
-                    column,
-                    _blank(ours),
-                    _blank(ours_there),
-                    _blank(theirs),
-                    same,
-                    there_same,
-                    note,
-                ]
-            )
-    header = [
-        "method",
-        "our_best_variant",
-        "papers_variant",
-        "column",
-        "ours",
-        "ours_with_the_papers_variant",
-        "printed",
-        "agrees",
-        "agrees_with_the_papers_variant",
-        "why",
     ]
-    text = [
-        "Cells that agree with the printed table to its three decimals: "
-        f"{percent(sum(line[7] for line in compared), len(compared))}; with the paper's variant of "
-        f"each method: {percent(sum(line[8] for line in compared), len(compared))}.",
-        markdown_table(
-            header,
-            [
-                [f"{cell:.4f}" if isinstance(cell, float) else cell for cell in line]
-                for line in compared
-                if not line[7]
-            ],
-        )
-        if not all(line[7] for line in compared)
-        else "",
-        "## Every variant, against the published results in full precision",
-        comparison.describe_rows([row for method in METHODS for row in rows[method].values()]),
-        comparison.describe_dnlo(list(rows["dnlo"].values())),
+    agreeing, there = (
+        percent(sum(line[which] for line in compared), len(compared))
+        for which in ("agrees", "agrees_with_the_papers_variant")
+    )
+    differing = [
+        {column: f"{x:.4f}" if isinstance(x, float) else x for column, x in line.items()}
+        for line in compared
+        if not line["agrees"]
     ]
     return [
-        write_csv(results.out / f"{name}_comparison.csv", header, compared),
+        write_csv(results.out / f"{name}_comparison.csv", compared),
         write_text(
-            results.out / f"{name}_comparison.md", f"# {name}: comparison with the paper", *text
+            results.out / f"{name}_comparison.md",
+            f"# {name}: comparison with the paper",
+            f"Cells that agree with the printed table to its three decimals: {agreeing}; with the "
+            f"paper's variant of each method: {there}.",
+            markdown_table(differing) if differing else "",
+            "## Every variant, against the published results in full precision",
+            comparison.describe_rows([row for by in rows.values() for row in by.values()]),
+            comparison.describe_dnlo(list(rows["dnlo"].values())),
         ),
     ]
 
 
-def _blank(value: float | None) -> float | str:
-    return "" if value is None else value
+def _printed_cells(
+    rows: Mapping[str, Row], best: Row, printed: tuple[Any, ...]
+) -> Iterator[dict[str, Any]]:
+    """A line for each printed number of a method."""
+    variant, *numbers = printed
+    involved = [row for row in (rows[variant], rows["B1"]) if not row.agrees]
+    why = "; ".join(dict.fromkeys(f"{row.reference}: {row.why()}" for row in involved))
+    ours, there = _values(best, rows["B1"]), _values(rows[variant], rows["B1"])
+    for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True):
+        same, same_there = (_reads_as(each[column], number) for each in (ours, there))
+        other = f"best variant is {best.reference} here" if same_there else why
+        yield {
+            "method": TITLES[best.method],
+            "our_best_variant": best.reference,
+            "papers_variant": variant,
+            "column": column,
+            **_blank(
+                {
+                    "ours": ours[column],
+                    "ours_with_the_papers_variant": there[column],
+                    "printed": number,
+                }
+            ),
+            "agrees": same,
+            "agrees_with_the_papers_variant": same_there,
+            "why": "" if same else other,
+        }
+
+
+def _reads_as(value: float | None, printed: float | None) -> bool:
+    if value is None or printed is None:
+        return value is printed
+    return abs(value - printed) <= _SAME_PRINT
 
 
 def write_variant_table(name: str, results: Results) -> list[Path]:
@@ -257,68 +229,54 @@ def write_variant_table(name: str, results: Results) -> list[Path]:
     dataset, method = VARIANT_TABLES[name]
     rows = results.of(dataset, method)
     best = best_variant(rows)
-    header = ["reference", *_COLUMNS[:4], "rectified: e_at (m)", "rectified: e_aR (deg)"]
-    lines: list[list[Any]] = [
-        [row.reference, *row.errors, *rectified_errors(row)]
+    values = {
+        row.reference: dict(
+            zip((*_ERRORS, *_RECTIFIED), (*row.errors, *rectified_errors(row)), strict=True)
+        )
         for row in sorted(rows, key=lambda row: REFERENCES.index(row.reference))
-    ]
-    printed = [
-        [
-            line[0],
-            *(_print(value, value if line[0] == best.reference else None) for value in line[1:]),
-        ]
-        for line in lines
-    ]
-    title = f"# Table {name.removeprefix('table')}. {_DRIVES[dataset]} using {TITLES[method]}"
-    compared = [
-        [
-            row.reference,
-            metric,
-            ours,
-            theirs,
-            agree(ours, theirs),
-            "" if agree(ours, theirs) else row.why(),
-        ]
+    }
+    printed = (
+        {"reference": name}
+        | {column: _print(x, x if name == best.reference else None) for column, x in each.items()}
+        for name, each in values.items()
+    )
+    compared = (
+        {
+            "reference": row.reference,
+            "column": column,
+            "ours": ours,
+            "published": theirs,
+            "agrees": agree(ours, theirs),
+            "why": "" if agree(ours, theirs) else row.why(),
+        }
         for row in rows
-        for metric, ours, theirs in zip(_COLUMNS[:4], row.errors, row.theirs, strict=True)
-    ]
+        for column, ours, theirs in zip(_ERRORS, row.errors, row.theirs, strict=True)
+    )
     blocks = [comparison.describe_rows(rows)]
     if method == "dnlo":
-        blocks.append(comparison.describe_dnlo(rows))
-        blocks.append(
-            markdown_table(
-                [
-                    "reference",
-                    "objective",
-                    "objective at the published answer",
-                    "e_at (m)",
-                    "published e_at (m)",
-                ],
-                [
-                    [
-                        row.reference,
-                        f"{row.objective:.6f}",
-                        f"{row.published_objective:.6f}",
-                        f"{row.errors[2]:.4f}",
-                        f"{row.theirs[2]:.4f}",
-                    ]
-                    for row in rows
-                ],
-            )
+        objectives = (
+            {
+                "reference": row.reference,
+                "objective": f"{row.objective:.6f}",
+                "objective at the published answer": f"{row.published_objective:.6f}",
+                "e_at (m)": f"{row.errors[2]:.4f}",
+                "published e_at (m)": f"{row.theirs[2]:.4f}",
+            }
+            for row in rows
         )
+        blocks += [comparison.describe_dnlo(rows), markdown_table(objectives)]
     return [
         write_text(
             results.out / f"{name}.md",
-            title,
-            markdown_table(header, printed),
+            f"# Table {name.removeprefix('table')}. {_DRIVES[dataset]} using {TITLES[method]}",
+            markdown_table(printed),
             f"The best variant by e_at is bold. {_NOTE}",
         ),
-        write_csv(results.out / f"{name}.csv", header, lines),
         write_csv(
-            results.out / f"{name}_comparison.csv",
-            ["reference", "column", "ours", "published", "agrees", "why"],
-            compared,
+            results.out / f"{name}.csv",
+            ({"reference": reference, **each} for reference, each in values.items()),
         ),
+        write_csv(results.out / f"{name}_comparison.csv", compared),
         write_text(
             results.out / f"{name}_comparison.md",
             f"# {name}: comparison with the published results",

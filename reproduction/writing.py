@@ -1,20 +1,24 @@
-"""CSV and Markdown files."""
+"""CSV and Markdown: files, tables, pages. A table is a list of rows that map column to value."""
 
-from __future__ import annotations
-
+import argparse
 import csv
+import os
 import re
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from hand_eye_calib.errors import InputError
 
+TableRow = Mapping[str, object]
 
-def write_csv(path: Path, header: Sequence[object], rows: Iterable[Iterable[object]]) -> Path:
-    """Write rows of values under a header; returns the path. Numbers keep all digits."""
+
+def write_csv(path: Path, rows: Iterable[TableRow]) -> Path:
+    """Write a table; returns the path. Numbers keep all digits."""
+    rows = list(rows)
     with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
+        writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
+        writer.writeheader()
         writer.writerows(rows)
     return path
 
@@ -25,9 +29,13 @@ def write_text(path: Path, *blocks: str) -> Path:
     return path
 
 
-def markdown_table(header: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
-    """A Markdown table of strings and numbers."""
-    lines = [header, ["---"] * len(header), *rows]
+def markdown_table(rows: Iterable[TableRow], titles: str = "") -> str:
+    """A Markdown table; ``titles`` (``a | b | c``) in place of the names of the columns."""
+    rows = list(rows)
+    if not rows:
+        return "Nothing."
+    header = titles.split(" | ") if titles else list(rows[0])
+    lines: list[Iterable[object]] = [header, ["---"] * len(header), *(r.values() for r in rows)]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
@@ -62,6 +70,39 @@ def put_into_page(page: Path, name: str, text: str) -> None:
         raise InputError(f"cannot use {page}: {error.strerror}") from None
 
 
+def data_folder(given: Path | None) -> Path | None:
+    """The folder of recordings that was given, else that of the environment, else None."""
+    folder = given or os.environ.get("HAND_EYE_CALIB_DATA")
+    return Path(folder) if folder else None
+
+
+def study_parser(
+    name: str, about: str | None, page: str = "put the tables into this page"
+) -> argparse.ArgumentParser:
+    """Parser of a study that has a command of its own: recordings, and a page for its tables."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {name}", description=about, allow_abbrev=False
+    )
+    parser.add_argument(
+        "--data-folder",
+        metavar="DIR",
+        type=Path,
+        default=data_folder(None),
+        help="folder of the real recordings (valimaki2023, euroc_vio, ...); without it, simulated "
+        "ones only. Default: $HAND_EYE_CALIB_DATA",
+    )
+    parser.add_argument("--page", metavar="FILE", type=Path, help=page)
+    return parser
+
+
+def show(page: Path | None, tables: Mapping[str, str]) -> None:
+    """Print named tables, and put them into the page if there is one."""
+    for name, text in tables.items():
+        print(text, flush=True)
+        if page:
+            put_into_page(page, name, text)
+
+
 def bullets(items: Iterable[str]) -> str:
     """A Markdown list."""
     return "\n".join(f"- {item}" for item in items)
@@ -71,3 +112,13 @@ def percent(part: int, whole: int) -> str:
     """Such as "4328 of 4332 (99.91 %)", rounded down: only all is 100 %."""
     share = int(1e4 * part / whole) / 100 if whole else 0.0
     return f"{part} of {whole} ({share:.2f} %)"
+
+
+def counted(words: Iterable[str]) -> str:
+    """Words with how often they occur, the most frequent first."""
+    return ", ".join(f"{word} {count}" for word, count in Counter(words).most_common())
+
+
+def triple(values: Iterable[float], factor: float = 1.0, form: str = ".1f") -> str:
+    """Numbers times a factor, a comma between them."""
+    return ", ".join(f"{factor * value:{form}}" for value in values)

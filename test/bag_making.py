@@ -1,5 +1,6 @@
 """Bags of whatever messages a test needs."""
 
+import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -66,6 +67,39 @@ def path_message(stamps_ns, poses, frame="map"):
         )
 
     return make
+
+
+def imu(rates, first_covariance=0.0, stamp_ns=12_000_000_005):
+    """A serialised Imu with angular rates (rad/s)."""
+    covariance, of_rates = np.zeros(9), np.zeros(9)
+    of_rates[0] = first_covariance
+    types = JAZZY.types
+    vector = types["geometry_msgs/msg/Vector3"]
+    message = types["sensor_msgs/msg/Imu"](
+        header=header(JAZZY, stamp_ns, "imu_link"),
+        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.6, w=0.8),
+        orientation_covariance=covariance,
+        angular_velocity=vector(*rates),
+        angular_velocity_covariance=of_rates,
+        linear_acceleration=vector(0.0, 0.0, 9.81),
+        linear_acceleration_covariance=covariance,
+    )
+    return bytes(JAZZY.serialize_cdr(message, message.__msgtype__))
+
+
+def fix(status, latitude=60.0, longitude=25.0, altitude=30.0, stamp_ns=12_000_000_005):
+    """A serialised NavSatFix (deg, deg, m)."""
+    types = JAZZY.types
+    message = types["sensor_msgs/msg/NavSatFix"](
+        header=header(JAZZY, stamp_ns, "imu_link"),
+        status=types["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude,
+        position_covariance=np.zeros(9),
+        position_covariance_type=0,
+    )
+    return bytes(JAZZY.serialize_cdr(message, message.__msgtype__))
 
 
 def write_messages(path, messages, storage="mcap", mode=None):

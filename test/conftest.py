@@ -1,19 +1,13 @@
 """What every test may use."""
 
-import contextlib
 import signal
 
-import numpy as np
 import pytest
 from hypothesis import settings
 
 # Tests never time anything, and CI must not differ from run to run.
 settings.register_profile("hand_eye_calib", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("hand_eye_calib")
-
-# Importing pymap3d makes NumPy raise where it warns, for good: here it is imported without that.
-with np.errstate(), contextlib.suppress(ImportError):
-    import pymap3d  # noqa: F401
 
 # A shell starts what runs in the background with Ctrl-C ignored, and children inherit that: tests
 # that send it would wait for ever.

@@ -3,13 +3,14 @@
 from pathlib import Path
 
 import numpy as np
-from bag_making import JAZZY, TF, tf_message
-from motions import disturbed, wandering_poses
+from bag_making import JAZZY, TF, fix, imu, tf_message
+from motions import disturbed, geodetic, wandering_poses
 from rosbags import rosbag2
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags.messages import FIX_TYPE, IMU_TYPE
 from hand_eye_calib.io.bags.writer import write_streams
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE
@@ -35,7 +36,9 @@ _ROBOT = """\
 
 def make(folder: Path) -> None:
     """Fill a folder: ``my_drive/``, ``lidar.tum``, ``camera.tum``, ``camera.csv``, ``ins.csv``,
-    ``flange.tum``, ``camera_on_arm.tum``, ``robot.urdf``, and results.
+    ``gnss.csv``, ``imu.csv``, ``flange.tum``, ``camera_on_arm.tum``, ``robot.urdf``, and results.
+
+    INS, antenna and IMU are where the camera is.
     """
     drive = simulate_drive(7, HILLY_DRIVE).parent[:_POSES]
     lidar = _noisy(drive.stamps_ns, drive.poses, 1, "lidar", "odom")
@@ -43,8 +46,14 @@ def make(folder: Path) -> None:
     hec.write_trajectory(folder / "lidar.tum", lidar)
     hec.write_trajectory(folder / "camera.tum", camera)
     np.savetxt(folder / "camera.csv", _rows(camera, scalar_first=True), "%.9f", delimiter=",")
-    _write_bag(folder / "my_drive", lidar, camera)
-    _write_ins(folder / "ins.csv", camera)
+    imu_ns, rates = _rates(camera)
+    places = _geodetic(camera)
+    _write_bag(folder / "my_drive", lidar, camera, places, (imu_ns, rates))
+    _write_ins(folder / "ins.csv", camera, places)
+    times = camera.stamps_ns[:, None] * 1e-9
+    _write_csv(folder / "gnss.csv", "time,latitude,longitude,height", np.hstack([times, places]))
+    columns = np.column_stack([imu_ns * 1e-9, rates])
+    _write_csv(folder / "imu.csv", "time,wx,wy,wz", columns)
 
     arm = wandering_poses(_POSES, seed=3)
     stamps_ns = drive.stamps_ns
@@ -67,8 +76,21 @@ def _rows(trajectory, scalar_first):
     return np.column_stack([trajectory.stamps_ns * 1e-9, trajectory.poses[:, :3, 3], quats])
 
 
-def _write_bag(path, lidar, camera):
-    """Odometry of both sensors, and the lidar's as /tf, too."""
+def _rates(trajectory):
+    """Stamps between the poses, and the mean angular rates there."""
+    rotations = Rotation.from_matrix(trajectory.poses[:, :3, :3])
+    steps_ns = np.diff(trajectory.stamps_ns)
+    turned = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
+    return trajectory.stamps_ns[:-1] + steps_ns // 2, turned / (steps_ns * 1e-9)[:, None]
+
+
+def _geodetic(trajectory):
+    """Latitude, longitude (deg) and height (m) of every position."""
+    return np.transpose(geodetic(trajectory.poses[:, :3, 3], (60.17, 24.94, 20.0)))
+
+
+def _write_bag(path, lidar, camera, places, rates):
+    """Odometry of both sensors, the lidar's as /tf too, the antenna's fixes and the IMU's rates."""
     storage = rosbag2.StoragePlugin.MCAP
     with rosbag2.Writer(path, version=9, storage_plugin=storage) as writer:
         streams = {"/lidar/odometry": (lidar, _ODOMETRY), "/camera/odometry": (camera, _ODOMETRY)}
@@ -77,16 +99,23 @@ def _write_bag(path, lidar, camera):
         for stamp_ns, pose in zip(lidar.stamps_ns.tolist(), lidar.poses, strict=True):
             message = tf_message([(stamp_ns, "odom", "lidar", pose)])(JAZZY)
             writer.write(connection, stamp_ns, JAZZY.serialize_cdr(message, TF))
+        connection = writer.add_connection("/gnss/fix", FIX_TYPE, typestore=JAZZY)
+        for stamp_ns, place in zip(camera.stamps_ns.tolist(), places.tolist(), strict=True):
+            writer.write(connection, stamp_ns, fix(2, *place, stamp_ns=stamp_ns))
+        connection = writer.add_connection("/imu", IMU_TYPE, typestore=JAZZY)
+        for stamp_ns, rate in zip(rates[0].tolist(), rates[1].tolist(), strict=True):
+            writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
 
 
-def _write_ins(path, trajectory):
+def _write_ins(path, trajectory, places):
     """Latitude, longitude, height, and angles as an INS has them."""
-    import pymap3d
-
-    lat, lon, height = pymap3d.enu2geodetic(*trajectory.poses[:, :3, 3].T, 60.17, 24.94, 20.0)
     yaw, pitch, roll = (
         Rotation.from_matrix(trajectory.poses[:, :3, :3]).as_euler("ZYX", degrees=True).T
     )
-    columns = [trajectory.stamps_ns * 1e-9, lat, lon, height, roll, -pitch, (90 - yaw) % 360]
+    columns = [trajectory.stamps_ns * 1e-9, places, roll, -pitch, (90 - yaw) % 360]
     names = "time,latitude,longitude,height,roll_deg,pitch_deg,heading_deg"
-    np.savetxt(path, np.column_stack(columns), "%.10f", delimiter=",", header=names, comments="")
+    _write_csv(path, names, np.column_stack(columns))
+
+
+def _write_csv(path, names, columns):
+    np.savetxt(path, columns, "%.10f", delimiter=",", header=names, comments="")

@@ -2,13 +2,14 @@
 
 import os
 import signal
+import threading
 from pathlib import Path
 
 import numpy as np
 from result_making import calibration
 
 from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.cli.batch.calibrating import failed
+from hand_eye_calib.cli.batch.workers import failed
 from hand_eye_calib.geometry import se3
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -29,6 +30,13 @@ def always_dies(task):
     if task.name == "bad":
         os.kill(os.getpid(), signal.SIGKILL)
     return failed(task, "done")
+
+
+def never_ends(task):
+    """Work that writes the number of its process into a pipe and then waits."""
+    with open(task.options["pipe"], "w") as pipe:
+        print(os.getpid(), file=pipe)
+    threading.Event().wait()
 
 
 def recordings_of(seed, count, unknown_z=False):

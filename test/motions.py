@@ -4,6 +4,7 @@ import numpy as np
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
 
@@ -69,3 +70,17 @@ def feed(calibrator, stream, trajectory):
         strict=True,
     ):
         calibrator.add_pose(stream, stamp_ns, pose[:3, 3].tolist(), quat_xyzw.tolist())
+
+
+def geodetic(positions, origin):
+    """Latitudes and longitudes (deg) and heights (m) of positions (N, 3) east, north and up of an
+    origin (deg, deg, m) within some kilometres: what LocalOrigin gives, the other way round.
+    """
+    place = LocalOrigin()
+    place.geodetic = *np.radians(origin[:2]), origin[2]
+    per_radian_m = 6.37e6 * np.array([np.cos(place.geodetic[0]), 1.0, 0.0]) + [0, 0, 1]
+    found = np.tile(place.geodetic, (len(positions), 1))
+    for _ in range(10):  # each leaves less than a hundredth of the error
+        missing = (positions - place.local(*found.T)) / per_radian_m
+        found += missing[:, [1, 0, 2]]
+    return *np.degrees(found[:, :2].T), found[:, 2]

@@ -5,21 +5,19 @@ so, where they are absent.
 """
 
 import csv
+import json
+import random
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from published_data import data_folder
 from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import read_trajectory
-
-TANGO = {
-    "caligula": "CALIGULA_2017-04-06-18-21-33",
-    "mars": "MARS_2017-04-06-18-23-37",
-    "nero": "NERO_2017-04-06-18-25-25",
-}
+from reproduction.recordings import rigs_of
 
 # WGS 84.
 _EQUATORIAL_RADIUS, _ECCENTRICITY_SQUARED = 6378137.0, 6.69437999014e-3
@@ -63,56 +61,77 @@ class Recording:
 
 def tango_pairs():
     """Three handheld devices on one rig, clocks not shared: (parent, child) in a cycle."""
-    devices = {name: _asl_csv("asl_tango_easy", file) for name, file in TANGO.items()}
-    known = {
-        ("caligula", "mars"): -126.834,
-        ("mars", "nero"): -107.736,
-        ("nero", "caligula"): 234.570,
+    offsets = {
+        "tango_caligula_mars": -126.834,
+        "tango_mars_nero": -107.736,
+        "tango_nero_caligula": 234.570,
     }
     return [
-        Recording(f"tango {parent}<-{child}", devices[parent], devices[child], offset, scale)
-        for ((parent, child), offset), scale in zip(known.items(), _TANGO_SCALES, strict=True)
+        _of_rig("asl_tango_easy", name, name, offset, scale)
+        for (name, offset), scale in zip(offsets.items(), _TANGO_SCALES, strict=True)
     ]
 
 
 def primesense():
     """Motion capture against a camera that sees a target, with gross jumps."""
-    stem = "2017-04-09-18-13-10_"
-    parent, child = (
-        _asl_csv("asl_primesense", stem + name)
-        for name in ("vicon_prime_sense", "W_camera_rgb_image_raw")
-    )
-    return Recording("primesense", parent, child, 0.02)
+    return _of_rig("asl_primesense", "primesense", "primesense", 0.02)
 
 
 def robot_arm(which):
     """An arm's hand against a camera: "complete" is real, with gross jumps; "sim" turns about
     nearly one axis.
     """
-    names = {
-        "complete": (
-            "complete_bag_color_and_ir_base_link_sr300_hinge",
-            "complete_bag_color_and_ir_target_ir",
-        ),
-        "sim": ("sim_hand", "sim_camera"),
-    }[which]
-    return Recording(
-        f"arm {which}",
-        *(_asl_csv("asl_robot_arm", f"robot_arm_{name}") for name in names),
-        _ARM_OFFSETS_S[which],
-    )
+    rig = {"complete": "robot_arm", "sim": "robot_arm about one axis"}[which]
+    return _of_rig("asl_robot_arm", rig, f"arm {which}", _ARM_OFFSETS_S[which])
+
+
+def stops(seed):
+    """Poses (32, 4, 4) of the hand and of the camera of the real arm, in no order: those that
+    rsasaki0109/Calibrex fits to for this seed (docs/benchmarks/ethz_hand_eye_opencv.md).
+    """
+    arm = robot_arm("complete")
+    hand_ns = arm.parent.stamps_ns
+    best = {}
+    for eye, stamp_ns in enumerate(arm.child.stamps_ns):
+        hand = int(np.argmin(np.abs(hand_ns - stamp_ns)))
+        apart_ns = abs(int(hand_ns[hand] - stamp_ns))
+        if apart_ns <= 11_000_000:
+            best[hand] = min(best.get(hand, (apart_ns, eye)), (apart_ns, eye))
+    pairs = sorted((hand, eye) for hand, (_, eye) in best.items())
+    order = list(range(len(pairs)))
+    random.Random(seed).shuffle(order)
+    hands, eyes = zip(*(pairs[index] for index in sorted(order[16:48])), strict=True)
+    return arm.parent.poses[list(hands)], arm.child.poses[list(eyes)]
+
+
+def eye_to_hand():
+    """Poses (50, 4, 4) of an arm's base in its hand and of a target on the hand in a fixed camera's
+    view, both inverse: MoveIt's samples.
+    """
+    path = data_folder() / "independent" / "moveit_samples" / "pose_samples.json"
+    if not path.exists():
+        pytest.skip(f"{path} is absent")
+    rows = np.array(json.loads(path.read_text(encoding="utf-8")), dtype=float)
+    return tuple(se3.inverse(rows[:, part].reshape(-1, 4, 4)) for part in range(2))
+
+
+def thinned(stream, interval_s):
+    """Poses at least about so far apart."""
+    keep = [0]
+    for index, stamp_ns in enumerate(stream.stamps_ns):
+        if stamp_ns - stream.stamps_ns[keep[-1]] >= (interval_s - 0.02) * 1e9:
+            keep.append(index)
+    return stream[np.array(keep)]
 
 
 def zxl19(bag, child):
     """INS against lidar odometry ("LO") or a monocular camera of unknown scale ("VO") on a road
     vehicle, bags 1 to 3.
     """
-    folder = data_folder() / "zxl19" / f"bag{bag}"
+    rig = {"LO": "zxl19_lidar", "VO": "zxl19_camera"}[child]
     scale = {1: 3.34, 2: 3.76, 3: 2.66}[bag] if child == "VO" else 1.0
-    parent, child_poses = _mat(folder / "INS_FCPE.mat"), _mat(folder / f"{child}_FCPE.mat")
-    return Recording(
-        f"zxl19 {bag} {child}", parent, child_poses, _ZXL19_OFFSETS_S[child][bag - 1], scale
-    )
+    offset = _ZXL19_OFFSETS_S[child][bag - 1]
+    return _of_rig("zxl19", rig, f"zxl19 {bag} {child}", offset, scale, f"bag{bag}")
 
 
 def zxl19_raw():
@@ -125,9 +144,7 @@ def zxl19_raw():
 
 def boreas():
     """Lidar (stamps in microseconds) and radar (nanoseconds) of a car, both from one INS."""
-    return Recording(
-        "boreas", _boreas_csv("lidar_poses.csv", 1_000), _boreas_csv("radar_poses.csv", 1)
-    )
+    return _of_rig("boreas", "boreas", "boreas")
 
 
 BOREAS_TRUTH = se3.from_rotation_translation(
@@ -135,21 +152,42 @@ BOREAS_TRUTH = se3.from_rotation_translation(
 )
 
 
+# Of the unit that EuRoC's odometry calls its body: good to about 10 mm and 0.15 deg.
+EUROC_TRUTH = np.array(
+    [
+        [0.0148655, -0.9998809, 0.0041403, -0.0216401],
+        [0.9995572, 0.0149672, 0.0257155, -0.0646770],
+        [-0.0257744, 0.0037562, 0.9996607, 0.0098107],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+
+
+def euroc(estimate, flight):
+    """Visual-inertial odometry of a flight ("vio_stereo", "v2_01") and the true poses of camera
+    0.
+    """
+    folder = data_folder() / "euroc_vio"
+    files = (folder / f"{estimate}_{flight}.tum", folder / f"cam0_truth_{flight}.tum")
+    return Recording(f"euroc {estimate} {flight}", *map(read_trajectory, files))
+
+
+SIMPLE_KITTI_TRUTH = se3.from_quat_xyzw((0.8, -0.3, 0.5), (0.333307, -0.063488, 0.753055, 0.563723))
+
+
+def simple_kitti(drive):
+    """Lidar odometry of a road vehicle, camera axes, and the truth with an extrinsic of its own."""
+    folder = data_folder() / "simple_kitti"
+    files = (folder / f"odometry_{drive}.tum", folder / f"truth_{drive}.tum")
+    return Recording(f"simple_kitti {drive}", *map(read_trajectory, files))
+
+
 def kitti(which):
     """The KITTI drives of Välimäki et al. 2023 as their SLAM recorded them, stamps not shared:
     "short" or "long".
     """
-    folder = data_folder() / "valimaki2023" / "kitti_tests"
-    if which == "short":
-        drive = folder / "2011_09_30_drive_0027"
-        files = (
-            drive / "LIDAR_HDL64E" / "traj_HDL_aft_opt.csv",
-            drive / "cam01" / "KeyFrameTrajectory_TUM_Format.txt",
-        )
-        return Recording("kitti short", *map(read_trajectory, files))
-    drive = folder / "2011_10_03_drive_0027"
-    files = (drive / camera / "KeyFrameTrajectory_TUM_Format.txt" for camera in ("cam01", "cam23"))
-    return Recording("kitti long", *map(read_trajectory, files), 0.0, _KITTI_LONG_SCALE)
+    scale = _KITTI_LONG_SCALE if which == "long" else 1.0
+    return _of_rig("valimaki2023", f"kitti_{which}", f"kitti {which}", 0.0, scale)
 
 
 def all_recordings():
@@ -171,34 +209,16 @@ def asl_rows(folder, name):
     return np.loadtxt(data_folder() / folder / f"{name}.csv", delimiter=",")
 
 
-def _asl_csv(folder, name):
-    rows = asl_rows(folder, name)
-    return _tidy(np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:])
-
-
-def _mat(path):
-    rows = np.loadtxt(path)
-    return _tidy(np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, [5, 6, 7, 4]])
+def _of_rig(folder, rig, name, offset_s=0.0, scale=1.0, which="whole"):
+    """A recording of :mod:`reproduction.recordings` with what is known about it."""
+    rigs = {found.name: found for found in rigs_of(data_folder(), folder)}
+    recording = rigs[rig].recordings[which]
+    return Recording(name, recording.parent, recording.child, offset_s, scale)
 
 
 def _tidy(stamps_ns, translations, quats_xyzw):
     stamps_ns, first = np.unique(stamps_ns, return_index=True)
     return Trajectory.from_quat_xyzw(stamps_ns, translations[first], quats_xyzw[first])
-
-
-def _boreas_csv(name, unit_ns):
-    path = data_folder() / "boreas" / "boreas-2021-08-05-13-34" / name
-    with open(path, encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    stamps_ns = np.array([int(row["GPSTime"]) * unit_ns for row in rows])
-    roll, pitch, yaw = (
-        np.array([float(row[key]) for row in rows]) for key in ("roll", "pitch", "heading")
-    )
-    rotation = Rotation.from_euler("XYZ", -np.c_[roll, pitch, yaw])
-    position = np.array(
-        [[float(row[key]) for key in ("easting", "northing", "altitude")] for row in rows]
-    )
-    return Trajectory(stamps_ns, se3.from_rotation_translation(rotation.as_matrix(), position))
 
 
 def _odometry_csv(path):

@@ -1,6 +1,8 @@
 """The node in a process of its own; the test's process is the other end of the middleware."""
 
 import itertools
+import multiprocessing
+import multiprocessing.forkserver
 import os
 import signal
 import socket
@@ -12,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from motions import disturbed
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
@@ -21,6 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
 import hand_eye_calib
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros import conversions
 
@@ -59,7 +63,9 @@ def free_domain():
 
 
 def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS):
-    """Stamps and noise-free poses of both sensors on a rig that turns about all axes."""
+    """Stamps and poses of both sensors on a rig that turns about all axes. Without noise they would
+    be one stream computed from the other.
+    """
     s = np.arange(n_poses) * period_ns * 1e-9
     turns = np.stack(
         [0.5 * np.sin(0.7 * s), 0.4 * np.sin(0.9 * s + 1.0), 0.8 * np.sin(0.4 * s)], axis=1
@@ -67,7 +73,8 @@ def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS):
     places = np.stack([s, 2.0 * np.sin(0.5 * s), 0.5 * np.cos(0.8 * s)], axis=1)
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     T_cw_pw = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, 0.1, 2.0]))
-    return start_ns + period_ns * np.arange(n_poses), Ts_pw_p, T_cw_pw @ Ts_pw_p @ T_PARENT_CHILD
+    Ts_cw_c = disturbed(T_cw_pw @ Ts_pw_p @ T_PARENT_CHILD, 1, 5e-5, 5e-5)
+    return start_ns + period_ns * np.arange(n_poses), Ts_pw_p, Ts_cw_c
 
 
 def message(kind, stamp_ns, T_world_sensor, sensor_frame):
@@ -97,27 +104,86 @@ def matrix(transform):
     return se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
 
 
-class NodeProcess:
-    """``python -m hand_eye_calib calibrator`` with its output in a file."""
+# Importing is most of what a start takes: nodes are forked from a process that has done so.
+_FORKS = multiprocessing.get_context("forkserver")
+_FORKS.set_forkserver_preload(
+    ["pytest", "hand_eye_calib.cli.main", "hand_eye_calib.ros.running", "ros_harness"]
+)
 
-    def __init__(self, domain, log_file, ros_arguments):
+
+def stop_forks():
+    """End the process that nodes are forked from; processor time counts when it is waited for."""
+    multiprocessing.forkserver._forkserver._stop()
+
+
+def _run_node(arguments, log_file, environment):
+    """The node's process, from the fork to its end."""
+    with log_file.open("wb") as log:
+        for stream in (1, 2):
+            os.dup2(log.fileno(), stream)
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(log_file.parent)
+    sys.stdout.reconfigure(write_through=True)
+    sys.argv = ["hand_eye_calib", *arguments]
+    sys.exit(main(arguments))
+
+
+class _Forked:
+    """A forked node, in words of :class:`subprocess.Popen`."""
+
+    def __init__(self, *arguments):
+        self._process = _FORKS.Process(target=_run_node, args=arguments)
+        self._process.start()
+        self.pid = self._process.pid
+
+    @property
+    def returncode(self):
+        return self._process.exitcode
+
+    def poll(self):
+        return self._process.exitcode
+
+    def wait(self, timeout=None):
+        self._process.join(timeout)
+        assert self.returncode is not None, f"process {self.pid} does not end"
+        return self.returncode
+
+    def send_signal(self, number):
+        os.kill(self.pid, number)
+
+    def kill(self):
+        self._process.kill()
+
+
+class NodeProcess:
+    """The command ``calibrator`` in a process of its own, with its output in a file; ``before`` is
+    Python code that runs first, in an interpreter that is started for it.
+    """
+
+    def __init__(self, domain, log_file, ros_arguments, before=""):
         self._log_file = log_file
-        command = [sys.executable, "-m", "hand_eye_calib", "calibrator"]
         if not any("report:=" in str(argument) for argument in ros_arguments):
             ros_arguments = [*ros_arguments, "-p report:=false"]  # it takes a processor for seconds
-        arguments = [word for argument in ros_arguments for word in str(argument).split(" ", 1)]
+        words = [word for argument in ros_arguments for word in str(argument).split(" ", 1)]
+        arguments = ["calibrator", "--ros-args", *words]
         source = str(Path(hand_eye_calib.__file__).parents[1])
-        environment = {
+        environment = os.environ | {
             "ROS_DOMAIN_ID": str(domain),
             "PYTHONUNBUFFERED": "1",
             "PYTHONPATH": os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")])),
         }
+        log_file.touch()
+        if not before:
+            self.process = _Forked(arguments, log_file, environment)
+            return
+        run = "import runpy; runpy.run_module('hand_eye_calib', run_name='__main__')"
         with log_file.open("wb") as log:
             self.process = subprocess.Popen(
-                [*command, "--ros-args", *arguments],
+                [sys.executable, "-c", f"{before}\n{run}", *arguments],
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=os.environ | environment,
+                env=environment,
                 cwd=log_file.parent,  # below it, output directories may be chosen
             )
 
@@ -125,23 +191,16 @@ class NodeProcess:
     def log(self):
         return self._log_file.read_text(errors="replace")
 
-    def wait_for_log(self, *texts):
+    def wait_for_log(self, *texts, may_have_ended=False):
         """Wait until the log has all texts; returns the log."""
         end = time.monotonic() + PATIENCE_S
         while not all(text in self.log for text in texts):
             assert time.monotonic() < end, f"no {texts} in the node's log:\n{self.log}"
-            assert self.process.poll() is None, (
+            assert may_have_ended or self.process.poll() is None, (
                 f"the node ended with {self.process.returncode}:\n{self.log}"
             )
             time.sleep(0.02)
         return self.log
-
-    def wait_for_text(self, *texts):
-        """Wait until the log has all texts, though the node may have ended."""
-        end = time.monotonic() + PATIENCE_S
-        while not all(text in self.log for text in texts):
-            assert time.monotonic() < end, f"no {texts} in the node's log:\n{self.log}"
-            time.sleep(0.05)
 
     def wait(self):
         """Exit code once the node has ended by itself."""

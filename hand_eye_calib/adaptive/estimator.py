@@ -76,8 +76,7 @@ _DECISIVE = 0.7
 _MOST_POSES, _MOST_POSES_LASTING = 300, 200
 _BURST = np.array([0, 1, 2, 3, 5, 8, 13, 21, 34, 55])
 
-# Systematic errors that are in the model while the noise levels are fitted: scale, bias, time. Both
-# biases at once would differ by noise alone.
+# In the model while levels are fitted: scale, time, one bias. Two would differ by noise alone.
 _WHILE_FITTING = [0, 1, 2, 3, 7]
 
 # No lever arm is that long (m).
@@ -92,7 +91,7 @@ _MOST_SPIKES = 0.2
 # If more than this share are, and the tails are heavy without them, most of them belong to these.
 _MOST_SPIKES_IN_TAILS = 0.1
 
-# Changes of this share of the evidence leave the noise levels as they are.
+# Refit the noise levels only if more than this share of poses changed status.
 _NEGLIGIBLE = 0.005
 
 # Strides where a target's camera is noisy, if so many poses remain.
@@ -200,7 +199,10 @@ def _keep_freed_memory() -> None:
 
 def _while_fitting(systematic: Sequence[str]) -> list[int]:
     """Parameters of systematic errors that are in the model while the noise levels are fitted."""
-    return _WHILE_FITTING if len(systematic) > 1 else parameters_of(systematic[0])
+    if len(systematic) == 1:
+        return parameters_of(systematic[0])
+    chosen = {column for name in systematic for column in parameters_of(name)}
+    return [column for column in _WHILE_FITTING if column in chosen]
 
 
 def _strided(state: _State) -> IntArray:
@@ -473,9 +475,7 @@ def _without_outliers(state: _State, quick: bool) -> _State:
 
 
 def _without_mild_spikes(state: _State) -> _State:
-    """With those poses back that count as wrong by themselves, but would by no more than tails that
-    are heavy anyway make probable. As part of these tails they count less.
-    """
+    """Reinstates outlier poses that a Student-t tail explains; they are down-weighted instead."""
     left_out = state.outliers.spikes
     errors = np.zeros_like(state.error)
     errors[left_out] = se3.log(
@@ -588,10 +588,11 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
     if state.is_clock_free or candidates.best != systematic[0]:
         candidates = candidates.judged_by_parts(prefers_time=state.is_clock_free)
 
+    models = candidates.models
+
     def at_its_own(name: str) -> _State:
-        return dataclasses.replace(state, systematic=name, columns=parameters_of(name)).moved(
-            candidates.fits[name].step
-        )
+        own = dataclasses.replace(state, systematic=name, columns=models[name].parameters)
+        return own.moved(models[name].fit.step)
 
     best = candidates.best
     if "bias" in best:
@@ -599,15 +600,15 @@ def _with_systematic_errors(state: _State, systematic: Sequence[str]) -> _State:
         # travel seems to be nearer: both are judged at their own parameters.
         scales = [name for name in candidates.credible if "scale" in name]
         best = min(
-            (best, *sorted(scales, key=candidates.criterion)[:1]),
-            key=lambda name: at_its_own(name).posterior.normal.cost + candidates.penalties[name],
+            (best, *sorted(scales, key=lambda name: models[name].criterion)[:1]),
+            key=lambda name: at_its_own(name).posterior.normal.cost + models[name].penalty,
         )
     chosen = dataclasses.replace(
         at_its_own(best),
         other_sigmas=candidates.sigmas(("scale", "time")),
         cov_beyond=state.cov_beyond + candidates.spread_about(best),
     )
-    states = posterior.states_after(candidates.fits[best].step, columns_of(best, tried))
+    states = posterior.states_after(models[best].fit.step, columns_of(chosen.columns, tried))
     return _freed(chosen, states)
 
 

@@ -308,7 +308,7 @@ def linearise(
     parameters : (11,) array
         Of all systematic errors, see the module.
     columns : sequence of int
-        Those whose derivatives are asked for. The three of a bias follow each other.
+        Those whose derivatives are asked for.
     """
     n = len(streams) - 1
     found = Linearisation(
@@ -334,9 +334,10 @@ def _linearise(
     """Fill in the arrays of a part of the increments, whose columns and ``by_scale`` are zero."""
     used, asked = {*columns, *np.flatnonzero(parameters).tolist()}, {*columns}
 
-    def at(first: int, size: int = 3) -> slice:
-        start = 6 + columns.index(first)
-        return slice(start, start + size)
+    def of(kind: set[int]) -> tuple[list[int], list[int]]:
+        """Columns of the parameters of a kind that are asked for, and their axes."""
+        chosen = sorted(kind & asked)
+        return [6 + columns.index(index) for index in chosen], [i - min(kind) for i in chosen]
 
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
     back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
@@ -363,17 +364,20 @@ def _linearise(
     np.subtract(np.eye(6), adjoints, out=by[:, :, :6])
     found.by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
     if SCALE in asked:
-        by[:, :, at(SCALE, 1)] = found.by_scale
+        by[:, :, 6 + columns.index(SCALE)] = found.by_scale[:, :, 0]
     if asked & _CHILD_BIASES:
-        by[:, :3, at(1)] = back[:, :3, :3] @ metres_c
+        at, along = of(_CHILD_BIASES)
+        by[:, :3, at] = (back[:, :3, :3] @ metres_c)[:, :, along]
     if asked & _PARENT_BIASES:
+        at, along = of(_PARENT_BIASES)
         axes = T_parent_child[:3, :3].T @ np.swapaxes(by_parent[:, :3, :3], 1, 2)
-        by[:, :3, at(4)] = -axes @ metres_p
+        by[:, :3, at] = (-axes @ metres_p)[:, :, along]
     if TIME in asked:
         late = turned(adjoints, course.twists[:-1]) - course.twists[1:]
-        by[:, :, at(TIME, 1)] = late[:, :, None]
+        by[:, :, 6 + columns.index(TIME)] = late
     if asked & _RATES:
-        by[:, 3:, at(8)] = by_rate
+        at, along = of(_RATES)
+        by[:, 3:, at] = by_rate[:, :, along]
     by[:, :, -1] = se3.log(back @ between(by_parent, T_parent_child))
     found.adjoints[:], found.metres[:] = adjoints, np.linalg.norm(step, axis=1)
 

@@ -36,6 +36,7 @@ from hand_eye_calib.adaptive.resampling import part_products
 from hand_eye_calib.adaptive.state_space import Posterior, StateSpace, multiplied
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.text import angle, length
 
 # Of the latent states.
 _WHITE_ROTATION = slice(3, 6)
@@ -47,7 +48,7 @@ _FIRST_WALK = np.log(1e-6)
 _LEAST_WHITE_SHARE, _LEAST_WALK_SHARE = -14.0, -12.0
 
 # Poses of the windows that are aligned by themselves: for the first lever arm, and for the first
-# orientations. The first lever arm is drawn to zero by so much where the motion does not show it.
+# orientations. The first lever arm is drawn to zero by so much where the motion does not tell it.
 _START_WINDOWS, _ALIGNED_WINDOW = (480, 60), 100
 _START_STEPS, _SETTLED_START, _DRAWN = 50, 1e-6, 1e-6
 
@@ -144,11 +145,11 @@ class LeverArmSolution:
             float(sigmas[level])
             for level in (noise_model.TRANSLATION, noise_model.WALK_TRANSLATION)
         )
-        turned = float(np.degrees(sigmas[noise_model.WALK_ROTATION]))
+        turned = float(sigmas[noise_model.WALK_ROTATION])
         worse = float(np.mean(self.worse))
         said = [
-            f"each position is off by {100 * white:.2g} cm per axis, and the odometry drifts by "
-            f"{100 * walk:.2g} cm and {turned:.2g} deg from one to the next"
+            f"each position is off by {length(white)} per axis, and the odometry drifts by "
+            f"{length(walk)} and {angle(turned)} from one to the next"
         ]
         if worse:
             said.append(f"{worse:.0%} of the positions are far less precise, and are left out")

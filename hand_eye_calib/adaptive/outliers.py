@@ -188,7 +188,9 @@ def _squared(columns: FloatArray) -> FloatArray:
 def _chi_squares(
     values: FloatArray, prior: FloatArray, posterior: FloatArray, left_out: BoolArray
 ) -> FloatArray:
-    """Of smoothed values (n, 6), whose own evidence counted unless it was left out."""
+    """Chi-square (n,) of smoothed values (n, 6); their covariance is prior minus posterior, or plus
+    if the value was excluded.
+    """
     spread = np.where(left_out[:, None, None], prior + posterior, prior - posterior)
     spread += _ROUNDING * prior + _LEAST_VARIANCE * np.eye(6)
     return inverse_products(spread, values)

@@ -21,6 +21,7 @@ from hand_eye_calib.adaptive.noise_model import (
 from hand_eye_calib.adaptive.part_delays import PartDelay
 from hand_eye_calib.adaptive.world_drift import WorldDrift
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.text import angle, length
 
 _TURNING = {
     "sensors": "",
@@ -149,7 +150,7 @@ class AdaptiveSolution:
     spikes : (n + 1,) bool array
         Poses that are wrong by themselves, and left out.
     is_drowned : bool
-        Whether white noise drowns the rotation between poses, so that only some of them were used.
+        Whether single poses are noisier than the rotation between them: only some were used.
     heavy_tails : bool
         Whether white errors are weighed as of Student's t distribution.
     misfit : float
@@ -295,26 +296,23 @@ class AdaptiveSolution:
         noise, per_metre = self.noise, self._after_a_metre
         if not self.metres_per_pose:
             return [
-                f"each pose is off by {_angle(noise.rotation_white)} per axis (both sensors "
-                f"together), and what stays grows by {_angle(noise.rotation_drift)} from pose to "
-                "pose",
+                f"Noise: {angle(noise.rotation_white)} per axis of each pose (both sensors "
+                f"together). Drift: {angle(noise.rotation_drift)} from pose to pose.",
                 *map(_slow_in_words, (slow for slow in noise.slow if slow.part == "rotation")),
             ]
         said = [
-            f"each pose is off by {_length(noise.translation_white)} and "
-            f"{_angle(noise.rotation_white)} per axis (both sensors together)"
-            f"{_TURNING[noise.centre]}",
-            f"what stays grows by {_length(noise.translation_drift)} and "
-            f"{_angle(noise.rotation_drift)} from pose to pose, that is by "
-            f"{_length(noise.translation_drift * per_metre)} and "
-            f"{_angle(noise.rotation_drift * per_metre)} in the first metre, "
-            "ten times that in a hundred",
+            f"Noise: {length(noise.translation_white)} and {angle(noise.rotation_white)} per axis "
+            f"of each pose (both sensors together){_TURNING[noise.centre]}.",
+            f"Drift: {length(noise.translation_drift * per_metre)} and "
+            f"{angle(noise.rotation_drift * per_metre)} after 1 m, "
+            f"{length(10 * noise.translation_drift * per_metre)} and "
+            f"{angle(10 * noise.rotation_drift * per_metre)} after 100 m.",
         ]
         said += [_slow_in_words(slow) for slow in noise.slow]
         if noise.jitter_s > _NOTABLE_JITTER_S:
             said.append(f"stamps jitter by {1000 * noise.jitter_s:.2g} ms")
         if self.heavy_tails:
-            said.append("many poses are far more wrong than the rest, and count less")
+            said.append("Some poses are outliers and get less weight.")
         return said
 
     def _systematic_in_words(self) -> list[str]:
@@ -355,16 +353,8 @@ class AdaptiveSolution:
 def _slow_in_words(slow: SlowNoise) -> str:
     if slow.kind == "scale":
         return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
-    size = _length(slow.sigma) if slow.part == "translation" else _angle(slow.sigma)
+    size = length(slow.sigma) if slow.part == "translation" else angle(slow.sigma)
     return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
-
-
-def _length(metres: float) -> str:
-    return f"{100 * metres:.2g} cm"
-
-
-def _angle(radians: float) -> str:
-    return f"{np.degrees(radians):.2g} deg"
 
 
 def _when(one: str, several: str, stamps_ns: IntArray) -> list[str]:

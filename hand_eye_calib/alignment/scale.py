@@ -2,7 +2,11 @@
 
 from dataclasses import dataclass
 
-from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
+from hand_eye_calib.alignment.similarity import (
+    MAX_UNEXPLAINED_TRANSLATION,
+    SimilarityFit,
+    fit_similarity,
+)
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -88,3 +92,47 @@ def child_scaled(pose_pairs: PosePairs, factor: float) -> PosePairs:
     Ts_cw_c = pose_pairs.Ts_cw_c.copy()
     Ts_cw_c[:, :3, 3] *= factor
     return PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, Ts_cw_c)
+
+
+@dataclass(frozen=True)
+class ScaleInUse:
+    """Factor of the child's lengths, and the estimate it comes from if it was estimated."""
+
+    value: float = 1.0
+    estimate: Scale | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def settle_scale(pose_pairs: PosePairs, option: str | float) -> ScaleInUse:
+    """The scale to use: given, or estimated if the option ``scale`` asks for it.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If it is to be estimated and cannot be.
+    """
+    if option == "none":
+        return ScaleInUse()
+    if not isinstance(option, str):
+        return ScaleInUse(option)
+    if option == "estimate":
+        scale = estimate_scale(pose_pairs)
+        if not scale.fit.explains_translation:
+            raise NotEnoughDataError(
+                "the scale cannot be estimated: even with a scale, "
+                f"{scale.fit.unexplained_translation:.0%} of the motion stays unexplained "
+                f"(at most {MAX_UNEXPLAINED_TRANSLATION:.0%} is allowed); "
+                "check the streams, or give scale"
+            )
+        return ScaleInUse(scale.value, scale)
+    try:
+        scale = estimate_scale(pose_pairs)
+    except NotEnoughDataError:
+        return ScaleInUse()
+    if not scale.differs:
+        return ScaleInUse()
+    warning = (
+        f"the child's lengths are multiplied by {scale.value:.4f} +/- {scale.sigma:.4f}, "
+        "as estimated from the motion"
+    )
+    return ScaleInUse(scale.value, scale, (warning,))

@@ -48,7 +48,7 @@ MAX_UNEXPLAINED_TRANSLATION = 0.3
 # Smaller ones are rounding.
 _MIN_SIGMA_ROTATION, _MIN_SIGMA_TRANSLATION = 1e-7, 1e-9
 
-# Damping of directions that the motion does not show, in balanced units.
+# Damping of directions that the motion does not determine, in balanced units.
 _DAMPING = 1e-10
 
 _SCALE, _OFFSET, _UNKNOWNS = 6, 7, 8

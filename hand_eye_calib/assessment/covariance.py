@@ -9,7 +9,7 @@ Two estimates are made. In each direction the larger one holds:
   model misses.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -96,6 +96,15 @@ class Assessment:
     cov_parent_child_in_child: FloatArray
     observability: tuple[DofObservability, ...]
 
+    def named(self, verdict: DofVerdict) -> list[str]:
+        """Names of the axes with a verdict."""
+        return [dof.name for dof in self.observability if dof.verdict is verdict]
+
+    def known_translations(self) -> BoolArray:
+        """Whether the motion, not a prior alone, reveals x, y and z of the parent, (3,)."""
+        unknown = (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
+        return np.array([dof.verdict not in unknown for dof in self.observability[:3]])
+
 
 def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:
     """Covariance and observability of a solution.
@@ -142,7 +151,7 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         solution.T_parent_child,
         solution.jumps,
         solution.noise.rotation_variance,
-        # Noise that drowns the rotation between poses is not told from small rotations.
+        # Rotations below the noise of single poses cannot be told from none.
         MIN_SHARE if solution.is_drowned else MIN_SHARE_WITH_TILT,
     )
     unseen = basis([*solution.unseen.T, *hidden])
@@ -286,6 +295,25 @@ def combined(
     known = np.eye(6) - unknown @ unknown.T
     covariance = known @ larger_by_direction(model, resampled) @ known + _unknown_variance(unknown)
     return Assessment(covariance, _verdicts(T_parent_child[:3, :3], covariance, unknown))
+
+
+def without_axes(
+    assessment: Assessment, T_parent_child: FloatArray, axes: Collection[str]
+) -> Assessment:
+    """An assessment that counts these axes of the parent's frame as unobservable."""
+    # A direction that is unknown already is hardly ever an axis: both would hide a second one.
+    known = {*axes} - {*assessment.named(DofVerdict.UNOBSERVABLE)}
+    rows = [index for index, axis in enumerate(AXES) if axis in known]
+    if not rows:
+        return assessment
+    to_parent = np.kron(np.eye(2), T_parent_child[:3, :3])
+    unknown = np.asarray(to_parent[rows].T, dtype=float)
+    found = combined(T_parent_child, assessment.cov_parent_child_in_child, None, unknown)
+    observability = tuple(
+        before if before.verdict is DofVerdict.UNOBSERVABLE else after
+        for before, after in zip(assessment.observability, found.observability, strict=True)
+    )
+    return Assessment(found.cov_parent_child_in_child, observability)
 
 
 def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray, FloatArray]:

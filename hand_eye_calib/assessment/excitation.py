@@ -18,6 +18,7 @@ from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.text import amount, angle, length, listing
 
 # Most poses that are looked at, evenly over the session: enough to see curves, and few enough to
 # cost a few milliseconds.
@@ -181,17 +182,19 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     if most < MIN_ROTATION:
         turn = "drive curves in both directions" if seen.drives else "rotate about all axes"
         return (
-            f"hardly any rotation so far (at most {_degrees(most)}): {_list(hidden)} not "
+            f"hardly any rotation so far (at most {_degrees(most)}): {listing(hidden)} not "
             f"observable, {turn}"
         )
     fine = [axis for axis, angle in angles.items() if angle >= MIN_ROTATION]
     small = [axis for axis in angles if axis not in fine]
-    text = f"rotation about {_list(fine)} is fine ({_list([_degrees(angles[a]) for a in fine])})"
+    text = (
+        f"rotation about {listing(fine)} is fine ({listing([_degrees(angles[a]) for a in fine])})"
+    )
     if small:
         below = _degrees(max(angles[axis] for axis in small), round_up=True)
-        text += f"; {_list([_ROTATION_ABOUT[axis] for axis in small])} under {below}"
+        text += f"; {listing([_ROTATION_ABOUT[axis] for axis in small])} under {below}"
     vertical = TRANSLATIONS[int(np.argmax(seen.rotation))] if seen.drives else ""
-    names = _list([_described(name, vertical) for name in hidden])
+    names = listing([_described(name, vertical) for name in hidden])
     return f"{text}: {names} not observable, {_advice(hidden, small, seen.drives)}"
 
 
@@ -218,17 +221,15 @@ def _weak(calibration: Calibration, seen: Excitation) -> str:
     weak = [dof for dof in calibration.observability if dof.verdict is DofVerdict.WEAK]
     if not weak:
         return ""
-    limits = f"{WEAK_TRANSLATION * 100:g} cm or {np.degrees(WEAK_ROTATION):g} deg"
+    limits = f"{length(WEAK_TRANSLATION)} or {angle(WEAK_ROTATION)}"
     return (
-        f"{_list([_with_sigma(dof) for dof in weak])} still more uncertain than {limits}: "
+        f"{listing([_with_sigma(dof) for dof in weak])} still more uncertain than {limits}: "
         f"continue, with {'more curves' if seen.drives else 'larger rotations about all axes'}"
     )
 
 
 def _with_sigma(dof: DofObservability) -> str:
-    if dof.name in TRANSLATIONS:
-        return f"{dof.name} (+/- {dof.sigma * 100:.0f} cm)"
-    return f"{dof.name} (+/- {np.degrees(dof.sigma):.1f} deg)"
+    return f"{dof.name} (+/- {amount(dof.name, dof.sigma)})"
 
 
 def _degrees(angle: float, round_up: bool = False) -> str:
@@ -236,7 +237,3 @@ def _degrees(angle: float, round_up: bool = False) -> str:
     if round_up:
         return f"{max(np.ceil(degrees), 1.0):.0f} deg"
     return f"{degrees:.0f} deg" if degrees >= 10 else f"{degrees:.1f} deg"
-
-
-def _list(words: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

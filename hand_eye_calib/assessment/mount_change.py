@@ -33,6 +33,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.text import angle, length
 
 # Shifts that are looked for: one standard deviation per axis (m, rad).
 SHIFT_M, SHIFT_RAD = 0.03, float(np.radians(1.0))
@@ -330,11 +331,10 @@ class PossibleShift:
         if self.probability < 0.5:
             return ()
         return (
-            f"the first {self.share:.0%} of the recording and the rest differ by "
-            f"{100 * np.linalg.norm(self.xi[:3]):.2g} cm and "
-            f"{np.degrees(np.linalg.norm(self.xi[3:])):.2g} deg, more than their noise explains: "
-            "the mount may have moved, or an odometry has changed; the standard deviations contain "
-            "half of that",
+            f"The first {self.share:.0%} and the last {1 - self.share:.0%} of the recording give "
+            f"different results ({length(float(np.linalg.norm(self.xi[:3])))}, "
+            f"{angle(float(np.linalg.norm(self.xi[3:])))}). Perhaps a sensor moved, or an odometry "
+            "got worse. The +/- values already include half of this.",
         )
 
 

@@ -22,7 +22,7 @@ from hand_eye_calib.assessment.covariance import (
     Assessment,
     judged,
 )
-from hand_eye_calib.calibration import DofObservability, DofVerdict
+from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.geometry import se3
 
 # Axis name to (value, standard deviation), in m and rad.
@@ -70,6 +70,23 @@ class Fused:
     T_parent_child: FloatArray
     assessment: Assessment
     contradictions: dict[str, float]
+
+    def status(self, converged: bool) -> SolveStatus:
+        """How a solve ended."""
+        if not converged:
+            return SolveStatus.NOT_CONVERGED
+        if self.contradictions:
+            return SolveStatus.CONTRADICTED
+        unobservable = self.assessment.named(DofVerdict.UNOBSERVABLE)
+        return SolveStatus.UNOBSERVABLE if unobservable else SolveStatus.OK
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the reasons of the verdict do not say."""
+        names = self.assessment.named(DofVerdict.PRIOR)
+        if not names:
+            return []
+        return [f"{', '.join(names)} of the child sensor: mostly from the prior, not the motion"]
 
 
 def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fused:

@@ -24,17 +24,14 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 # must exceed what noise may make of it.
 _SIGMAS, _SMOOTHING_SIGMAS, _BIASES = 6.0, 8.0, 2.0
 
-# Two frames are one if they are this close (m, rad), within their standard deviations, which must
-# not be larger than these.
+# Two frames are one if they are this close (m, rad), within their standard deviations. That of the
+# rotation must not be larger than this.
 _SAME_M, _SAME_RAD = 0.005, float(np.radians(0.3))
-_MAX_SIGMA_M, _MAX_SIGMA_RAD = 0.01, float(np.radians(0.5))
-_WITHIN = 3.0
+_MAX_SIGMA_RAD, _WITHIN = float(np.radians(0.5)), 3.0
 
-# Nearly one: hardly two sensors fit so close.
-_NEARLY_M, _NEARLY_WITHIN = 0.012, 4.0
-
-# Farther apart two frames are no question.
-_APART_M = 0.05
+# Upper bounds of the lever arm (m; so many standard deviations above its length). Hardly two
+# sensors fit closer than the second; of other orientations, none are closer than the first.
+_SAME_POSITION_M, _NEARLY_M, _UPPER = 0.002, 0.012, 2.0
 
 # Gains of rotations, less 1, from which on there is a warning, an error.
 _GAIN_WARNING, _GAIN_ERROR = 0.003, 0.03
@@ -67,31 +64,6 @@ _MOVED_ERROR_M, _MOVED_ERROR_RAD = 0.02, float(np.radians(1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
-class ByModel:
-    """What a noise model that fits has found in two streams.
-
-    Attributes
-    ----------
-    T_parent_child : (4, 4) array
-        X.
-    offset_sigma_s : float
-        Standard deviation of the time offset; zero if it was not estimated.
-    is_steady : bool
-        There is neither a delay of positions, nor a world that moves, nor another time offset.
-    """
-
-    T_parent_child: FloatArray
-    offset_sigma_s: float
-    is_steady: bool
-
-    @property
-    def leaves_no_doubt(self) -> bool:
-        """Whether the estimator has nothing to add: the frames are not nearly one either."""
-        distance_m = float(np.linalg.norm(self.T_parent_child[:3, 3]))
-        return self.is_steady and self.offset_sigma_s > 0 and distance_m > _APART_M
-
-
-@dataclass(frozen=True, kw_only=True)
 class Aligned:
     """Two streams that agree.
 
@@ -105,22 +77,18 @@ class Aligned:
         X.
     covariance : (6, 6) array
         Of (rho, phi) in ``X exp(rho, phi)``.
-    model : ByModel or None
     """
 
     pose_pairs: PosePairs
     motions: MotionPairs
     T_parent_child: FloatArray
     covariance: FloatArray
-    model: ByModel | None = None
 
     @cached_property
     def solution(self) -> AdaptiveSolution | None:
         """Answer of the adaptive estimator from some of the poses, with a free clock; None if they
-        are too few, if it does not settle, or if a model has ruled out what it would be asked for.
+        are too few, or if it does not settle.
         """
-        if self.model and self.model.leaves_no_doubt:
-            return None
         poses = self.pose_pairs[:: -(-len(self.pose_pairs) // _MOST_POSES)]
         if len(poses) < _FEWEST_POSES:
             return None
@@ -168,7 +136,7 @@ class Aligned:
 
 def check_aligned(aligned: Aligned) -> list[Finding]:
     """Findings about two streams that agree."""
-    if same := _check_same(aligned):
+    if same := check_same(aligned):
         return same
     gains, gain_findings = _check_gains(aligned)
     found = response(aligned.pose_pairs, aligned.T_parent_child, gains)
@@ -180,20 +148,20 @@ def check_aligned(aligned: Aligned) -> list[Finding]:
     ]
 
 
-def _check_same(aligned: Aligned) -> list[Finding]:
+def check_same(aligned: Aligned) -> list[Finding]:
     """Finding about an extrinsic, or a translation, of zero."""
     T, sigmas = aligned.best_known
-    if sigmas[:3].max() > _MAX_SIGMA_M or sigmas[3:].max() > _MAX_SIGMA_RAD:
+    distance_m, sigma_m = float(np.linalg.norm(T[:3, 3])), float(sigmas[:3].max())
+    upper_m = distance_m + _UPPER * sigma_m
+    if upper_m > _NEARLY_M or sigmas[3:].max() > _MAX_SIGMA_RAD:
         return []
-    distance_m = float(np.linalg.norm(T[:3, 3]))
     angle_rad = float(se3.rotation_angle(T[:3, :3]))
-    if distance_m > max(_NEARLY_M, _NEARLY_WITHIN * sigmas[:3].max()):
-        return []
-    is_exact = distance_m < max(_SAME_M, _WITHIN * sigmas[:3].max())
-    severity = Severity.ERROR if is_exact else Severity.WARNING
     if angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max()):
+        is_exact = distance_m < max(_SAME_M, _WITHIN * sigma_m)
+        severity = Severity.ERROR if is_exact else Severity.WARNING
         return [wording.same_frame(distance_m, angle_rad, severity)]
-    return [wording.same_position(distance_m, float(sigmas[:3].max()), severity)]
+    severity = Severity.ERROR if upper_m < _SAME_POSITION_M else Severity.WARNING
+    return [wording.same_position(distance_m, sigma_m, severity)]
 
 
 def _check_gains(aligned: Aligned) -> tuple[FloatArray, list[Finding]]:

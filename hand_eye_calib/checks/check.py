@@ -26,7 +26,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.aligned import Aligned, ByModel, check_aligned
+from hand_eye_calib.checks.aligned import Aligned, check_aligned, check_same
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
 from hand_eye_calib.checks.hypotheses import (
     LAGS_S,
@@ -36,6 +36,8 @@ from hand_eye_calib.checks.hypotheses import (
     StreamPair,
     explain,
 )
+from hand_eye_calib.checks.independence import check_independent
+from hand_eye_calib.checks.lengths import check_lengths
 from hand_eye_calib.checks.streams import (
     check_flat,
     check_frozen,
@@ -56,6 +58,10 @@ from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 # standard deviations. Differences of lengths from which on an error is given.
 _OFFSET_ERROR_S, _OFFSET_WARNING_S, _OFFSET_NOTE_S, _OFFSET_SIGMAS = 0.1, 0.01, 0.005, 5.0
 _SCALE_ERROR = 0.03
+
+# Of the interval of slow streams: accuracy of the coarse offset between them, and the gap that they
+# are interpolated across if their clocks differ by more.
+_COARSE, _SLOW_GAP = 0.5, 1.5
 
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
 _UNIT_TOLERANCE = 0.1
@@ -99,7 +105,6 @@ def check_streams(
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
     correlation: Correlation | None = None,
-    model: ByModel | None = None,
 ) -> CheckResult:
     """Check two streams.
 
@@ -114,9 +119,6 @@ def check_streams(
         Longest time between two poses that interpolation may bridge, in seconds.
     correlation : Correlation, optional
         Of the angular rates of the streams as they are, if it is known.
-    model : ByModel, optional
-        What a noise model that fits has found with the known offset and scale: it is not estimated
-        again.
 
     Returns
     -------
@@ -125,9 +127,10 @@ def check_streams(
     findings = _check_each(parent, child, max_gap_s, check_stream)
     if any(finding.severity is Severity.ERROR for finding in findings):
         return CheckResult(gravest_first(findings))
-    streams = StreamPair(parent, child.shifted(time_offset_s).scaled(scale), max_gap_s)
     correlation = correlation or correlate_rates(parent, child, max_gap_s)
-    correlation = replace(correlation, offset_s=correlation.offset_s - time_offset_s)
+    streams, correlation = _on_one_clock(
+        StreamPair(parent, child.scaled(scale), max_gap_s), time_offset_s, correlation
+    )
     aligned = streams
     if correlation.is_clear:
         aligned = replace(streams, child=streams.child.shifted(correlation.offset_s))
@@ -149,9 +152,35 @@ def check_streams(
     if not correlation.is_clear:
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
-    findings += explanation.findings
+    findings = _with_lengths([*findings, *explanation.findings], parent)
     known = time_offset_s, scale
-    return _check_agreeing(streams, explanation, correlation, findings, known, model)
+    return _check_agreeing(streams, explanation, correlation, findings, known)
+
+
+def _offset(streams: StreamPair, correlation: Correlation, fit: SimilarityFit) -> TimeOffset:
+    """The time offset of streams that agree: the coarse one if they are too slow to refine it."""
+    if streams.are_slow:
+        return TimeOffset(correlation.offset_s, streams.interval_s, correlation, None)
+    return refine_time_offset(streams.parent, streams.child, correlation, streams.max_gap_s, fit)
+
+
+def _on_one_clock(
+    streams: StreamPair, known_s: float, correlation: Correlation
+) -> tuple[StreamPair, Correlation]:
+    """The streams with the known offset, and the correlation from there. Poses too far apart to
+    interpolate are compared where they have stamps in common, unless the coarse offset is off by
+    more than its accuracy.
+    """
+    moved = replace(streams, child=streams.child.shifted(known_s))
+    from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
+    if not streams.are_slow:
+        return moved, from_known
+    for at_s, found in ((known_s, moved), (0.0, streams)):
+        in_common = synchronise(found.parent, found.child, found.max_gap_s)
+        is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s
+        if len(in_common) > MIN_PAIRS and (is_near or not correlation.is_clear):
+            return found, replace(correlation, offset_s=0.0)
+    return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
@@ -165,6 +194,7 @@ def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list
         return findings
     if any(finding.code == "coarse_positions" for finding in findings):
         return findings  # rounded positions stay the same while the sensor moves
+    findings = _with_lengths(findings, parent)
     if not has_positions:
         parent, child = parent.scaled(0.0), child.scaled(0.0)
     return [*findings, *check_frozen(parent, child)]
@@ -185,6 +215,15 @@ def _check_each(
     return findings
 
 
+def _with_lengths(findings: list[Finding], parent: Trajectory) -> list[Finding]:
+    """With what there is to say of the unit of length; not if something else explains the motion,
+    such as inverse poses.
+    """
+    if not parent.has_positions or any(finding.makes_unusable for finding in findings):
+        return findings
+    return findings + check_lengths(parent)
+
+
 def unit_of(scale: float) -> tuple[float, str] | None:
     """Factor to metres and name of the usual unit of length that a scale is about; None if it is
     about none.
@@ -199,35 +238,27 @@ def _check_agreeing(
     correlation: Correlation,
     findings: list[Finding],
     known: tuple[float, float],
-    model: ByModel | None,
 ) -> CheckResult:
     """What else there is to say of streams that agree under a hypothesis, with a known time offset
     and scale.
     """
     is_sound = not any(finding.makes_unusable for finding in findings)
-    # A model of streams with a mistake is of no use.
-    model = None if explanation.hypothesis.code or not is_sound else model
     corrected = explanation.hypothesis.undo(streams)
-    if model and model.offset_sigma_s:
-        offset = TimeOffset(0.0, model.offset_sigma_s, correlation, None)
-    else:
-        offset = refine_time_offset(
-            corrected.parent, corrected.child, correlation, corrected.max_gap_s, explanation.fit
-        )
+    offset = _offset(corrected, correlation, explanation.fit)
     pose_pairs = synchronise(
         corrected.parent, corrected.child.shifted(correlation.offset_s), corrected.max_gap_s
     )
     scale = None if explanation.same_unit else _scale(pose_pairs, explanation.fit)
     rotations = _motions(pose_pairs).Ts_parenti_parentj[:, :3, :3]
     fit = scale.fit if scale else explanation.fit
-    aligned = _aligned(streams, offset.seconds, fit, model) if is_sound else None
+    aligned = _aligned(streams, offset.seconds, fit) if is_sound else None
     findings = [
         *findings,
         *check_offset(aligned.refined(offset) if aligned else offset, known[0]),
         *(_check_scale(scale, known[1]) if scale else []),
         *([wording.unit_unseen()] if explanation.same_unit else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
-        *(check_aligned(aligned) if aligned else []),
+        *(_check_aligned(streams, offset.seconds, aligned) if aligned else []),
     ]
     rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
     return CheckResult(
@@ -246,9 +277,16 @@ def _scale(pose_pairs: PosePairs, start: SimilarityFit) -> Scale | None:
         return None
 
 
-def _aligned(
-    streams: StreamPair, offset_s: float, fit: SimilarityFit, model: ByModel | None
-) -> Aligned:
+def _check_aligned(streams: StreamPair, offset_s: float, aligned: Aligned) -> list[Finding]:
+    """Findings about streams that agree; of one that was computed from the other, no more than
+    that.
+    """
+    if copied := check_independent(streams.parent, streams.child, offset_s):
+        return [*copied, *check_same(aligned)]
+    return check_aligned(aligned)
+
+
+def _aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit) -> Aligned:
     """Streams that agree without any mistake undone, on one clock and in one unit of length."""
     child = streams.child.shifted(offset_s).scaled(fit.scale)
     pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
@@ -257,7 +295,6 @@ def _aligned(
         motions=_motions(pose_pairs),
         T_parent_child=fit.T_parent_child,
         covariance=fit.covariance[:6, :6],
-        model=model,
     )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.status import listing
+from hand_eye_calib.text import angle, length, listing
 
 if TYPE_CHECKING:
     from hand_eye_calib.adaptive.part_delays import PartDelay
@@ -115,7 +115,7 @@ class Finding:
 
     def __str__(self) -> str:
         cause = f" ({self.cause})" if self.cause else ""
-        return f"{self.what}{cause}; {self.advice}"
+        return f"{self.what.rstrip('.')}{cause}; {self.advice}"
 
 
 # Jumps up to this share hardly matter to the methods that leave them out.
@@ -163,7 +163,13 @@ def _note(code: str, stream: str, what: str, advice: str) -> Finding:
 
 
 def _error(
-    code: str, stream: str, what: str, advice: str, confidence: Confidence = Confidence.CERTAIN
+    code: str,
+    stream: str,
+    what: str,
+    advice: str,
+    confidence: Confidence = Confidence.CERTAIN,
+    cause: str = "",
+    evidence: tuple[tuple[str, float], ...] = (),
 ) -> Finding:
     return Finding(
         code=code,
@@ -172,6 +178,8 @@ def _error(
         confidence=confidence,
         what=what,
         advice=advice,
+        cause=cause,
+        evidence=evidence,
     )
 
 
@@ -340,7 +348,7 @@ def swapped_coordinates(
     """Latitude and longitude are swapped: x and y need these factors (2,)."""
     lat = float(np.degrees(np.arccos(min(factors[1], 1.0))))
     lon = float(np.degrees(np.arccos(min(1.0 / factors[0], 1.0))))
-    found = _error(
+    return _error(
         "swapped_coordinates",
         stream,
         f"latitude and longitude of the {stream} seem to be swapped: its distances along x (east) "
@@ -350,8 +358,8 @@ def swapped_coordinates(
         f"instead of {unexplained:.0%}",
         "swap latitude and longitude at their source, or the names of the columns",
         Confidence.LIKELY,
+        evidence=_of_factors(factors, unexplained, unexplained_mended),
     )
-    return replace(found, evidence=_of_factors(factors, unexplained, unexplained_mended))
 
 
 def mirrored_positions(stream: str, unexplained: float, unexplained_mended: float) -> Finding:
@@ -372,7 +380,7 @@ def longitude_scale(
     stream: str, factors: FloatArray, unexplained: float, unexplained_mended: float
 ) -> Finding:
     """Degrees of longitude were made metres as if they were as long as those of latitude."""
-    found = _error(
+    return _error(
         "longitude_scale",
         stream,
         f"the {stream}'s distances along x (east) must be multiplied by {factors[0]:.3g}, those "
@@ -380,9 +388,6 @@ def longitude_scale(
         f"unexplained instead of {unexplained:.0%}",
         "multiply x by the cosine of the latitude, or give latitude and longitude themselves",
         Confidence.LIKELY,
-    )
-    return replace(
-        found,
         cause="longitudes that became metres without the cosine of the latitude",
         evidence=_of_factors(factors, unexplained, unexplained_mended),
     )
@@ -402,15 +407,15 @@ def _of_factors(
 def rate_unit(stream: str, ratio: float) -> Finding:
     """Angular rates are in degrees and read as radians, or the other way round."""
     units = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
-    found = _error(
+    return _error(
         "rate_unit",
         stream,
         f"the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are "
         f"{units[0]} and were read as {units[1]}",
         "name the unit in the header, such as wx_deg_s or wx_rad_s; a message has rad/s",
         Confidence.LIKELY,
+        evidence=(("ratio", ratio),),
     )
-    return replace(found, evidence=(("ratio", ratio),))
 
 
 def unsolved(what: str) -> Finding:
@@ -508,12 +513,11 @@ def inverse_both(confidence: Confidence) -> Finding:
         "both",
         "both streams seem to hold inverse poses (of the world in the sensor): inverted, their "
         "paths and the lever arm between them are shorter",
-        "invert every pose of both streams; otherwise the result is the pose of one world in the "
-        "other",
+        "invert every pose of both streams, or the result is the pose of one world in the other "
+        "(which is what a fixed camera beside an arm needs)",
         confidence,
     )
-    is_likely = confidence is not Confidence.POSSIBLE
-    return found if is_likely else replace(found, severity=Severity.WARNING)
+    return replace(found, severity=Severity.WARNING) if confidence is Confidence.POSSIBLE else found
 
 
 def time_offset(found: TimeOffset, total_s: float, severity: Severity) -> Finding:
@@ -534,17 +538,15 @@ def time_offset(found: TimeOffset, total_s: float, severity: Severity) -> Findin
 
 def units(scale: float, sigma: float, unit: str, factor: float) -> Finding:
     """The child's lengths are in another unit, by the scale that was found."""
-    return Finding(
-        code="units",
-        stream="child",
-        severity=Severity.ERROR,
-        confidence=Confidence.CERTAIN,
-        what=f"the child's lengths are {unit} while the parent's are metres (factor "
+    found = _error(
+        "units",
+        "child",
+        f"the child's lengths are {unit} while the parent's are metres (factor "
         f"{scale:.5g} +/- {sigma:.2g})",
-        advice="convert them to metres",
+        "convert them to metres",
         evidence=(("scale", scale), ("sigma", sigma)),
-        options=(("scale", factor),),
     )
+    return replace(found, options=(("scale", factor),))
 
 
 def scale_differs(scale: Scale, factor: float, severity: Severity) -> Finding:
@@ -600,7 +602,7 @@ def same_frame(distance_m: float, angle_rad: float, severity: Severity) -> Findi
         severity=severity,
         confidence=Confidence.LIKELY,
         what="both streams are of one and the same frame: the extrinsic is the identity, to "
-        f"{1e3 * distance_m:.1f} mm and {np.degrees(angle_rad):.2f} deg",
+        f"{length(distance_m)} and {angle(angle_rad)}",
         cause="such as two topics of one odometry, or odometry of the robot's base that was "
         "derived from the other sensor",
         advice="give the stream of the child sensor itself",
@@ -616,7 +618,7 @@ def same_position(distance_m: float, sigma_m: float, severity: Severity) -> Find
         severity=severity,
         confidence=Confidence.LIKELY,
         what="both streams have the same positions and other orientations: the translation "
-        f"between the sensors is zero ({1e3 * distance_m:.1f} +/- {1e3 * sigma_m:.1f} mm)",
+        f"between the sensors is zero ({length(distance_m)} +/- {length(sigma_m)})",
         cause="such as positions that were fused from the other sensor, or given for another "
         "point of the robot than the sensor",
         advice="give positions of the child sensor itself",
@@ -626,25 +628,21 @@ def same_position(distance_m: float, sigma_m: float, severity: Severity) -> Find
 
 def interleaved(stream: str, ratio: float, distance_m: float) -> Finding:
     """Poses of two sensors take turns."""
-    return Finding(
-        code="interleaved",
-        stream=stream,
-        severity=Severity.ERROR,
-        confidence=Confidence.LIKELY,
-        what=f"the {stream} stream's poses alternate between two levels {distance_m:.2g} m apart",
+    return _error(
+        "interleaved",
+        stream,
+        f"the {stream} stream's poses alternate between two levels {distance_m:.2g} m apart",
+        "give each its own topic, and calibrate one",
+        Confidence.LIKELY,
         cause="two sensors, or two programs, publish on one topic",
-        advice="give each its own topic, and calibrate one",
         evidence=(("roughness_ratio", ratio), ("distance_m", distance_m)),
     )
 
 
 def coarse_positions(stream: str, step_m: float, is_float32: bool, severity: Severity) -> Finding:
     """Positions lie on a grid."""
-    cause = (
-        "numbers of 32 bits far from the origin, such as map coordinates"
-        if is_float32
-        else "they were rounded"
-    )
+    far = "numbers of 32 bits far from the origin, such as map coordinates"
+    cause = far if is_float32 else "they were rounded"
     return Finding(
         code="coarse_positions",
         stream=stream,
@@ -659,16 +657,14 @@ def coarse_positions(stream: str, step_m: float, is_float32: bool, severity: Sev
 
 def flat(stream: str, other: str, tilt_rad: float) -> Finding:
     """A stream has x, y and yaw only while the other one tilts."""
-    return Finding(
-        code="flat",
-        stream=stream,
-        severity=Severity.ERROR,
-        confidence=Confidence.CERTAIN,
-        what=f"the {stream} stream has only x, y and yaw, while the {other} tilts by "
+    return _error(
+        "flat",
+        stream,
+        f"the {stream} stream has only x, y and yaw, while the {other} tilts by "
         f"{np.degrees(tilt_rad):.1f} deg (root mean square)",
-        cause="odometry in 2D, such as that of wheels",
-        advice="give poses with all six degrees of freedom, or record on level ground and measure "
+        "give poses with all six degrees of freedom, or record on level ground and measure "
         "height, roll and pitch by hand",
+        cause="odometry in 2D, such as that of wheels",
         evidence=(("tilt_rad", tilt_rad),),
     )
 
@@ -701,11 +697,7 @@ def position_clock(stream: str, delay: PartDelay, shift_m: float, severity: Seve
         f"{late} against its orientations: at this speed a shift of {shift_m:.2g} m",
         cause="positions and orientations of one stream come from different sources or filters",
         advice="use the poses before that filter, or correct the delay of the positions",
-        evidence=(
-            ("delay_s", delay.seconds),
-            ("sigma_s", delay.sigma_s),
-            ("shift_m", shift_m),
-        ),
+        evidence=(("delay_s", delay.seconds), ("sigma_s", delay.sigma_s), ("shift_m", shift_m)),
     )
 
 
@@ -780,8 +772,8 @@ def mount_moved(
     rad); or something drifts.
     """
     distance_m, angle_rad = moved
-    sizes = [f"{100 * distance_m:.2g} cm"] if distance_m else []
-    sizes += [f"{np.degrees(angle_rad):.2g} deg"] if angle_rad else []
+    sizes = [length(distance_m)] if distance_m else []
+    sizes += [angle(angle_rad)] if angle_rad else []
     when = f"changes {at_s:.0f} s after the start (within {span_s:.0f} s)"
     cause = "a mount that came loose or was knocked, or an estimator that started anew"
     if not change.is_step:

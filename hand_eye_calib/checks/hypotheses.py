@@ -52,6 +52,10 @@ _ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
 _INVERTED, _LIKELY_INVERTED = 0.3, 1.0
 _PATH_STEP_S, _LEAST_LEVER_ARM_M = 0.3, 1e-3
 
+# An arm about its base, or a camera around its target, moves less than the base or target seen from
+# it. Sensors that stay within this distance (m), an arm's reach, may be such; stops too.
+_REACH_M = 3.0
+
 # Two frames are one if they are this close to each other (m, rad).
 _SAME_FRAME_M, _SAME_FRAME_RAD = 0.01, 0.01
 
@@ -63,6 +67,16 @@ class StreamPair:
     parent: Trajectory
     child: Trajectory
     max_gap_s: float
+
+    @property
+    def interval_s(self) -> float:
+        """Median time between poses of the faster stream, s."""
+        return min(self.parent.interval_s, self.child.interval_s)
+
+    @property
+    def are_slow(self) -> bool:
+        """Whether nothing is interpolated between most poses of both streams."""
+        return self.interval_s > self.max_gap_s
 
     def pairs(self, lag_s: float, max_pairs: int) -> MotionPairs:
         """Motion pairs over ``lag_s`` seconds.
@@ -352,10 +366,21 @@ def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
         other = "parent" if hypothesis.stream == "child" else "child"
         finding = wording.inverse(other, _confidence(evidence, _INVERTED))
         return Explanation(Hypothesis("inverse", other, _inverted), inverted_fit, (finding,))
-    finding = wording.inverse_both(_confidence(evidence, _LIKELY_INVERTED))
+    likely = np.inf if _may_be_an_arm(streams) else _LIKELY_INVERTED
+    finding = wording.inverse_both(_confidence(evidence, likely))
     if finding.confidence is Confidence.POSSIBLE:
         return replace(explanation, findings=(finding,))
     return Explanation(_BOTH_INVERTED, inverted_fit, (finding,))
+
+
+def _may_be_an_arm(streams: StreamPair) -> bool:
+    """Whether inverse poses may be right, or path lengths deceive: stops, or a small space."""
+    both = (streams.parent.poses, streams.child.poses)
+    positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
+    return streams.are_slow or all(
+        np.linalg.norm(each - np.median(each, axis=0), axis=1).max() < _REACH_M
+        for each in positions
+    )
 
 
 def _finding(hypothesis: Hypothesis) -> Finding:

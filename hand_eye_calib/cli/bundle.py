@@ -121,10 +121,13 @@ def _streams(inputs: Mapping[str, Any], folder: Path) -> tuple[Trajectory, ...]:
             for source in sources
         ]
         return tuple(read_bag_trajectory(inputs["bag"], *names)[0] for names in named)
-    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_file
+    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
 
-    files = [inputs[stream]["file"] for stream in ("parent", "child")]
-    return tuple(read_trajectory_file(file, AUTO, repair=True).trajectory for file in files)
+    files = [
+        {"path": inputs[stream]["file"], "format": AUTO, "repair": True}
+        for stream in ("parent", "child")
+    ]
+    return tuple(reading.trajectory for reading in read_trajectory_files(files))
 
 
 def tum_text(trajectory: Trajectory) -> str:

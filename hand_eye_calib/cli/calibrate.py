@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.options import add_config_arguments, add_output_arguments, options_from
-from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.cli.robot import add_robot_arguments
 from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError
@@ -82,7 +81,7 @@ def add_file_arguments(parser: argparse.ArgumentParser) -> None:
         for stream in STREAMS:
             of_one = settings | {"help": f"the same for {stream.upper()} only"}
             option = f"--{stream}-{name.replace('_', '-')}"
-            advanced(group.add_argument(option, dest=f"{stream}_{name}", **of_one))
+            group.add_argument(option, dest=f"{stream}_{name}", **of_one)
 
 
 def read_files(
@@ -108,23 +107,25 @@ def read_files(
     HandEyeCalibError
         If a file cannot be read.
     """
-    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_file
+    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
 
-    trajectories: dict[str, Trajectory] = {}
-    repairs: list[str] = []
-    for stream in STREAMS:
-        with waiting_for(f"reading {getattr(arguments, stream)}"):
-            trajectories[stream], repaired, guesses = read_trajectory_file(
-                getattr(arguments, stream),
-                _given(arguments, stream, "format") or AUTO,
-                repair=True,
-                measures=options.get(f"{stream}_measures", AUTO),
-                **_settings_of(arguments, stream),
-            )
-        for text in guesses:
+    files = [
+        {
+            "path": getattr(arguments, stream),
+            "format": _given(arguments, stream, "format") or AUTO,
+            "repair": True,
+            "measures": options.get(f"{stream}_measures", AUTO),
+            **_settings_of(arguments, stream),
+        }
+        for stream in STREAMS
+    ]
+    with waiting_for(f"reading {arguments.parent} and {arguments.child}"):
+        read = dict(zip(STREAMS, read_trajectory_files(files), strict=True))
+    for stream, reading in read.items():
+        for text in reading.guesses:
             note(_FILE_OPTION.sub(f"`{stream}_\\1`", text))
-        repairs += repaired
-    return trajectories, repairs
+    repairs = [text for reading in read.values() for text in reading.repairs]
+    return {stream: reading.trajectory for stream, reading in read.items()}, repairs
 
 
 def _given(arguments: argparse.Namespace, stream: str, name: str) -> Any:
@@ -166,9 +167,6 @@ def run(arguments: argparse.Namespace) -> int:
 
         files = [arguments.parent, arguments.child, *arguments.others]
         return calibrate_and_deliver(_read_rig(files, arguments), arguments, {"files": files})
-    from hand_eye_calib.cli.memory import prepare_to_solve
-
-    prepare_to_solve()
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.engine.checked import at_clear_offset, checked
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
@@ -180,10 +178,10 @@ def run(arguments: argparse.Namespace) -> int:
     config = offline_config(trajectories["parent"], trajectories["child"], options)
     snapshot = whole_snapshot(config, **trajectories)
     with waiting_for("solving"):
-        snapshot = at_clear_offset(snapshot, options)
+        snapshot = at_clear_offset(snapshot)
         calibration = snapshot.estimate()
     with waiting_for("checking the streams"):
-        calibration, snapshot = checked(calibration, snapshot, options)
+        calibration, snapshot = checked(calibration, snapshot)
     inputs: dict[str, Any] = {"options": snapshot.config.to_options()}
     for stream in STREAMS:
         inputs[stream] = {"file": str(getattr(arguments, stream)), **_extent(trajectories[stream])}
@@ -199,7 +197,7 @@ def _read_rig(files: Sequence[str], arguments: argparse.Namespace) -> dict[str, 
     named.
     """
     from hand_eye_calib.cli.rig import add_sensor
-    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_file
+    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
 
     of_one = [
         f"--{stream}-{name.replace('_', '-')}"
@@ -210,13 +208,11 @@ def _read_rig(files: Sequence[str], arguments: argparse.Namespace) -> dict[str, 
     if of_one:
         raise ConfigError(f"{of_one[0]} is of two files; give the option for all of a rig's files")
     settings = {name: getattr(arguments, name) for name in FILE_OPTIONS}
-    format = settings.pop("format") or AUTO
+    settings |= {"format": arguments.format or AUTO, "repair": True}
+    with waiting_for(f"reading {', '.join(files)}"):
+        read = read_trajectory_files([{"path": file, **settings} for file in files])
     found: dict[str, Trajectory] = {}
-    for file in files:
-        with waiting_for(f"reading {file}"):
-            trajectory, repairs, guesses = read_trajectory_file(
-                file, format, repair=True, **settings
-            )
+    for file, (trajectory, repairs, guesses) in zip(files, read, strict=True):
         for text in (*guesses, *repairs):
             note(text)
         add_sensor(found, trajectory.sensor_frame or Path(file).stem, trajectory)

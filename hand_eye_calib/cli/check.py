@@ -1,15 +1,14 @@
 """``check BAG`` or ``check PARENT CHILD``: check both streams before they are calibrated."""
 
 import argparse
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.calibrate import STREAMS, add_file_arguments, read_files
-from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
+from hand_eye_calib.cli.console import note, typed_options, waiting_for, with_progress
 from hand_eye_calib.cli.options import (
     add_config_arguments,
     add_json_argument,
@@ -59,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
     from hand_eye_calib.checks.findings import answered, gravest_first
     from hand_eye_calib.checks.streams import summarise
-    from hand_eye_calib.cli.findings import verdict
+    from hand_eye_calib.cli.present import show
 
     if len(arguments.inputs) > 2:
         raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.inputs)}")
@@ -74,19 +73,30 @@ def run(arguments: argparse.Namespace) -> int:
         checked = _checked(parent, child, (offset_s, scale), arguments)
     findings = gravest_first(answered([*checked.findings, *of_files], config))
     streams = {name: summarise(one) for name, one in trajectories.items() if len(one) > 1}
-    if arguments.json:
-        document = _document(sources, streams, findings, checked)
-        print(json.dumps(document, indent=2, allow_nan=False))
-    else:
-        print(_text(sources, streams, findings, checked))
-    if arguments.out:
-        from hand_eye_calib.cli.reporting import write_check
+    said = _verdict(findings)
+
+    def draw() -> str:
+        from hand_eye_calib.report.check_page import render_check
 
         named = _named(sources, is_bag=len(arguments.inputs) == 1)
         corrected = child.shifted(offset_s).scaled(scale)
-        said = (findings, named, verdict(findings))
-        write_check(arguments.out, parent, corrected, checked, *said, config.max_gap)
-    return fail(str(findings[0]), 1) if findings and findings[0].makes_unusable else 0
+        return render_check(parent, corrected, checked, findings, named, said, config.max_gap)
+
+    def finish() -> None:
+        from hand_eye_calib.cli.reporting import CHECK, write_page
+
+        if arguments.out:
+            write_page(arguments.out / CHECK, draw)
+
+    errors = [str(finding) for finding in findings[:1] if finding.makes_unusable]
+    return show(
+        arguments,
+        lambda: _document(sources, streams, findings, checked),
+        lambda: "\n".join([said, "", *_table(findings), "", *_lines(sources, streams, checked)]),
+        finish=finish,
+        errors=errors,
+        code=len(errors),
+    )
 
 
 def _checked(
@@ -177,14 +187,10 @@ def _document(
     }
 
 
-def _text(
-    sources: Mapping[str, str],
-    streams: "Mapping[str, StreamSummary]",
-    findings: "Sequence[Finding]",
-    checked: "CheckResult",
-) -> str:
-    from hand_eye_calib.cli.findings import table, verdict
-
+def _lines(
+    sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]", checked: "CheckResult"
+) -> list[str]:
+    """Both streams, and how much the parent turns."""
     lines = [f"{stream} is {printable(source)}" for stream, source in sources.items()]
     lines.append("{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS))
     for name, summary in streams.items():
@@ -202,4 +208,37 @@ def _text(
         lines.append(
             f"Rotation of the parent in 3 s about its axes, root mean square: {turned} deg"
         )
-    return "\n".join([verdict(findings), "", table(findings), "", *lines])
+    return lines
+
+
+def _verdict(findings: "Sequence[Finding]") -> str:
+    """What the findings mean for a calibration with these streams, in one sentence."""
+    from hand_eye_calib.verdict import Verdict
+
+    serious = [finding for finding in findings if finding.severity.value != "note"]
+    if not serious:
+        return f"{Verdict.USE.value}: nothing speaks against calibrating with these streams."
+    errors = [finding for finding in serious if finding.makes_unusable]
+    word = (Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE).value
+    if all(finding.options for finding in serious):
+        options = " ".join(typed_options(finding.options) for finding in serious)
+        return f"{word}: not as they are; calibrate with {options}."
+    codes = ", ".join(finding.code for finding in errors or serious if not finding.options)
+    if not errors:
+        return f"{word}: look at the findings first ({codes})."
+    return f"{word}: no result from these streams is right ({codes or errors[0].code})."
+
+
+def _table(findings: "Sequence[Finding]") -> Iterator[str]:
+    """Lines of the findings, in their order."""
+    from hand_eye_calib.cli.present import wrapped
+
+    if not findings:
+        yield "No findings."
+    for finding in findings:
+        mark = finding.severity.value
+        mark = mark if mark == "note" else mark.upper()
+        yield f"{mark:<8} {finding.code:<17} {finding.stream:<7} {finding.confidence.value}"
+        options = typed_options(finding.options)
+        for text in (finding.what, f"-> {finding.advice}{options and f': {options}'}"):
+            yield from wrapped(text, "    ", "    ")

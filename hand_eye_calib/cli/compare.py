@@ -1,7 +1,6 @@
 """``compare RESULT...``: has the mount moved, or which recording shows that it has?"""
 
 import argparse
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Compare; returns the exit code."""
     from hand_eye_calib.io.results import load_result
+    from hand_eye_calib.plain import json_text
     from hand_eye_calib.session.compare import Change, compare
 
     results = [load_result(path) for path in arguments.results]
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
             installed = read_installed(arguments.installed, *frames)
     found = compare(results, installed, _names(arguments.results))
     if arguments.json:
-        print(json.dumps(found.to_dict(), indent=2, allow_nan=False))
+        print(json_text(found.to_dict()))
     else:
         print("\n".join(printable(line) for line in _lines(found, results[0])))
     codes = {Change.SAME: EXIT_SAME, Change.MOVED: EXIT_MOVED}

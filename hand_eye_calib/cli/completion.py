@@ -1,11 +1,8 @@
 """``completion SHELL``: what a shell needs to complete commands, options, values and topics."""
 
 import argparse
-import os
-from collections.abc import Callable
-from typing import Any
 
-from hand_eye_calib.errors import HandEyeCalibError, MissingDependencyError
+from hand_eye_calib.errors import MissingDependencyError
 
 EXAMPLES = """\
 examples:
@@ -15,8 +12,6 @@ examples:
 
 _SHELLS = ("bash", "zsh", "fish")
 _PROGRAM = "hand_eye_calib"
-# Set by the shell functions of argcomplete: the number of words before the arguments.
-_START = "_ARGCOMPLETE"
 
 # ros2 completes the package and the executable; what follows is ours.
 _OF_ROS2 = r"""
@@ -60,53 +55,3 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.shell == "bash":
         print(_OF_ROS2, end="")
     return 0
-
-
-def is_asked_for() -> bool:
-    """Whether a shell asks what could be typed next."""
-    return _START in os.environ
-
-
-def command_in_line() -> str | None:
-    """The command in the line that is being typed, None if there is none yet."""
-    words = os.environ.get("COMP_LINE", "")[: int(os.environ.get("COMP_POINT", "0"))].split(" ")
-    complete = [word for word in words[:-1] if word][int(os.environ[_START]) :]
-    return next((word for word in complete if not word.startswith("-")), None)
-
-
-def answer(parser: argparse.ArgumentParser) -> None:
-    """Tell the shell what could be typed next, and end the process."""
-    import argcomplete
-
-    argcomplete.autocomplete(parser)
-
-
-def offer(action: argparse.Action, values: Callable[[argparse.Namespace], Any]) -> None:
-    """Let a shell offer values for an option.
-
-    Parameters
-    ----------
-    action : argparse.Action
-    values : callable
-        What can be typed, given what has been typed.
-    """
-
-    def completer(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-        return [str(value) for value in values(parsed_args)]
-
-    setattr(action, "completer", completer)  # noqa: B010
-
-
-def topics_of(bags: Any) -> list[str]:
-    """Topics of a bag with poses; none if it cannot be read."""
-    from hand_eye_calib.io.bags import PoseBag
-    from hand_eye_calib.io.bags.messages import PATH_TYPE, POSE_TYPES
-    from hand_eye_calib.io.bags.parts import PART_TYPES
-
-    usable = (*POSE_TYPES, PATH_TYPE, *PART_TYPES)
-
-    try:
-        with PoseBag(*bags) as bag:
-            return [topic.name for topic in bag.topics() if topic.type in usable]
-    except HandEyeCalibError:
-        return []

@@ -1,5 +1,9 @@
-"""What commands print beside their result: notes, errors and progress, all on stderr."""
+"""What commands print beside their result: notes, errors and progress, all on stderr. And how the
+command line spells options.
+"""
 
+import dataclasses
+import re
 import sys
 import threading
 import time
@@ -7,17 +11,60 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
-from hand_eye_calib.cli.spelling import as_typed
+from hand_eye_calib.config import CalibratorConfig, option_name
 from hand_eye_calib.errors import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+    from rich.table import Table
 
 _Item = TypeVar("_Item")
 
 _SILENT_S = 2.0
 _REDRAW_S = 0.2
 _CLEAR_LINE = "\r\033[K"
+
+OPTION_FIELDS = {option_name(field): field for field in dataclasses.fields(CalibratorConfig)}
+
+# Options of :func:`hand_eye_calib.read_trajectory`.
+_FILE_OPTIONS = [
+    f"{stream}{name}"
+    for stream in ("", "parent_", "child_")
+    for name in ("format", "columns", "times", "stamp_unit")
+]
+
+# Names that are no words of the language, such as max_gap and prior.z, wherever they stand, but not
+# in a path, after dashes or in quotes; and any name in backticks.
+_UNMISTAKABLE = [name for name in (*OPTION_FIELDS, *_FILE_OPTIONS) if set(name) & set("._")]
+_NAMES = re.compile(
+    rf"`(?P<quoted>[\w.]+)`|(?<![\w./\\='-])(?P<plain>{'|'.join(map(re.escape, _UNMISTAKABLE))})"
+    r"(?![\w/=-]|\.\w)"
+)
+
+
+def flag(name: str) -> str:
+    """The option of the command line for a public option name, without the leading dashes."""
+    return name.replace(".", "-").replace("_", "-")
+
+
+def typed_options(options: Iterable[tuple[str, object]]) -> str:
+    """Options by their public names, as they are typed."""
+    return " ".join(f"--{flag(name)} {value}" for name, value in options)
+
+
+def as_typed(text: str) -> str:
+    """A message of the engine with its option names as they are typed.
+
+    Messages spell options as Python and the node do. ``raise max_gap`` becomes ``raise --max-gap``;
+    a name that is also a word is in backticks, and becomes an option, too.
+    """
+    return _NAMES.sub(_typed, text)
+
+
+def _typed(match: re.Match[str]) -> str:
+    name = match["quoted"] or match["plain"]
+    is_option = name in OPTION_FIELDS or name in _FILE_OPTIONS
+    return f"--{flag(name)}" if is_option else match[0]
 
 
 def note(text: object) -> None:
@@ -121,3 +168,13 @@ def _progress_bar() -> "Progress":
         console=Console(stderr=True),
         transient=True,
     )
+
+
+def print_table(table: "Table") -> None:
+    """Print a table; through a pipe with whole lines, not those of a terminal of 80 columns."""
+    from rich.console import Console
+
+    console = Console(highlight=False, markup=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, markup=False, width=240)
+    console.print(table)

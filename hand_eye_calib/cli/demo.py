@@ -4,7 +4,6 @@ the truth.
 
 import argparse
 import dataclasses
-import json
 import math
 import os
 import shutil
@@ -16,25 +15,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import fail, note, waiting_for
-from hand_eye_calib.cli.options import add_json_argument
-from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
-from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
+from hand_eye_calib.cli.console import note, waiting_for
+from hand_eye_calib.cli.options import add_json_argument, at_least
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import HandEyeCalibError, InputError
+from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 
 if TYPE_CHECKING:
     from hand_eye_calib.arrays import FloatArray
     from hand_eye_calib.calibration import Calibration
-    from hand_eye_calib.engine.calibrator import Calibrator
-    from hand_eye_calib.io.bags import PoseBag
     from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 
-# A minute of driving with good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, a
-# few SLAM corrections of decimetres.
+# A minute of driving.
 DRIVE = dataclasses.replace(HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera")
-NOISE = NoiseConfig(gaussian=0.002, rotation_per_metre=0.5, outliers=0.005, drift=0.002)
 
 PLAY_SPEED = 20.0
 # The same messages go through the same engine: only the conversion to quaternions differs.
@@ -55,69 +51,55 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "replaced. Default: demo_output",
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="another seed gives another recording. Default: 0"
+        "--seed",
+        type=at_least(0),
+        default=0,
+        help="another seed gives another recording. Default: 0",
     )
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo; returns the exit code."""
-    from hand_eye_calib.cli.present import exit_code
+    from hand_eye_calib.cli.present import exit_code, show
+    from hand_eye_calib.cli.replaying import replay
+    from hand_eye_calib.cli.reporting import with_cross_check, write_report
+    from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import simulate_drive
 
-    player = _import_player()
-    if arguments.seed < 0:
-        raise InputError(f"--seed must not be negative; got {arguments.seed}")
     with waiting_for("simulating"):
-        drive = simulate_drive(arguments.seed, DRIVE, NOISE)
+        drive = simulate_drive(arguments.seed, DRIVE, REALISTIC)
         bag_path = _write_bag(arguments.out, drive)
     note(f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
-    with waiting_for("replaying the bag"):
-        calibrator = _replay(bag_path)
-        offline = calibrator.estimate()
+    replayed = replay([bag_path], TOPICS["parent"], TOPICS["child"], CalibratorConfig())
+    offline, snapshot = replayed.calibration, replayed.calibrator.snapshot()
     note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
     with waiting_for("playing"):
-        live = _play(player, bag_path, arguments.out / "node.log", offline.stamp_ns)
+        live = _play(Player, bag_path, arguments.out / "node.log", offline.stamp_ns)
     note("3/4 calibrated live; cross-checks and report follow")
     document = _document(drive, bag_path, offline, live)
-    print(json.dumps(document, indent=2, allow_nan=False) if arguments.json else _text(document))
-    sys.stdout.flush()
-    _write_report(arguments.out, bag_path, calibrator, offline)
-    note(f"4/4 done; everything is in {arguments.out}")
+
+    def finish() -> None:
+        with waiting_for("cross-checks with other methods and halves of the recording"):
+            calibration, evidence = with_cross_check(offline, snapshot)
+        write_report(arguments.out, calibration, evidence, snapshot.config, replayed.inputs)
+        note(f"4/4 done; everything is in {arguments.out}")
+
+    errors = []
     if max(document["agreement"].values()) > AGREEMENT:
-        return fail(
+        errors = [
             f"offline and online differ by more than {AGREEMENT}: {document['agreement']}; "
-            "the same messages must give the same",
-            1,
-        )
-    return exit_code(offline)
-
-
-def _write_report(
-    out: Path, bag_path: Path, calibrator: "Calibrator", offline: "Calibration"
-) -> None:
-    from hand_eye_calib.cli.reporting import with_cross_check, write_report
-
-    inputs: dict[str, Any] = {"bag": str(bag_path)}
-    inputs |= {stream: {"topic": topic} for stream, topic in TOPICS.items()}
-    snapshot = calibrator.snapshot()
-    with waiting_for("cross-checks with other methods and halves of the recording"):
-        calibration, evidence = with_cross_check(offline, snapshot)
-    write_report(out, calibration, evidence, snapshot.config, inputs)
-
-
-def _import_player() -> "type[Player]":
-    try:
-        from hand_eye_calib.ros.player import Player
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] == "hand_eye_calib":
-            raise
-        raise MissingDependencyError(
-            f"the demo runs the live node and needs ROS 2's Python packages ({error.name} is "
-            "missing): source the setup file of a ROS 2 installation, or "
-            "pip install 'hand_eye_calib[ros]'"
-        ) from None
-    return Player
+            "the same messages must give the same"
+        ]
+    code = 1 if errors else exit_code(offline)
+    return show(
+        arguments,
+        lambda: document,
+        lambda: _text(document),
+        finish=finish,
+        errors=errors,
+        code=code,
+    )
 
 
 def _write_bag(out: Path, drive: "SimulatedDrive") -> Path:
@@ -140,28 +122,14 @@ def _write_bag(out: Path, drive: "SimulatedDrive") -> Path:
     return path
 
 
-def _opened(bag_path: Path) -> "PoseBag":
+def _play(player_type: "type[Player]", bag_path: Path, log_path: Path, stamp_ns: int) -> Any:
     from hand_eye_calib.io.bags import PoseBag
 
-    return PoseBag(bag_path)
-
-
-def _replay(bag_path: Path) -> "Calibrator":
-    from hand_eye_calib.cli.replaying import feed
-    from hand_eye_calib.engine.calibrator import Calibrator
-
-    calibrator = Calibrator()
-    with _opened(bag_path) as bag:
-        feed(calibrator, bag.blocks(TOPICS["parent"], TOPICS["child"]), TOPICS)
-    return calibrator
-
-
-def _play(player_type: "type[Player]", bag_path: Path, log_path: Path, stamp_ns: int) -> Any:
     _stay_on_this_machine()
     with (
         _node(log_path) as check,
         player_type(TOPICS, check) as player,
-        _opened(bag_path) as bag,
+        PoseBag(bag_path) as bag,
     ):
         player.play(bag.poses(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
         return player.wait_for_extrinsic(stamp_ns)

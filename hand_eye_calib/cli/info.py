@@ -1,12 +1,18 @@
-"""``info RESULT``: show a saved calibration, or pack it for a report."""
+"""``info RESULT``: show a saved calibration, pack it for a report, or move a trajectory by it."""
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.moving import add_moving_arguments, move
+from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.cli.robot import add_description_arguments, write_description
 from hand_eye_calib.errors import ConfigError
+
+if TYPE_CHECKING:
+    from hand_eye_calib.calibration import Calibration
+
+_TEXT = (".tum", ".txt")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,8 +33,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write what a report of a wrong answer needs to a zip file: versions, options, "
         "findings, the result and 200 kB of downsampled poses without their place; nothing else",
     )
-    add_moving_arguments(parser)
+    _add_moving_arguments(parser)
     add_json_argument(parser)
+
+
+def _add_moving_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--move`` and ``--to``."""
+    parser.add_argument(
+        "--move",
+        metavar="CHILD",
+        help="trajectory file of the child sensor: move it by the result, so that it is the parent "
+        "sensor's trajectory, with the result's time offset and scale",
+    )
+    parser.add_argument(
+        "--to",
+        metavar="FILE",
+        type=Path,
+        help="where to: .tum or .txt for a text file, .bag for rosbag1, otherwise a new mcap bag",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -39,10 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
     calibration = load_result(arguments.result)
     if arguments.write and not arguments.urdf:
         raise ConfigError("--write needs --urdf: the description to change")
-    move(calibration, arguments)
+    _move(calibration, arguments)
     if arguments.bundle:
         from hand_eye_calib.cli.bundle import write_bundle
-        from hand_eye_calib.cli.console import note
 
         for text in write_bundle(arguments.result, arguments.bundle):
             note(text)
@@ -50,3 +71,27 @@ def run(arguments: argparse.Namespace) -> int:
     print(as_json(calibration) if arguments.json else as_text(calibration))
     write_description(calibration, arguments)
     return 0
+
+
+def _move(calibration: "Calibration", arguments: argparse.Namespace) -> None:
+    """Write the child's trajectory as that of the parent sensor, if it was asked for.
+
+    Raises
+    ------
+    ConfigError
+        If one of both options is missing.
+    InputError
+        If a file cannot be read or written.
+    """
+    if bool(arguments.move) != bool(arguments.to):
+        raise ConfigError("--move CHILD and --to FILE go together")
+    if not arguments.move:
+        return
+    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_file, write_trajectory
+
+    child, repairs, guesses = read_trajectory_file(arguments.move, AUTO, repair=True)
+    suffix = arguments.to.suffix
+    storage = "tum" if suffix in _TEXT else "rosbag1" if suffix == ".bag" else "mcap"
+    write_trajectory(arguments.to, calibration.child_as_parent(child), storage)
+    for text in [*guesses, *repairs, f"wrote {arguments.to}"]:
+        note(text)

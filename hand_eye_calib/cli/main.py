@@ -5,21 +5,27 @@ when it is asked for, so that a missing optional package breaks no other command
 """
 
 import argparse
+import atexit
+import errno
+import gc
 import importlib
 import os
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-from hand_eye_calib.cli import completion
-from hand_eye_calib.cli.console import fail
-from hand_eye_calib.cli.parser import EXIT_USAGE, CommandParser
+from hand_eye_calib.cli.console import as_typed, fail
+from hand_eye_calib.config import did_you_mean
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+from hand_eye_calib.io.limits import ReadingMemory
 
-EXIT_FAILED = 1
+EXIT_FAILED, EXIT_USAGE = 1, 2
 EXIT_INTERRUPTED = 128 + 2  # what a shell reports for SIGINT and SIGPIPE
 EXIT_BROKEN_PIPE = 128 + 13
+
+# Characters of a name that a message shows.
+_MOST_SHOWN = 60
 
 COMMANDS = {
     "replay": "calibrate from the poses in a bag",
@@ -42,6 +48,13 @@ examples:
 
 exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
 unobservable or the verdict is DO NOT USE"""
+
+# How the names of ROS 2's packages end.
+_OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
+# Set by the shell functions of argcomplete.
+_COMPLETING = "_ARGCOMPLETE"
+# New containers after which Python looks for cycles of them: imports alone make 50,000 that stay.
+_NEW_CONTAINERS = 100_000
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -73,6 +86,7 @@ def exit_code_of(run: Callable[[], int]) -> int:
     # The matrices are small. Several threads would wait for each other, and take three times as
     # long if other programs run.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    ReadingMemory.switch_on()
     try:
         code = run()
         sys.stdout.flush()
@@ -84,16 +98,27 @@ def exit_code_of(run: Callable[[], int]) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] == "hand_eye_calib":
             raise
-        return fail(
-            f"this needs the Python package {error.name!r}, which is not installed; install it and "
-            "try again",
-            EXIT_FAILED,
-        )
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return fail(_what_to_install(error.name), EXIT_FAILED)
     except BrokenPipeError:
         _discard_stdout()
         return EXIT_BROKEN_PIPE
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        name = str(error.filename)[:_MOST_SHOWN]
+        return fail(f"cannot use {name}...: {error.strerror}; give a shorter name", EXIT_FAILED)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+
+def _what_to_install(name: str) -> str:
+    """The line about a Python package that is missing."""
+    if name.partition(".")[0].endswith(_OF_ROS):
+        return (
+            f"this needs ROS 2's Python packages ({name} is missing): source the setup file of a "
+            "ROS 2 installation, or pip install 'hand_eye_calib[ros]'"
+        )
+    return f"this needs the Python package {name!r}, which is not installed; install it, try again"
 
 
 def named_command() -> int:
@@ -103,62 +128,68 @@ def named_command() -> int:
     return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
 
 
+class CommandParser(argparse.ArgumentParser):
+    """Parser whose errors are one line on stderr, with exit code 2."""
+
+    def __init__(self, **options: Any) -> None:
+        options |= {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+        super().__init__(**options)
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line on stderr and exit with code 2."""
+        text = as_typed(f"{message} (see {self.prog} --help)")
+        self.exit(EXIT_USAGE, f"hand_eye_calib: error: {text}\n")
+
+    def refuse(self, words: Sequence[str]) -> NoReturn:
+        """End with wrong usage: options or arguments that are none."""
+        word = next((word.partition("=")[0] for word in words if word.startswith("-")), None)
+        if word is None:
+            self.error(f"unexpected argument {words[0]!r}")
+        self.error(f"unknown option {word}{did_you_mean(word, self._option_string_actions)}")
+
+    def shorten_usage(self) -> None:
+        """Leave out of the usage line what need not be given: the help lists all options."""
+        words = [self.prog, "[OPTION ...]"]
+        for action in self._actions:
+            if action.required or not action.option_strings:
+                dots = " ..." if action.nargs in ("*", "+") else ""
+                words += [*action.option_strings[:1], f"{action.metavar}{dots}"]
+        self.usage = self.usage or " ".join(words)
+
+
 def _run(argv: Sequence[str]) -> int:
-    if completion.is_asked_for():
-        return _complete()
-    chosen = next((argument for argument in argv if not argument.startswith("-")), None)
-    # The other commands matter only if the first word is none, but --help, say.
-    parser, of_commands = _parsers(COMMANDS.keys() & argv[:1] or COMMANDS)
-    module: Any = None
-    if chosen in of_commands:
-        module, command_parser = _with_arguments(chosen, of_commands)
-        if command_parser.get_default("passed_on") is None:
-            command_parser.refuse_unknown(argv[list(argv).index(chosen) + 1 :])
-    arguments, rest = parser.parse_known_args(argv)
-    if rest and not hasattr(arguments, "passed_on"):
-        of_commands[arguments.command].refuse(rest[0])
-    arguments.passed_on = rest
-    arguments.typed = list(argv)
-    return module.run(arguments)
-
-
-def _complete() -> int:
-    """Tell the shell what could be typed next."""
-    parser, of_commands = _parsers(COMMANDS)
-    chosen = completion.command_in_line()
-    if chosen in of_commands:
-        _with_arguments(chosen, of_commands)
-    completion.answer(parser)
-    return 0
-
-
-def _with_arguments(
-    chosen: str, of_commands: dict[str, CommandParser]
-) -> tuple[Any, CommandParser]:
-    """The module of a command, and its parser with all arguments."""
-    module = importlib.import_module(f"hand_eye_calib.cli.{chosen}")
-    command_parser = of_commands[chosen]
-    module.add_arguments(command_parser)
-    command_parser.add_help_all()
-    return module, command_parser
-
-
-def _parsers(names: Collection[str]) -> tuple[CommandParser, dict[str, CommandParser]]:
-    """The parser of the program, and those of these commands by name, still without arguments."""
+    command = next((word for word in argv if not word.startswith("-")), None)
     parser = CommandParser(
         prog="hand_eye_calib",
         description="Extrinsic calibration of two sensors on one rigid body from their motion.",
         epilog=_EPILOG,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    if command is not None and command not in COMMANDS:
+        known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
+        parser.error(f"invalid choice: {command!r}, {known}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    return parser, {
-        name: commands.add_parser(
-            name, help=summary, description=summary, prog=f"hand_eye_calib {name}"
-        )
-        for name, summary in COMMANDS.items()
-        if name in names
-    }
+    module: Any = None
+    of_command = parser
+    for name, summary in COMMANDS.items():
+        added = commands.add_parser(name, help=summary, description=summary)
+        if name == command or _COMPLETING in os.environ:
+            module, of_command = importlib.import_module(f"hand_eye_calib.cli.{name}"), added
+            module.add_arguments(added)
+            added.shorten_usage()
+    if _COMPLETING in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)  # tells the shell, and ends the process
+    arguments, rest = parser.parse_known_args(argv)
+    if command != "calibrator":
+        if rest:
+            of_command.refuse(rest)
+        # What is imported stays. To search it for garbage takes 3 % of the time of `calibrate`.
+        gc.set_threshold(_NEW_CONTAINERS)
+        atexit.register(gc.freeze)
+    arguments.passed_on, arguments.typed = rest, list(argv)
+    return module.run(arguments)
 
 
 class _Version(argparse.Action):

@@ -5,14 +5,11 @@ same options by name.
 import argparse
 import dataclasses
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.cli.completion import offer
-from hand_eye_calib.cli.console import note
-from hand_eye_calib.cli.parser import advanced
-from hand_eye_calib.cli.spelling import OPTION_FIELDS, flag
+from hand_eye_calib.cli.console import OPTION_FIELDS, flag, note
 from hand_eye_calib.config import (
     CalibratorConfig,
     NodeConfig,
@@ -30,8 +27,31 @@ _NODE_NAMES = ("calibrator", "**", "*")
 _DEST = "option "
 _PRIOR = "prior."
 
-# What most people set; the other options are shown by --help-all.
+# What most people set: the help has these options first.
 _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
+
+
+def argument_type(parse: Callable[[str], Any], prefix: str = "") -> Callable[[str], Any]:
+    """The type of an argument: a ConfigError is wrong usage, its message without ``prefix``."""
+
+    def parsed(text: str) -> Any:
+        try:
+            return parse(text)
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(str(error).removeprefix(prefix)) from None
+
+    return parsed
+
+
+def at_least(minimum: int) -> Callable[[str], int]:
+    """The type of an argument that is a whole number of at least ``minimum``."""
+
+    def parse(text: str) -> int:
+        if not text.isdecimal() or int(text) < minimum:
+            raise ConfigError(f"expected a whole number of at least {minimum}, got {text!r}")
+        return int(text)
+
+    return argument_type(parse)
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,12 +62,18 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     for name in _COMMON:
         _add_option(group, name)
     _add_prior_and_config(group)
+    rare = parser.add_argument_group("calibration options that are rarely needed")
     for name in OPTION_FIELDS:
         if name not in _COMMON:
-            advanced(_add_option(group, name))
+            _add_option(rare, name)
 
 
-def _add_option(group: argparse._ArgumentGroup, name: str) -> argparse.Action:
+def offer(action: argparse.Action, values: Callable[[argparse.Namespace], Sequence[str]]) -> None:
+    """Let a shell offer values for an option, given what has been typed before."""
+    setattr(action, "completer", lambda parsed_args, **_: values(parsed_args))  # noqa: B010
+
+
+def _add_option(group: argparse._ArgumentGroup, name: str) -> None:
     field = OPTION_FIELDS[name]
     meta = field.metadata
     unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
@@ -56,14 +82,13 @@ def _add_option(group: argparse._ArgumentGroup, name: str) -> argparse.Action:
         f"--{flag(name)}",
         dest=_DEST + name,
         default=argparse.SUPPRESS,
-        type=_argument_type(field),
+        type=argument_type(lambda text: _value(field, text), f"{name} "),
         metavar=_metavar(name, meta),
         help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
     )
     words = [*(meta["choices"] or ()), *meta["words"]]
     if words:
         offer(action, lambda _: words)
-    return action
 
 
 def _add_prior_and_config(group: argparse._ArgumentGroup) -> None:
@@ -132,33 +157,18 @@ def _axes() -> str:
     return ", ".join(name.removeprefix(_PRIOR) for name in OPTION_FIELDS if _PRIOR in name)
 
 
+@argument_type
 def _prior_argument(text: str) -> tuple[str, Any]:
     axis, equals, value = text.partition("=")
     if not equals or _PRIOR + axis not in OPTION_FIELDS:
-        raise argparse.ArgumentTypeError(
-            f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_axes()}; got {text!r}"
-        )
-    try:
-        return _PRIOR + axis, check_value(OPTION_FIELDS[_PRIOR + axis], value)
-    except ConfigError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+        raise ConfigError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_axes()}; got {text!r}")
+    return _PRIOR + axis, check_value(OPTION_FIELDS[_PRIOR + axis], value)
 
 
 def _metavar(name: str, meta: Mapping[str, Any]) -> str:
     if meta["choices"]:
         return "{" + ",".join(meta["choices"]) + "}"
     return "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
-
-
-def _argument_type(field: dataclasses.Field[Any]) -> Callable[[str], Any]:
-    def parse(text: str) -> Any:
-        try:
-            return _value(field, text)
-        except ConfigError as error:
-            message = str(error).removeprefix(f"{option_name(field)} ")
-            raise argparse.ArgumentTypeError(message) from None
-
-    return parse
 
 
 def _value(field: dataclasses.Field[Any], value: Any) -> Any:

@@ -1,27 +1,38 @@
 """A calibration on the screen: as text for people, as JSON for programs, and as an exit code."""
 
 import argparse
-import json
 import shlex
+import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hand_eye_calib.calibration import Calibration, DofVerdict, Reason, Verdict
-from hand_eye_calib.cli.console import fail, note, waiting_for
-from hand_eye_calib.cli.publishing import static_transform_command
-from hand_eye_calib.cli.reporting import with_cross_check, write_report
+from hand_eye_calib.cli.console import as_typed, fail, note, typed_options, waiting_for
+from hand_eye_calib.cli.reporting import (
+    static_transform_command,
+    with_cross_check,
+    write_report,
+)
 from hand_eye_calib.cli.robot import with_robot, write_description
-from hand_eye_calib.cli.spelling import as_typed, flag
 from hand_eye_calib.errors import printable
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.report.words import given_or_estimated, listing, with_sigma
-from hand_eye_calib.status import amount
+from hand_eye_calib.plain import json_text
+from hand_eye_calib.text import (
+    amount,
+    angle,
+    axes_in_words,
+    given_or_estimated,
+    listing,
+    with_sigma,
+)
 from hand_eye_calib.verdict import shown
 
 if TYPE_CHECKING:
+    from hand_eye_calib.engine.evidence import Evidence
     from hand_eye_calib.engine.snapshot import Snapshot
 
 _EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
@@ -70,28 +81,71 @@ def deliver(
     **more
         What else the JSON document holds.
     """
-    evidence = None
     calibration = with_robot(calibration, arguments)
-    if arguments.out:
+    evidence: Evidence | None = None
+    if arguments.out and snapshot is not None:
+        with waiting_for("cross-checks with other methods and halves of the recording"):
+            calibration, evidence = with_cross_check(calibration, snapshot)
+
+    def save() -> Path:
         from hand_eye_calib.io.results import keep_earlier_results, save_result
 
-        if snapshot is not None:
-            with waiting_for("cross-checks with other methods and halves of the recording"):
-                calibration, evidence = with_cross_check(calibration, snapshot)
         keep_earlier_results(arguments.out)
-        note(f"wrote {save_result(calibration, arguments.out, inputs)}")
-    print(
-        as_json(calibration, inputs=inputs, **more)
-        if arguments.json
-        else as_text(calibration, next_steps(calibration, arguments, snapshot))
-    )
-    write_description(calibration, arguments)
-    if evidence is not None and snapshot is not None:
-        write_report(arguments.out, calibration, evidence, snapshot.config, inputs)
+        return save_result(calibration, arguments.out, inputs)
+
+    def finish() -> None:
+        write_description(calibration, arguments)
+        if evidence is not None and snapshot is not None:
+            write_report(arguments.out, calibration, evidence, snapshot.config, inputs)
+
     code = exit_code(calibration)
-    if code == _EXIT_FAILED:
-        reason = calibration.reasons[0]
-        fail(f"{reason.sentence}; do not use this result, {reason.what_to_do}", code)
+    reasons = calibration.reasons[:1] if code == _EXIT_FAILED else ()
+    return show(
+        arguments,
+        lambda: calibration.to_dict() | {"inputs": inputs} | more,
+        lambda: as_text(calibration, next_steps(calibration, arguments, snapshot)),
+        save=save,
+        finish=finish,
+        errors=[f"{one.sentence}; do not use this result, {one.what_to_do}" for one in reasons],
+        code=code,
+    )
+
+
+def show(
+    arguments: argparse.Namespace,
+    document: Callable[[], Mapping[str, Any]],
+    text: Callable[[], str],
+    *,
+    save: Callable[[], Path] | None = None,
+    finish: Callable[[], None] | None = None,
+    errors: Iterable[str] = (),
+    code: int = 0,
+) -> int:
+    """Show what a command found, in the order of all commands; returns ``code``.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        With ``json`` and ``out``.
+    document, text : callable
+        What ``--json`` prints, and what is printed otherwise.
+    save : callable, optional
+        Writes the files of ``--out``, before anything is printed; returns the most important one.
+    finish : callable, optional
+        Writes what takes longer, or may fail, after that.
+    errors : iterable of str
+        Lines for stderr, at the end.
+    code : int
+        The exit code.
+    """
+    if arguments.out and save is not None:
+        note(f"wrote {save()}")
+    print(json_text(document()) if arguments.json else text())
+    sys.stdout.flush()
+    if finish is not None:
+        finish()
+    for error in errors:
+        fail(error, code)
     return code
 
 
@@ -104,9 +158,9 @@ def exit_code(calibration: Calibration) -> int:
     return 0 if is_all else _EXIT_NOT_ALL
 
 
-def as_json(calibration: Calibration, **more: Any) -> str:
-    """One JSON document: Calibration.to_dict() and ``more``."""
-    return json.dumps(calibration.to_dict() | more, indent=2, allow_nan=False)
+def as_json(calibration: Calibration) -> str:
+    """One JSON document: Calibration.to_dict()."""
+    return json_text(calibration.to_dict())
 
 
 def as_text(calibration: Calibration, steps: Iterable[str] = ()) -> str:
@@ -159,8 +213,9 @@ def _details(calibration: Calibration) -> Iterator[str]:
 
 
 def _reason_lines(calibration: Calibration) -> Iterator[str]:
-    for reason in shown(calibration.reasons):
-        if not calibration.headline.endswith(reason.sentence):
+    for number, reason in enumerate(shown(calibration.reasons)):
+        # What to do about the first one may follow the headline, which says why, at once.
+        if number or not calibration.headline.endswith(reason.sentence):
             yield from wrapped(reason.sentence, "- ", "  ")
         yield from wrapped(_what_to_do(reason), "  -> ", "     ")
 
@@ -171,7 +226,7 @@ def _warning_lines(calibration: Calibration) -> Iterator[str]:
 
 
 def _what_to_do(reason: Reason) -> str:
-    options = " ".join(f"--{flag(name)} {value}" for name, value in reason.options)
+    options = typed_options(reason.options)
     return f"{reason.what_to_do}: {options}" if options else reason.what_to_do
 
 
@@ -197,9 +252,9 @@ def next_steps(
     if snapshot is not None and (motion := _motion_advice(calibration, snapshot)):
         steps.append(motion)
     extra = [
-        f"--{flag(name)} {value}"
+        typed_options([option])
         for reason in shown(calibration.reasons)
-        for name, value in reason.options
+        for option in reason.options
     ]
     if calibration.verdict is not Verdict.DO_NOT_USE:
         reach = calibration.out_of_reach
@@ -236,9 +291,10 @@ def convergence_line(entry: Mapping[str, Any]) -> str:
     return f"{at} {position} m, {angles} deg, {poses} poses, {verdict}"
 
 
-def _values(names: tuple[str, ...] | str, values: list[float], decimals: int) -> str:
+def _values(names: Sequence[str], values: Sequence[float | None], decimals: int) -> str:
     return " ".join(
-        f"{name} {value:.{decimals}f}" for name, value in zip(names, values, strict=True)
+        f"{name} unknown" if value is None else f"{name} {value:.{decimals}f}"
+        for name, value in zip(names, values, strict=True)
     )
 
 
@@ -263,7 +319,8 @@ def transform_lines(
     angles, sigmas = transform[f"{kind}_deg"], transform[f"sigma_{kind}_deg"]
     for name, value, sigma in zip(names, angles, sigmas, strict=True):
         yield f"  {name:<6} {with_sigma(value, sigma, 2):>24} deg"
-    yield f"  quaternion {_values(('x', 'y', 'z', 'w'), transform['quat_xyzw'], 6)}"
+    quaternion = transform["quat_xyzw"]
+    yield f"  quaternion {_values('xyzw', quaternion, 6) if quaternion else 'unknown'}"
 
 
 def _observability(calibration: Calibration) -> str:
@@ -287,17 +344,16 @@ def _floor_lines(calibration: Calibration) -> Iterator[str]:
     if calibration.floor is not None and np.isfinite(calibration.sigmas).any():
         from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE, FLOOR_TILT
 
+        sigmas = zip(calibration.observability, calibration.sigmas_of_floor, strict=True)
         told = [
-            f"{dof.name} {amount(dof.name, sigma)}"
-            for dof, sigma in zip(
-                calibration.observability, calibration.sigmas_of_floor, strict=True
-            )
+            f"{axes_in_words([dof.name])} by {amount(dof.name, sigma)}"
+            for dof, sigma in sigmas
             if np.isfinite(dof.sigma)
         ]
         yield (
-            "not in these standard deviations, because it is the same all the time: odometry that "
-            f"is off by {FLOOR_SCALE:.0%} in scale and {np.degrees(FLOOR_ROTATION):.2g} deg, with "
-            f"an axis of rotation tilted by {np.degrees(FLOOR_TILT):.2g} deg: {', '.join(told)}"
+            f"not in these standard deviations: a constant odometry error ({100 * FLOOR_SCALE:g} % "
+            f"in scale, {angle(FLOOR_ROTATION)}, an axis of rotation tilted by "
+            f"{angle(FLOOR_TILT)}) would change {', '.join(told)}"
         )
 
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from itertools import chain, islice, pairwise
+from itertools import chain, combinations, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,6 +17,7 @@ from hand_eye_calib.cli.present import convergence_line
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.bags import PoseBag, PoseBlock
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
 
 _STREAMS = ("parent", "child")
 _NS_PER_S = 1_000_000_000
+# Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
+_LONGEST_PAUSE_S = 60.0
+# A vehicle hardly moves so many times faster in a pause than it ever does beside it.
+_FASTER = 2.0
 
 
 class _Output(NamedTuple):
@@ -75,6 +80,7 @@ def replay(
     Parameters
     ----------
     paths : list of path-like
+        Parts of one recording; see :func:`refuse_recordings`.
     parent, child : str, TfSource or None
         Topic or pair of frames; None if the bag leaves no choice.
     config : CalibratorConfig
@@ -100,7 +106,11 @@ def replay(
     convergence = Convergence(calibrator, every_s) if every_s else None
     with PoseBag(*paths) as bag:
         sources = _sources(bag, parent, child, output)
-        calibrator.reconfigure(_measuring(bag, sources, config))
+        config = _measuring(bag, sources, config)
+        with output.waiting_for("comparing the bags"):
+            measures = {"parent": config.parent_measures, "child": config.child_measures}
+            refuse_recordings(paths, sources, config.max_gap, measures)
+        calibrator.reconfigure(config)
         warnings = _read(bag, sources, calibrator, convergence, output)
         files = bag.files()
     for text in warnings:
@@ -141,20 +151,23 @@ def replay_journal(directory: Path, options: Mapping[str, Any]) -> Replayed:
     HandEyeCalibError
         If the journal cannot be used, or has too few poses.
     """
-    from hand_eye_calib.io.journal import read_about
-    from hand_eye_calib.ros.session_journal import resume
+    from hand_eye_calib.io.journal import read_journal
+    from hand_eye_calib.ros.session_journal import give
 
-    about = read_about(directory)
-    calibrator = Calibrator(CalibratorConfig.from_options({**about.get("options", {}), **options}))
     with waiting_for(f"reading {directory}"):
-        resume(directory, calibrator)
+        journal = read_journal(directory)
+        session = journal.about["parent"]
+        config = CalibratorConfig.from_options({**session.get("options", {}), **options})
+        names = [each.name for each in dataclasses.fields(config)]
+        given = [name for name in names if name in session.get("given", ())]
+        given += CalibratorConfig.from_options(options).given
+        calibrator = Calibrator(dataclasses.replace(config, given=given))
+        give(journal, directory, calibrator)
     with waiting_for("solving"):
         calibration = calibrator.estimate()
-    topics = about.get("topics", {})
-    sources = {stream: topics.get(stream, stream) for stream in _STREAMS}
+    sources = {stream: journal.about.get(stream, {}).get("topic") or stream for stream in _STREAMS}
     inputs = {"journal": str(directory), **calibrator.inputs(sources)}
-    files = sorted(directory.glob("session-*.journal"))
-    return Replayed(calibration, inputs, files, calibrator)
+    return Replayed(calibration, inputs, sorted(directory.glob("*.tum")), calibrator)
 
 
 def _sources(
@@ -342,3 +355,134 @@ def fingerprints(files: Sequence[Path], quiet: bool = False) -> list[dict[str, A
 def _started(blocks: Iterator[Any]) -> Iterator[Any]:
     """The same blocks, after what a bag has to do before the first of them."""
     return chain(list(islice(blocks, 1)), blocks)
+
+
+# ------------------------------- parts of one recording, or several recordings
+
+
+class _Part(NamedTuple):
+    """The poses of one stream in one of the bags."""
+
+    path: Path | str
+    poses: Trajectory
+    # Whether another bag has the same pose at a stamp, if it is of this recording. A path is
+    # corrected as it grows; positions and rates begin anew in each bag.
+    is_fixed: bool
+
+    @property
+    def first_s(self) -> float:
+        return float(self.poses.stamps_ns[0]) * 1e-9
+
+    @property
+    def last_s(self) -> float:
+        return float(self.poses.stamps_ns[-1]) * 1e-9
+
+
+def refuse_recordings(
+    paths: Sequence[Path | str],
+    sources: "Mapping[str, str | TfSource]",
+    max_gap_s: float,
+    measures: Mapping[str, str] | None = None,
+) -> None:
+    """Refuse bags that are not parts of one recording.
+
+    Parts continue each other, hold different topics, or repeat the same poses, as two recorders do
+    that run side by side.
+
+    Parameters
+    ----------
+    paths : sequence of path-like
+    sources : mapping
+        "parent" and "child" to a topic or a pair of frames.
+    max_gap_s : float
+        Poses of two parts may be out of order for so long.
+    measures : mapping, optional
+        "parent" and "child" to what their poses are read as.
+
+    Raises
+    ------
+    InputError
+        If two bags are recordings of their own; the message names them and says why.
+    """
+    if len(paths) < 2:
+        return
+    for stream, source in sources.items():
+        read = (_part(path, source, (measures or {}).get(stream, "auto")) for path in paths)
+        parts = sorted(filter(None, read), key=lambda part: part.first_s)
+        latest: _Part | None = None
+        for first, second in combinations(parts, 2):
+            if difference := _overlap(first, second, max_gap_s):
+                raise _refusal(first, second, source, difference)
+        for part in parts:
+            if latest is not None and (difference := _break(latest, part)):
+                raise _refusal(latest, part, source, difference)
+            latest = part if latest is None else max(latest, part, key=lambda each: each.last_s)
+
+
+def _refusal(first: _Part, second: _Part, source: Any, difference: str) -> InputError:
+    return InputError(
+        f"{first.path} and {second.path} are two recordings, not parts of one: {source} "
+        f"{difference}; calibrate each by itself, or all with --batch FILE, which lists them"
+    )
+
+
+def _part(path: Path | str, source: "str | TfSource", measures: str) -> _Part | None:
+    """The poses of a source in one bag; None without any."""
+    from hand_eye_calib.io.bags import PoseBag, trajectory_of
+    from hand_eye_calib.io.bags.messages import PATH_TYPE
+
+    with PoseBag(path) as bag:
+        paths = {topic.name for topic in bag.topics() if topic.type == PATH_TYPE}
+        try:
+            poses, _ = trajectory_of(bag, source, measures)
+            return _Part(path, poses, poses.measures == "poses" and source not in paths)
+        except InputError:
+            # It is no recording of its own: without the topic, or without the static transforms
+            # that only a first part has. What is damaged is said when all parts are read.
+            return None
+
+
+def _overlap(first: _Part, second: _Part, max_gap_s: float) -> str:
+    """What tells that poses of one time are not the same; empty for nothing."""
+    one, two = first.poses, second.poses
+    last_ns = min(one.stamps_ns[-1], two.stamps_ns[-1])
+    overlap_s = (last_ns - two.stamps_ns[0]) * 1e-9
+    if overlap_s <= max_gap_s:
+        return ""
+    shared, rows, others = np.intersect1d(
+        one.stamps_ns, two.stamps_ns, assume_unique=True, return_indices=True
+    )
+    is_same = np.ones(len(shared), dtype=bool)
+    if first.is_fixed and second.is_fixed:
+        is_same = (one.poses[rows] == two.poses[others]).all(axis=(1, 2))
+    count = min(
+        int(((each.stamps_ns >= two.stamps_ns[0]) & (each.stamps_ns <= last_ns)).sum())
+        for each in (one, two)
+    )
+    if is_same.sum() >= count / 2:
+        return ""
+    return f"has different poses in both for {overlap_s:.1f} s of the same time"
+
+
+def _break(first: _Part, second: _Part) -> str:
+    """What tells that a part does not continue one before; empty for nothing."""
+    pause_s = second.first_s - first.last_s
+    if pause_s > _LONGEST_PAUSE_S:
+        return f"pauses for {pause_s:.0f} s between them"
+    if pause_s < 0 or not first.is_fixed:
+        return ""
+    distance = float(np.linalg.norm(second.poses.poses[0, :3, 3] - first.poses.poses[-1, :3, 3]))
+    steps = [_steps(part.poses) for part in (first, second) if len(part.poses) > 1]
+    if not steps:
+        return ""
+    lengths, times_s = np.concatenate(steps, axis=1)
+    furthest = _FASTER * (lengths / times_s).max() * max(pause_s, float(np.median(times_s)))
+    if distance > furthest:
+        return f"goes on {distance:.1f} m away after {pause_s:.1f} s, as if it had started again"
+    return ""
+
+
+def _steps(trajectory: Trajectory) -> np.ndarray:
+    """Lengths (m) and times (s) from pose to pose, (2, N - 1)."""
+    lengths = np.linalg.norm(np.diff(trajectory.poses[:, :3, 3], axis=0), axis=1)
+    return np.stack([lengths, np.diff(trajectory.stamps_ns) * 1e-9])

@@ -1,24 +1,33 @@
-"""What ``--out`` adds to a calibration: cross-checks and ``report.html``; and ``check.html`` of the
-command ``check``.
+"""Pages: ``report.html`` of a calibration or a rig, ``check.html``, and what they need. And the
+process that writes them for a session of the node.
 """
 
 import dataclasses
+import os
+import pickle
+import shlex
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.cli.console import note, waiting_for
-from hand_eye_calib.cli.publishing import static_transform_command
+from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import HandEyeCalibError, InputError
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.evidence import Evidence
     from hand_eye_calib.engine.snapshot import Snapshot
+    from hand_eye_calib.geometry.trajectory import Trajectory
+    from hand_eye_calib.ros.report_process import SessionResult
 
 REPORT, CHECK = "report.html", "check.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
+# Frame of a child sensor that names none: in a rig it has the name of its input.
+_NAMELESS = "child_sensor"
+# Every other program goes before the process that writes the pages of a session.
+_NICENESS = 15
 
 
 def with_cross_check(
@@ -51,89 +60,28 @@ def with_cross_check(
     return checked, evidence
 
 
-def write_report(
-    directory: Path,
-    calibration: Calibration,
-    evidence: "Evidence",
-    config: CalibratorConfig,
-    inputs: Mapping[str, Any],
-) -> None:
-    """Write the report into a directory; if a library for it is missing, say so and go on.
+def static_transform_command(calibration: Calibration) -> str:
+    """Shell command that publishes the child's pose as a static transform, in the frame that it is
+    mounted on.
 
-    Parameters
-    ----------
-    directory : path-like
-    calibration, evidence, config, inputs
-        Those of :func:`rendered`.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
+    Empty if the verdict is DO NOT USE. For an axis that the motion does not determine it has a word
+    that static_transform_publisher refuses.
     """
-    if can_draw(REPORT):
-        given = (calibration, evidence, config, inputs)
-        _write(Path(directory) / REPORT, "the report", rendered, *given)
+    numbers = calibration.usable_numbers()
+    if not numbers:
+        return ""
+    told = " ".join(
+        f"--{name} {value if isinstance(value, str) else f'{round(value, 9) + 0.0:.9f}'}"
+        for name, value in numbers.items()
+    )
+    parent, child = map(shlex.quote, (calibration.mounting[0], calibration.child_frame))
+    return (
+        f"ros2 run tf2_ros static_transform_publisher {told} "
+        f"--frame-id {parent} --child-frame-id {child}"
+    )
 
 
-def write_check(directory: Path, *arguments: Any) -> None:
-    """Write the page of the stream checks into a directory; if a library for it is missing, say so
-    and go on.
-
-    Parameters
-    ----------
-    directory : path-like
-    *arguments
-        Those of :func:`~hand_eye_calib.report.check_page.render_check`.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    if can_draw(CHECK):
-        from hand_eye_calib.report.check_page import render_check
-
-        _write(Path(directory) / CHECK, "the page", render_check, *arguments)
-
-
-def write_rig_report(directory: Path, *arguments: Any) -> None:
-    """Write the report of a rig into a directory; if a library for it is missing, say so and go on.
-
-    Parameters
-    ----------
-    directory : path-like
-    *arguments
-        Those of :func:`~hand_eye_calib.report.rig_page.render_rig`.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    if can_draw(REPORT):
-        from hand_eye_calib.report.rig_page import render_rig
-
-        _write(Path(directory) / REPORT, "the report", render_rig, *arguments)
-
-
-def _write(path: Path, what: str, render: Callable[..., str], *arguments: Any) -> None:
-    with waiting_for(f"writing {what}"):
-        save_page(path, render(*arguments))
-    note(f"wrote {path}")
-
-
-def can_draw(file_name: str) -> bool:
-    """Whether the libraries for pages are installed; prints which one is missing."""
-    try:
-        import hand_eye_calib.report.report  # noqa: F401
-    except ModuleNotFoundError as error:
-        library = (error.name or "").partition(".")[0]
-        if library not in _OPTIONAL:
-            raise
-        note(f"no {file_name}: {library} is missing; pip install {library}")
-        return False
-    return True
+# ----------------------------------------------------------------------- pages
 
 
 def rendered(
@@ -152,15 +100,67 @@ def rendered(
         The options that gave the result.
     inputs : dict
         Where the data came from, in plain values.
-
-    Returns
-    -------
-    str
     """
     from hand_eye_calib.report.report import render
 
     command = static_transform_command(calibration)
     return render(calibration, config, evidence, inputs=inputs, command=command)
+
+
+def write_report(directory: Path, *arguments: Any) -> None:
+    """Write the report of a calibration; ``arguments`` are those of :func:`rendered`.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    write_page(Path(directory) / REPORT, lambda: rendered(*arguments))
+
+
+def write_rig_report(directory: Path, *arguments: Any) -> None:
+    """Write the report of a rig; ``arguments`` are those of
+    :func:`~hand_eye_calib.report.rig_page.render_rig`.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+
+    def render() -> str:
+        from hand_eye_calib.report.rig_page import render_rig
+
+        return render_rig(*arguments)
+
+    write_page(directory / REPORT, render)
+
+
+def write_page(path: Path, render: Callable[[], str]) -> None:
+    """Write the page that ``render`` returns; if a library for it is missing, say so and go on.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    if can_draw(path.name):
+        with waiting_for(f"writing {path.name}"):
+            save_page(path, render())
+        note(f"wrote {path}")
+
+
+def can_draw(file_name: str) -> bool:
+    """Whether the libraries for pages are installed; prints which one is missing."""
+    try:
+        import hand_eye_calib.report.report  # noqa: F401
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        if library not in _OPTIONAL:
+            raise
+        note(f"no {file_name}: {library} is missing; pip install {library}")
+        return False
+    return True
 
 
 def save_page(path: Path, text: str) -> Path:
@@ -183,3 +183,73 @@ def save_page(path: Path, text: str) -> Path:
             f"cannot write {error.filename or path}: {error.strerror}; choose another directory"
         ) from None
     return path
+
+
+# ----------------------------------------------------------- a session's pages
+
+
+def write_session() -> None:
+    """Write the pages of a session into the directory that is the only argument of this process.
+
+    It reads the result from standard input, as ``ros/report_process.py`` writes it. The results of
+    further child sensors go to standard output.
+    """
+    os.nice(_NICENESS)
+    result: SessionResult = pickle.load(sys.stdin.buffer)
+    directory = Path(sys.argv[1])
+    try:
+        if result.others:
+            pickle.dump(_session_rig(directory / "rig", result), sys.stdout.buffer)
+        if result.with_report:
+            from hand_eye_calib.engine.checked import checked
+
+            calibration, _ = checked(result.calibration, result.snapshot, may_mend=False)
+            calibration, evidence = with_cross_check(calibration, result.snapshot)
+            write_report(directory, calibration, evidence, result.snapshot.config, result.inputs)
+    except HandEyeCalibError as error:
+        sys.exit(fail(error, 1))
+
+
+def _session_rig(directory: Path, result: "SessionResult") -> list[Calibration]:
+    """Solve for all sensors of a session together, and write the files and the page; returns the
+    results of the further child sensors.
+
+    Raises
+    ------
+    HandEyeCalibError
+        If they cannot be solved together, or nothing can be written.
+    """
+    from hand_eye_calib.io.rig_files import save_rig
+    from hand_eye_calib.rig.calibrate import solve_rig
+
+    rig = solve_rig(*_rig_of(result))
+    inputs = {**result.inputs, "sensors": list(rig.sensors)}
+    save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
+    write_rig_report(directory, rig, rig.sensors)
+    return [*rig.calibrations[1:]]
+
+
+def _rig_of(result: "SessionResult") -> "tuple[dict[str, Trajectory], dict[str, Any]]":
+    """The trajectories of all sensors by their frames, and the options to solve them with.
+
+    A time offset and a scale in numbers are the child's, which has them; the others have none.
+    """
+    snapshot = result.snapshot
+    parent, child = snapshot.streams
+    config, options = snapshot.config, snapshot.config.to_options()
+    of_all = ["method", "max_gap", "target.translation", "target.rotation"]
+    if isinstance(config.time_offset, str):
+        of_all.append("time_offset")
+    else:
+        child = child.shifted(config.time_offset)
+    if isinstance(config.scale, str):
+        of_all.append("scale")
+    else:
+        child = child.scaled(config.scale)
+    found = {snapshot.parent_frame: parent, snapshot.child_frame: child}
+    for name, other in result.others.items():
+        if other.config.child_measures not in ("auto", "poses"):
+            raise InputError(f"{name} has {other.config.child_measures}: a rig takes poses")
+        frame = other.child_frame
+        found[name if frame in found or frame == _NAMELESS else frame] = other.streams[1]
+    return found, {name: options[name] for name in of_all}

@@ -1,23 +1,28 @@
 """A rig of three sensors or more: calibrated, printed and saved."""
 
 import argparse
-import json
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import fail, note, waiting_for
+from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.options import options_from
-from hand_eye_calib.cli.present import exit_code, transform_lines, wrapped
+from hand_eye_calib.cli.present import exit_code, show, transform_lines, wrapped
+from hand_eye_calib.cli.reporting import write_rig_report
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
     from hand_eye_calib.geometry.trajectory import Trajectory
+    from hand_eye_calib.io.remote import AsGiven
     from hand_eye_calib.rig.result import RigCalibration
 
 
-def calibrate_bag(arguments: argparse.Namespace) -> int:
-    """Calibrate a rig from the topics of a bag; returns the exit code."""
-    from hand_eye_calib.cli.replaying import fingerprints
+def calibrate_bag(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+    """Calibrate a rig from the topics of a bag; returns the exit code.
+
+    ``as_given`` puts the name of a remote bag back into plain values.
+    """
+    from hand_eye_calib.cli.replaying import fingerprints, refuse_recordings
     from hand_eye_calib.io.bags import PoseBag, trajectory_of
     from hand_eye_calib.io.transforms import TfSource
 
@@ -25,6 +30,7 @@ def calibrate_bag(arguments: argparse.Namespace) -> int:
     with PoseBag(*arguments.bags) as bag:
         for topic in arguments.topics:
             source = TfSource.parse(topic) if ":" in topic else topic
+            refuse_recordings(arguments.bags, {"parent": source}, CalibratorConfig.max_gap)
             with waiting_for(f"reading {topic}"):
                 trajectory, notes = trajectory_of(bag, source)
             for text in notes:
@@ -36,7 +42,7 @@ def calibrate_bag(arguments: argparse.Namespace) -> int:
         files = bag.files()
     if arguments.out:
         inputs["files"] = fingerprints(files)
-    return calibrate_and_deliver(found, arguments, inputs)
+    return calibrate_and_deliver(found, arguments, as_given(inputs))
 
 
 def calibrate_and_deliver(
@@ -53,9 +59,7 @@ def calibrate_and_deliver(
     inputs : dict
         Where the data came from, in plain values.
     """
-    from hand_eye_calib.cli.memory import prepare_to_solve
-
-    prepare_to_solve()
+    from hand_eye_calib.io.rig_files import save_rig
     from hand_eye_calib.rig.calibrate import solve_rig
 
     _refuse_robot(arguments)
@@ -63,22 +67,22 @@ def calibrate_and_deliver(
     with waiting_for(f"solving for {len(trajectories)} sensors"):
         rig = solve_rig(trajectories, options)
     inputs = {**inputs, "options": dict(options)}
-    if arguments.out:
-        from hand_eye_calib.cli.reporting import write_rig_report
-        from hand_eye_calib.io.rig_files import save_rig
 
-        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
-        write_rig_report(arguments.out, rig, inputs.get("topics") or inputs["files"])
-    print(
-        json.dumps(rig.to_dict() | {"inputs": inputs}, indent=2, allow_nan=False)
-        if arguments.json
-        else "\n".join(printable(line) for line in as_lines(rig))
-    )
+    def finish() -> None:
+        if arguments.out:
+            write_rig_report(arguments.out, rig, inputs.get("topics") or inputs["files"])
+
     codes = [exit_code(each) for each in rig.calibrations]
     failed = [each for each in rig.calibrations if each.status.failure]
-    for each in failed:
-        fail(f"{each.child_frame}: {each.headline}", max(codes))
-    return 1 if failed else max(codes)
+    return show(
+        arguments,
+        lambda: rig.to_dict() | {"inputs": inputs},
+        lambda: "\n".join(printable(line) for line in as_lines(rig)),
+        save=lambda: save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs),
+        finish=finish,
+        errors=[f"{each.child_frame}: {each.headline}" for each in failed],
+        code=1 if failed else max(codes),
+    )
 
 
 def add_sensor(found: dict[str, "Trajectory"], name: str, trajectory: "Trajectory") -> None:
@@ -106,7 +110,6 @@ def as_lines(rig: "RigCalibration") -> list[str]:
             line
             for reason in each.reasons
             for line in wrapped(f"{reason.sentence}: {reason.what_to_do}", "- ", "  ")
-            if not each.headline.endswith(reason.sentence)
         ]
         lines += [line for text in each.warnings for line in wrapped(f"Note: {text}", "", "  ")]
         lines += [*transform_lines(each.to_dict()["T_parent_child"]), ""]

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import note, waiting_for
-from hand_eye_calib.cli.parser import advanced
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.status import listing
+from hand_eye_calib.text import listing
 
 if TYPE_CHECKING:
     from hand_eye_calib.calibration import Calibration
@@ -24,21 +23,20 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
         help="compare the result with this: a URDF, an earlier extrinsic.yaml, a bag with "
         '/tf_static, or "X Y Z ROLL PITCH YAW" in m and rad. Default: --urdf, if it is given',
     )
-    base_frame = group.add_argument(
+    group.add_argument(
         "--base-frame",
         metavar="FRAME",
         help="state the child's pose in this frame too, as --urdf or the bag's /tf_static has it",
     )
-    advanced(base_frame)
-    advanced(add_description_arguments(group))
+    add_description_arguments(group)
 
 
-def add_description_arguments(parser: argparse._ActionsContainer) -> argparse.Action:
-    """Add ``--urdf`` and ``--write``; returns the latter."""
+def add_description_arguments(parser: argparse._ActionsContainer) -> None:
+    """Add ``--urdf`` and ``--write``."""
     parser.add_argument(
         "--urdf", metavar="FILE", type=Path, help="robot description with both sensors' frames"
     )
-    return parser.add_argument(
+    parser.add_argument(
         "--write",
         metavar="FILE",
         type=Path,

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import with_progress
-from hand_eye_calib.cli.options import add_json_argument
+from hand_eye_calib.cli.options import add_json_argument, at_least
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.simulation.options import (
     HILLY_DRIVE,
     MIXTURE,
     PUBLISHED_DRIVE,
+    REALISTIC,
     DriveConfig,
     NoiseConfig,
 )
@@ -41,7 +42,6 @@ TUM format:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     parser.add_argument(
         "--out",
@@ -51,11 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="directory to make; it must be empty or not exist",
     )
     parser.add_argument(
-        "--runs", type=_positive, default=1, metavar="N", help="number of recordings. Default: 1"
+        "--runs", type=at_least(1), default=1, metavar="N", help="number of recordings. Default: 1"
     )
     parser.add_argument(
         "--seed",
-        type=_not_negative,
+        type=at_least(0),
         default=0,
         help="the same seed gives the same recordings. Default: 0",
     )
@@ -96,13 +96,20 @@ def _add_noise_arguments(parser: argparse.ArgumentParser) -> None:
             f"--{option}",
             type=float,
             metavar=option.upper(),
-            help=f"{meta['doc']}{unit} Default: 0.",
+            help=f"{meta['doc']}{unit} Default: {getattr(REALISTIC, name)}.",
         )
-    group.add_argument(
+    level = group.add_mutually_exclusive_group()
+    level.add_argument(
+        "--noise-free",
+        action="store_true",
+        help="exact poses but for the noise options that are given: streams that agree to the last "
+        "digit count as copies of each other, and a result from them as unusable",
+    )
+    level.add_argument(
         "--mixture",
         action="store_true",
         help=f"the paper's mixture: --noise {MIXTURE.gaussian} --outliers {MIXTURE.outliers} "
-        f"--drift {MIXTURE.drift}; those that are given go before",
+        f"--drift {MIXTURE.drift}; noise options that are given replace these",
     )
 
 
@@ -172,7 +179,9 @@ def _configs(arguments: argparse.Namespace) -> tuple[DriveConfig, NoiseConfig]:
         for option, name in _NOISE_OPTIONS.items()
         if getattr(arguments, option) is not None
     }
-    return config, dataclasses.replace(MIXTURE if arguments.mixture else NoiseConfig(), **given)
+    noise = MIXTURE if arguments.mixture else REALISTIC
+    noise = NoiseConfig() if arguments.noise_free else noise
+    return config, dataclasses.replace(noise, **given)
 
 
 def _make_empty(folder: Path) -> None:
@@ -188,19 +197,3 @@ def _make_empty(folder: Path) -> None:
             f"{folder} is not empty, and nothing in it is overwritten; remove it or choose another "
             "with --out"
         )
-
-
-def _positive(text: str) -> int:
-    return _at_least(1, text)
-
-
-def _not_negative(text: str) -> int:
-    return _at_least(0, text)
-
-
-def _at_least(minimum: int, text: str) -> int:
-    if not text.isdecimal() or int(text) < minimum:
-        raise argparse.ArgumentTypeError(
-            f"expected a whole number of at least {minimum}, got {text!r}"
-        )
-    return int(text)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import note
+from hand_eye_calib.cli.options import argument_type
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -245,8 +246,9 @@ def _stop_signals() -> Callable[[], bool]:
     return lambda: bool(came)
 
 
+@argument_type
 def _address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
-        raise argparse.ArgumentTypeError(f"expected PORT or HOST:PORT, got {text!r}")
+        raise ConfigError(f"expected PORT or HOST:PORT, got {text!r}")
     return host.strip("[]"), int(port)

@@ -7,13 +7,11 @@ files.
 import sys
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import Correlation
-from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.calibration import Calibration
@@ -28,7 +26,6 @@ from hand_eye_calib.engine.snapshot import (
     name_frames,
     pair_poses,
 )
-from hand_eye_calib.engine.state import check_state
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
@@ -36,9 +33,6 @@ from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
 # Bounds of a quaternion's squared length.
 _MIN_NORM2 = (1 - QUATERNION_NORM_TOLERANCE) ** 2
 _MAX_NORM2 = (1 + QUATERNION_NORM_TOLERANCE) ** 2
-
-# Fields of a SimilarityFit whose names were others in the state of version 0.1.
-_OLD_FIT_NAMES = {"moved": "rms_translation", "turned": "rms_rotation"}
 
 
 class UnusablePose(InputError):
@@ -98,52 +92,6 @@ class Calibrator:
             self._forget_pairs()
         self._config = config
 
-    def state(self) -> dict[str, np.ndarray]:
-        """All poses and pairs as a flat mapping of names to arrays, for :meth:`restore`. Options
-        are not part of it.
-        """
-        state = {
-            f"{stream}.{name}": value
-            for stream in STREAMS
-            for name, value in self._buffers[stream].state().items()
-        }
-        kept = self._kept
-        state |= {
-            "kept.stamps_ns": kept.stamps_ns,
-            "kept.Ts_pw_p": kept.Ts_pw_p,
-            "kept.Ts_cw_c": kept.Ts_cw_c,
-            "base": np.array(self._paired_at or ""),
-        }
-        return state | (_offset_state(self._time_offset) if self._time_offset else {})
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from a :meth:`state`, of this or an earlier calibrator.
-
-        Raises
-        ------
-        InputError
-            If no calibrator gave this state; nothing changes.
-        """
-        check_state(state, STREAMS, self._limits.capacity)
-        try:
-            self._restore(state)
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
-            raise InputError(f"the saved state cannot be used ({error})") from None
-
-    def _restore(self, state: Mapping[str, np.ndarray]) -> None:
-        parts: dict[str, dict[str, np.ndarray]] = {
-            part: {} for part in (*STREAMS, "kept", "offset", "correlation", "fit")
-        }
-        for name, value in state.items():
-            part, _, rest = name.partition(".")
-            if rest:
-                parts[part][rest] = value
-        buffers = {stream: PoseBuffer.from_state(parts[stream], self._limits) for stream in STREAMS}
-        kept = PosePairs(**parts["kept"])
-        time_offset = _offset_from_state(parts) if parts["offset"] else None
-        self._buffers, self._kept_parts, self._time_offset = buffers, [kept], time_offset
-        self._paired_at = str(state["base"]) or None
-
     def inputs(self, topics: Mapping[str, object]) -> dict[str, Any]:
         """Options and streams in plain values: where a result came from.
 
@@ -161,6 +109,10 @@ class Calibrator:
     def statistics(self, stream: str) -> StreamStatistics:
         """StreamStatistics of "parent" or "child"."""
         return self._buffers[stream].statistics
+
+    def frame(self, stream: str) -> str:
+        """Name of a stream's sensor frame, as its messages give it; empty if it is not known."""
+        return self._buffers[stream].frame
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
         """Set the name of a stream's sensor frame, as its messages give it. An option that names
@@ -479,25 +431,3 @@ def _what_is_wrong(position: Sequence[float], quat_xyzw: Sequence[float]) -> Inp
         f"quaternion (x {qx}, y {qy}, z {qz}, w {qw}) has length {length:.4g}, expected 1 within "
         f"{QUATERNION_NORM_TOLERANCE}"
     )
-
-
-def _offset_state(offset: TimeOffset) -> dict[str, np.ndarray]:
-    """A TimeOffset as a flat mapping of names to arrays."""
-    state: dict[str, Any] = {"offset.seconds": offset.seconds, "offset.sigma_s": offset.sigma_s}
-    for part, found in (("correlation", offset.correlation), ("fit", offset.fit)):
-        if found is not None:
-            state |= {f"{part}.{field.name}": getattr(found, field.name) for field in fields(found)}
-    return {name: np.asarray(value) for name, value in state.items()}
-
-
-def _offset_from_state(parts: Mapping[str, Mapping[str, np.ndarray]]) -> TimeOffset:
-    """The TimeOffset that gave these parts of a state."""
-
-    def values(part: str) -> dict[str, Any]:
-        return {
-            _OLD_FIT_NAMES.get(name, name): value if value.ndim else value.item()
-            for name, value in parts[part].items()
-        }
-
-    fit = SimilarityFit(**values("fit")) if parts["fit"] else None
-    return TimeOffset(**values("offset"), correlation=Correlation(**values("correlation")), fit=fit)

@@ -50,17 +50,11 @@ class Mended:
     told: tuple[str, ...] = ()
 
 
-def at_clear_offset(snapshot: Snapshot, given: Collection[str]) -> Snapshot:
+def at_clear_offset(snapshot: Snapshot) -> Snapshot:
     """The snapshot with an estimated time offset if :func:`mend` would set that after a solve
     without: the solve without it is left out.
-
-    Parameters
-    ----------
-    snapshot : Snapshot
-    given : collection of str
-        Names of the options that were set.
     """
-    if "time_offset" in given or not _has_clock(snapshot.config):
+    if "time_offset" in snapshot.config.given or not _has_clock(snapshot.config):
         return snapshot
     if not snapshot.correlation.is_clear:
         return snapshot
@@ -82,7 +76,7 @@ def _has_clock(config: CalibratorConfig) -> bool:
 
 
 def checked(
-    calibration: Calibration, snapshot: Snapshot, given: Collection[str] | None = None
+    calibration: Calibration, snapshot: Snapshot, *, may_mend: bool = True
 ) -> tuple[Calibration, Snapshot]:
     """Check the streams of a result, and mend what a check is certain of.
 
@@ -91,8 +85,8 @@ def checked(
     calibration : Calibration
     snapshot : Snapshot
         The poses it comes from.
-    given : collection of str, optional
-        Names of the options that were set. None: nothing is solved again.
+    may_mend : bool
+        False: nothing is solved again.
 
     Returns
     -------
@@ -101,31 +95,32 @@ def checked(
     snapshot : Snapshot
         With the options that gave it.
     """
-    found = mend(calibration, snapshot, given)
+    if not may_mend:
+        return _with(calibration, snapshot.check(calibration).findings), snapshot
+    found = mend(calibration, snapshot)
     warnings = dict.fromkeys((*found.told, *calibration.warnings, *found.calibration.warnings))
     return replace(found.calibration, warnings=tuple(warnings)), found.snapshot
 
 
-def mend(
-    calibration: Calibration, snapshot: Snapshot, given: Collection[str] | None = None
-) -> Mended:
+def mend(calibration: Calibration, snapshot: Snapshot, settled: Collection[str] = ()) -> Mended:
     """Check the streams of a result. If a check is certain of the time offset or of the scale, and
-    the option was not given, solve again with it, and keep that if there is less to say against it.
-    Parameters as of :func:`checked`.
+    the user did not set it, solve again with it, and keep that if there is less to say against it.
+    ``settled`` names options that an earlier check has set.
     """
+    given = snapshot.config.given.union(settled)
     ahead = _set_ahead(calibration, snapshot, given)
     if ahead and _is_sound(ahead) and _is_large(ahead.calibration.time_offset_s, calibration):
         return replace(ahead, told=_told((), ahead.options, ahead.calibration))
     if ahead:
         snapshot = with_options(snapshot, {"time_offset": CalibratorConfig.time_offset})
         calibration = snapshot.estimate()
-    by_model = {} if given is None else _offset_of_model(calibration, snapshot, given)
+    by_model = _offset_of_model(calibration, snapshot, given)
     again = ahead if by_model and ahead else _solved_with(snapshot, by_model)
     if again and _is_sound(again):
         return replace(again, told=_told((), by_model, again.calibration))
     check = snapshot.check(calibration)
     found = Mended(_with(calibration, check.findings), snapshot, check)
-    certain = {} if given is None else _certain(check.findings, given)
+    certain = _certain(check.findings, given)
     options = by_model | certain
     if options != by_model:
         again = _solved_with(snapshot, options)
@@ -138,11 +133,11 @@ def mend(
 
 
 def _set_ahead(
-    calibration: Calibration, snapshot: Snapshot, given: Collection[str] | None
+    calibration: Calibration, snapshot: Snapshot, given: Collection[str]
 ) -> Mended | None:
     """The result as it is if :func:`at_clear_offset` has set its time offset, otherwise None."""
     options = {"time_offset": snapshot.config.time_offset}
-    if given is None or "time_offset" in given or options["time_offset"] != "estimate":
+    if "time_offset" in given or options["time_offset"] != "estimate":
         return None
     check = snapshot.check(calibration)
     return Mended(_with(calibration, check.findings), snapshot, check, options)
@@ -182,13 +177,6 @@ def with_options(snapshot: Snapshot, options: Mapping[str, Any]) -> Snapshot:
         buffered_child=child,
         paired_at=None,
         time_offset=None,
-    )
-
-
-def set_options(config: CalibratorConfig) -> frozenset[str]:
-    """Of the options that a check can be certain of, those that differ from their default."""
-    return frozenset(
-        name for name in _MENDED if getattr(config, name) != getattr(CalibratorConfig, name)
     )
 
 

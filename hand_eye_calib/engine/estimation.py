@@ -2,6 +2,7 @@
 assess, add the prior, judge.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,22 +10,20 @@ import numpy as np
 
 from hand_eye_calib.adaptive import estimator as adaptive_estimator
 from hand_eye_calib.adaptive.estimator import AdaptiveSolution
-from hand_eye_calib.adaptive.increments import Streams, course_of
+from hand_eye_calib.adaptive.increments import SYSTEMATIC, Streams, course_of
 from hand_eye_calib.adaptive.part_delays import PartDelay, spread_by_delays
 from hand_eye_calib.adaptive.world_drift import WorldDrift
-from hand_eye_calib.alignment.scale import Scale, child_scaled, estimate_scale
-from hand_eye_calib.alignment.similarity import MAX_UNEXPLAINED_TRANSLATION
+from hand_eye_calib.alignment.scale import Scale, ScaleInUse, child_scaled, settle_scale
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive
-from hand_eye_calib.assessment.floor import common_mode_floor
-from hand_eye_calib.assessment.model_fit import MAX_JUMPS, why_not
+from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive, without_axes
+from hand_eye_calib.assessment.floor import axes_lost_by_tilt, common_mode_floor
 from hand_eye_calib.assessment.mount_change import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
-from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
+from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import ConfigError, NotEnoughDataError
+from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
@@ -36,8 +35,9 @@ from hand_eye_calib.solvers.solution import Solution
 # look like motion.
 _SPAN = 10
 
-# Standard deviations below which a delay is none.
-_NO_DELAY = 3.0
+# Largest share of the increments that may be jumps: with jumps at a tenth of the poses of both
+# trajectories it is a fifth.
+_MAX_JUMPS = 0.25
 
 _PROVED = {True: "yes", False: "no", None: "not tried"}
 
@@ -95,26 +95,55 @@ class _Evaluation:
             spread = spread + np.outer(self.drift.shift, self.drift.shift)
         return spread if self.shift is None else spread + self.shift.spread
 
-    @property
-    def is_steady(self) -> bool:
-        """Whether a noise model shows neither a delay of positions nor a world that moves."""
-        if not self.delays or self.drift is None:
-            return False
-        return not self.drift.is_significant and max(d.sigmas for d in self.delays) < _NO_DELAY
 
+@dataclass(frozen=True, kw_only=True)
+class Solved:
+    """Poses that were solved, before priors are added and unknown directions are set."""
 
-@dataclass(frozen=True)
-class _ScaleInUse:
-    """Factor of the child's lengths, and the estimate it comes from if it was estimated."""
+    evaluation: _Evaluation
+    assessment: Assessment
+    stamps_ns: IntArray
+    config: CalibratorConfig
+    scale: ScaleInUse
+    time_offset: TimeOffset | None
 
-    value: float = 1.0
-    estimate: Scale | None = None
-    warnings: tuple[str, ...] = ()
+    def calibration(self, unseen: Collection[str] = ()) -> Calibration:
+        """The result without frame names.
+
+        Parameters
+        ----------
+        unseen : collection of str
+            Axes that count as unobservable whatever the method says; so do those that a tilted
+            axis of rotation would move too far.
+        """
+        evaluation, scale, offset = self.evaluation, self.scale, self.time_offset
+        T_method = evaluation.solution.T_parent_child
+        sigmas = np.array([dof.sigma for dof in self.assessment.observability[:3]])
+        hidden = {*unseen, *axes_lost_by_tilt(*evaluation.spans, T_method, sigmas)}
+        fused = fuse(T_method, without_axes(self.assessment, T_method, hidden), self.config.prior())
+        result = _calibration(evaluation, fused, self.stamps_ns, self.config)
+        offset_s = offset.seconds if offset else fixed_time_offset(self.config)
+        return replace(
+            result,
+            time_offset_s=offset_s + evaluation.time_correction_s,
+            time_offset_sigma_s=evaluation.time_sigma_s or (offset.sigma_s if offset else 0.0),
+            scale=scale.value * evaluation.scale_correction,
+            scale_sigma=scale.value * evaluation.scale_sigma
+            or (scale.estimate.sigma if scale.estimate else 0.0),
+            warnings=scale.warnings + result.warnings,
+        )
 
 
 def estimate_extrinsic(
     pose_pairs: PosePairs, config: CalibratorConfig, time_offset: TimeOffset | None = None
 ) -> Calibration:
+    """Solve and assess synchronised poses: the calibration of :func:`solve_poses`."""
+    return solve_poses(pose_pairs, config, time_offset).calibration()
+
+
+def solve_poses(
+    pose_pairs: PosePairs, config: CalibratorConfig, time_offset: TimeOffset | None = None
+) -> Solved:
     """Solve and assess synchronised poses.
 
     Parameters
@@ -126,11 +155,6 @@ def estimate_extrinsic(
     time_offset : TimeOffset, optional
         The offset that the poses already have, if it was estimated.
 
-    Returns
-    -------
-    Calibration
-        Without frame names.
-
     Raises
     ------
     ConfigError
@@ -138,7 +162,7 @@ def estimate_extrinsic(
     NotEnoughDataError
         If there are too few poses for the reference or for the scale.
     """
-    scale = _settle_scale(pose_pairs, config)
+    scale = settle_scale(pose_pairs, config.scale)
     METHODS[config.method].require_backend(config.backend)
     solve = _SOLVE.get(config.method, _solve_only_pairs)
     scaled = child_scaled(pose_pairs, scale.value)
@@ -149,19 +173,13 @@ def estimate_extrinsic(
         scale.estimate, None if evaluation.time_correction_s else time_offset
     )
     spread += evaluation.spread(time_offset.seconds if time_offset else 0.0)
-    assessment = widened(evaluation.assessment, T_method[:3, :3], spread)
-    fused = fuse(T_method, assessment, config.prior())
-    result = _calibration(evaluation, fused, pose_pairs.stamps_ns, config)
-    offset_s = time_offset.seconds if time_offset else fixed_time_offset(config)
-    return replace(
-        result,
-        time_offset_s=offset_s + evaluation.time_correction_s,
-        time_offset_sigma_s=evaluation.time_sigma_s
-        or (time_offset.sigma_s if time_offset else 0.0),
-        scale=scale.value * evaluation.scale_correction,
-        scale_sigma=scale.value * evaluation.scale_sigma
-        or (scale.estimate.sigma if scale.estimate else 0.0),
-        warnings=scale.warnings + result.warnings,
+    return Solved(
+        evaluation=evaluation,
+        assessment=widened(evaluation.assessment, T_method[:3, :3], spread),
+        stamps_ns=pose_pairs.stamps_ns,
+        config=config,
+        scale=scale,
+        time_offset=time_offset,
     )
 
 
@@ -170,7 +188,7 @@ def estimate_beside(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibrat
     floor, a proof that the minimum is global, or a prior. Parameters as of
     :func:`estimate_extrinsic`, with a scale that is given.
     """
-    scaled = child_scaled(pose_pairs, _settle_scale(pose_pairs, config).value)
+    scaled = child_scaled(pose_pairs, settle_scale(pose_pairs, config.scale).value)
     evaluation = _solve_reference(scaled, _method(config), config.reference, is_beside=True)
     fused = fuse(evaluation.solution.T_parent_child, evaluation.assessment, {})
     return _calibration(evaluation, fused, pose_pairs.stamps_ns, config)
@@ -184,12 +202,12 @@ def _calibration(
     residuals = _residuals(evaluation, stamps_ns, fused.T_parent_child)
     floor = None
     if not evaluation.is_beside:
-        known = _known_by_motion(fused)
+        known = fused.assessment.known_translations()
         floor = common_mode_floor(*evaluation.spans, fused.T_parent_child, known)
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
-        status=_status(solution.converged, fused),
+        status=fused.status(solution.converged),
         observability=fused.assessment.observability,
         T_method=solution.T_parent_child,
         floor=floor,
@@ -208,20 +226,13 @@ def _calibration(
         **config.target_fields(),
         stamp_ns=int(stamps_ns[-1]),
         warnings=(
-            *_warnings_of(fused),
+            *fused.warnings,
             *evaluation.warnings,
             *(evaluation.shift.warnings if evaluation.shift else ()),
         ),
         motion_residuals=residuals,
         other_answer=evaluation.other_answer,
-        is_steady=evaluation.is_steady and not config.prior(),
     )
-
-
-def _known_by_motion(fused: Fused) -> BoolArray:
-    """Whether the motion, not a prior alone, reveals x, y and z of the parent, (3,)."""
-    unknown = (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
-    return np.array([dof.verdict not in unknown for dof in fused.assessment.observability[:3]])
 
 
 def _residuals(
@@ -254,8 +265,9 @@ def fixed_time_offset(config: CalibratorConfig) -> float:
 def _solve_auto(
     pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
 ) -> _Evaluation:
-    """The adaptive estimator if its noise model fits, as judged with DNLO's answer, otherwise DNLO;
-    and DNLO if a reference is given, which only the paper's methods have.
+    """The adaptive estimator, unless its noise model cannot work on these poses or a reference is
+    given, which only the paper's methods have: then DNLO. The other answer is that of the other
+    method, whose distance the verdict judges.
 
     The adaptive estimator is solved once; DNLO's reference is chosen from the noise that it found.
     """
@@ -263,41 +275,33 @@ def _solve_auto(
     if config.reference != "auto":
         dnlo = _solve_pairs(pose_pairs, with_dnlo)
         return replace(dnlo, method_reason=f"auto: dnlo, for reference {config.reference} is given")
-    if len(pose_pairs) < MIN_POSES:
-        evaluation = _solve_adaptive(pose_pairs, config, is_clock_free)
-        reason = f"auto: fewer than {MIN_POSES} poses, too few to compare with dnlo"
-        return replace(evaluation, method_reason=reason)
-    solution = _adaptive_solution(pose_pairs, is_clock_free)
-    dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
+    solution = _adaptive_solution(pose_pairs, config, is_clock_free)
     by_model = _evaluated(pose_pairs, solution)
-    floor = common_mode_floor(*by_model.spans, solution.T_parent_child)
-    witness = dnlo
-    misfit = why_not(solution, by_model.assessment, _answer(witness), floor)
-    if misfit and solution.systematic != "none":
-        # DNLO does not know of systematic errors. Without them it may agree.
-        corrected = _without_biases(_corrected(pose_pairs, solution), solution)
-        witness = _solve_pairs(corrected, replace(with_dnlo, reference=dnlo.reference))
-        misfit = why_not(solution, by_model.assessment, _answer(witness), floor)
-    compared = f"dnlo on reference {dnlo.reference}"
-    if misfit:
-        reason = f"auto: {compared} stands, because the noise model does not fit: {misfit}"
+    if len(pose_pairs) < MIN_POSES:
+        reason = f"auto: adaptive; fewer than {MIN_POSES} poses are too few to compare with dnlo"
+        return replace(by_model, method_reason=reason)
+    if not solution.converged or solution.is_drowned:
+        why = "single poses are noisier than the motion between them"
+        why = why if solution.is_drowned else "the adaptive estimator did not converge"
+        dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
+        reason = f"auto: dnlo on reference {dnlo.reference}, because {why}"
         return replace(dnlo, method_reason=reason, other_answer=_beside(by_model))
-    reason = f"auto: the noise model fits, and its answer agrees with that of {compared}"
-    return replace(by_model, method_reason=reason, other_answer=_beside(witness))
+    # DNLO does not know of systematic errors: it is compared on poses without them.
+    if solution.systematic != "none":
+        pose_pairs = _without_biases(_corrected(pose_pairs, solution), solution)
+    dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
+    reason = f"auto: adaptive, compared with dnlo on reference {dnlo.reference}"
+    return replace(by_model, method_reason=reason, other_answer=_beside(dnlo))
 
 
 def _beside(evaluation: _Evaluation) -> tuple[FloatArray, FloatArray] | None:
     """An answer that was not chosen, and its covariance, if it knows all axes."""
-    if not evaluation.solution.converged or _n_unobservable(evaluation.assessment):
+    if not evaluation.solution.converged or evaluation.assessment.named(DofVerdict.UNOBSERVABLE):
         return None
     return (
         evaluation.solution.T_parent_child,
         evaluation.assessment.cov_parent_child_in_child,
     )
-
-
-def _answer(evaluation: _Evaluation) -> tuple[FloatArray, Assessment]:
-    return evaluation.solution.T_parent_child, evaluation.assessment
 
 
 def _solve_pairs(
@@ -314,7 +318,7 @@ def _solve_pairs(
     for reference in _LONGER_REFERENCES:
         # The prediction assumes noise without spikes and favours short baselines if there are any.
         # Longer ones may still lift the motion out of the noise.
-        n_unobservable = _n_unobservable(chosen.assessment)
+        n_unobservable = len(chosen.assessment.named(DofVerdict.UNOBSERVABLE))
         if n_unobservable == 0:
             break
         if len(pose_pairs) < 2 * int(reference[1:]):
@@ -324,7 +328,7 @@ def _solve_pairs(
             "leaves more axes unobservable"
         )
         longer = _solve_reference(pose_pairs, method, reference, reason)
-        if _n_unobservable(longer.assessment) < n_unobservable:
+        if len(longer.assessment.named(DofVerdict.UNOBSERVABLE)) < n_unobservable:
             chosen = longer
     return replace(chosen, other_answer=choice.answer, shift=choice.shift)
 
@@ -365,14 +369,6 @@ def _solve_reference(
     )
 
 
-def _n_unobservable(assessment: Assessment) -> int:
-    return len(_named(assessment, DofVerdict.UNOBSERVABLE))
-
-
-def _named(assessment: Assessment, verdict: DofVerdict) -> list[str]:
-    return [dof.name for dof in assessment.observability if dof.verdict is verdict]
-
-
 def _solve_only_pairs(
     pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
 ) -> _Evaluation:
@@ -384,20 +380,20 @@ def _solve_adaptive(
     pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
 ) -> _Evaluation:
     """The adaptive estimator, which uses no reference."""
-    evaluation = _evaluated(pose_pairs, _adaptive_solution(pose_pairs, is_clock_free))
-    jumps = 1.0 - float(np.mean(evaluation.weights))
-    warning = (
-        f"{jumps:.0%} of the increments are jumps: the errors do not fit the adaptive noise "
-        "model; compare with method dnlo"
-    )
-    return replace(evaluation, warnings=(warning,) if jumps > MAX_JUMPS else ())
+    return _evaluated(pose_pairs, _adaptive_solution(pose_pairs, config, is_clock_free))
 
 
-def _adaptive_solution(pose_pairs: PosePairs, is_clock_free: bool) -> AdaptiveSolution:
+def _adaptive_solution(
+    pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
+) -> AdaptiveSolution:
+    """The adaptive estimator's answer, without a scale or a time offset that the user set."""
+    options = {"scale": "scale", "time": "time_offset"}
+    known = {name for name, option in options.items() if config.is_known(option)}
     return adaptive_estimator.solve(
         pose_pairs.stamps_ns,
         pose_pairs.Ts_pw_p,
         pose_pairs.Ts_cw_c,
+        [name for name in SYSTEMATIC if known.isdisjoint(name.split("+"))],
         is_clock_free=is_clock_free,
         with_delays=True,
     )
@@ -426,6 +422,11 @@ def _without_biases(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePa
 def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation:
     """An answer of the adaptive estimator, assessed."""
     stamps_ns, Ts_cw_c = pose_pairs.stamps_ns, _corrected(pose_pairs, solution).Ts_cw_c
+    jumps = float(np.mean(solution.jumps))
+    warning = (
+        f"{jumps:.0%} of the increments are jumps: the errors do not fit the adaptive noise "
+        "model; compare with method dnlo"
+    )
     return _Evaluation(
         solution=solution,
         assessment=assess_adaptive(pose_pairs, solution),
@@ -442,6 +443,7 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         delays=solution.delays or (),
         clock=solution.clock,
         drift=solution.world_drift,
+        warnings=(warning,) if jumps > _MAX_JUMPS else (),
         shift=possible_shift(solution.part_products, solution.misfit),
     )
 
@@ -462,35 +464,6 @@ def _spans(
 _SOLVE = {"auto": _solve_auto, "adaptive": _solve_adaptive}
 
 
-def _settle_scale(pose_pairs: PosePairs, config: CalibratorConfig) -> _ScaleInUse:
-    """The scale to use: given, or estimated if the option asks for it."""
-    if config.scale == "none":
-        return _ScaleInUse()
-    if not isinstance(config.scale, str):
-        return _ScaleInUse(config.scale)
-    if config.scale == "estimate":
-        scale = estimate_scale(pose_pairs)
-        if not scale.fit.explains_translation:
-            raise NotEnoughDataError(
-                "the scale cannot be estimated: even with a scale, "
-                f"{scale.fit.unexplained_translation:.0%} of the motion stays unexplained "
-                f"(at most {MAX_UNEXPLAINED_TRANSLATION:.0%} is allowed); "
-                "check the streams, or give scale"
-            )
-        return _ScaleInUse(scale.value, scale)
-    try:
-        scale = estimate_scale(pose_pairs)
-    except NotEnoughDataError:
-        return _ScaleInUse()
-    if not scale.differs:
-        return _ScaleInUse()
-    warning = (
-        f"the child's lengths are multiplied by {scale.value:.4f} +/- {scale.sigma:.4f}, "
-        "as estimated from the motion"
-    )
-    return _ScaleInUse(scale.value, scale, (warning,))
-
-
 def _spread_by_alignment(scale: Scale | None, time_offset: TimeOffset | None) -> FloatArray:
     """Covariance (6, 6) that an estimated scale and time offset add to the extrinsic's."""
     spread = np.zeros((6, 6))
@@ -501,20 +474,3 @@ def _spread_by_alignment(scale: Scale | None, time_offset: TimeOffset | None) ->
         by_offset = time_offset.fit.sensitivity[:, 1]
         spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
     return spread
-
-
-def _status(converged: bool, fused: Fused) -> SolveStatus:
-    if not converged:
-        return SolveStatus.NOT_CONVERGED
-    if fused.contradictions:
-        return SolveStatus.CONTRADICTED
-    unobservable = _named(fused.assessment, DofVerdict.UNOBSERVABLE)
-    return SolveStatus.UNOBSERVABLE if unobservable else SolveStatus.OK
-
-
-def _warnings_of(fused: Fused) -> list[str]:
-    """What the reasons of the verdict do not say."""
-    mostly_prior = _named(fused.assessment, DofVerdict.PRIOR)
-    if not mostly_prior:
-        return []
-    return [f"{', '.join(mostly_prior)} of the child sensor: mostly from the prior, not the motion"]

@@ -4,15 +4,19 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.config import CalibratorConfig, Prior, prior_fields
+from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, Prior
 from hand_eye_calib.engine.checked import at_clear_offset, checked
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
 
 #: Called with the share that is done, 0 to 1, and the step that begins.
 Progress: TypeAlias = Callable[[float, str], None]
+
+# Pose pairs that are used unless an option says otherwise: the noise model takes 8 kB for each, and
+# hours at ten a second hold as many.
+_MOST_PAIRS = 100_000
 
 
 def calibrate(
@@ -46,8 +50,9 @@ def calibrate(
 
     Each keyword is the option of :class:`~hand_eye_calib.config.CalibratorConfig` of that name,
     which has its meaning, unit, range and default; None stands for the default. All pose pairs are
-    used unless ``max_pairs`` is given. The streams are checked, too: if a check is certain of the
-    time offset or of the scale, and it was not given, it is estimated, and a warning says so.
+    used, up to 100,000, unless ``max_pairs`` is given. The streams are checked, too: if a check is
+    certain of the time offset or of the scale, and it was not given, it is estimated, and a warning
+    says so.
 
     Parameters
     ----------
@@ -78,22 +83,22 @@ def calibrate(
     for name in ("parent", "child", "prior", "progress"):
         del options[name]
     options = {name: value for name, value in options.items() if value is not None}
-    of_streams = _no_limit(parent, child) | _measures(parent, child)
+    of_streams = _most_pairs(parent, child) | _measures(parent, child)
     config = CalibratorConfig(**(of_streams | options | prior_fields(prior or {})))
     snapshot = whole_snapshot(config, parent, child)
     if progress is None:
-        snapshot = at_clear_offset(snapshot, options)
-        return checked(snapshot.estimate(), snapshot, options)[0]
+        snapshot = at_clear_offset(snapshot)
+        return checked(snapshot.estimate(), snapshot)[0]
     # The snapshot keeps what these steps give.
     progress(0.0, "time offset")
-    snapshot = at_clear_offset(snapshot, options)
+    snapshot = at_clear_offset(snapshot)
     snapshot.resolved()
     progress(0.2, "pairing")
     snapshot.pose_pairs()
     progress(0.3, "solving")
     result = snapshot.estimate()
     progress(0.8, "checking the streams")
-    result, _ = checked(result, snapshot, options)
+    result, _ = checked(result, snapshot)
     progress(1.0, "done")
     return result
 
@@ -107,13 +112,37 @@ def _require_trajectories(parent: object, child: object) -> None:
             )
 
 
+def prior_fields(prior: Prior) -> dict[str, str]:
+    """The same prior as options of a CalibratorConfig, attribute to text.
+
+    Raises
+    ------
+    ConfigError
+        If an axis is unknown or its value is not a text or a pair of numbers.
+    """
+    fields = {}
+    for axis, known in prior.items():
+        if axis not in (*AXIS_UNITS, "transform"):
+            raise ConfigError(f"prior takes {', '.join(AXIS_UNITS)} or transform; got {axis!r}")
+        if not isinstance(known, str):
+            try:
+                value, sigma = map(float, known)
+            except (TypeError, ValueError):
+                raise ConfigError(
+                    f"prior {axis} must be (value, standard deviation) or a text; got {known!r}"
+                ) from None
+            known = f"{value!r}+/-{sigma!r}"
+        fields[f"prior_{axis}"] = known
+    return fields
+
+
 def offline_config(
     parent: Trajectory, child: Trajectory, options: Mapping[str, object]
 ) -> CalibratorConfig:
-    """The CalibratorConfig for two whole trajectories, from options by their public names: no limit
-    on the pairs unless they set one.
+    """The CalibratorConfig for two whole trajectories, from options by their public names: all
+    pairs up to 100,000 unless they set another limit.
     """
-    of_streams = _no_limit(parent, child) | _measures(parent, child)
+    of_streams = _most_pairs(parent, child) | _measures(parent, child)
     return CalibratorConfig.from_options(of_streams | dict(options))
 
 
@@ -122,6 +151,8 @@ def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajecto
     parent_frame, child_frame, warnings = name_frames(
         config, {"parent": parent.sensor_frame, "child": child.sensor_frame}
     )
+    if min(len(parent), len(child)) > config.max_pairs == _MOST_PAIRS:
+        warnings += (f"{_MOST_PAIRS:,} pose pairs are used at most; give max_pairs to use more",)
     return Snapshot(
         config=config,
         kept=PosePairs.empty(),
@@ -134,9 +165,9 @@ def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajecto
     )
 
 
-def _no_limit(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
-    """Options under which all poses of both trajectories are used."""
-    return {"max_pairs": max(len(parent), len(child), 10)}
+def _most_pairs(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
+    """Options under which all poses of both trajectories are used, unless there are too many."""
+    return {"max_pairs": min(max(len(parent), len(child), 10), _MOST_PAIRS)}
 
 
 def _measures(parent: Trajectory, child: Trajectory) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -244,36 +242,3 @@ class PoseBuffer:
         self._poses[:rest] = self._poses[split : self._count].copy()
         self._count = rest
         self._dropped_until_ns = until_ns
-
-    def state(self) -> dict[str, np.ndarray]:
-        """The whole buffer as arrays, for :meth:`from_state`."""
-        statistics = dataclasses.astuple(self.statistics)
-        dropped_until = [] if self._dropped_until_ns is None else [self._dropped_until_ns]
-        return {
-            "stamps_ns": self._stamps_ns[: self._count].copy(),
-            "poses": self._poses[: self._count].copy(),
-            "frame": np.array(self.frame),
-            "statistics": np.array([-1 if value is None else value for value in statistics]),
-            "dropped_until_ns": np.array(dropped_until, dtype=np.int64),
-        }
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, np.ndarray], limits: BufferLimits) -> PoseBuffer:
-        """The buffer that gave this state, of this or an earlier version."""
-        buffer = cls(limits)
-        buffer._count = len(state["stamps_ns"])
-        buffer._stamps_ns[: buffer._count] = state["stamps_ns"]
-        buffer._poses[: buffer._count] = state["poses"]
-        buffer.frame = str(state["frame"])
-        *counts, first_ns, last_ns = state["statistics"].tolist()
-        (
-            buffer._received,
-            buffer._refused_duplicate,
-            buffer._refused_late,
-            buffer._dropped_unpaired,
-        ) = counts
-        if buffer._received:
-            buffer._first_ns, buffer._last_ns = first_ns, last_ns
-        name = "dropped_until_ns" if "dropped_until_ns" in state else "let_go_until_ns"
-        buffer._dropped_until_ns = int(state[name][0]) if len(state[name]) else None
-        return buffer

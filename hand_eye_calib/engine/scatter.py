@@ -6,8 +6,9 @@ misses, such as errors that last longer than it assumes. The second show what ch
 recording. Neither shows an error that is constant.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,10 @@ from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import OtherAnswers
+from hand_eye_calib.engine.estimation import Solved
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.plain import plain
 
 # Fewest other answers that have a scatter.
 _MIN_OTHERS = 3
@@ -80,23 +83,18 @@ class CrossCheck:
         """Plain values for JSON or YAML; None for what is not known."""
         columns = {name: values for name, values in vars(self).items() if name != "axes"}
         return {
-            axis: {
-                name: float(values[k]) if np.isfinite(values[k]) else None
-                for name, values in columns.items()
-            }
+            axis: plain({name: values[k] for name, values in columns.items()})
             for k, axis in enumerate(self.axes)
         }
 
 
-def quick_cross_check(
-    calibration: Calibration, config: CalibratorConfig, pose_pairs: PosePairs
-) -> CrossCheck:
-    """Compare a result with what DNLO gives at a few references and from each half: part of every
-    solve.
+def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
+    """The result of a solve, compared with what DNLO gives at a few references and from each half:
+    part of every solve. An axis that none of the references reveals is unobservable.
 
     Parameters
     ----------
-    calibration : Calibration
+    solved : Solved
     config : CalibratorConfig
         The options that gave it.
     pose_pairs : PosePairs
@@ -104,14 +102,30 @@ def quick_cross_check(
 
     Returns
     -------
-    CrossCheck
+    Calibration
     """
-    others, halves = OtherAnswers(calibration, config, pose_pairs).quick()
-    return compare_answers(
-        calibration,
-        [other.calibration for other in others],
-        [half.calibration for half in halves],
-    )
+    result = solved.calibration()
+    answers = OtherAnswers(result, config, pose_pairs).quick()
+    others, halves = ([answer.calibration for answer in kind] for kind in answers)
+    if unseen := _unseen_by_all(result, others):
+        result = solved.calibration(unseen)
+    return replace(result, cross_check=compare_answers(result, others, halves).to_dict())
+
+
+def _unseen_by_all(calibration: Calibration, others: Sequence[Calibration]) -> list[str]:
+    """Axes that a result knows, and no sound answer at other references.
+
+    None for a method with a reference: it is chosen, or given, where the motion shows most, which
+    others at shorter ones need not see.
+    """
+    robust = [other for other in others if _is_sound(other)]
+    if len(robust) < _MIN_OTHERS or METHODS[calibration.method].uses_reference:
+        return []
+    return [
+        dof.name
+        for index, dof in enumerate(calibration.observability)
+        if math.isfinite(dof.sigma) and all(np.isinf(other.sigmas[index]) for other in robust)
+    ]
 
 
 def compare_answers(

@@ -18,15 +18,13 @@ from hand_eye_calib.alignment.time_offset import (
     estimate_time_offset,
     time_offset_of_speeds,
 )
-from hand_eye_calib.assessment.model_fit import MAX_MISFIT
 from hand_eye_calib.calibration import Calibration, DofVerdict
-from hand_eye_calib.checks.aligned import ByModel
 from hand_eye_calib.checks.check import CheckResult, check_offset, check_parts, check_streams
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimation import estimate_extrinsic, fixed_time_offset
+from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
 from hand_eye_calib.engine.estimators import ESTIMATORS
-from hand_eye_calib.engine.scatter import quick_cross_check
+from hand_eye_calib.engine.scatter import cross_checked
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
@@ -45,8 +43,9 @@ _NEGLIGIBLE_S = 0.005
 # One that is farther away is no time offset (s).
 _BELIEVABLE_S = 1.0
 
-# A noise model that moves poses in time by more (s) than this may have missed something.
-_SETTLED_S = 0.0025
+# Weighted squared residual per degree of freedom up to which a noise model fits: it is 1 if the
+# model holds, and less if there is no noise.
+_MAX_MISFIT = 2.0
 
 # Smaller time offsets (s) of streams that are no poses are found by every solve.
 FOUND_BY_SOLVE_S = 0.25
@@ -170,9 +169,8 @@ class Snapshot:
             raise NotEnoughDataError(self._what_is_missing(len(self._pose_pairs)))
         if self.config.measured != "poses":
             return self._named(self._estimate_part())
-        result = estimate_extrinsic(self._pose_pairs, self.config, self.time_offset)
-        checked = quick_cross_check(result, self.config, self._pose_pairs)
-        return self._named(replace(result, cross_check=checked.to_dict()))
+        solved = solve_poses(self._pose_pairs, self.config, self.time_offset)
+        return self._named(cross_checked(solved, self.config, self._pose_pairs))
 
     def _estimate_part(self) -> Calibration:
         """The part of the extrinsic that streams without rotations or positions show."""
@@ -244,7 +242,6 @@ class Snapshot:
             scale=1.0 if isinstance(scale, str) else scale,
             max_gap_s=self.max_gap_s,
             correlation=self.correlation,
-            model=self._by_model(calibration),
         )
         obsolete = set()
         if len(self.kept):
@@ -253,21 +250,6 @@ class Snapshot:
             obsolete.add("one_axis")  # the result has shown otherwise
         findings = [found for found in result.findings if found.code not in obsolete]
         return replace(result, findings=gravest_first(answered(findings, self.config)))
-
-    def _by_model(self, calibration: Calibration | None) -> ByModel | None:
-        """What the noise model of a result tells the checks; None if it does not fit, or has moved
-        the poses by itself.
-        """
-        if calibration is None or not noise_fits(calibration):
-            return None
-        moved_s = calibration.time_offset_s - fixed_time_offset(self.resolved().config)
-        if abs(moved_s) > _SETTLED_S:
-            return None
-        return ByModel(
-            T_parent_child=calibration.T_parent_child,
-            offset_sigma_s=calibration.time_offset_sigma_s,
-            is_steady=calibration.is_steady,
-        )
 
     def _check_parts(self, calibration: Calibration | None) -> list[Finding]:
         found = [Finding.from_dict(each) for each in (calibration.findings if calibration else ())]
@@ -323,7 +305,7 @@ class Snapshot:
 def noise_fits(calibration: Calibration) -> bool:
     """Whether the result is the noise model's, and its residuals fit."""
     noise = calibration.noise
-    return noise is not None and noise["misfit"] <= MAX_MISFIT
+    return noise is not None and noise["misfit"] <= _MAX_MISFIT
 
 
 def _hides_a_translation(calibration: Calibration) -> bool:

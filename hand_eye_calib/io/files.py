@@ -40,7 +40,11 @@ def read_bytes(path: str | Path, largest: int) -> bytes:
         If it is not a regular file, or larger than ``largest`` bytes.
     """
     with open(open_regular(path), "rb") as file:
-        data = file.read(largest + 1)
+        # The buffer is as large as what is asked for.
+        size = min(os.fstat(file.fileno()).st_size, largest)
+        data = file.read(size + 1)
+        if len(data) > size:  # it grows, or does not know its size
+            data += file.read(largest + 1 - len(data))
     if len(data) > largest:
         raise InputError(f"cannot read {path}: it is larger than {largest} bytes")
     return data

@@ -1,7 +1,10 @@
 """What is installed now: from a robot description, an earlier result, a bag, or numbers."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import parse_pose
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
@@ -19,15 +22,32 @@ def read_installed(text: str, parent_frame: str, child_frame: str) -> Extrinsic:
     Parameters
     ----------
     text : str
-        A robot description (``.urdf``), a result (``extrinsic.yaml``, or its directory), a bag
-        with ``/tf_static``, or ``X Y Z ROLL PITCH YAW`` in m and rad.
+        As of :func:`open_installed`, which says what is raised, too.
     parent_frame, child_frame : str
         The sensors' frames.
 
     Raises
     ------
     InputError
-        If it cannot be read or does not have these frames.
+        If it does not have these frames.
+    """
+    return open_installed(text)(parent_frame, child_frame)
+
+
+def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
+    """Read what is installed before the sensors' frames are known: the parent's and the child's
+    give the pose of the child sensor in the parent sensor's frame, as :func:`read_installed`.
+
+    Parameters
+    ----------
+    text : str
+        A robot description (``.urdf``), a result (``extrinsic.yaml``, or its directory), a bag
+        with ``/tf_static``, or ``X Y Z ROLL PITCH YAW`` in m and rad.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
     ConfigError
         If it is neither a file nor six numbers.
     """
@@ -37,12 +57,13 @@ def read_installed(text: str, parent_frame: str, child_frame: str) -> Extrinsic:
     except (OSError, ValueError):
         exists = False
     if not exists:
-        return _numbers(text)
+        numbers = _numbers(text)
+        return lambda parent_frame, child_frame: numbers
     if path.suffix in _RESULTS or (path / FILE_NAME).exists():
-        return _result(path, parent_frame, child_frame)
+        return partial(_of_result, load_result(path), path)
     is_description = path.suffix in _DESCRIPTIONS
     frames = RobotDescription(path).frames if is_description else frames_of_bag(path)
-    return of_frames(frames, parent_frame, child_frame, str(path))
+    return partial(of_frames, frames, origin=str(path))
 
 
 def of_frames(frames: Frames, parent_frame: str, child_frame: str, origin: str) -> Extrinsic:
@@ -70,17 +91,16 @@ def frames_of_bag(path: str | Path) -> Frames:
 def _numbers(text: str) -> Extrinsic:
     try:
         values = parse_pose("installed", text)
-    except ConfigError:
+    except ConfigError as error:
         raise ConfigError(
-            "what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or "
-            f"X Y Z ROLL PITCH YAW in m and rad; got {text!r}"
+            "what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or six "
+            f"numbers in m and rad: {error}"
         ) from None
     rotation = se3.rotation_from_rpy(values[3:])
     return Extrinsic(se3.from_rotation_translation(rotation, values[:3]), text)
 
 
-def _result(path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
-    result = load_result(path)
+def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
     found, wanted = (result.parent_frame, result.child_frame), (parent_frame, child_frame)
     T, covariance = result.T_parent_child, result.covariance
     if found == wanted[::-1]:

@@ -1,51 +1,43 @@
-"""The session journal: the input of the calibrator, written to disk as it arrives, so that a crash
-loses next to nothing.
+"""The session journal: the poses that the node takes, written to disk as they arrive, so that a
+crash loses next to nothing.
 
-A journal is a directory of segments ``session-<number>.journal``. A segment opens with a checkpoint
-of the whole engine and goes on with every pose and frame name since; when it has grown enough, the
-next segment starts from a new checkpoint and older ones are removed. Records carry their length and
-a checksum: a reader takes the whole records and stops at the first that is not, so that a process
-killed in the middle of a write costs at most the record it was writing.
+A journal is a directory with a text file for each stream, ``parent.tum``, ``child.tum`` and so on,
+which other programs read as well: a line ``t x y z qx qy qz qw`` for each pose, with the stamp in
+seconds and all digits of every number. Lines that begin with ``# {`` hold JSON. The first says what
+the stream is and which options hold, later ones what has changed. ``parent_poses`` says how many
+poses the parent's file had when the poses below it were written, which gives the order of arrival.
+A process that is killed while it writes leaves a line without an end; a reader stops before the
+first line that it cannot read.
 """
 
-import io
+import json
 import os
-import re
 import shutil
-import struct
-import zipfile
-import zlib
+from array import array
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeAlias
+from typing import Any, BinaryIO
 
 import numpy as np
-import yaml
-from numpy.typing import NDArray
 
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import other_names
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.files import read_bytes, write_atomically
-from hand_eye_calib.io.limits import LARGEST_RECORD, LARGEST_SEGMENT, LONGEST_NAME
-from hand_eye_calib.io.yaml_files import read_yaml
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.files import open_regular, write_atomically
+from hand_eye_calib.io.limits import LONGEST_LINE
+from hand_eye_calib.io.trajectory_files.writing import tum_line, tum_lines
 
-_MAGIC = b"hand_eye_calib journal 1\n"
-_HEADER = struct.Struct("<cII")  # kind, payload length, checksum of kind and payload
-_POSE = struct.Struct("<Bq7d")
-_CHECKPOINT, _POSE_KIND, _FRAME = b"C", b"P", b"F"
+_FORMAT, _VERSION = "hand_eye_calib/journal", 2
 _STREAMS = ("parent", "child", *other_names())
+_BATCH = "parent_poses"
+_SEGMENTS = "session-*.journal"  # of version 1
+_NS_PER_S = 1_000_000_000
+_LARGEST_STAMP_NS = int(np.iinfo(np.int64).max)
 
-#: Options and topics of the session, beside its segments.
-ABOUT_NAME = "session.yaml"
-
-_SEGMENT_NAME = re.compile(r"session-(\d{1,18})\.journal")
-
-Checkpoint: TypeAlias = Mapping[str, NDArray[Any]]
-PoseEvent: TypeAlias = tuple[
-    Literal["pose"], str, int, tuple[float, float, float], tuple[float, float, float, float]
-]
-FrameEvent: TypeAlias = tuple[Literal["frame"], str, str]
-Event: TypeAlias = PoseEvent | FrameEvent
+#: What is known of each stream: plain values, such as topic, frame, origin and options.
+About = Mapping[str, Mapping[str, Any]]
 
 
 class JournalWriter:
@@ -54,12 +46,14 @@ class JournalWriter:
     Parameters
     ----------
     directory : path
-        Made if it does not exist. Segments in it are replaced by this session's.
-    checkpoint : dict of str to arrays
-        The engine's state to start from
-        (:meth:`hand_eye_calib.engine.calibrator.Calibrator.state`).
-    segment_bytes : int
-        Bytes since the checkpoint at which :attr:`is_full` asks for a new one.
+        Made if it does not exist.
+    about : mapping of str to mappings
+        What is known of each stream.
+    poses : mapping of str to Trajectory
+        Poses of the session so far, by stream.
+    resumed : Journal, optional
+        The session in the directory, if that goes on: what cannot be read at the end of its files
+        is cut off, and ``poses`` are there already.
 
     Raises
     ------
@@ -68,114 +62,277 @@ class JournalWriter:
     """
 
     def __init__(
-        self, directory: str | Path, checkpoint: Checkpoint, segment_bytes: int = 16_000_000
+        self,
+        directory: str | Path,
+        about: About,
+        poses: Mapping[str, Trajectory] | None = None,
+        resumed: "Journal | None" = None,
     ) -> None:
         self._directory = Path(directory)
-        self._directory.mkdir(parents=True, exist_ok=True)
-        self._segment_bytes = segment_bytes
-        self._file: Any = None
-        self._pending = bytearray()
-        self.rotate(checkpoint)
+        self._files: dict[str, BinaryIO] = {}
+        self._pending: dict[str, list[str]] = {stream: [] for stream in about}
+        self._about: dict[str, Mapping[str, Any]] = {}
+        self._parent_poses = 0
+        if resumed is None:
+            self._begin(about, poses or {})
+        else:
+            self._go_on(resumed)
+        self.describe(about)
 
-    @property
-    def is_full(self) -> bool:
-        """Whether it is time to :meth:`rotate`."""
-        return self._written + len(self._pending) >= self._segment_bytes
+    def _begin(self, about: About, poses: Mapping[str, Trajectory]) -> None:
+        self._directory.mkdir(parents=True, exist_ok=True)
+        texts = {}
+        for stream, known in about.items():
+            lines = tum_lines(poses[stream]) if stream in poses else []
+            texts[self._path(stream)] = "\n".join([_head(stream, known), *lines, ""])
+        write_atomically(texts)
+        self._parent_poses = len(poses.get("parent", ()))
+        for stream, known in about.items():
+            self._open(stream)
+            self._about[stream] = known
+
+    def _go_on(self, resumed: "Journal") -> None:
+        self._parent_poses = int((resumed.streams == "parent").sum())
+        for stream, end in resumed.whole_bytes.items():
+            self._open(stream)
+            self._files[stream].truncate(end)
+            self._about[stream] = resumed.about[stream]
+            self._pending.setdefault(stream, [])
+        for stream in self._pending.keys() - resumed.whole_bytes.keys():
+            write_atomically({self._path(stream): _head(stream, {}) + "\n"})
+            self._open(stream)
+
+    def _open(self, stream: str) -> None:
+        flags = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
+        descriptor = os.open(self._path(stream), flags)
+        # Unbuffered: what is flushed is with the operating system and survives this process.
+        self._files[stream] = open(descriptor, "ab", buffering=0)  # noqa: SIM115
+
+    def _path(self, stream: str) -> Path:
+        return self._directory / f"{stream}.tum"
 
     def add_pose(
-        self,
-        stream: str,
-        stamp_ns: int,
-        position: Sequence[float],
-        quat_xyzw: Sequence[float],
+        self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
     ) -> None:
         """Note a pose; it reaches the disk with the next :meth:`flush`."""
-        self._add(_POSE_KIND, _POSE.pack(_STREAMS.index(stream), stamp_ns, *position, *quat_xyzw))
+        self._pending[stream].append(tum_line(stamp_ns, (*position, *quat_xyzw)))
 
-    def set_frame(self, stream: str, sensor_frame: str) -> None:
-        """Note a stream's sensor frame."""
-        self._add(_FRAME, bytes([_STREAMS.index(stream)]) + sensor_frame.encode())
+    def describe(self, about: About) -> None:
+        """Note what is known of the streams: what has changed reaches the disk at once."""
+        self.flush()
+        for stream, known in about.items():
+            before = self._about.get(stream, {})
+            if changed := {key: each for key, each in known.items() if before.get(key) != each}:
+                self._write(stream, [_comment(changed)])
+            self._about[stream] = {**before, **known}
 
     def flush(self) -> None:
         """Hand everything noted to the operating system, where it survives this process."""
-        if self._pending:
-            # Unbuffered: a short write leaves a torn record at the end, which the next flush would
-            # bury.
-            self._check_in_place()
-            taken = self._file.write(self._pending)
-            if taken != len(self._pending):
-                raise OSError(f"only {taken} of {len(self._pending)} bytes were written")
-            self._written += taken
-            self._pending.clear()
+        parent = self._pending["parent"]
+        self._write("parent", parent)
+        self._parent_poses += len(parent)
+        parent.clear()
+        for stream, lines in self._pending.items():
+            if lines:
+                self._write(stream, [_comment({_BATCH: self._parent_poses}), *lines])
+                lines.clear()
 
-    def rotate(self, checkpoint: Checkpoint) -> None:
-        """Start a new segment from a checkpoint, and remove the old ones once it is on disk."""
-        old = _segments(self._directory)
-        number = _number(old[-1]) + 1 if old else 1
-        path = self._directory / f"session-{number:06d}.journal"
-        beginning = _MAGIC + _record(_CHECKPOINT, _pack_checkpoint(checkpoint))
-        temporary = path.with_suffix(".tmp")
-        with open(temporary, "wb") as file:
-            file.write(beginning)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        self.close()
-        self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - kept open for the session
-        self._path = path
-        self._written, self._pending = 0, bytearray()
-        for segment in old:
-            segment.unlink(missing_ok=True)
+    def _write(self, stream: str, lines: Sequence[str]) -> None:
+        if not lines:
+            return
+        file, text = self._files[stream], "\n".join([*lines, ""]).encode()
+        # A file that is no longer where it was would take what is written, and lose it.
+        if not os.path.samestat(os.stat(self._path(stream)), os.fstat(file.fileno())):
+            raise OSError("another program has replaced its file")
+        taken = file.write(text)
+        if taken != len(text):
+            raise OSError(f"only {taken} of {len(text)} bytes were written")
 
     def close(self) -> None:
         """Flush and close."""
-        if self._file is not None:
-            try:
-                self.flush()
-            finally:
-                self._file.close()
-                self._file = None
-
-    def _check_in_place(self) -> None:
-        """Raise OSError if the file is no longer where it was: what is written would be lost."""
-        if not os.path.samestat(os.stat(self._path), os.fstat(self._file.fileno())):
-            raise OSError("another program has replaced its file")
-
-    def _add(self, kind: bytes, payload: bytes) -> None:
-        self._pending += _record(kind, payload)
+        try:
+            self.flush()
+        finally:
+            for file in self._files.values():
+                file.close()
 
 
-def write_about(directory: str | Path, about: Mapping[str, Any]) -> None:
-    """Write beside the segments what a person wants to know of the session: plain values.
+def _head(stream: str, known: Mapping[str, Any]) -> str:
+    return _comment({"format": _FORMAT, "version": _VERSION, "stream": stream, **known})
 
-    Raises
-    ------
-    OSError
+
+def _comment(values: Mapping[str, Any]) -> str:
+    return f"# {json.dumps(values)}"
+
+
+@dataclass(frozen=True)
+class Journal:
+    """The session that a directory holds; its poses are in the order in which they arrived.
+
+    Attributes
+    ----------
+    about : dict of str to dict
+        By stream: "options", "topic", "frame", "origin" and what else was noted.
+    streams : (N,) str array
+    stamps_ns : (N,) int64 array
+    poses : (N, 7) array
+        x y z (m), qx qy qz qw.
+    whole_bytes : dict of str to int
+        Bytes of each stream's file up to the end of the last line that could be read.
+    lost_bytes : int
+        Bytes after those, of all files; 0 after a clean end.
     """
-    text = yaml.safe_dump(dict(about), sort_keys=False, allow_unicode=True)
-    write_atomically({Path(directory) / ABOUT_NAME: text})
+
+    about: dict[str, dict[str, Any]]
+    streams: np.ndarray
+    stamps_ns: IntArray
+    poses: FloatArray
+    whole_bytes: dict[str, int]
+    lost_bytes: int
 
 
-def read_about(directory: str | Path) -> dict[str, Any]:
-    """What :func:`write_about` wrote; empty if there is nothing.
+def read_journal(directory: str | Path) -> Journal:
+    """Read the session that a directory holds.
 
     Raises
     ------
     InputError
-        If it cannot be read or is no mapping of names to mappings.
+        If there is no journal, or it cannot be read.
     """
-    path = Path(directory) / ABOUT_NAME
-    if not path.exists():
+    directory = Path(directory)
+    if _is_old(directory):
+        raise InputError(
+            f"the session journal in {directory} is of version 0.1, whose binary format is not "
+            "read any more: use that version for it, or move it away to start anew"
+        )
+    if not has_session(directory):
+        raise InputError(f"no session journal in {directory}")
+    found = {
+        stream: _read_file(path)
+        for stream in _STREAMS
+        if os.path.lexists(path := directory / f"{stream}.tum")
+    }
+    arrived = np.concatenate([each.arrived for each in found.values()])
+    order = np.argsort(arrived, kind="stable")
+    counts = [len(each.arrived) for each in found.values()]
+    return Journal(
+        about={stream: each.about for stream, each in found.items()},
+        streams=np.repeat([*found], counts)[order],
+        stamps_ns=np.concatenate([each.stamps_ns for each in found.values()])[order],
+        poses=np.concatenate([each.poses for each in found.values()])[order],
+        whole_bytes={stream: each.whole_bytes for stream, each in found.items()},
+        lost_bytes=sum(each.lost_bytes for each in found.values()),
+    )
+
+
+@dataclass(frozen=True)
+class _File:
+    """One stream: about, poses, and of each the time of its arrival in poses of the parent."""
+
+    about: dict[str, Any]
+    stamps_ns: IntArray
+    poses: FloatArray
+    arrived: FloatArray
+    whole_bytes: int
+    lost_bytes: int
+
+
+def _read_file(path: Path) -> _File:
+    about: dict[str, Any] = {}
+    # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
+    stamps_ns, poses, arrived = array("q"), array("d"), array("d")
+    whole_bytes = 0
+    try:
+        with open(open_regular(path), "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            while (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
+                try:
+                    if line.startswith(b"#"):
+                        about |= _noted(line)
+                    else:
+                        stamp_ns, pose = _pose(line)
+                        stamps_ns.append(stamp_ns)
+                        poses.extend(pose)
+                        # The parent's poses count from 0; others came between two of them.
+                        arrived.append(about.get(_BATCH, len(stamps_ns) - 0.5) - 0.5)
+                except (ValueError, RecursionError):
+                    break
+                whole_bytes += len(line)
+    except OSError as error:
+        raise InputError(f"cannot read the session journal {path}: {error.strerror}") from None
+    if about.get("format") != _FORMAT:
+        raise InputError(
+            f"the session journal {path} is damaged from its first byte; move it away to start anew"
+        )
+    if about.get("version") != _VERSION:
+        raise InputError(
+            f"the session journal {path} is of format version {about.get('version')}, this program "
+            f"reads {_VERSION}: use the version that wrote it, or move it away to start anew"
+        )
+    return _File(
+        about,
+        np.array(stamps_ns),
+        np.array(poses).reshape(-1, 7),
+        np.array(arrived),
+        whole_bytes,
+        size - whole_bytes,
+    )
+
+
+def _noted(line: bytes) -> dict[str, Any]:
+    """What a comment notes of the stream; nothing if it is somebody's own.
+
+    Raises
+    ------
+    ValueError
+    """
+    if not line.startswith(b"# {"):
         return {}
-    about = read_yaml(path)
-    if not isinstance(about, dict) or not all(isinstance(each, dict) for each in about.values()):
-        raise InputError(f"{path}: expected a mapping of names to mappings; remove the file")
-    return about
+    noted: dict[str, Any] = json.loads(line[2:])
+    kinds = {
+        _BATCH: int,
+        "options": dict,
+        "given": list,
+        "topic": str,
+        "frame": str,
+        "origin": list,
+    }
+    for name, kind in kinds.items():
+        if not isinstance(noted.get(name, kind()), kind):
+            raise ValueError(f"{name} is no {kind.__name__}")
+    return noted
+
+
+def _pose(line: bytes) -> tuple[int, list[float]]:
+    """Stamp (ns) and pose of a line.
+
+    Raises
+    ------
+    ValueError
+    """
+    stamp, *values = line.split()
+    seconds, _, decimals = stamp.partition(b".")
+    if len(values) != 7 or len(decimals) != 9:
+        raise ValueError("no pose")
+    sign = -1 if seconds.startswith(b"-") else 1
+    stamp_ns = int(seconds) * _NS_PER_S + sign * int(decimals)
+    if abs(stamp_ns) > _LARGEST_STAMP_NS:
+        raise ValueError("a stamp that is too large")
+    return stamp_ns, [float(value) for value in values]
 
 
 def has_session(directory: str | Path) -> bool:
-    """Whether a directory holds a journal."""
-    return bool(_segments(Path(directory)))
+    """Whether a directory holds a journal, of this or an earlier version."""
+    directory = Path(directory)
+    try:
+        # A reset may rename the directory meanwhile.
+        return (directory / "parent.tum").is_file() or _is_old(directory)
+    except OSError:
+        return False
+
+
+def _is_old(directory: Path) -> bool:
+    return any(directory.glob(_SEGMENTS)) and not (directory / "parent.tum").exists()
 
 
 def keep_aside(directory: str | Path) -> Path:
@@ -195,146 +352,8 @@ def keep_aside(directory: str | Path) -> Path:
 
 
 def count_poses(directory: str | Path) -> int | None:
-    """Number of poses in the session that a directory holds; None if it is damaged.
-
-    Raises
-    ------
-    OSError
-    """
+    """Number of poses in the session that a directory holds; None if it cannot be read."""
     try:
-        checkpoint, events, _ = read_journal(directory)
-        kept = sum(int(checkpoint[f"{stream}.statistics"][0]) for stream in _STREAMS[:2])
-    except (InputError, LookupError, ValueError, TypeError):
+        return len(read_journal(directory).stamps_ns)
+    except InputError:
         return None
-    return kept + sum(event[0] == "pose" for event in events)
-
-
-def read_journal(directory: str | Path) -> tuple[dict[str, NDArray[Any]], list[Event], int]:
-    """Read the session that a directory holds.
-
-    Parameters
-    ----------
-    directory : path
-
-    Returns
-    -------
-    checkpoint : dict of str to arrays
-    events : list of tuple
-        ("pose", stream, stamp_ns, position, quat_xyzw) and ("frame", stream, name), in the order
-        in which they arrived.
-    lost_bytes : int
-        Bytes at the end that were not whole; 0 after a clean end.
-
-    Raises
-    ------
-    InputError
-        If there is no journal, or none of its segments begins with a whole checkpoint.
-    """
-    segments = _segments(Path(directory))
-    if not segments:
-        raise InputError(f"no session journal in {directory}")
-    for segment in reversed(segments):
-        try:
-            data = read_bytes(segment, LARGEST_SEGMENT)
-        except OSError as error:
-            raise InputError(
-                f"cannot read the session journal {segment}: {error.strerror}"
-            ) from None
-        records, end = _whole_records(data)
-        if records and records[0][0] == _CHECKPOINT:
-            try:
-                events = [_event(*record) for record in records[1:]]
-                return _unpack_checkpoint(records[0][1]), events, len(data) - end
-            except InputError as error:
-                raise InputError(f"cannot use the session journal {segment}: {error}") from None
-    raise InputError(
-        f"the session journal {segments[-1]} is damaged from its first byte; move it away to start "
-        "anew"
-    )
-
-
-def _segments(directory: Path) -> list[Path]:
-    """Segments in their order; files of other names, such as copies, are not looked at.
-
-    None in a directory that cannot be read, or that is renamed while it is read (a reset).
-    """
-    try:
-        names = os.listdir(directory)
-    except (FileNotFoundError, NotADirectoryError, PermissionError):
-        return []
-    found = [directory / name for name in names if _SEGMENT_NAME.fullmatch(name)]
-    return sorted(found, key=_number)
-
-
-def _number(segment: Path) -> int:
-    return int(segment.stem.rpartition("-")[2])
-
-
-def _record(kind: bytes, payload: bytes) -> bytes:
-    return _HEADER.pack(kind, len(payload), zlib.crc32(payload, zlib.crc32(kind))) + payload
-
-
-def _whole_records(data: bytes) -> tuple[list[tuple[bytes, bytes]], int]:
-    """Records up to the first that is cut off or damaged, and where that begins."""
-    records: list[tuple[bytes, bytes]] = []
-    position = len(_MAGIC)
-    if data[:position] != _MAGIC:
-        return records, 0
-    while position + _HEADER.size <= len(data):
-        kind, length, checksum = _HEADER.unpack_from(data, position)
-        start = position + _HEADER.size
-        if length > LARGEST_RECORD or start + length > len(data):
-            break
-        payload = data[start : start + length]
-        if zlib.crc32(payload, zlib.crc32(kind)) != checksum:
-            break
-        records.append((kind, payload))
-        position = start + length
-    return records, position
-
-
-def _event(kind: bytes, payload: bytes) -> Event:
-    """The event of a record, whose checksum was right."""
-    if kind not in (_POSE_KIND, _FRAME):
-        raise InputError(f"it has a record of unknown kind {kind!r}, of a newer version perhaps")
-    try:
-        if kind == _POSE_KIND:
-            number, stamp_ns, x, y, z, qx, qy, qz, qw = _POSE.unpack(payload)
-            return "pose", _STREAMS[number], stamp_ns, (x, y, z), (qx, qy, qz, qw)
-        if len(payload) > LONGEST_NAME:
-            raise ValueError(f"a frame's name has {len(payload)} bytes")
-        return "frame", _STREAMS[payload[0]], payload[1:].decode()
-    except (struct.error, LookupError, ValueError) as error:
-        raise InputError(f"it has a record that cannot be right ({error})") from None
-
-
-def _pack_checkpoint(checkpoint: Checkpoint) -> bytes:
-    packed = io.BytesIO()
-    np.savez(packed, **checkpoint)  # type: ignore[arg-type]
-    return packed.getvalue()
-
-
-def _unpack_checkpoint(payload: bytes) -> dict[str, NDArray[Any]]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(payload)) as archive:
-            return {
-                info.filename.removesuffix(".npy"): _unpack_array(archive, info)
-                for info in archive.infolist()
-            }
-    # A damaged archive makes zipfile and NumPy raise nearly anything.
-    except Exception as error:
-        raise InputError(f"its checkpoint cannot be right ({error})") from None
-
-
-def _unpack_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """An array of the archive, not larger than its bytes; never one of Python objects."""
-    if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
-        raise ValueError("an array is compressed")
-    file: BinaryIO = io.BytesIO(archive.read(info))
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):
-        raise ValueError("an array is of another version")
-    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    if dtype.hasobject or is_fortran or dtype.kind not in "biufU":
-        raise ValueError(f"an array is of type {dtype}")
-    return np.frombuffer(file.read(), dtype=dtype).reshape(shape).copy()

@@ -1,29 +1,26 @@
 """Limits of what is read from files.
 
-A file is never believed about its own size: what is larger than these limits is refused before
-memory is allocated for it. Reading a bag takes at most 64 MB plus four times
-:data:`LARGEST_MESSAGE`, whatever the file claims; the poses that are kept come on top.
+A file is never believed about its own size. Text and YAML are refused before memory is allocated
+for them. Bags are read by libraries: while they do so, a command gives the process no more memory
+than :data:`LARGEST_GROWTH`; the poses that are kept come on top.
 """
+
+from pathlib import Path
+from typing import Self
 
 _MIB = 1 << 20
 
 # ---- bags
 
-#: Bytes of one message of a topic that is read, after decompression.
-LARGEST_MESSAGE = 32 * _MIB
-#: Bytes of one chunk that is read whole, before and after decompression.
-LARGEST_CHUNK = 64 * _MIB
-#: Messages in one chunk.
-MOST_MESSAGES_PER_CHUNK = 250_000
-#: Chunks in one file.
-MOST_CHUNKS = 1_000_000
+#: Bytes of memory that reading a bag may take, in a command
+LARGEST_GROWTH = 512 * _MIB
 #: Channels or connections in one file.
 MOST_TOPICS = 10_000
 #: Storage files of one bag.
 MOST_BAG_FILES = 1_000
-#: Bytes of messages that wait because chunks overlap in time.
-LARGEST_OVERLAP = 16 * _MIB
-#: Bytes that a file may unpack to: this much ...
+#: Bytes of messages of a damaged file, or one without index, that wait to be put in order
+LARGEST_DISORDER = 16 * _MIB
+#: Bytes that a compressed file may unpack to: this much ...
 SMALLEST_UNPACKED = 64 * _MIB
 #: ... plus this many times its own size.
 LARGEST_RATIO = 256
@@ -31,8 +28,6 @@ LARGEST_RATIO = 256
 LONGEST_NAME = 1_024
 #: Frames in the transform tree of a bag.
 MOST_FRAMES = 10_000
-#: Bytes of a record that describes a topic or a schema.
-LARGEST_DESCRIPTION = 4 * _MIB
 #: A block of messages is passed on when it has reached this many bytes.
 BLOCK_BYTES = 4 * _MIB
 
@@ -56,9 +51,50 @@ LONGEST_LINE = 65_536
 #: Columns of a csv file.
 MOST_COLUMNS = 1_000
 
-# ---- session journal
 
-#: Bytes of one record of a session journal.
-LARGEST_RECORD = 1 << 30
-#: Bytes of one file of a session journal.
-LARGEST_SEGMENT = LARGEST_RECORD + 64 * _MIB
+class ReadingMemory:
+    """Lets the process grow by :data:`LARGEST_GROWTH` in all while a bag is read, and no more; a
+    context manager, entered as often as the bag is read from. What asks for more gets a
+    MemoryError.
+
+    It does nothing until :meth:`switch_on` was called, as the limit is one of the whole process:
+    commands call it, a program that reads bags in one of its threads may not want it.
+    """
+
+    _is_on = False
+
+    def __init__(self) -> None:
+        self._left = LARGEST_GROWTH
+
+    @classmethod
+    def switch_on(cls) -> None:
+        """Limit the memory from now on, where the system can (Linux)."""
+        cls._is_on = _STATM.exists()
+
+    def __enter__(self) -> Self:
+        if self._is_on:
+            import resource
+
+            self._before = _address_space()
+            self._limits = resource.getrlimit(resource.RLIMIT_AS)
+            allowed = [limit for limit in self._limits if limit != resource.RLIM_INFINITY]
+            soft = min([self._before + self._left, *allowed])
+            resource.setrlimit(resource.RLIMIT_AS, (soft, self._limits[1]))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_on:
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_AS, self._limits)
+            self._left -= _address_space() - self._before
+
+
+_STATM = Path("/proc/self/statm")
+
+
+def _address_space() -> int:
+    """Bytes of virtual memory of this process, which is what the limit counts."""
+    import resource
+
+    return int(_STATM.read_text().split()[0]) * resource.getpagesize()

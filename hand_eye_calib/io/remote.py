@@ -1,33 +1,30 @@
 """Bags in object storage and on web servers: whatever fsspec reaches, such as
 ``s3://bucket/run_1``, ``gs://...``, ``https://host/run_1.mcap``.
 
-A bag is copied to a temporary folder, read there, and the copy removed.
+A bag is copied by fsspec to a temporary folder, read there, and the copy removed.
 """
 
+import json
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import Any
 
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io.limits import MOST_BAG_FILES
 
-_Plain = TypeVar("_Plain")
+AsGiven = Callable[[Any], Any]
 
 _MARK = "://"
-# What a store says of a file that changes if its content does.
-_STATES = (
-    *("ETag", "etag", "md5Hash", "md5", "content_md5", "checksum", "generation"),
-    *("LastModified", "last_modified", "mtime", "updated", "created"),
-)
 # Files of a bag, as their names end.
 _SUFFIXES = (".yaml", ".mcap", ".db3", ".bag", ".zstd")
 
 
-def is_url(path: str) -> bool:
+def is_url(path: object) -> bool:
     """Whether a bag is named by a URL rather than a path."""
-    return _MARK in path
+    return _MARK in str(path)
 
 
 def public(url: str) -> str:
@@ -57,9 +54,9 @@ def expanded(pattern: str) -> list[str]:
         return sorted(system.unstrip_protocol(found) for found in system.glob(path.rstrip("/")))
 
 
-def states(url: str) -> list[list[str]]:
-    """Name, size and what else the store says of each file of a bag, from which one sees whether it
-    has changed.
+def states(url: str) -> list[str]:
+    """What the store says of each file of a bag, such as size, date and digest, from which one sees
+    whether it has changed.
 
     Raises
     ------
@@ -68,41 +65,43 @@ def states(url: str) -> list[list[str]]:
     """
     with _reaching(url):
         system, path = _opened(url)
-        files = _files(system, path)
-        return [
-            [name, str(info.get("size")), *(f"{key}={info[key]}" for key in _STATES if key in info)]
-            for name, info in ((name, system.info(name)) for name in files)
-        ]
+        return [str(sorted(system.info(name).items())) for name in _files(system, path)]
 
 
 @contextmanager
-def local_copies(
-    paths: Sequence[str],
-) -> Iterator[tuple[list[str], Callable[[_Plain], _Plain]]]:
+def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
     """Paths of the same bags on this machine; what is remote is copied for as long as the block
-    lasts.
+    lasts. Errors raised in the block name the URLs.
 
     Yields
     ------
-    paths : list of str
+    paths : list
     as_given : callable
         Puts the URLs back into plain values that name the copies.
 
     Raises
     ------
     InputError
-        If a store cannot be reached, or there is no bag.
+        If a store cannot be reached, there is no bag, or it would fill more than half of the disk.
     """
+    if not any(map(is_url, paths)):
+        yield list(paths), lambda value: value
+        return
     with tempfile.TemporaryDirectory(prefix="hand_eye_calib_") as folder:
-        urls: dict[str, str] = {}
-        local = []
-        for number, path in enumerate(paths):
-            if is_url(path):
-                copy = str(_copied(path, Path(folder, str(number))))
-                urls[copy] = public(path).rstrip("/")
-                path = copy
-            local.append(path)
-        yield local, lambda value: _renamed(value, urls)
+        local = [
+            _copied(str(path), Path(folder, str(number))) if is_url(path) else path
+            for number, path in enumerate(paths)
+        ]
+        names = {
+            str(copy): public(str(path)).rstrip("/")
+            for copy, path in zip(local, paths, strict=True)
+            if is_url(path)
+        }
+        try:
+            yield local, lambda value: _renamed(value, names)
+        except HandEyeCalibError as error:
+            error.args = tuple(_renamed(list(error.args), names))
+            raise
 
 
 def _copied(url: str, folder: Path) -> Path:
@@ -110,13 +109,33 @@ def _copied(url: str, folder: Path) -> Path:
     with _reaching(url):
         system, path = _opened(url)
         files = _files(system, path)
-        name = _name(path.rstrip("/"))
-        target = folder / name if files == [path] else folder
         folder.mkdir()
+        room = _room(folder)
         for file in files:
             # The name's last part only: a store does not choose where things go.
-            system.get_file(file, str(folder / _name(file)))
-        return target
+            system.get_file(file, str(folder / _name(file)), callback=room)
+        return folder / _name(path) if files == [path] else folder
+
+
+def _room(folder: Path) -> Any:
+    """A callback that ends a copy which is too large, whatever size the store gave for it.
+
+    Half of the free space is left to the copies of other processes.
+    """
+    from fsspec.callbacks import Callback
+
+    largest = shutil.disk_usage(folder).free // 2
+
+    class Room(Callback):
+        def relative_update(self, inc: int = 1) -> None:
+            super().relative_update(inc)
+            if self.value > largest:
+                raise InputError(
+                    f"it is larger than {largest / 1e9:.3g} GB, half of the free space of "
+                    f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
+                )
+
+    return Room()
 
 
 def _opened(url: str) -> tuple[Any, str]:
@@ -176,11 +195,7 @@ def _reaching(url: str) -> Iterator[None]:
 
 def _renamed(value: Any, names: dict[str, str]) -> Any:
     """Plain values with some texts in them replaced."""
-    if isinstance(value, dict):
-        return {key: _renamed(item, names) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_renamed(item, names) for item in value]
-    if isinstance(value, str):
-        for old, new in names.items():
-            value = value.replace(old, new)
-    return value
+    text = json.dumps(value)
+    for old, new in names.items():
+        text = text.replace(json.dumps(old)[1:-1], json.dumps(new)[1:-1])
+    return json.loads(text)

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-import yaml
-
 from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
 from hand_eye_calib.io.limits import LARGEST_TEXT
-from hand_eye_calib.io.yaml_files import read_yaml
+from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.version import package_version
 
@@ -57,11 +55,7 @@ def save_result(
         If they cannot be written.
     """
     document = calibration.to_dict() | {"provenance": provenance(inputs or {})}
-    texts = {
-        FILE_NAME: yaml.safe_dump(
-            document, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
-        ),
-    }
+    texts = {FILE_NAME: yaml_text(document)}
     if calibration.verdict is not Verdict.DO_NOT_USE:
         ready = {XACRO_NAME: _xacro_text(calibration), LAUNCH_NAME: launch_text([calibration])}
         texts = ready | texts

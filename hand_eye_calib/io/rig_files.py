@@ -9,12 +9,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.files import write_atomically
 from hand_eye_calib.io.results import LAUNCH_NAME, RIG_NAME, launch_text, provenance, save_result
+from hand_eye_calib.io.yaml_files import yaml_text
 
 
 def save_rig(
@@ -50,11 +49,7 @@ def save_rig(
     """
     directory = Path(directory)
     whole = {**document, "provenance": provenance(inputs or {})}
-    texts = {
-        RIG_NAME: yaml.safe_dump(
-            whole, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
-        )
-    }
+    texts = {RIG_NAME: yaml_text(whole)}
     usable = [each for each in calibrations if each.verdict is not Verdict.DO_NOT_USE]
     if usable:
         texts[LAUNCH_NAME] = launch_text(usable)

@@ -20,6 +20,7 @@ from hand_eye_calib.io.limits import (
     LONGEST_NUMBER,
     MOST_YAML_VALUES,
 )
+from hand_eye_calib.plain import plain
 
 _SCALARS = ("null", "bool", "int", "float", "str")
 _MERGE = "tag:yaml.org,2002:merge"
@@ -54,6 +55,13 @@ def read_yaml(path: str | Path) -> Any:
         If it cannot be read, is not YAML or exceeds a limit; one line that names the file.
     """
     return parse_yaml(read_text(path, "YAML", LARGEST_YAML), str(path))
+
+
+def yaml_text(document: Any) -> str:
+    """Values of any kind as a YAML file for programs and people."""
+    return yaml.safe_dump(
+        plain(document), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
+    )
 
 
 def parse_yaml(text: str, name: str) -> Any:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hand_eye_calib.arrays import IntArray
+from hand_eye_calib.arrays import IntArray, median
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs
 
@@ -16,6 +16,7 @@ def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = _MAX_PAIRS)
     ----------
     pose_pairs : PosePairs
     lag_s : float
+        The interval of the poses if that is longer.
     max_pairs : int
 
     Returns
@@ -23,7 +24,10 @@ def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = _MAX_PAIRS)
     MotionPairs
         Empty if no two poses lie that far apart.
     """
-    i, j = _indices_over(pose_pairs.stamps_ns, lag_s, max_pairs)
+    stamps_ns = pose_pairs.stamps_ns
+    if len(stamps_ns) > 1:
+        lag_s = max(lag_s, median(np.diff(stamps_ns)) * 1e-9)
+    i, j = _indices_over(stamps_ns, lag_s, max_pairs)
     return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i, j)
 
 

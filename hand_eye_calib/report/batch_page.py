@@ -25,8 +25,8 @@ from hand_eye_calib.report.report_figures import (
     page_style,
 )
 from hand_eye_calib.report.style import new_figure
-from hand_eye_calib.report.words import counted, with_sigma
 from hand_eye_calib.session.agreement import Agreement, Kind
+from hand_eye_calib.text import counted, with_sigma
 from hand_eye_calib.verdict import Verdict
 
 Plain = Mapping[str, Any]
@@ -95,7 +95,7 @@ def _vehicle(vehicle: Plain, number: int) -> dict[str, Any]:
     rows, newest = vehicle["rows"], vehicle["newest"]
     tone = _TONES[found.kind]
     return {
-        "title": vehicle["name"] or "All recordings",
+        "title": vehicle["name"],
         "id": f"vehicle-{number}",
         "frames": " in ".join(reversed(vehicle["frames"])),
         "count": counted(len(rows), "recording"),

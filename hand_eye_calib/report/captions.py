@@ -11,7 +11,7 @@ from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.engine.answers import Answer
 from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.report.words import counted, length, listing, share, size
+from hand_eye_calib.text import amount, angle, counted, length, listing, share
 
 Caption = Callable[[Calibration, Evidence], str]
 
@@ -95,7 +95,7 @@ def _of_residuals(calibration: Calibration, evidence: Evidence) -> str:
     factor, unit = time_axis(evidence.tracks.times_s[-1])
     return (
         f"{text}; {n_out:,} ({share(n_out / len(residuals.times_s))}) were rejected as outliers, "
-        f"the largest {size(values[largest], axis)} at "
+        f"the largest {amount(axis, values[largest])} at "
         f"{residuals.times_s[largest] * factor:.1f} {unit}."
     )
 
@@ -111,7 +111,7 @@ def residual_sizes(calibration: Calibration, evidence: Evidence) -> dict[str, Fl
 
 
 def _each(sizes: Mapping[str, FloatArray], of: Callable[[FloatArray], FloatArray]) -> str:
-    return listing([size(float(of(values)), axis) for axis, values in sizes.items()])
+    return listing([amount(axis, float(of(values))) for axis, values in sizes.items()])
 
 
 def _of_convergence(calibration: Calibration, evidence: Evidence) -> str:
@@ -263,10 +263,10 @@ def of_streams(seen: StreamView) -> str:
     apart = np.abs(np.diff(seen.angles, axis=1))
     text += (
         f"Here half of the {len(seen.angles)} motions over {seen.lag_s:g} s differ by less than "
-        f"{size(float(np.median(apart)), 'yaw')}"
+        f"{angle(float(np.median(apart)))}"
     )
     if len(seen.along_axis):
-        text += f" and {size(float(np.median(np.abs(np.diff(seen.along_axis, axis=1)))), 'x')}"
+        text += f" and {length(float(np.median(np.abs(np.diff(seen.along_axis, axis=1)))))}"
     return f"{text}. {bars}"
 
 
@@ -281,7 +281,7 @@ _WHAT_COINCIDES = {
 def _half_of_the_time(seen: StreamView) -> str:
     if not np.isfinite(seen.apart):
         return "Here the streams never overlap."
-    apart = length(seen.apart) if seen.quantity == "speed" else size(seen.apart, "yaw")
+    apart = length(seen.apart) if seen.quantity == "speed" else angle(seen.apart)
     return f"Here they differ by less than {apart}/s half of the time."
 
 
@@ -315,7 +315,7 @@ def _largest(difference: FloatArray, known: BoolArray) -> str:
         index = int(np.argmax(values))
         if values[index] >= 0:
             name = AXES[first + index]
-            texts.append(f"{size(values[index], name)} ({name})")
+            texts.append(f"{amount(name, values[index])} ({name})")
     return listing(texts)
 
 

@@ -20,18 +20,19 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, captions
 from hand_eye_calib.report.report_figures import draw_all
-from hand_eye_calib.report.words import (
+from hand_eye_calib.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.text import (
+    amount,
+    angle,
     counted,
     duration,
     fixed,
     given_or_estimated,
+    in_words,
     length,
     listing,
-    plain,
-    size,
     with_sigma,
 )
-from hand_eye_calib.status import ROTATIONS, TRANSLATIONS, amount
 from hand_eye_calib.verdict import shown, target_of
 
 Plain = Mapping[str, Any]
@@ -143,7 +144,7 @@ def environment() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     made.filters["number"] = fixed
-    made.filters["plain"] = plain
+    made.filters["in_words"] = in_words
     made.filters["printable"] = printable
     return made
 
@@ -215,7 +216,7 @@ def _direction(transform: Plain, calibration: Calibration) -> dict[str, Any]:
     return {
         "maps": printable(transform["maps"]),
         "rows": [row | {"value": row["value"].replace("+/-", "±")} for row in rows + turned],
-        "quat_xyzw": [] if unknown & {*ROTATIONS} else transform["quat_xyzw"],
+        "quat_xyzw": transform["quat_xyzw"],
         "is_locked": is_locked,
     }
 
@@ -231,7 +232,7 @@ def _axes(calibration: Calibration) -> list[dict[str, Any]]:
             {
                 "name": dof.name,
                 "title": _AXIS_NAMES.get(dof.name, f"along {dof.name}"),
-                "sigma": size(dof.sigma, dof.name) if np.isfinite(dof.sigma) else "unknown",
+                "sigma": amount(dof.name, dof.sigma) if np.isfinite(dof.sigma) else "unknown",
                 "verdict": dof.verdict.value,
                 "words": _WORDS[dof.verdict],
                 "bar": _bar(dof.sigma / limit),
@@ -297,8 +298,8 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
 
 def _noise(noise: Plain) -> str:
     def levels(kind: str, suffix: str) -> str:
-        translation = size(noise[f"translation_{kind}_m{suffix}"], "x")
-        return f"{translation} and {size(noise[f'rotation_{kind}_rad{suffix}'], 'yaw')}"
+        translation = length(noise[f"translation_{kind}_m{suffix}"])
+        return f"{translation} and {angle(noise[f'rotation_{kind}_rad{suffix}'])}"
 
     jumps = counted(len(noise["jumps_before_stamp_ns"]), "jump")
     return (
@@ -348,11 +349,11 @@ def _provenance(inputs: Plain) -> list[tuple[str, str]]:
     versions = {name: _version(name) for name in ("hand_eye_calib", "numpy", "scipy")}
     rows = [
         ("Written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")),
-        ("Versions", plain(versions | {"python": platform.python_version()})),
+        ("Versions", in_words(versions | {"python": platform.python_version()})),
     ]
     # Without folders, which are nobody's business who gets this page; extrinsic.yaml has them.
     rows += [
-        (name.capitalize(), plain(_without_folders(value)))
+        (name.capitalize(), in_words(_without_folders(value)))
         for name, value in inputs.items()
         if name not in ("parent", "child", "options", "files")
     ]

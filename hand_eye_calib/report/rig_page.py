@@ -23,8 +23,8 @@ from hand_eye_calib.report.report_figures import (
     page_style,
 )
 from hand_eye_calib.report.style import GREEN, new_figure
-from hand_eye_calib.report.words import counted, size, with_sigma
 from hand_eye_calib.rig.result import RigCalibration
+from hand_eye_calib.text import angle, counted, length, with_sigma
 
 _VIEWS = ((0, 1), (0, 2))
 # Of the figure's extent: the axes of a sensor; the least extent, m.
@@ -86,10 +86,10 @@ def _noise(rig: RigCalibration) -> list[tuple[str, ...]]:
     return [
         (
             name,
-            size(noise.translation_white, "x"),
-            size(noise.rotation_white, "yaw"),
-            size(noise.translation_drift, "x"),
-            size(noise.rotation_drift, "yaw"),
+            length(noise.translation_white),
+            angle(noise.rotation_white),
+            length(noise.translation_drift),
+            angle(noise.rotation_drift),
             f"{noise.n_jumps}",
             f"{noise.n_spikes}",
         )

@@ -147,8 +147,8 @@ def _pairwise(
     first = dataclasses.replace(first, sensor_frame=name)
     other = dataclasses.replace(other, sensor_frame=of_other)
     config = offline_config(first, other, options)
-    snapshot = at_clear_offset(whole_snapshot(config, first, other), options)
-    return checked(snapshot.estimate(), snapshot, options)[0]
+    snapshot = at_clear_offset(whole_snapshot(config, first, other))
+    return checked(snapshot.estimate(), snapshot)[0]
 
 
 def _on_table(table: Table, at: int, sensors: tuple[str, ...], method: str) -> Calibration:

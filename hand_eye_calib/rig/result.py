@@ -12,6 +12,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.rig.solution import RigSolution
+from hand_eye_calib.text import angle, length
 
 _FORMAT, _VERSION = "hand_eye_calib/rig", 1
 
@@ -57,8 +58,8 @@ class Closure:
         """In words."""
         how = "closes" if self.closes else "DOES NOT CLOSE"
         return (
-            f"{' - '.join(self.sensors)} {how}: off by {1000 * self.translation_m:.1f} mm and "
-            f"{np.degrees(self.rotation_rad):.3f} deg, chi-square {self.chi2:.1f} with "
+            f"{' - '.join(self.sensors)} {how}: off by {length(self.translation_m)} and "
+            f"{angle(self.rotation_rad)}, chi-square {self.chi2:.1f} with "
             f"{self.dof} degrees of freedom"
         )
 
@@ -125,10 +126,9 @@ class RigCalibration:
     def noise_in_words(self) -> list[str]:
         """A line for every sensor."""
         return [
-            f"{name}: each pose is off by {1000 * noise.translation_white:.2g} mm and "
-            f"{np.degrees(noise.rotation_white):.2g} deg per axis; what stays grows by "
-            f"{1000 * noise.translation_drift:.2g} mm and "
-            f"{np.degrees(noise.rotation_drift):.2g} deg from pose to pose; "
+            f"{name}: each pose is off by {length(noise.translation_white)} and "
+            f"{angle(noise.rotation_white)} per axis; drift: {length(noise.translation_drift)} and "
+            f"{angle(noise.rotation_drift)} from pose to pose; "
             f"{noise.n_jumps} jumps, {noise.n_spikes} poses left out"
             for name, noise in zip(self.sensors, self.solution.noise, strict=True)
         ]

@@ -69,18 +69,21 @@ class CalibratorNode(Node):
             self._log.warning(line)
         # From now on, participants may choose a directory below this one.
         self._output_base = output_path(self._options.node.output_directory or ".").resolve()
+        if self._options.node.monitor:
+            self._options.calibrator.require_poses("monitor")
+        _ = self._options.calibrator.measured  # or it raises
         self._session.reconfigure(self._options.calibrator)
         self._checks = CheckMonitor()
         self._files = ResultFiles()
         self._report = ReportProcess()
+        self._tf = TfBroadcaster(self, self._log)
+        self._robot = Robot(self, self._log, self._options.node, self._tf)
         self._inputs = self._make_input("parent"), self._make_input("child")
         self._others = self._make_others()
         self._session.topics = {each.name: each.topic for each in self._inputs}
         self._open_journal()
         self._topics = ResultTopics(self)
-        self._tf = TfBroadcaster(self, self._log)
         self._tf.switch(self._options.node.publish_tf)
-        self._robot = Robot(self, self._log, self._options.node, self._tf)
         self._mount = None
         if self._options.node.monitor:
             self._session.watch_only(LIMITS)
@@ -201,7 +204,7 @@ class CalibratorNode(Node):
     def _publish_result(self, calibration: Calibration) -> None:
         self._topics.publish(calibration)
         if not self._robot.lacks_base(calibration):
-            self._tf.add(calibration, self._checks.faults())
+            self._tf.add(calibration, self._cycle.goal.progress.is_done)
 
     def _publish_others(self, calibrations: Sequence[Calibration]) -> None:
         """Publish new results of the further child sensors, in their order."""
@@ -248,8 +251,13 @@ class CalibratorNode(Node):
         if saved and is_wanted and result is not None and cycle.snapshot is not None:
             path = output_path(options.output_directory)
             told = SessionResult(result, cycle.snapshot, inputs, options.report, others)
-            self._report.write(path, told)
-            text += f", {told.what_follows}"
+            try:
+                self._report.write(path, told)
+                text += f", {told.what_follows}"
+            except OSError as error:
+                missing = f"{told.files} cannot be written: {error.strerror}"
+                self._log.warning(missing)
+                text += f"; {missing}"
         return saved, text
 
     def _log_outcome(self, success: bool, text: str) -> None:

@@ -28,8 +28,6 @@ class InputMonitor:
     ----------
     arrived, ignored : int
         Messages, and those of them that came while the node was disabled.
-    restored : int
-        Messages with a corrupt stamp that could be restored.
     refused : Counter
         Messages that could not be used, by reason.
     delay_s : float or None
@@ -40,7 +38,6 @@ class InputMonitor:
     def __init__(self) -> None:
         self.arrived = 0
         self.ignored = 0
-        self.restored = 0
         self.refused: Counter[str] = Counter()
         self.delay_s: float | None = None
         self.delivery = Delivery()
@@ -151,7 +148,6 @@ class InputMonitor:
             "refused: repeated stamp": statistics.refused_duplicate,
             "refused: too late": statistics.refused_late,
             **{f"refused: {reason}": count for reason, count in sorted(self.refused.items())},
-            "corrupt stamps restored": self.restored,
             "dropped: no pose of the other input at their time": statistics.dropped_unpaired,
             "ignored while disabled": self.ignored,
         }

@@ -13,9 +13,10 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import other_names
 from hand_eye_calib.engine.pose_buffer import StreamStatistics
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.bags.messages import MALFORMED, PoseFields, unpack_stamp_ns
-from hand_eye_calib.io.bags.parts import MessageReader, measured_as
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+from hand_eye_calib.io.bags.messages import MALFORMED, unpack_stamp_ns
+from hand_eye_calib.io.bags.poses import PoseFields
+from hand_eye_calib.io.bags.topics import MessageReader, measured_as
 from hand_eye_calib.ros.conversions import MESSAGES
 from hand_eye_calib.ros.input_monitor import InputMonitor
 from hand_eye_calib.ros.live_session import LiveSession
@@ -23,11 +24,6 @@ from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.stamp_guard import Judgement, StampGuard, Verdict
 
-# Best effort hears reliable publishers too; the queue holds seconds of a fast stream while a
-# callback is busy.
-_QOS = QoSProfile(
-    depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
-)
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
 # Messages taken in one callback beyond the first; services and timers have their turn then.
@@ -85,6 +81,7 @@ class PoseInput:
         self._on_jump_back = on_jump_back
         self._sensor_frame = ""
         self._max_gap_ns = 0.0
+        self._unusable = ""
         self._wanted: str = "auto"
         self._is_watching = False
 
@@ -110,7 +107,7 @@ class PoseInput:
 
     def resume(self) -> None:
         """Go on where a session on disk has ended."""
-        self.guard.last_ns = self.statistics.last_stamp_ns
+        self.guard.resume(self.statistics.last_stamp_ns)
 
     def discover(self, wanted_type: str) -> None:
         """Look for publishers; to be called often."""
@@ -122,7 +119,20 @@ class PoseInput:
 
     def what_is_missing(self) -> str:
         """Why nothing has come yet, if more is known than that; otherwise empty."""
-        return ""
+        return self._unusable
+
+    def _measures_as(self, type_name: str) -> str:
+        """What messages of a type (empty for transforms) are read as here.
+
+        Raises
+        ------
+        ConfigError
+            If they cannot be used.
+        """
+        measures = measured_as(type_name, self._wanted, self.topic)
+        if self._is_watching and measures != "poses":
+            raise ConfigError(f"monitor needs poses; {self.topic} has {measures}")
+        return measures
 
     # -------------------------------------------------------------- messages
 
@@ -149,7 +159,6 @@ class PoseInput:
         self._use(self.guard.flush(time.monotonic()), is_first)
 
     def _use(self, judgement: Judgement, is_first: bool) -> None:
-        self.monitor.restored += len(judgement.restored)
         for stamp_ns in judgement.dropped:
             text = "its stamp does not fit those before and after it"
             self._refuse(with_stamp(stamp_ns), "corrupt stamp", text)
@@ -165,7 +174,7 @@ class PoseInput:
             if pose.sensor_frame is not None:
                 self._set_frame(pose.sensor_frame)
             self._session.add_pose(self.name, stamp_ns, pose.position, pose.quat_xyzw)
-        except InputError as error:
+        except HandEyeCalibError as error:
             self._refuse(with_stamp(stamp_ns), "unusable", str(error))
 
     def _set_frame(self, sensor_frame: str) -> None:
@@ -209,17 +218,30 @@ class TopicInput(PoseInput):
         self._type_name = ""
 
     def discover(self, wanted_type: str) -> None:
-        """Subscribe as soon as the type is known, and again if the publisher changes it."""
+        """Subscribe as soon as the type is known, and again if the publisher changes it.
+
+        Raises
+        ------
+        ConfigError
+            If a type that is wanted cannot be used. A type that is found is refused in the log.
+        """
         offered = self._offered_types()
         type_name = self._choose_type(offered) if wanted_type == "auto" else wanted_type
+        self._unusable = ""
         if type_name is not None and type_name != self._type_name:
-            self._subscribe(type_name)
-        publishers = self._node.count_publishers(self.relative_topic)
+            try:
+                self._subscribe(type_name)
+            except ConfigError as error:
+                if wanted_type != "auto":
+                    raise
+                self._unusable = str(error)
+                self._log.error(f"{self.topic} is not used: {error}", ("unusable", self.name))
+        publishers = self._node.count_publishers(self.topic)
         self.monitor.delivery.has_one_publisher = publishers == 1
 
     def describe_silence(self) -> str:
         """Why nothing has come yet, as far as the graph tells."""
-        publishers = self._node.count_publishers(self.relative_topic)
+        publishers = self._node.count_publishers(self.topic)  # which does not follow remaps itself
         count = f"{publishers or 'no'} publisher{'s' * (publishers != 1)}"
         return f"no pose yet on {self.topic} ({count})"
 
@@ -241,14 +263,13 @@ class TopicInput(PoseInput):
         return usable[0] if usable else None
 
     def _subscribe(self, type_name: str) -> None:
+        measures = self._measures_as(type_name)
+        self._session.set_measures(self.name, measures)
         if self._subscription is not None:
             self._log.warning(f"{self.topic} has changed its type from {self._type_name}")
             self._node.destroy_subscription(self._subscription)
-        measures = measured_as(type_name, self._wanted, self.topic)
-        if self._is_watching and measures != "poses":
-            raise ConfigError(f"monitor watches poses; {self.topic} has {measures}")
+            self._subscription = None
         read = MessageReader(type_name, measures, self._session.origin(self.name))
-        self._session.set_measures(self.name, measures)
 
         def on_message(data: Any, info: dict[str, Any]) -> None:
             self.receive(read, data, info)
@@ -263,7 +284,7 @@ class TopicInput(PoseInput):
                 MESSAGES[type_name],
                 self.relative_topic,
                 callback,
-                _QOS,
+                _qos(),
                 # As bytes: making the objects of a message takes ten times as long as reading what
                 # is needed of it.
                 raw=True,
@@ -287,6 +308,16 @@ class TopicInput(PoseInput):
             self._refuse(f"received at {received_s:.3f} s", "malformed", str(error))
             return
         self.accept(stamp_ns, partial(read, data))
+
+
+def _qos() -> QoSProfile:
+    """Best effort, which hears reliable publishers too, and a queue for seconds of a fast stream.
+
+    One for each subscription: rclpy writes its overrides into the profile that it is given.
+    """
+    return QoSProfile(
+        depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
+    )
 
 
 def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, dict[str, Any]]]:

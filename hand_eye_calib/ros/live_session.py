@@ -1,26 +1,25 @@
 """The session of the node: the engine, the number of the session, and its journal on disk."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
-from hand_eye_calib.io.journal import ABOUT_NAME, has_session, read_about
+from hand_eye_calib.io.journal import Journal, has_session, read_journal
 from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.session_journal import (
     DirectoryLock,
+    Poses,
     SessionJournal,
-    resume,
+    give,
+    poses_so_far,
     takers,
-    whole_state,
 )
 
 # How long a disk may hold up the end of the program.
@@ -104,17 +103,25 @@ class LiveSession:
         for own_stream, each in takers(stream, self.calibrator, self.others):
             each.set_frame(own_stream, sensor_frame)
         if self._journal is not None:
-            self._journal.set_frame(stream, sensor_frame)
+            self._journal.describe({stream: {"frame": sensor_frame}})
 
     def set_measures(self, stream: str, measures: str) -> None:
-        """Take what a stream measures, as its message type says, one of config.MEASURES."""
+        """Take what a stream measures, as its message type says, one of config.MEASURES.
+
+        Raises
+        ------
+        ConfigError
+            If nothing can be calibrated with what the other stream measures.
+        """
         if stream in self.others:
             other = self.others[stream]
             other.reconfigure(replace(other.config, child_measures=measures))
             return
         name = f"{stream}_measures"
         if self._measures.get(name, "poses") != measures:
-            self._measures[name] = measures
+            measured = self._measures | {name: measures}
+            _ = replace(self.calibrator.config, **measured).measured  # or it raises
+            self._measures = measured
             self.reconfigure(self.calibrator.config)
 
     def origin(self, stream: str) -> LocalOrigin:
@@ -138,7 +145,7 @@ class LiveSession:
         self.number += 1
         self.has_new_poses = False
         if self._journal is not None:
-            self._journal.begin(self._state())
+            self._journal.begin()
 
     # -------------------------------------------------------------- journal
 
@@ -177,8 +184,8 @@ class LiveSession:
         self.stop_journal()
         if directory is not None:
             self._lock = DirectoryLock(directory.parent)
-            resumed = resuming and self._resume(directory)
-            self._journal = SessionJournal(directory, self._state(), self._about(), resumed)
+            resumed = self._resume(directory) if resuming else None
+            self._journal = SessionJournal(directory, self._about(), self._poses(), resumed)
         return True
 
     def flush_journal(self) -> None:
@@ -186,14 +193,14 @@ class LiveSession:
         if self._journal is not None:
             if self._known_origins() != self._origins_on_disk:
                 self._journal.describe(self._about())
-            self._journal.flush(self._state)
+            self._journal.flush(self._poses)
             self._log_notes(self._journal)
 
     def stop_journal(self) -> bool:
         """Write what is left; False if the disk keeps it busy."""
         if self._journal is None:
             return True
-        ended = self._journal.stop(self._state, _GRACE_S)
+        ended = self._journal.stop(self._poses, _GRACE_S)
         self._log_notes(self._journal)
         self._journal = None
         if self._lock is not None:
@@ -201,41 +208,47 @@ class LiveSession:
             self._lock = None
         return ended
 
-    def _resume(self, directory: Path) -> bool:
-        """Whether the session in a directory goes on."""
+    def _resume(self, directory: Path) -> Journal | None:
+        """The session in a directory, which goes on; None if there is none that can."""
         if not has_session(directory):
             self._log.info(f"no session to resume in {directory}: a new one begins")
-            return False
+            return None
         try:
-            origins = _origins_in(directory)
-            poses = resume(directory, self.calibrator, self.others)
+            journal = read_journal(directory)
+            give(journal, directory, self.calibrator, self.others)
+            origins = _origins_in(directory, journal)
         except HandEyeCalibError as error:
             self._log.error(f"cannot resume: {error}; a new session begins")
             for calibrator in (self.calibrator, *self.others.values()):
                 calibrator.reset()
-            return False
+            return None
         for stream, geodetic in origins.items():
             self.origin(stream).geodetic = geodetic
+        poses = sum(self.calibrator.statistics(stream).received for stream in STREAMS)
         self.has_new_poses = poses > 0
         self._log.info(f"session resumed from {directory}: {poses} poses")
-        return True
+        return journal
 
-    def _state(self) -> dict[str, np.ndarray]:
-        return whole_state(self.calibrator, self.others)
+    def _poses(self) -> Poses:
+        return poses_so_far(self.calibrator, self.others)
 
     def inputs(self) -> dict[str, Any]:
         """Where the poses came from and the options, in plain values."""
         return self.calibrator.inputs(self.topics)
 
     def _about(self) -> dict[str, dict[str, Any]]:
-        """Options, topics and origins, for whoever reads the journal."""
+        """Options, topics, frames and origins, for whoever reads the journal."""
         self._origins_on_disk = self._known_origins()
-        about: dict[str, dict[str, Any]] = {
-            "options": self.calibrator.config.to_options(),
-            "topics": dict(self.topics),
-        }
-        if self._origins_on_disk:
-            about["origins"] = self._origins_on_disk
+        config = self.calibrator.config
+        of_all = {"options": config.to_options(), "given": sorted(config.given)}
+        about: dict[str, dict[str, Any]] = {}
+        for stream in (*STREAMS, *self.others):
+            about[stream] = {"topic": self.topics.get(stream, ""), **of_all}
+            (own_stream, calibrator), *_ = takers(stream, self.calibrator, self.others)
+            if frame := calibrator.frame(own_stream):
+                about[stream]["frame"] = frame
+            if stream in self._origins_on_disk:
+                about[stream]["origin"] = self._origins_on_disk[stream]
         return about
 
     def _known_origins(self) -> dict[str, Any]:
@@ -251,16 +264,18 @@ class LiveSession:
                 self._log.info(text)
 
 
-def _origins_in(directory: Path) -> dict[str, tuple[float, float, float]]:
+def _origins_in(directory: Path, journal: Journal) -> dict[str, tuple[float, float, float]]:
     """Latitude and longitude (rad) and height (m) that the positions of a session count from."""
     origins = {}
-    for stream, values in read_about(directory).get("origins", {}).items():
+    for stream, about in journal.about.items():
+        if "origin" not in about:
+            continue
         try:
-            latitude, longitude, height = map(float, values)
+            latitude, longitude, height = map(float, about["origin"])
         except (TypeError, ValueError):
             raise InputError(
-                f"{directory / ABOUT_NAME}: origins must be latitude and longitude (rad) and "
-                f"height (m); found {values!r} of {stream}"
+                f"{directory}: origin must be latitude and longitude (rad) and height (m); found "
+                f"{about['origin']!r} of {stream}"
             ) from None
         origins[stream] = latitude, longitude, height
     return origins
@@ -268,11 +283,12 @@ def _origins_in(directory: Path) -> dict[str, tuple[float, float, float]]:
 
 def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorConfig:
     """The options for a further child sensor: what is set for the child in numbers is not its."""
-    options = config.to_options()
-    of_child = [name for name in options if name.startswith("prior.")] + ["child_frame"]
-    of_child += [name for name in ("time_offset", "scale") if not isinstance(options[name], str)]
-    kept = {name: value for name, value in options.items() if name not in of_child}
-    return CalibratorConfig.from_options({**kept, "child_measures": measures})
+    of_child = {field.name for field in fields(config) if field.name.startswith("prior_")}
+    of_child |= {"child_frame"}
+    numbers = ("time_offset", "scale")
+    of_child |= {name for name in numbers if not isinstance(getattr(config, name), str)}
+    defaults = {name: getattr(CalibratorConfig, name) for name in of_child}
+    return replace(config, child_measures=measures, given=config.given - of_child, **defaults)
 
 
 def journal_directory(options: NodeConfig) -> Path | None:

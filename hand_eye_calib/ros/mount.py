@@ -13,7 +13,7 @@ from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.robot import Robot
 from hand_eye_calib.ros.status import ERROR, OK, WARN, Report
 from hand_eye_calib.session.monitor import LEARNING_S, Alarm, MountMonitor
-from hand_eye_calib.status import amount, listing
+from hand_eye_calib.text import amount, listing
 
 # Poses are paired soon, and few are kept.
 LIMITS = BufferLimits(

@@ -82,17 +82,18 @@ class Parameters:
         self.unknown = [
             _unknown(name) for name in given if name not in FIELDS and name not in qos_names
         ]
+        # Those that somebody set, at their defaults or not.
         self._values = {
-            name: _start_value(field, given[name]) if name in given else field.default
+            name: _start_value(field, given[name])
             for name, field in FIELDS.items()
+            if name in given
         }
         self.calibrator, self.node = _configs(self._values)
         check(self.node)
         self._check_node = check
         for name, field in FIELDS.items():
-            node.declare_parameter(
-                name, self._values[name], _descriptor(field), ignore_override=True
-            )  # it is in the value
+            value = self._values.get(name, field.default)
+            node.declare_parameter(name, value, _descriptor(field), ignore_override=True)
         self._on_change = on_change
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
@@ -122,7 +123,8 @@ class Parameters:
 
 def _configs(values: _Values) -> tuple[CalibratorConfig, NodeConfig]:
     def part(config: type[OptionSet]) -> dict[str, Any]:
-        return {option_name(field): values[option_name(field)] for field in _fields(config)}
+        names = map(option_name, _fields(config))
+        return {name: values[name] for name in names if name in values}
 
     return (
         CalibratorConfig.from_options(part(CalibratorConfig)),

@@ -14,7 +14,7 @@ from typing import IO, Any
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.engine.snapshot import Snapshot
 
-_COMMAND = "from hand_eye_calib.cli.session_report import main; main()"
+_COMMAND = "from hand_eye_calib.cli.reporting import write_session; write_session()"
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,14 @@ class SessionResult:
     others: Mapping[str, Snapshot] = field(default_factory=dict)
 
     @property
-    def what_follows(self) -> str:
+    def files(self) -> str:
         """What is written, in words."""
-        if not self.others:
-            return "report.html follows"
-        return "report.html and rig/ follow" if self.with_report else "rig/ follows"
+        return " and ".join(["report.html"] * self.with_report + ["rig/"] * bool(self.others))
+
+    @property
+    def what_follows(self) -> str:
+        """The same as a sentence."""
+        return f"{self.files} follow" + "s" * (" and " not in self.files)
 
 
 class ReportProcess:
@@ -49,10 +52,15 @@ class ReportProcess:
 
         The result is handed over in a file that has no name: nobody else can change it, and no
         pipe has to be waited for at the end of the node.
+
+        Raises
+        ------
+        OSError
+            If the temporary directory is full, or no process can be started.
         """
         self._end_earlier()
-        self._answer = tempfile.TemporaryFile() if result.others else None  # noqa: SIM115
         path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+        answer = tempfile.TemporaryFile() if result.others else None  # noqa: SIM115
         with tempfile.TemporaryFile() as file:
             pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
             file.seek(0)
@@ -60,10 +68,11 @@ class ReportProcess:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _COMMAND, str(directory.resolve())],
                 stdin=file,
-                stdout=self._answer or subprocess.DEVNULL,
+                stdout=answer or subprocess.DEVNULL,
                 env=os.environ | {"PYTHONPATH": path},
                 process_group=0,
             )
+        self._answer = answer
 
     def take_others(self) -> list[Calibration]:
         """Results of further child sensors in their order, once, when they are there."""
@@ -84,3 +93,4 @@ class ReportProcess:
             with contextlib.suppress(ProcessLookupError):
                 self._process.kill()
             self._process.wait()
+        self._process = self._answer = None

@@ -122,7 +122,7 @@ def describe(calibration: Calibration, seen: Excitation | None = None) -> str:
 
 
 def status_in_words(calibration: Calibration, seen: Excitation | None) -> str:
-    """The status, and what the motion does not show yet: what ``/diagnostics`` says too."""
+    """The status, and which axes are not determined yet: what ``/diagnostics`` says too."""
     missing = what_is_missing(seen, calibration) if seen is not None and seen.n_poses else ""
     return "; ".join(filter(None, (calibration.status.value, missing)))
 

@@ -11,7 +11,7 @@ from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import HandEyeCalibError, InputError, printable
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.frames import Frames, checked_pose
-from hand_eye_calib.io.installed import of_frames, read_installed
+from hand_eye_calib.io.installed import of_frames, open_installed
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.tf import STATIC_TOPIC, message_type
 from hand_eye_calib.session.compare import with_comparison
@@ -49,6 +49,11 @@ class Robot:
     problem : str
         Why the installed extrinsic or the base frame is not known yet; empty if it is, or if
         nothing was asked for.
+
+    Raises
+    ------
+    ConfigError, InputError
+        If what is installed cannot be read.
     """
 
     def __init__(self, node: Node, log: NodeLog, options: NodeConfig, own: _Own) -> None:
@@ -58,6 +63,7 @@ class Robot:
         self._fixed: dict[str, Any] = {}
         self._again_at_s = 0.0
         self.problem = ""
+        self._read = self._of_tf if self._source in ("", TF) else open_installed(self._source)
         if needs_tf(options):
             node.create_subscription(message_type("installed"), STATIC_TOPIC, self._hear, _QOS)
 
@@ -100,10 +106,8 @@ class Robot:
         """Whether the pose in the base frame was asked for and is not there."""
         return calibration.base_frame != self._base_frame
 
-    def _read(self, parent_frame: str, child_frame: str) -> Extrinsic:
-        if self._source == TF:
-            return of_frames(Frames(self._fixed), parent_frame, child_frame, STATIC_TOPIC)
-        return read_installed(self._source, parent_frame, child_frame)
+    def _of_tf(self, parent_frame: str, child_frame: str) -> Extrinsic:
+        return of_frames(Frames(self._fixed), parent_frame, child_frame, STATIC_TOPIC)
 
     def _report(self, problem: str) -> None:
         self.problem = problem

@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.journal import (
+    About,
+    Journal,
     JournalWriter,
     count_poses,
     has_session,
     keep_aside,
-    read_journal,
-    write_about,
 )
 
 # How often what came in is handed to the disk: what a crash can cost.
@@ -37,47 +38,44 @@ _LOCK_NAME = ".calibrator.lock"
 _MOST_WAITING = 240
 
 
-# The engine's state as arrays, and what the thread is told to do with what.
-State = dict[str, np.ndarray]
+# The poses so far by stream, and what the thread is told to do with what.
+Poses = dict[str, Trajectory]
 _Work = Callable[[Any], None]
 
 
-def whole_state(calibrator: Calibrator, others: Mapping[str, Calibrator]) -> State:
-    """The state of the engine, and those of further child sensors under their names."""
-    state = calibrator.state()
-    for name, other in others.items():
-        state |= {f"{name}/{part}": value for part, value in other.state().items()}
-    return state
+def poses_so_far(calibrator: Calibrator, others: Mapping[str, Calibrator]) -> Poses:
+    """What an engine, and those of further child sensors, have of each stream: as it came in, or
+    at the stamps of pairs where some were made.
+    """
+    parent, child = calibrator.snapshot().streams
+    found = {"parent": parent, "child": child}
+    return found | {name: other.snapshot().streams[1] for name, other in others.items()}
 
 
-def resume(
-    directory: Path, calibrator: Calibrator, others: Mapping[str, Calibrator] | None = None
-) -> int:
-    """Bring a calibrator, and those of further child sensors, to where the session in a directory
-    ended; returns how many poses the first one has.
+def give(
+    journal: Journal,
+    directory: Path,
+    calibrator: Calibrator,
+    others: Mapping[str, Calibrator] | None = None,
+) -> None:
+    """Give a calibrator, and those of further child sensors, the session of a directory.
 
     Raises
     ------
     InputError
-        If there is no session, or it is damaged.
+        If they do not take it.
     """
-    others = others or {}
-    checkpoint, events, _ = read_journal(directory)
-    calibrator.restore({part: value for part, value in checkpoint.items() if "/" not in part})
-    for name, other in others.items():
-        beginning = f"{name}/"
-        state = {
-            part.removeprefix(beginning): value
-            for part, value in checkpoint.items()
-            if part.startswith(beginning)
-        }
-        if state:
-            other.restore(state)
-    for kind, stream, *event in events:
-        for own_stream, each in takers(stream, calibrator, others):
-            take = each.add_pose if kind == "pose" else each.set_frame
-            take(own_stream, *event)
-    return sum(calibrator.statistics(stream).received for stream in ("parent", "child"))
+    try:
+        for name, each in {"child": calibrator, **(others or {})}.items():
+            for stream, own_stream in (("parent", "parent"), (name, "child")):
+                if frame := journal.about.get(stream, {}).get("frame"):
+                    each.set_frame(own_stream, frame)
+            rows = np.isin(journal.streams, ["parent", name])
+            streams, poses = journal.streams[rows], journal.poses[rows]
+            own_streams = np.where(streams == "parent", "parent", "child")
+            each.add_poses(own_streams, journal.stamps_ns[rows], poses[:, :3], poses[:, 3:])
+    except InputError as error:
+        raise InputError(f"cannot use the session journal {directory}: {error}") from None
 
 
 def takers(
@@ -111,7 +109,8 @@ class DirectoryLock:
         self._descriptor: int | None = None
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(self.directory / _LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o644)
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
+            self._descriptor = os.open(self.directory / _LOCK_NAME, flags, 0o644)
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.ftruncate(self._descriptor, 0)
             os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
@@ -139,29 +138,28 @@ class SessionJournal:
     Parameters
     ----------
     directory : path
-    state : dict of str to arrays
-        The engine's state to start from.
-    about : mapping
-        Options and topics of the session, in plain values.
-    resumed : bool
-        The state is that of the session in the directory, which need not be kept aside then.
+    about : mapping of str to mappings
+        Of each stream: options, topic, origin.
+    poses : dict of str to Trajectory
+        Of the session so far.
+    resumed : Journal, optional
+        The session in the directory goes on; otherwise it is kept aside.
     """
 
     def __init__(
-        self, directory: Path, state: State, about: Mapping[str, Any], resumed: bool = False
+        self, directory: Path, about: About, poses: Poses, resumed: Journal | None = None
     ) -> None:
         self.directory = Path(directory)
         self.error = ""
         self._notes: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
         self._events: list[tuple[Any, ...]] = []
         self._jobs: queue.Queue[tuple[_Work, Any] | None] = queue.Queue()
-        self._is_full = False
         self._failed_at: float | None = None
-        self._broken = False  # in the thread: the segment must not be written to any more
-        self._is_ours = resumed
+        self._broken = False  # in the thread: the files must not be written to any more
+        self._is_ours = resumed is not None
         self._writer: JournalWriter | None = None
-        self._about = about
-        self._jobs.put((self._open, state))
+        self._about = {stream: dict(known) for stream, known in about.items()}
+        self._jobs.put((self._go_on, resumed) if resumed else (self._open, poses))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
@@ -171,51 +169,43 @@ class SessionJournal:
         """Note a pose that the engine has taken."""
         self._events.append((stream, stamp_ns, position, quat_xyzw))
 
-    def set_frame(self, stream: str, sensor_frame: str) -> None:
-        """Note the name of a stream's sensor frame."""
-        self._events.append((stream, sensor_frame))
+    def describe(self, about: About) -> None:
+        """Note what is known of the streams."""
+        self._jobs.put((self._describe, about))
 
-    def describe(self, about: Mapping[str, Any]) -> None:
-        """Take other options or topics of the session."""
-        self._jobs.put((self._write_about, about))
-
-    def flush(self, make_state: Callable[[], State]) -> None:
+    def flush(self, make_poses: Callable[[], Poses]) -> None:
         """Hand what was noted to the thread; to be called often.
 
         Parameters
         ----------
-        make_state : callable
-            Gives the engine's state, for a new segment.
+        make_poses : callable
+            Gives the poses so far, for a journal that is begun again after an error.
         """
         events, self._events = self._events, []
         if self._failed_at is not None:
             if time.monotonic() - self._failed_at >= _RETRY_S:
                 self._failed_at = None
-                self._jobs.put((self._open, make_state()))
+                self._jobs.put((self._open, make_poses()))
         elif self._jobs.qsize() > _MOST_WAITING:
             self._failed_at = time.monotonic()
             self._fail("the disk does not answer")
-        elif self._is_full:
-            self._is_full = False
-            self._jobs.put((self._write, events))
-            self._jobs.put((self._rotate, make_state()))
         elif events:
             self._jobs.put((self._write, events))
 
-    def begin(self, state: State) -> None:
-        """Start a new session; the one so far is kept aside."""
+    def begin(self) -> None:
+        """Start a new session without poses; the one so far is kept aside."""
         self._jobs.put((self._write, self._events))
         self._events = []
-        self._jobs.put((self._begin, state))
+        self._jobs.put((self._begin, {}))
 
     def notes(self) -> Iterator[tuple[bool, str]]:
         """Lines for the log since the last call, each with whether it is a warning."""
         while not self._notes.empty():
             yield self._notes.get()
 
-    def stop(self, make_state: Callable[[], State], timeout_s: float) -> bool:
+    def stop(self, make_poses: Callable[[], Poses], timeout_s: float) -> bool:
         """Write what is left and end the thread; False if the disk keeps it busy."""
-        self.flush(make_state)
+        self.flush(make_poses)
         self._jobs.put(None)
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
@@ -238,7 +228,7 @@ class SessionJournal:
                 self._fail(error.strerror or str(error))
 
     def _give_up(self, reason: str) -> None:
-        """Leave this segment as it is; a new one is begun later."""
+        """Leave the files as they are; they are begun again later."""
         self._broken = True
         self._failed_at = time.monotonic()
         self._fail(reason)
@@ -248,23 +238,25 @@ class SessionJournal:
         text = f"cannot write the session journal in {self.directory}: {reason}; "
         self._notes.put((True, text + "going on without it: a crash would lose this session"))
 
-    def _open(self, state: State) -> None:
+    def _go_on(self, resumed: Journal) -> None:
+        self._writer = JournalWriter(self.directory, self._about, resumed=resumed)
+
+    def _open(self, poses: Poses) -> None:
         if not self._is_ours:
             self._keep_aside()
         self._is_ours = True
-        self._writer = JournalWriter(self.directory, state)
+        self._writer = JournalWriter(self.directory, self._about, poses)
         self._broken = False
-        write_about(self.directory, self._about)
         if self.error:
             self.error = ""
             text = f"the session journal in {self.directory} is being written again"
             self._notes.put((False, text))
 
-    def _begin(self, state: State) -> None:
+    def _begin(self, poses: Poses) -> None:
         if self._writer is not None and not self._broken:
             self._writer.close()
         self._writer, self._is_ours = None, False
-        self._open(state)
+        self._open(poses)
 
     def _keep_aside(self) -> None:
         """Keep an earlier session, unless there is nothing in it."""
@@ -275,7 +267,9 @@ class SessionJournal:
             return
         aside = keep_aside(self.directory)
         size = (
-            "a damaged session" if poses is None else f"the session before this one ({poses} poses)"
+            "a session that cannot be read"
+            if poses is None
+            else f"the session before this one ({poses} poses)"
         )
         how = (
             f"stop the node, rename that folder to {self.directory.name} and start with the "
@@ -287,15 +281,11 @@ class SessionJournal:
         if self._broken or self._writer is None:
             return
         for event in events:
-            self._writer.add_pose(*event) if len(event) == 4 else self._writer.set_frame(*event)
+            self._writer.add_pose(*event)
         self._writer.flush()
-        self._is_full = self._writer.is_full
 
-    def _write_about(self, about: Mapping[str, Any]) -> None:
-        self._about = about
+    def _describe(self, about: About) -> None:
+        for stream, known in about.items():
+            self._about.setdefault(stream, {}).update(known)
         if not self._broken and self._writer is not None:
-            write_about(self.directory, about)
-
-    def _rotate(self, state: State) -> None:
-        if not self._broken and self._writer is not None:
-            self._writer.rotate(state)
+            self._writer.describe(self._about)

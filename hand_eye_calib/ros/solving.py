@@ -20,7 +20,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.check import CheckResult, can_check
-from hand_eye_calib.engine.checked import mend, set_options, with_options
+from hand_eye_calib.engine.checked import mend, with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 
@@ -141,7 +141,7 @@ def _check(job: Job, calibration: Calibration | None) -> Checked:
         snapshot = with_options(job.snapshot, job.options)
         if calibration is None:
             return Checked(job.session, time.monotonic() - start, snapshot.check())
-        found = mend(calibration, snapshot, set_options(snapshot.config))
+        found = mend(calibration, snapshot, job.options)
     except Exception as error:  # the node reports it
         return Checked(job.session, time.monotonic() - start, failure=_failure(error))
     seconds = time.monotonic() - start

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 from hand_eye_calib.ros.solving import Answer, Checked, Failure, FailureKind, Job, Solved
@@ -21,6 +22,10 @@ _COMMAND = "from hand_eye_calib.ros.solving import main; main()"
 
 # A job is sent so many times before it is given up.
 _ATTEMPTS = 2
+
+# A job hangs that has taken this long (s), and so many times the longest before it: solves grow
+# with their data, but not by that from one to the next, and a slow computer needs seconds for each.
+HANGS_AFTER_S, _HANGS_TIMES = 120.0, 20.0
 
 # A process that has closed its pipes is killed after so long.
 _LAST_BREATH_S = 1.0
@@ -32,7 +37,8 @@ class SolvingProcess:
     """Answers jobs in another process, in the order they were submitted.
 
     The process is started at once and again when it has died; the job in hand is sent again then.
-    It ends with this one, however this one ends.
+    One that hangs is killed and started again; the job in hand has failed then. It ends with this
+    one, however this one ends.
 
     Parameters
     ----------
@@ -49,6 +55,7 @@ class SolvingProcess:
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._stopping = threading.Event()
+        self._hangs_after_s = HANGS_AFTER_S
         self._process = self._started()
         # A daemon: a disk or a pipe that hangs must not keep the node alive.
         self._thread = threading.Thread(target=self._run, name="solving", daemon=True)
@@ -112,16 +119,23 @@ class SolvingProcess:
         """Yield the job's answers; failures in their place if the process dies again and again."""
         answered = 0
         for _ in range(_ATTEMPTS):
+            watch = _Watch(self._process, self._hangs_after_s)
             try:
                 for index, answer in enumerate(self._exchange(job)):
                     if index >= answered:
                         yield answer
                         answered += 1
+                self._hangs_after_s = max(self._hangs_after_s, _HANGS_TIMES * watch.seconds)
                 return
             except _NOT_AN_ANSWER:
                 if self._stopping.is_set():
                     return
-                cause = self._restart()
+                cause = self._restart(watch)
+            finally:
+                watch.cancel()
+            if watch.has_killed:
+                self._hangs_after_s *= 2.0  # it may have been a long solve
+                break
         failure = Failure(FailureKind.UNEXPECTED, f"the solving process {cause}")
         kinds = [Solved, Checked][: 1 + job.check]
         for kind in kinds[answered:]:
@@ -136,18 +150,44 @@ class SolvingProcess:
         for _ in range(1 + job.check):
             yield pickle.load(back)
 
-    def _restart(self) -> str:
+    def _restart(self, watch: "_Watch") -> str:
         """Start the process again; returns how it ended."""
         code = _end(self._process)
         self._process = self._started()
         if self._stopping.is_set():
             self._process.kill()
-        cause = (
-            f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
-        )
+        if watch.has_killed:
+            cause = f"had no answer after {self._hangs_after_s:.3g} s and was killed"
+        elif code < 0:
+            cause = f"was ended by {signal.Signals(-code).name}"
+        else:
+            cause = f"ended with code {code}"
         self._notes.put(f"the solving process {cause}; it was started again")
         self._on_answer()
         return cause
+
+
+class _Watch:
+    """Kills a process that is not done after some seconds, unless it is cancelled."""
+
+    def __init__(self, process: "subprocess.Popen[bytes]", after_s: float) -> None:
+        self.has_killed = False
+        self._process, self._began_s = process, time.monotonic()
+        self._timer = threading.Timer(after_s, self._kill)
+        self._timer.daemon = True
+        self._timer.start()
+
+    @property
+    def seconds(self) -> float:
+        """Time so far."""
+        return time.monotonic() - self._began_s
+
+    def cancel(self) -> None:
+        self._timer.cancel()
+
+    def _kill(self) -> None:
+        self.has_killed = True
+        self._process.kill()
 
 
 def _end(process: "subprocess.Popen[bytes]") -> int:

@@ -1,5 +1,6 @@
-"""The extrinsic on ``/tf_static``: only if it has settled, and never as a second parent."""
+"""The extrinsic on ``/tf_static``: only once the goal is reached, and never as a second parent."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -12,11 +13,12 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.ros.conversions import to_mounting
 from hand_eye_calib.ros.log import NodeLog
-from hand_eye_calib.ros.settled import SettledRule, what_is_unknown
+from hand_eye_calib.text import listing
+from hand_eye_calib.verdict import target_of
 
 STATIC_TOPIC = "/tf_static"
 DYNAMIC_TOPIC = "/tf"
@@ -79,8 +81,8 @@ class FrameTree:
 
 
 class TfBroadcaster:
-    """Broadcasts settled results on ``/tf_static`` while that is switched on, and with them the
-    results of further child sensors.
+    """Broadcasts the results of a session that has reached its goal on ``/tf_static`` while that is
+    switched on, and with them the results of further child sensors.
 
     Parameters
     ----------
@@ -90,7 +92,6 @@ class TfBroadcaster:
 
     def __init__(self, node: Node, log: NodeLog) -> None:
         self._node, self._log = node, log
-        self._rule = SettledRule()
         self._newest: Calibration | None = None
         self._waiting_for = "no result yet"
         self._forbidden = ""
@@ -104,7 +105,7 @@ class TfBroadcaster:
 
     @property
     def is_on(self) -> bool:
-        """Whether settled results are broadcast."""
+        """Whether results are broadcast once the goal is reached."""
         return bool(self._subscriptions)
 
     @property
@@ -121,7 +122,7 @@ class TfBroadcaster:
             return f"refused: {self._forbidden}"
         if self._publisher is not None:
             return "; ".join(["broadcast", *self._forbidden_others.values()])
-        return f"not yet: {self._waiting_for}"
+        return f"not yet: {self._waiting_for or 'the transform tree is looked at first'}"
 
     def switch(self, on: bool) -> None:
         """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
@@ -140,11 +141,11 @@ class TfBroadcaster:
         """Whether this node has broadcast the transform."""
         return transform in self._own
 
-    def add(self, calibration: Calibration, faults: tuple[str, ...]) -> None:
-        """Take the next result of the session."""
+    def add(self, calibration: Calibration, is_done: bool) -> None:
+        """Take the next result of the session, and whether the goal is reached with it."""
         self._newest = calibration
-        self._rule.add(calibration)
-        self._waiting_for = self._rule.what_is_missing(faults)
+        unknown = what_is_unknown(calibration)
+        self._waiting_for = unknown if is_done else "the goal is not reached"
         self._broadcast()
 
     def add_others(self, calibrations: Sequence[Calibration]) -> None:
@@ -165,7 +166,6 @@ class TfBroadcaster:
 
     def restart(self) -> None:
         """Begin a new session: what was broadcast is withdrawn."""
-        self._rule.restart()
         self._newest, self._waiting_for = None, "no result yet"
         self._others, self._forbidden_others = [], {}
         self._withdraw()
@@ -229,7 +229,7 @@ class TfBroadcaster:
             self._node.destroy_subscription(self._subscriptions.pop(DYNAMIC_TOPIC))
         if self._publisher is None:
             self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, _STATIC_QOS)
-            self._log.info("the result has settled: it is broadcast on /tf_static from now on")
+            self._log.info("the result is broadcast on /tf_static from now on")
         others = [each for each in self._others if each.child_frame not in self._forbidden_others]
         # In one message: new listeners get the last one alone.
         transforms = [to_mounting(each) for each in (self._newest, *others)]
@@ -245,6 +245,19 @@ class TfBroadcaster:
                 "the edge on /tf_static is withdrawn; listeners that have heard it keep it until "
                 "they are restarted"
             )
+
+
+def what_is_unknown(calibration: Calibration) -> str:
+    """What a result lacks to be a whole transform that may be used; empty if nothing."""
+    if calibration.verdict is Verdict.DO_NOT_USE:
+        return calibration.headline
+    rough = [
+        dof.name
+        for dof in calibration.observability
+        if not math.isfinite(dof.sigma)
+        or (dof.verdict is not DofVerdict.PRIOR and dof.sigma > target_of(dof.name, calibration))
+    ]
+    return f"{listing(rough)} not known to the target" if rough else ""
 
 
 def message_type(wanted_by: str = "publish_tf") -> type[Any]:

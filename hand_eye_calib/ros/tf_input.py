@@ -11,7 +11,7 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import InputError, printable
-from hand_eye_calib.io.bags.messages import PoseFields
+from hand_eye_calib.io.bags.poses import PoseFields
 from hand_eye_calib.io.transforms import TfSource
 from hand_eye_calib.ros.conversions import to_ns
 from hand_eye_calib.ros.inputs import PoseInput, waiting_messages, with_stamp
@@ -48,6 +48,7 @@ class TfInput(PoseInput):
 
     def configure(self, options: Parameters) -> None:
         super().configure(options)
+        self._measures_as("")
         self._stream.max_gap_s = options.calibrator.max_gap
 
     def discover(self, wanted_type: str) -> None:

@@ -1,10 +1,10 @@
 """Has the mount moved? A result against what is installed, or the results of several recordings.
 
-Stated standard deviations of whole recordings are honest, those of short ones somewhat small; the
-comparison takes them 1.4 times as large (docs/session.md has the measurements). A change is called
-one if an axis differs by more than chance makes of six axes once in 200 comparisons, or all axes
-together by what chance makes of them once in 1,000. An axis is called the same only if a change
-that matters would have been seen.
+Answers of one rig scatter from recording to recording by more than each of them states, as no
+recording shows its own constant errors: each result has that scatter beside its covariance
+(docs/session.md has the measurements). A change is called one if an axis differs by more than
+chance makes of six axes once in 200 comparisons, or all axes together by what chance makes of them
+once in 1,000. An axis is called the same only if a change that matters would have been seen.
 """
 
 from __future__ import annotations
@@ -24,11 +24,15 @@ from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
-from hand_eye_calib.status import amount, listing
+from hand_eye_calib.text import amount, listing
 from hand_eye_calib.verdict import target_of
 
-# Factor on stated variances.
-_CAUTION = 2.0
+# Scatter between recordings of one rig, per axis (m, rad): of flights and hand-held recordings, and
+# of vehicles. A vehicle turns about one axis, and knows the translation along it so many times
+# worse than along the others.
+_SCATTER_IN_HAND = np.repeat([0.008, np.radians(0.12)], 3)
+_SCATTER_OF_VEHICLE = np.repeat([0.020, np.radians(0.10)], 3)
+_VEHICLE = 4.0
 
 # Chance makes a change of so many standard deviations on any of six axes with probability 0.005,
 # and one of this chi-square on all of them together with probability 0.001. (In numbers, because
@@ -224,11 +228,14 @@ def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> 
 
 @dataclass(frozen=True)
 class _Stated:
-    """An extrinsic, its covariance along and about the parent's axes, and its floor there."""
+    """An extrinsic; along and about the parent's axes its covariance, how recordings of its rig
+    scatter, and its floor.
+    """
 
     name: str
     extrinsic: Extrinsic
     covariance: FloatArray
+    scatter: FloatArray
     floor: FloatArray
 
 
@@ -236,7 +243,8 @@ def _stated(given: Calibration | Extrinsic, name: str) -> _Stated:
     if isinstance(given, Extrinsic):
         is_known = bool(np.isfinite(given.covariance).all())
         covariance = given.covariance_in_parent if is_known else _UNKNOWN
-        return _Stated(name, given, covariance, np.zeros((6, 6)))
+        scatter = _scatter(covariance) if given.is_calibration else np.zeros((6, 6))
+        return _Stated(name, given, covariance, scatter, np.zeros((6, 6)))
     X = given.T_parent_child
     found = Extrinsic(X, name, given.covariance, is_calibration=True)
     to_parent = np.kron(np.eye(2), X[:3, :3])
@@ -244,8 +252,15 @@ def _stated(given: Calibration | Extrinsic, name: str) -> _Stated:
     hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability]
     unknown = np.diag(np.where(hidden, np.diag(_UNKNOWN), 0.0))
     is_known = bool(np.isfinite(given.covariance).all())
-    covariance = found.covariance_in_parent if is_known else _UNKNOWN
-    return _Stated(name, found, covariance + unknown, floor)
+    covariance = (found.covariance_in_parent if is_known else _UNKNOWN) + unknown
+    return _Stated(name, found, covariance, _scatter(covariance), floor)
+
+
+def _scatter(covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of the answers of several recordings beside that of one."""
+    variances = np.linalg.eigvalsh(covariance[:3, :3])
+    is_vehicle = variances[2] > _VEHICLE**2 * variances[1]
+    return np.diag((_SCATTER_OF_VEHICLE if is_vehicle else _SCATTER_IN_HAND) ** 2)
 
 
 def _require_same_frames(results: Sequence[Calibration | Extrinsic]) -> None:
@@ -275,10 +290,11 @@ def _limits(
 
 def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Difference:
     values = deviation(second.extrinsic.T_parent_child, first.extrinsic.T_parent_child)
-    covariance = _CAUTION * (first.covariance + second.covariance)
+    scatter, floor = first.scatter + second.scatter, first.floor + second.floor
     if not (first.extrinsic.is_calibration and second.extrinsic.is_calibration):
-        # What is the same in all recordings is in one of both only.
-        covariance = covariance + first.floor + second.floor
+        # What is the same in all recordings is in one of both only: the larger of both, by axis.
+        scatter = floor + np.diag(np.maximum(np.diag(scatter - floor), 0.0))
+    covariance = first.covariance + second.covariance + scatter
     covariance = covariance + 1e-18 * np.eye(6)
     sigmas = np.sqrt(np.diag(covariance))
     visible = (SIGMAS + MORE_SIGMAS) * sigmas

@@ -16,7 +16,9 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.covariance import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.assessment.excitation import MIN_ROTATION, Excitation
-from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.plain import plain
+from hand_eye_calib.text import amount, angle, length
 
 # An axis is known if its standard deviation is below this share of its target ...
 _SHARE = 0.7
@@ -76,9 +78,9 @@ class Progress:
             "will_not_get_there": self.will_not_get_there,
             "axes": {
                 axis: {
-                    "sigma": _finite(sigma),
-                    "target": _finite(target),
-                    "seconds_left": _finite(left_s),
+                    "sigma": plain(sigma),
+                    "target": plain(target),
+                    "seconds_left": plain(left_s),
                 }
                 for axis, sigma, target, left_s in columns
             },
@@ -150,7 +152,9 @@ class Goal:
         ratios = np.where(exempt, 0.0, (calibration.sigmas / wanted) ** 2)
         worst = int(np.argmax(ratios))
         motion_s = seen.motion_s
-        is_within = calibration.status is SolveStatus.OK and not faults and ratios[worst] <= 1.0
+        faults = faults or _errors(calibration)
+        may_be_used = calibration.verdict is not Verdict.DO_NOT_USE and not faults
+        is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
         is_known = bool(is_within) and motion_s >= _least_motion_s(calibration)
         point = _Point(motion_s, 1.0 / max(ratios[worst], 1e-12), is_known)
         # Every result of a robot that stands still is the same result.
@@ -218,19 +222,15 @@ class Goal:
             return f"Done: {_precision(self._best)}. Stop and save.{_floor(self._best, self)}"
         motion = helpful_motion(axis, seen)
         if stuck:
-            return f"This motion will not show {_called(axis)} well enough: {motion}."
+            return f"This motion will not determine {_called(axis)} well enough: {motion}."
         if not np.isfinite(left_s):
-            return f"{_called(axis)} does not show yet: {motion}."
-        return f"Go on for about {_duration(left_s)}: {_called(axis)} is behind, {motion}."
+            return f"{_called(axis)} is not determined yet: {motion}."
+        return f"Go on for about {_duration(left_s)}: {_called(axis)} takes longest, {motion}."
 
     @property
     def targets(self) -> FloatArray:
         """(6,) array: targets of x, y, z (m), roll, pitch, yaw (rad)."""
         return self._targets
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _settled_by_prior(calibration: Calibration) -> BoolArray:
@@ -241,6 +241,12 @@ def _settled_by_prior(calibration: Calibration) -> BoolArray:
 def _out_of_reach(calibration: Calibration) -> BoolArray:
     """Axes that streams of this kind never show."""
     return np.isin(AXES, calibration.out_of_reach)
+
+
+def _errors(calibration: Calibration) -> tuple[str, ...]:
+    """Errors that the result has of its own, as one of positions or rates."""
+    reasons = calibration.reasons
+    return tuple(r.sentence for r in reasons if r.is_finding and r.verdict is Verdict.DO_NOT_USE)
 
 
 def _least_motion_s(calibration: Calibration) -> float:
@@ -290,9 +296,9 @@ def _called(axis: str) -> str:
 
 def _precision(calibration: Calibration) -> str:
     metres, radians = calibration.sigmas[:3].max(), calibration.sigmas[3:].max()
-    told = [f"translation known to {_length(metres)}", f"rotation to {np.degrees(radians):.2g} deg"]
+    told = [f"translation known to {length(metres)}", f"rotation to {angle(radians)}"]
     if calibration.measured == "rotations" and calibration.out_of_reach:
-        told = [f"rotation known to {np.degrees(radians):.2g} deg"]
+        told = [f"rotation known to {angle(radians)}"]
     elif calibration.out_of_reach:
         told = told[:1]
     return f"{', '.join(told)} (one sigma)"
@@ -302,17 +308,13 @@ def _floor(calibration: Calibration, goal: Goal) -> str:
     """A note on errors that more motion does not average out, if they exceed the target."""
     beyond = calibration.sigmas_of_floor > goal.targets
     told = [
-        f"{axis} {_length(sigma) if axis in TRANSLATIONS else f'{np.degrees(sigma):.2g} deg'}"
+        f"{axis} {amount(axis, sigma)}"
         for axis, sigma, is_beyond in zip(AXES, calibration.sigmas_of_floor, beyond, strict=True)
         if is_beyond
     ]
     if not told:
         return ""
     return f" An error of 1 % in the odometry's scale would add {', '.join(told)}."
-
-
-def _length(metres: float) -> str:
-    return f"{1000 * metres:.2g} mm" if metres < 0.0095 else f"{100 * metres:.2g} cm"
 
 
 def _duration(seconds: float) -> str:

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+from hand_eye_calib.text import angle, duration, length
+
 AXES = {"x": "m", "y": "m", "z": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
 
 _AXES_OF_ROTATIONS = {"roll": "x", "pitch": "y", "yaw": "z"}
@@ -106,7 +108,7 @@ class Bar:
             return ""
         if not self.sigma:
             return f"wanted: {self.target}"
-        number, unit = self.sigma.split()
+        number, _, unit = self.sigma.rpartition(" ")
         same = self.target.endswith(f" {unit}")
         return f"± {number if same else self.sigma} of {self.target}"
 
@@ -226,7 +228,7 @@ def _view(name: str, names: tuple[str, ...], node: _Node, now_s: float) -> View:
         values=tuple(_values(node)),
         bars=() if is_watching else tuple(_bar(axis, values) for axis in AXES),
         watched=tuple(_watched(axis, mount) for axis in AXES) if is_watching else (),
-        result=() if is_watching else (_verdict(values.get("verdict", "")), _comparison(values)),
+        result=() if is_watching else tuple(_result(node)),
         reasons=tuple(_numbered(values, "reason")),
         health=tuple(_health(node, silent_s)),
         answer=node.answer if is_answered else None,
@@ -343,35 +345,10 @@ def _number(values: Mapping[str, str], key: str) -> float:
 
 
 def small(value: float, unit: str) -> str:
-    """A standard deviation or a difference, short: in mm, cm, m or deg; empty if not known."""
+    """A standard deviation or a difference, short; empty if not known."""
     if not math.isfinite(value):
         return ""
-    if unit == "rad":
-        return f"{_short(math.degrees(value))} deg"
-    size = abs(value)
-    if size < 0.00995:
-        return f"{_short(1000 * value)} mm"
-    if size < 0.995:
-        return f"{_short(100 * value)} cm"
-    return f"{_short(value)} m"
-
-
-def _short(value: float) -> str:
-    """Two digits, and not more than three decimals."""
-    if abs(value) >= 9.95:
-        return f"{value:.0f}"
-    if abs(value) >= 0.01:
-        return f"{value:.2g}"
-    return f"{value:.3f}" if abs(value) >= 0.0005 else "0"
-
-
-def duration(seconds: float) -> str:
-    """Seconds, minutes or hours."""
-    if seconds >= 86_400:
-        return "more than a day"
-    if seconds >= 5400:
-        return f"{seconds / 3600:.0f} h"
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+    return angle(value) if unit == "rad" else length(value)
 
 
 # ------------------------------------------------------------------------ pose
@@ -419,9 +396,23 @@ def _health(node: _Node, silent_s: float) -> Iterator[Line]:
 _VERDICTS = {"USE": Tone.GOOD, "USE WITH CARE": Tone.ACT, "DO NOT USE": Tone.BAD}
 
 
+# By the first words of the state; what is broadcast begins with other ones.
+_BROADCAST = {"not yet": Tone.BUSY, "refused": Tone.ACT}
+
+
 def _verdict(word: str) -> Line:
     text = word if word in _VERDICTS else "no result yet"
     return Line(_VERDICTS.get(word, Tone.UNKNOWN), "verdict", text)
+
+
+def _result(node: _Node) -> Iterator[Line]:
+    values = node.values("progress")
+    yield _verdict(values.get("verdict", ""))
+    yield _comparison(values)
+    state = node.values("extrinsic").get("broadcast on /tf_static", "off")
+    if state != "off":
+        tone = _BROADCAST.get(state.partition(":")[0], Tone.GOOD)
+        yield Line(tone, "on /tf_static", state)
 
 
 def _numbered(values: Mapping[str, str], name: str) -> Iterator[str]:

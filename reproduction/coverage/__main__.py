@@ -1,7 +1,5 @@
 """``python -m reproduction.coverage``: the coverage study from one command."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys
@@ -16,8 +14,9 @@ from hand_eye_calib.errors import ConfigError
 from reproduction.coverage import study
 from reproduction.coverage.measures import worsened
 from reproduction.coverage.page import page
-from reproduction.coverage.real_sets import real_rigs
 from reproduction.coverage.scores import METHODS
+from reproduction.recordings import real_rigs
+from reproduction.writing import study_parser
 
 _METHODS = tuple(name for name in METHODS if name in KNOWN_METHODS)
 _SEEDS = 10
@@ -25,36 +24,18 @@ _SEEDS = 10
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code: 1 if a row got worse."""
-    parser = argparse.ArgumentParser(
-        prog="python -m reproduction.coverage", description=__doc__, allow_abbrev=False
-    )
-    _add_arguments(parser)
-    return int(exit_code_of(lambda: run(parser.parse_args(argv))))
-
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--data-folder",
-        metavar="DIR",
-        type=Path,
-        help="folder of the real recordings (valimaki2023, euroc_vio, ...). Default: "
-        "$HAND_EYE_CALIB_DATA; without it, simulated recordings only",
-    )
-    parser.add_argument(
-        "--methods", default=",".join(_METHODS), help=f"Default: {','.join(_METHODS)}"
-    )
-    parser.add_argument(
-        "--tables", default=",".join(study.TABLES), help=f"Default: {','.join(study.TABLES)}"
-    )
+    parser = study_parser("reproduction.coverage", __doc__, page="write the page there")
+    for name, known in (("--methods", _METHODS), ("--tables", study.TABLES)):
+        parser.add_argument(name, default=",".join(known), help=f"Default: {','.join(known)}")
     parser.add_argument(
         "--seeds", type=int, default=_SEEDS, help=f"recordings per class. Default: {_SEEDS}"
     )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--page", metavar="FILE", type=Path, help="write the page there")
     parser.add_argument("--rows", metavar="FILE", type=Path, help="write the rows there (JSON)")
     parser.add_argument(
         "--update-baseline", action="store_true", help="store the rows instead of comparing"
     )
+    return int(exit_code_of(lambda: run(parser.parse_args(argv))))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -84,12 +65,12 @@ def _plan(arguments: argparse.Namespace) -> tuple[study.Plan, list[str]]:
         raise ConfigError("--seeds and --jobs must be at least 1")
     if arguments.update_baseline and (methods, tables) != (_METHODS, study.TABLES):
         raise ConfigError("--update-baseline stores all; leave out --methods and --tables")
-    given = arguments.data_folder or os.environ.get("HAND_EYE_CALIB_DATA")
+    given = arguments.data_folder
     plan = study.Plan(methods=methods, tables=tables, seeds=arguments.seeds)
     if not given:
         return plan, ["every real recording"]
-    rigs, absent = real_rigs(Path(given))
-    published = None if "valimaki2023" in absent else Path(given) / "valimaki2023"
+    rigs, absent = real_rigs(given)
+    published = None if "valimaki2023" in absent else given / "valimaki2023"
     return replace(plan, rigs=tuple(rigs), published=published), absent
 
 

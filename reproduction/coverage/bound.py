@@ -6,8 +6,6 @@ world in the other and the drift of odometry. That is a linear state space: its 
 is block tridiagonal, and one band Cholesky factorisation eliminates all but xi.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,21 +27,13 @@ _LEAST_VARIANCE = 1e-18
 
 @dataclass(frozen=True)
 class Side:
-    """One sensor.
-
-    Attributes
-    ----------
-    errors : SensorErrors
-    drawn : DrawnErrors
-    Ts : (N, 4, 4) array
-        True poses.
-    to_error : (6, 6) array
-        Takes its errors into c: Ad(X^-1) of the parent, -I of the child.
-    """
+    """One sensor."""
 
     errors: SensorErrors
     drawn: DrawnErrors
+    # True poses; (N, 4, 4) array.
     Ts: FloatArray
+    # Takes its errors into c: Ad(X^-1) of the parent, -I of the child; (6, 6) array.
     to_error: FloatArray
 
 

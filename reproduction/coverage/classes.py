@@ -1,14 +1,12 @@
 """Simulated recordings of many kinds, each with its Cramer-Rao bound."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.coverage import motions
@@ -20,49 +18,30 @@ _START_NS = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingClass:
-    """How the recordings of a class are made.
+    """How the recordings of a class are made."""
 
-    Attributes
-    ----------
-    motion : callable
-        ``motion(rng, duration_s)`` gives a Motion.
-    duration_s, rate_hz : float
-    parent, child : SensorErrors
-    lever_m : float
-        Length of the extrinsic's translation; its direction is drawn.
-    bound_from : str
-        What the bound rests on.
-    """
-
+    # ``motion(rng, duration_s)``.
     motion: Callable[[np.random.Generator, float], motions.Motion]
     duration_s: float
     rate_hz: float
     parent: SensorErrors
     child: SensorErrors
+    # Length of the extrinsic's translation; its direction is drawn.
     lever_m: float = 0.4
+    # What the bound rests on.
     bound_from: str = "Gaussian noise, exact"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulated:
-    """One recording of a class, with the truth.
-
-    Attributes
-    ----------
-    parent, child : Trajectory
-        As measured.
-    T_parent_child : (4, 4) array
-        The truth.
-    sides : (Side, Side)
-        True poses and drawn errors of both sensors.
-    dt : float
-        Time between poses, s.
-    """
+    """One recording of a class as measured, with the true extrinsic."""
 
     parent: Trajectory
     child: Trajectory
     T_parent_child: FloatArray
+    # True poses and drawn errors of both sensors.
     sides: tuple[Side, Side]
+    # Time between poses, s.
     dt: float
 
     def bound(self) -> FloatArray:
@@ -88,11 +67,10 @@ def simulate(
     to_child = se3.adjoint(se3.inverse(X))
     parent = draw(kind.parent, Ts, twists, dt, parent_rng)
     child = draw(kind.child, Ts @ X, twists @ to_child.T, dt, child_rng)
-    stamps_ns = _START_NS + np.round(times_s * 1e9).astype(np.int64)
     child_poses = se3.inverse(_world(mount_rng)) @ child.poses
     return Simulated(
-        parent=Trajectory(stamps_ns, parent.poses, "parent", "parent_odom"),
-        child=Trajectory(stamps_ns, child_poses, "child", "child_odom"),
+        parent=Trajectory(stamps_ns(times_s), parent.poses, "parent", "parent_odom"),
+        child=Trajectory(stamps_ns(times_s), child_poses, "child", "child_odom"),
         T_parent_child=X,
         sides=(
             Side(kind.parent, parent, Ts, to_child),
@@ -100,6 +78,11 @@ def simulate(
         ),
         dt=dt,
     )
+
+
+def stamps_ns(times_s: FloatArray) -> IntArray:
+    """Stamps (N,) of times since the start of a recording."""
+    return _START_NS + np.round(times_s * 1e9).astype(np.int64)
 
 
 def make(name: str, seed: int) -> Simulated:
@@ -130,7 +113,8 @@ def _white(metres: float, degrees: float) -> SensorErrors:
     return SensorErrors(white=sigmas(metres, degrees))
 
 
-def _slam(tau_s: float, metres: float, degrees: float) -> SensorErrors:
+def slam(tau_s: float, metres: float, degrees: float) -> SensorErrors:
+    """SLAM: errors of a map that last for so long."""
     return _slow(_white(0.008, 0.03), tau_s, metres, degrees, in_world=True)
 
 
@@ -138,8 +122,8 @@ _MOCAP = _white(0.0005, 0.05)
 _STEADY = _white(0.0004, 0.03)
 _HAND = _white(0.003, 0.2)
 _INS = _slow(_white(0.003, 0.01), 25.0, 0.12, 0.05, in_world=True)
-_LIDAR_ODOMETRY = replace(_white(0.01, 0.03), walk_by_metre=sigmas(0.006, 0.012))
-_VIO = replace(_white(0.0008, 0.03), walk=sigmas(0.004, 0.06))
+LIDAR_ODOMETRY = replace(_white(0.01, 0.03), walk_by_metre=sigmas(0.006, 0.012))
+VIO = replace(_white(0.0008, 0.03), walk=sigmas(0.004, 0.06))
 _FLICKER = tuple(GaussMarkov(tau, sigmas(0.002, 0.12)) for tau in (0.1, 0.4, 1.6, 6.4, 25.6))
 
 _Kind = Callable[..., RecordingClass]
@@ -171,7 +155,7 @@ _arm = _recorded_with(motions.arm, 0.15)
 
 CLASSES = {
     "hand_white": _hand(60.0, 20.0, _HAND, _white(0.004, 0.3)),
-    "hand_vio_walk": _hand(90.0, 20.0, _MOCAP, _VIO),
+    "hand_vio_walk": _hand(90.0, 20.0, _MOCAP, VIO),
     "hand_gm_1s": _hand(
         100.0, 20.0, _white(0.001, 0.08), _slow(_white(0.001, 0.08), 1.0, 0.005, 0.3)
     ),
@@ -179,7 +163,7 @@ CLASSES = {
         80.0, 20.0, _slow(_HAND, 0.3, 0.003, 0.2), _slow(_HAND, 0.3, 0.006, 0.4)
     ),
     "hand_flicker": _hand(80.0, 15.0, _MOCAP, replace(_white(0.001, 0.06), slow=_FLICKER)),
-    "car_ins_lidar": _car(240.0, 10.0, _INS, _LIDAR_ODOMETRY),
+    "car_ins_lidar": _car(240.0, 10.0, _INS, LIDAR_ODOMETRY),
     "car_vo_scale": _car(
         240.0,
         10.0,
@@ -191,7 +175,7 @@ CLASSES = {
         180.0,
         10.0,
         replace(_INS, jitter_s=0.001),
-        replace(_LIDAR_ODOMETRY, jitter_s=0.004),
+        replace(LIDAR_ODOMETRY, jitter_s=0.004),
         lever_m=1.0,
     ),
     "car_lever": _car(
@@ -201,7 +185,7 @@ CLASSES = {
         replace(_white(0.01, 0.08), walk_by_metre=sigmas(0.004, 0.008)),
         lever_m=5.0,
     ),
-    "car_two_slams": _car(250.0, 10.0, _slam(12.0, 0.05, 0.08), _slam(8.0, 0.08, 0.12)),
+    "car_two_slams": _car(250.0, 10.0, slam(12.0, 0.05, 0.08), slam(8.0, 0.08, 0.12)),
     "agv_ramps": _agv(
         240.0,
         10.0,
@@ -215,7 +199,7 @@ CLASSES = {
         _slow(_white(0.005, 0.05), 20.0, 0.015, 0.08, in_world=True),
     ),
     "drone_gnss_vio": _drone(
-        150.0, 20.0, _slow(_white(0.004, 0.05), 15.0, 0.15, 0.2, in_world=True), _VIO, lever_m=0.2
+        150.0, 20.0, _slow(_white(0.004, 0.05), 15.0, 0.15, 0.2, in_world=True), VIO, lever_m=0.2
     ),
     "drone_rotation_1deg": _drone(
         100.0, 20.0, _white(0.002, 1.0), replace(_white(0.003, 0.3), walk=sigmas(0.002, 0.02))
@@ -275,7 +259,7 @@ CLASSES = {
     "drone_two_vios": _drone(
         140.0,
         15.0,
-        _VIO,
+        VIO,
         replace(_white(0.001, 0.04), walk=sigmas(0.006, 0.05), scale=(0.005, 20.0)),
         lever_m=0.1,
     ),

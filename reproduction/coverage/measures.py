@@ -1,7 +1,5 @@
 """What the study measures, as rows that can be kept, printed and compared with those of before."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
@@ -34,22 +32,14 @@ _CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of measure.
-
-    Attributes
-    ----------
-    title : str
-    statistic : callable
-        Of the cases, a list of arrays, one per group: recordings of a class, axes of a set.
-    badness : callable
-        Of the statistic; larger is worse.
-    tolerance : float
-        A badness larger by no more than this is no worse.
-    """
+    """A kind of measure."""
 
     title: str
+    # Of the cases, a list of arrays, one per group: recordings of a class, axes of a set.
     statistic: Callable[[list[FloatArray]], float]
+    # Of the statistic; larger is worse.
     badness: Callable[[float], float]
+    # A badness larger by no more than this is no worse.
     tolerance: float
 
 
@@ -106,21 +96,14 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Row:
-    """Measures of one class, rig or cycle by one method.
-
-    Attributes
-    ----------
-    table, name, method : str
-    cases : dict
-        Kind of measure to its cases: key ``group/case`` to value.
-    seconds : float
-        Processor time of one answer, median; not compared.
-    """
+    """Measures of one class, rig or cycle by one method."""
 
     table: str
     name: str
     method: str
+    # Kind of measure to its cases: key ``group/case`` to value.
     cases: Mapping[str, Mapping[str, float]]
+    # Processor time of one answer, median; not compared.
     seconds: float = 0.0
 
     @property

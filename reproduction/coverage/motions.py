@@ -1,7 +1,5 @@
 """Motions of a rigid body with two sensors: hand-held, car, AGV, drone, robot arm."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

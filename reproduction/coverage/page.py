@@ -1,7 +1,5 @@
 """The study as a page: tables, goals, and the comparison with version 0.1."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -67,17 +65,8 @@ class Goal:
 
 
 def page(rows: Sequence[Row], earlier: Mapping[str, Row], absent: Sequence[str], seeds: int) -> str:
-    """The page in Markdown.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-    earlier : mapping
-        Rows of version 0.1 by key.
-    absent : sequence of str
-        Folders of recordings that were not there.
-    seeds : int
-        Recordings per class.
+    """The page in Markdown, from rows, those of version 0.1 by key, folders of recordings that were
+    not there, and the number of recordings per class.
     """
     blocks = [
         "# Certified coverage",
@@ -103,21 +92,23 @@ def _goal_table(found: Mapping[str, Sequence[Goal]]) -> str:
         for goal in reached:
             value = goal.value if goal.is_met else f"**{goal.value}**"
             values.setdefault(goal.text, {})[method] = value
-    cells = [[text, *(by.get(one, "") for one in found)] for text, by in values.items()]
-    return "Bold is missed.\n\n" + markdown_table(["goal", *found], cells)
+    rows = (
+        {"goal": text} | {each: by.get(each, "") for each in found} for text, by in values.items()
+    )
+    return "Bold is missed.\n\n" + markdown_table(rows)
 
 
 def _table(rows: Iterable[Row], columns: Sequence[str]) -> str:
     by_name: dict[str, list[Row]] = {}
     for row in rows:
         by_name.setdefault(row.name, []).append(row)
-    cells = [
-        [row.name, row.method, *(cell(row, kind) for kind in columns), f"{row.seconds:.2f}"]
+    return markdown_table(
+        {"": row.name, "method": row.method}
+        | {KINDS[kind].title: cell(row, kind) for kind in columns}
+        | {"CPU (s)": f"{row.seconds:.2f}"}
         for same in by_name.values()
         for row in same
-    ]
-    titles = [KINDS[kind].title for kind in columns]
-    return markdown_table(["", "method", *titles, "CPU (s)"], cells)
+    )
 
 
 def cell(row: Row, kind: str) -> str:
@@ -131,14 +122,19 @@ def cell(row: Row, kind: str) -> str:
 
 
 def _class_table(seeds: int) -> str:
-    cells = [
-        [name, f"{kind.duration_s:g}", f"{kind.rate_hz:g}", f"{kind.lever_m:g}", kind.bound_from]
+    rows = (
+        {
+            "class": name,
+            "duration (s)": f"{kind.duration_s:g}",
+            "rate (Hz)": f"{kind.rate_hz:g}",
+            "lever arm (m)": f"{kind.lever_m:g}",
+            "bound": kind.bound_from,
+        }
         for name, kind in CLASSES.items()
-    ]
-    header = ["class", "duration (s)", "rate (Hz)", "lever arm (m)", "bound"]
+    )
     return (
         f"{seeds} recordings each; motions in `reproduction/coverage/motions.py`, noise in "
-        f"`reproduction/coverage/classes.py`.\n\n{markdown_table(header, cells)}"
+        f"`reproduction/coverage/classes.py`.\n\n{markdown_table(rows)}"
     )
 
 
@@ -189,14 +185,8 @@ def _class_goals(found: Mapping[str, Row]) -> list[Goal]:
 
 def _truth_goals(found: Mapping[str, Row]) -> list[Goal]:
     together = found[POOLED["known answer"]]
-    reached = [
-        _between(
-            "real 90 % intervals with the floor cover at least 0.85",
-            together.value("covers_floor"),
-            0.85,
-            1.0,
-        )
-    ]
+    text = "real 90 % intervals with the floor cover at least 0.85"
+    reached = [_between(text, together.value("covers_floor"), 0.85, 1.0)]
     stereo = [row for name, row in found.items() if name.startswith("euroc_stereo ")]
     if stereo:
         mm, deg = (max(row.value(kind) for row in stereo) for kind in ("mm", "deg"))
@@ -259,12 +249,11 @@ def _progress(rows: Iterable[Row], earlier: Mapping[str, Row]) -> list[Goal]:
         for kind in ("mm", "deg")
     )
     worst = max(real, key=lambda key: real[key])
+    where = f"{worst[2]}, {worst[0]}"
     return [
         _between("translation error over dnlo of 0.1, at most 0.90", mm, 0, 0.90),
         _between("rotation error over dnlo of 0.1, at most 0.55", deg, 0, 0.55),
-        _between(
-            "no real set worse than 1.3 times", real[worst], 0, 1.3, f"{worst[2]}, {worst[0]}"
-        ),
+        _between("no real set worse than 1.3 times", real[worst], 0, 1.3, where),
     ]
 
 

@@ -1,9 +1,7 @@
 """Answers of the calibration, held against what is known."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +19,8 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.coverage import classes, mixed
 from reproduction.coverage.measures import COVERAGE, Row
-from reproduction.coverage.real_sets import CYCLE, Rig, Truth
-from reproduction.published import load_simulated
-from reproduction.recordings import PARTS, Recording
+from reproduction.published import load_simulated, path_to
+from reproduction.recordings import CYCLE, PARTS, Rig, Truth
 from reproduction.repeats import spread_and_sigma
 
 # Half the width of an interval, in standard deviations.
@@ -45,6 +42,11 @@ class Answer:
     calibration: Calibration | None
     seconds: float
 
+    @property
+    def is_ok(self) -> bool:
+        """Whether there is one, and its status is OK."""
+        return self.calibration is not None and self.calibration.status is SolveStatus.OK
+
 
 def answer(parent: Trajectory, child: Trajectory, options: Mapping[str, Any]) -> Answer:
     """Calibrate, and take the time."""
@@ -56,71 +58,90 @@ def answer(parent: Trajectory, child: Trajectory, options: Mapping[str, Any]) ->
     return Answer(calibration, time.process_time() - start)
 
 
+def _of_rig(rig: Rig, name: str, method: str) -> Answer:
+    recording = rig.recordings[name]
+    return answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
+
+
+def _name_of(rig: Rig, name: str) -> str:
+    return f"{rig.name} {name}".removesuffix(" whole")
+
+
+def _by_case(
+    table: str, name: str, method: str, found: Mapping[str, tuple[Answer, Mapping[str, float]]]
+) -> Row:
+    """A row from the answer and the measures of each case."""
+    cases: dict[str, dict[str, float]] = {}
+    for case, (_, measures) in found.items():
+        for kind, value in measures.items():
+            cases.setdefault(kind, {})[case] = value
+    return Row(table, name, method, cases, _seconds(one for one, _ in found.values()))
+
+
+def _seconds(answers: Iterable[Answer]) -> float:
+    return float(np.median([one.seconds for one in answers]))
+
+
 def class_row(name: str, method: str, seeds: int) -> Row:
     """Errors over the bound, NEES and coverage of a simulated class, fixed or mixed."""
     is_mixed = name in mixed.MIXED
-    cases: dict[str, dict[str, float]] = {}
-    seconds = []
+    found = {}
     for seed in range(seeds):
         recording = (mixed if is_mixed else classes).make(name, seed)
-        found = answer(recording.parent, recording.child, METHODS[method])
-        seconds.append(found.seconds)
-        for kind, value in _class_case(name, recording, found.calibration).items():
-            cases.setdefault(kind, {})[f"{seed}"] = value
-    table = "mixed" if is_mixed else "simulated"
-    return Row(table, name, method, cases, float(np.median(seconds)))
+        one = answer(recording.parent, recording.child, METHODS[method])
+        found[f"{seed}"] = one, _class_case(name, recording, one)
+    return _by_case("mixed" if is_mixed else "simulated", name, method, found)
 
 
-def _class_case(
-    name: str, recording: classes.Simulated, found: Calibration | None
-) -> dict[str, float]:
+def _class_case(name: str, recording: classes.Simulated, found: Answer) -> dict[str, float]:
+    calibration = found.calibration
     if name in classes.REFUSED:
-        return {"refused": float(found is None or bool(found.unobservable()))}
-    if found is None:
+        return {"refused": float(calibration is None or bool(calibration.unobservable()))}
+    if calibration is None:
         return {"answered": 0.0}
-    xi = se3.log(se3.inverse(found.T_parent_child) @ recording.T_parent_child)
+    xi = se3.log(se3.inverse(calibration.T_parent_child) @ recording.T_parent_child)
     bound = recording.bound()
     case = {
-        "answered": float(found.status is SolveStatus.OK),
+        "answered": float(found.is_ok),
         "bound": _squared(xi, bound),
         "bound_t": _squared(xi[:3], bound[:3, :3]),
         "bound_r": _squared(xi[3:], bound[3:, 3:]),
-        "mm": 1e3 * float(np.linalg.norm(xi[:3])),
-        "deg": float(np.degrees(np.linalg.norm(xi[3:]))),
+        **_sizes(xi),
     }
+    if np.isfinite(calibration.covariance).all():
+        case["nees"] = _squared(xi, calibration.covariance)
+    return case | _covers(xi, calibration)
+
+
+def _sizes(xi: FloatArray) -> dict[str, float]:
+    metres, radians = (float(np.linalg.norm(part)) for part in (xi[:3], xi[3:]))
+    return {"mm": 1e3 * metres, "deg": float(np.degrees(radians))}
+
+
+def _covers(xi: FloatArray, found: Calibration) -> dict[str, float]:
+    """The share of the components in their intervals, if there are any."""
     if not np.isfinite(found.covariance).all():
-        return case
+        return {}
     within = np.abs(xi) < _REACH * np.sqrt(np.diag(found.covariance))
-    return case | {"nees": _squared(xi, found.covariance), "covers": float(within.mean())}
+    return {"covers": float(within.mean())}
 
 
 def level_row(folder: Path, dataset: str, level: float | None, method: str) -> Row:
     """Errors on the published trajectories of a level."""
-    cases: dict[str, dict[str, float]] = {}
-    seconds = []
+    found = {}
     for case in load_simulated(folder, [dataset], None if level is None else [level]):
-        found = answer(case.parent, case.child, METHODS[method])
-        seconds.append(found.seconds)
-        for kind, value in _level_case(case.T_parent_child, found.calibration).items():
-            cases.setdefault(kind, {})[case.name] = value
-    name = dataset if level is None else f"{dataset} {level:g}"
-    return Row("levels", name, method, cases, float(np.median(seconds)))
+        one = answer(case.parent, case.child, METHODS[method])
+        found[case.name] = one, _level_case(case.T_parent_child, one)
+    return _by_case("levels", " ".join(path_to(dataset, level)), method, found)
 
 
-def _level_case(truth: FloatArray, found: Calibration | None) -> dict[str, float]:
-    if found is None:
+def _level_case(truth: FloatArray, found: Answer) -> dict[str, float]:
+    if found.calibration is None:
         return {"answered": 0.0}
-    xi = se3.log(se3.inverse(found.T_parent_child) @ truth)
-    e_at, e_aR = absolute_errors(found.T_parent_child, truth)
-    case = {
-        "answered": float(found.status is SolveStatus.OK),
-        "mm": 1e3 * e_at,
-        "deg": float(np.degrees(e_aR)),
-    }
-    if not np.isfinite(found.covariance).all():
-        return case
-    within = np.abs(xi) < _REACH * np.sqrt(np.diag(found.covariance))
-    return case | {"covers": float(within.mean())}
+    xi = se3.log(se3.inverse(found.calibration.T_parent_child) @ truth)
+    e_at, e_aR = absolute_errors(found.calibration.T_parent_child, truth)
+    sizes = {"mm": 1e3 * e_at, "deg": float(np.degrees(e_aR))}
+    return {"answered": float(found.is_ok), **sizes, **_covers(xi, found.calibration)}
 
 
 def _squared(xi: FloatArray, covariance: FloatArray) -> float:
@@ -129,13 +150,11 @@ def _squared(xi: FloatArray, covariance: FloatArray) -> float:
 
 def truth_row(rig: Rig, name: str, method: str) -> Row:
     """Error of a real recording against the known answer, over the axes that both know."""
-    recording = rig.recordings[name]
-    found = answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
-    row_name = f"{rig.name} {name}".removesuffix(" whole")
+    found = _of_rig(rig, name, method)
     cases = {"answered": {"": 0.0}}
     if found.calibration is not None and rig.truth is not None:
         cases = truth_cases(found.calibration, rig.truth)
-    return Row("known answer", row_name, method, cases, found.seconds)
+    return Row("known answer", _name_of(rig, name), method, cases, found.seconds)
 
 
 def truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]]:
@@ -182,40 +201,30 @@ def _by_axis(values: BoolArray, known: BoolArray) -> dict[str, float]:
 
 def refused_row(rig: Rig, name: str, method: str) -> Row:
     """Whether a recording that leaves something open is refused: no answer, or not an OK one."""
-    recording = rig.recordings[name]
-    found = answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
-    is_good = found.calibration is not None and found.calibration.status is SolveStatus.OK
-    row_name = f"{rig.name} {name}".removesuffix(" whole")
-    return Row("refused", row_name, method, {"refused": {"": float(not is_good)}}, found.seconds)
+    found = _of_rig(rig, name, method)
+    cases = {"refused": {"": float(not found.is_ok)}}
+    return Row("refused", _name_of(rig, name), method, cases, found.seconds)
 
 
 def scatter_row(rig: Rig, method: str) -> Row:
     """Scatter between the recordings of a rig over their stated sigmas."""
-    found = [
-        answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
-        for recording in rig.recordings.values()
-    ]
+    found = [_of_rig(rig, name, method) for name in rig.recordings]
     cases = _scatter_cases([one.calibration for one in found])
-    seconds = float(np.median([one.seconds for one in found]))
-    return Row("rig", rig.name, method, {"scatter": cases} if cases else {}, seconds)
+    return Row("rig", rig.name, method, {"scatter": cases} if cases else {}, _seconds(found))
 
 
 def parts_row(rig: Rig, name: str, method: str) -> Row:
     """Scatter between halves and between thirds of a recording over their stated sigmas."""
-    recording, options = rig.recordings[name], {**rig.options, **METHODS[method]}
-    row_name = f"{rig.name} {name}".removesuffix(" whole")
-    whole = answer(recording.parent, recording.child, options)
+    whole = _of_rig(rig, name, method)
     cases: dict[str, float] = {}
-    if whole.calibration is not None:
-        for count, label in PARTS.items():
-            parts = recording.parts(count, whole.calibration.time_offset_s)
-            answers = [_part_answer(part, options) for part in parts]
-            cases |= {f"{label} {key}": value for key, value in _scatter_cases(answers).items()}
-    return Row("parts", row_name, method, {"scatter": cases} if cases else {}, whole.seconds)
-
-
-def _part_answer(part: Recording, options: Mapping[str, Any]) -> Calibration | None:
-    return answer(part.parent, part.child, options).calibration
+    for count, label in PARTS.items() if whole.calibration is not None else ():
+        assert whole.calibration is not None
+        parts = rig.recordings[name].parts(count, whole.calibration.time_offset_s)
+        options = {**rig.options, **METHODS[method]}
+        answers = [answer(part.parent, part.child, options).calibration for part in parts]
+        cases |= {f"{label} {key}": value for key, value in _scatter_cases(answers).items()}
+    measures = {"scatter": cases} if cases else {}
+    return Row("parts", _name_of(rig, name), method, measures, whole.seconds)
 
 
 def _scatter_cases(answers: list[Calibration | None]) -> dict[str, float]:
@@ -234,23 +243,14 @@ def _scatter_cases(answers: list[Calibration | None]) -> dict[str, float]:
 
 def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
     """How far three pairwise answers miss closing, and that over their stated covariances."""
-    found = []
-    for name in CYCLE:
-        rig = rigs[name]
-        recording = rig.recordings["whole"]
-        found.append(answer(recording.parent, recording.child, {**rig.options, **METHODS[method]}))
+    found = [_of_rig(rigs[name], "whole", method) for name in CYCLE]
     good = [one.calibration for one in found if one.calibration is not None]
-    seconds = float(np.median([one.seconds for one in found]))
-    if len(good) < len(found):
-        return Row("cycle", "tango", method, {"answered": {"": 0.0}}, seconds)
-    xi, covariance = misclosure(good)
-    cases = {
-        "answered": 1.0,
-        "mm": 1e3 * float(np.linalg.norm(xi[:3])),
-        "deg": float(np.degrees(np.linalg.norm(xi[3:]))),
-        "chi2": _squared(xi, covariance),
-    }
-    return Row("cycle", "tango", method, {k: {"": v} for k, v in cases.items()}, seconds)
+    cases = {"answered": 0.0}
+    if len(good) == len(found):
+        xi, covariance = misclosure(good)
+        cases = {"answered": 1.0, **_sizes(xi), "chi2": _squared(xi, covariance)}
+    by_kind = {kind: {"": value} for kind, value in cases.items()}
+    return Row("cycle", "tango", method, by_kind, _seconds(found))
 
 
 def misclosure(answers: list[Calibration]) -> tuple[FloatArray, FloatArray]:

@@ -5,8 +5,6 @@ white errors, Gauss-Markov errors fixed to its body or to its world, and errors 
 (random walk, jumps, a drifting scale).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,16 +33,10 @@ class GaussMarkov:
 
 @dataclass(frozen=True)
 class Tail:
-    """Factors on the standard deviation of the white errors, drawn for each pose.
+    """Factors on the standard deviation of the white errors, drawn for each pose."""
 
-    Attributes
-    ----------
-    kind : str
-        ``student``: multivariate t with ``factor`` degrees of freedom. ``spikes``: a share of the
-        poses is worse by a factor. ``bursts``: the same in stretches of 1 s.
-    share, factor : float
-    """
-
+    # ``student``: multivariate t with ``factor`` degrees of freedom. ``spikes``: a share of the
+    # poses is worse by a factor. ``bursts``: the same in stretches of 1 s.
     kind: str
     share: float = 0.0
     factor: float = 1.0
@@ -95,53 +87,35 @@ def mixture_information(share: float, factor: float, dimensions: int = 6) -> flo
 
 @dataclass(frozen=True, kw_only=True)
 class SensorErrors:
-    """What a sensor gets wrong.
+    """What a sensor gets wrong."""
 
-    Attributes
-    ----------
-    white : (6,) array
-        Standard deviations of each pose.
-    walk, walk_by_metre : (6,) arrays
-        Standard deviations of the summed increments after 1 s, and after 1 m.
-    slow : tuple of GaussMarkov
-    scale : (float, float), optional
-        Standard deviation and correlation time (s) of a drifting scale.
-    jitter_s : float
-        Standard deviation of the stamps.
-    tail : Tail, optional
-        Of the white errors.
-    jumps_per_s : float
-    jump : (6,) array
-        Standard deviations of a jump.
-    """
-
+    # Standard deviations of each pose; (6,) array.
     white: FloatArray
+    # Standard deviations of the summed increments after 1 s, and after 1 m; (6,) array.
     walk: FloatArray = field(default_factory=_no_error)
     walk_by_metre: FloatArray = field(default_factory=_no_error)
     slow: tuple[GaussMarkov, ...] = ()
+    # Standard deviation and correlation time (s) of a drifting scale.
     scale: tuple[float, float] | None = None
+    # Standard deviation of the stamps.
     jitter_s: float = 0.0
+    # Of the white errors.
     tail: Tail | None = None
     jumps_per_s: float = 0.0
+    # Standard deviations of a jump; (6,) array.
     jump: FloatArray = field(default_factory=lambda: sigmas(0.1, 0.5))
 
 
 @dataclass(frozen=True)
 class DrawnErrors:
-    """A sensor's poses with one draw of its errors, and what the bound takes as known.
+    """A sensor's poses with one draw of its errors, and what the bound takes as known."""
 
-    Attributes
-    ----------
-    poses : (N, 4, 4) array
-        As measured.
-    white : (N, 6, 6) array
-        Inverse Fisher information of the white errors: their covariance if they are Gaussian.
-    walk : (N-1, 6, 6) array
-        Covariances of the increments' white errors, jumps included.
-    """
-
+    # As measured; (N, 4, 4) array.
     poses: FloatArray
+    # Inverse Fisher information of the white errors: their covariance if they are Gaussian; (N, 6,
+    # 6) array.
     white: FloatArray
+    # Covariances of the increments' white errors, jumps included; (N-1, 6, 6) array.
     walk: FloatArray
 
 

@@ -1,9 +1,7 @@
 """All rows of the study, on several processes, and where they are kept."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,6 @@ from hand_eye_calib.errors import InputError
 from reproduction.coverage.classes import CLASSES
 from reproduction.coverage.measures import POOLED, Row, pooled
 from reproduction.coverage.mixed import MIXED
-from reproduction.coverage.real_sets import CYCLE, Rig
 from reproduction.coverage.scores import (
     class_row,
     cycle_row,
@@ -23,6 +20,7 @@ from reproduction.coverage.scores import (
     truth_row,
 )
 from reproduction.published import LEVELS, SIMULATED
+from reproduction.recordings import CYCLE, Rig
 from reproduction.runner import in_parallel
 
 HERE = Path(__file__).parent
@@ -36,33 +34,22 @@ _DIGITS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What to measure.
-
-    Attributes
-    ----------
-    methods : tuple of str
-    tables : tuple of str
-        Of :data:`TABLES`.
-    rigs : tuple of Rig
-    published : pathlib.Path, optional
-        Folder of the paper's data.
-    seeds : int
-        Recordings per simulated class.
-    """
+    """What to measure."""
 
     methods: tuple[str, ...]
     tables: tuple[str, ...] = TABLES
     rigs: tuple[Rig, ...] = ()
+    # Folder of the paper's data.
     published: Path | None = None
+    # Recordings per simulated class.
     seeds: int = 10
 
 
 def measure(plan: Plan, jobs: int) -> list[Row]:
     """Rows of every class, level, rig and cycle for every method, then the pooled ones."""
     tasks = [task for method in plan.methods for task in _tasks(plan, method)]
-    rows = in_parallel(
-        _measured, [tuple(rest) for table, *rest in tasks if table in plan.tables], jobs
-    )
+    chosen = [tuple(rest) for table, *rest in tasks if table in plan.tables]
+    rows = in_parallel(_measured, chosen, jobs)
     together = [
         pooled(table, name, method, rows)
         for method in plan.methods
@@ -100,7 +87,7 @@ def _tasks(plan: Plan, method: str) -> list[tuple[Any, ...]]:
     return tasks
 
 
-def _measured(function, *arguments) -> Row:  # type: ignore[no-untyped-def]
+def _measured(function: Callable[..., Row], *arguments: Any) -> Row:
     return function(*arguments)
 
 
@@ -125,13 +112,7 @@ def _document(row: Row) -> dict[str, object]:
 
 
 def load(path: Path) -> dict[str, Row]:
-    """Kept rows by their keys.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
+    """Kept rows by their keys. Raises InputError if the file cannot be read."""
     try:
         documents = json.loads(path.read_text(encoding="utf-8"))["rows"]
         rows = [Row(**document) for document in documents]

@@ -1,1 +1,1 @@
-"""The studies of docs/session.md: when to stop, whether the mount has moved, what has moved."""
+"""The studies of docs/measurements.md: when to stop, whether and what has moved."""

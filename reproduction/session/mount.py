@@ -4,8 +4,6 @@ Simulated recordings of ten minutes follow each other, with one extrinsic; the m
 are drawn anew for each. A shift is put into the child's poses.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import resource
@@ -20,7 +18,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 from hand_eye_calib.session.monitor import MountMonitor
 from reproduction.coverage.classes import CLASSES, simulate
-from reproduction.coverage.real_sets import Rig
+from reproduction.recordings import Rig
 
 PIECE_S = 600.0
 # Each of these for as many hours as the others. Not the flat floor, which hides the height, and not
@@ -59,18 +57,13 @@ class Watched:
 
 @dataclass(frozen=True)
 class Delay:
-    """Seconds of driving until a shift was seen; infinite if it was not within half an hour.
-
-    Attributes
-    ----------
-    announced : float
-        The smallest shift along or about that direction that ten minutes of motion would show, as
-        the monitor says beforehand, over the shift.
-    """
+    """Seconds of driving until a shift was seen; infinite if it was not within half an hour."""
 
     kind: str
     size: str
     seconds: float
+    # The smallest shift along or about that direction that ten minutes of motion would show, as the
+    # monitor says beforehand, over the shift.
     announced: float
 
 
@@ -98,9 +91,15 @@ def mount(name: str, seed: int) -> FloatArray:
 
 def feed(monitor: MountMonitor, pairs: PosePairs, chunk_s: float = 1.0) -> None:
     """Give poses to the monitor as they come in, a second at a time."""
+    for _ in _fed(monitor, pairs, chunk_s):
+        pass
+
+
+def _fed(monitor: MountMonitor, pairs: PosePairs, chunk_s: float = 1.0) -> Iterator[None]:
     edges = np.flatnonzero(np.diff(pairs.stamps_ns // round(chunk_s * _SECOND_NS), prepend=-1))
     for first, last in zip(edges, [*edges[1:], len(pairs)], strict=True):
         monitor.add(pairs[first:last])
+        yield
 
 
 def false_alarms(name: str, hours: float) -> Watched:
@@ -156,9 +155,7 @@ def _delay(
     alarms = monitor.alarms
     for pairs in parts:
         moved = PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, pairs.Ts_cw_c @ se3.exp(xi))
-        edges = np.flatnonzero(np.diff(moved.stamps_ns // _SECOND_NS, prepend=-1))
-        for first, last in zip(edges, [*edges[1:], len(moved)], strict=True):
-            monitor.add(moved[first:last])
+        for _ in _fed(monitor, moved):
             if monitor.alarms > alarms:
                 return Delay(kind, size, float(monitor.seconds - before), announced)
     return Delay(kind, size, np.inf, announced)

@@ -2,14 +2,11 @@
 the shift found where the comparison says that it would be?
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +17,7 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.session.compare import Change, Difference, compare
-from reproduction.coverage.real_sets import Rig
+from reproduction.recordings import Rig
 from reproduction.writing import markdown_table
 
 # Injected along and about each axis of the parent sensor.
@@ -31,63 +28,42 @@ INJECTED = {"3 cm": 0.03, "0.3 deg": float(np.radians(0.3))}
 class Pair:
     """Two recordings of one rig: how they compare as they are, and with a shift of each axis in the
     second one.
-
-    Attributes
-    ----------
-    rig, names : str
-    difference : Difference
-    announced, found : (6,) bool arrays
-        Whether such a shift would be seen, as the comparison says, and whether it was.
     """
 
     rig: str
     names: str
     difference: Difference
+    # Whether such a shift would be seen, as the comparison says, and whether it was (6,).
     announced: BoolArray
     found: BoolArray
 
 
-def solve(rigs: Sequence[Rig], path: Path) -> dict[str, dict[str, Calibration]]:
-    """Results of every recording, and of its halves if it is cut, by rig; those in the file are
-    taken from there.
-    """
-    known = _load(path)
-    for rig in rigs:
-        for name, recording in rig.recordings.items():
-            if name in known.get(rig.name, {}):
-                continue
-            result = calibrate(recording.parent, recording.child, method="auto", **rig.options)
-            _keep(path, rig.name, name, result)
-            halves = recording.parts(2, result.time_offset_s) if rig.is_cut else []
-            for number, half in enumerate(halves, start=1):
-                try:
-                    part = calibrate(half.parent, half.child, method="auto", **rig.options)
-                except HandEyeCalibError:
-                    continue
-                _keep(path, f"{rig.name} {name}, halves", f"half {number}", part)
-    return _load(path)
+def solved(rig: Rig, name: str) -> dict[str, dict[str, Any]]:
+    """Plain results of a recording, and of its halves if it is cut: group to name to result."""
+    recording = rig.recordings[name]
+    result = calibrate(recording.parent, recording.child, method="auto", **rig.options)
+    halves: dict[str, Any] = {}
+    for number, half in enumerate(
+        recording.parts(2, result.time_offset_s) if rig.is_cut else (), 1
+    ):
+        try:
+            part = calibrate(half.parent, half.child, method="auto", **rig.options)
+        except HandEyeCalibError:
+            continue
+        halves[f"half {number}"] = part.to_dict()
+    return {rig.name: {name: result.to_dict()}, f"{rig.name} {name}, halves": halves}
 
 
-def _keep(path: Path, rig: str, name: str, result: Calibration) -> None:
-    document = {"rig": rig, "name": name, "result": result.to_dict()}
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(document, allow_nan=False) + "\n")
-
-
-def _load(path: Path) -> dict[str, dict[str, Calibration]]:
-    found: dict[str, dict[str, Calibration]] = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
-        document = json.loads(line)
-        result = Calibration.from_dict(document["result"])
-        found.setdefault(document["rig"], {})[document["name"]] = result
-    return found
-
-
-def compared(results: Mapping[str, Mapping[str, Calibration]]) -> list[Pair]:
-    """Every pair of results of a rig."""
+def compared(results: Iterable[Mapping[str, Mapping[str, Any]]]) -> list[Pair]:
+    """Every pair of results of a group."""
+    groups: dict[str, dict[str, Calibration]] = {}
+    for of_recording in results:
+        for group, named in of_recording.items():
+            found = {name: Calibration.from_dict(plain) for name, plain in named.items()}
+            groups.setdefault(group, {}).update(found)
     return [
-        _pair(rig, first, second, named)
-        for rig, named in results.items()
+        _pair(group, first, second, named)
+        for group, named in groups.items()
         for first, second in itertools.combinations(named, 2)
     ]
 
@@ -116,22 +92,23 @@ def _moved(result: Calibration, axis: int, size: float) -> Calibration:
 
 def table(pairs: Sequence[Pair]) -> str:
     """A row per pair."""
-    header = ("rig", "recordings", "chi2 of 6", "verdict", "would be seen from", "as said found")
-    return markdown_table(header, [_row(pair) for pair in pairs])
+    return markdown_table(map(_row, pairs))
 
 
-def _row(pair: Pair) -> tuple[object, ...]:
+def _row(pair: Pair) -> dict[str, object]:
     visible = pair.difference.visible
     centimetres, degrees = 100 * visible[:3].max(), np.degrees(visible[3:].max())
     announced = int(pair.announced.sum())
-    seen_from = f"{degrees:.2f} deg"
-    if np.isfinite(centimetres):
-        seen_from = f"{centimetres:.1f} cm, {seen_from}"
-    return (
-        pair.rig, pair.names, f"{pair.difference.chi2:.1f}", pair.difference.verdict.value,
-        seen_from,
-        f"{int((pair.announced & pair.found).sum())} of {announced}" if announced else "-",
-    )  # fmt: skip
+    as_said = f"{int((pair.announced & pair.found).sum())} of {announced}"
+    along = f"{centimetres:.1f} cm, " if np.isfinite(centimetres) else ""
+    return {
+        "rig": pair.rig,
+        "recordings": pair.names,
+        "chi2 of 6": f"{pair.difference.chi2:.1f}",
+        "verdict": pair.difference.verdict.value,
+        "would be seen from": f"{along}{degrees:.2f} deg",
+        "as said found": as_said if announced else "-",
+    }
 
 
 def summary(pairs: Sequence[Pair]) -> str:

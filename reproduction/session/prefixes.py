@@ -5,10 +5,8 @@ sees who watches a live session.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +16,12 @@ from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.calibration import Calibration
-from hand_eye_calib.config import CalibratorConfig, prior_fields
-from hand_eye_calib.engine.offline import whole_snapshot
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.offline import prior_fields, whole_snapshot
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from reproduction.coverage.classes import CLASSES, Simulated, simulate
-from reproduction.coverage.real_sets import Rig
+from reproduction.coverage.classes import CLASSES, simulate
+from reproduction.recordings import Rig
 
 # Class, and duration (s): five kinds of motion with two kinds of errors each.
 KINDS = {
@@ -38,25 +36,16 @@ _STEPS = 24
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """A recording with a known answer.
-
-    Attributes
-    ----------
-    name, kind : str
-    parent, child : Trajectory
-    truth : (4, 4) array
-    truth_sigmas : (6,) array
-        How well it is known, m and rad.
-    options : dict
-        What a user would give.
-    """
+    """A recording with a known answer."""
 
     name: str
     kind: str
     parent: Trajectory
     child: Trajectory
     truth: FloatArray
+    # How well it is known (6,), m and rad.
     truth_sigmas: FloatArray = field(default_factory=lambda: np.zeros(6))
+    # What a user would give.
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -77,7 +66,8 @@ def simulated(seeds: int) -> Iterator[Recorded]:
     for kind, classes in KINDS.items():
         for name, duration_s in classes.items():
             for seed in range(seeds * 2 // len(classes)):
-                made = _simulated(name, duration_s, seed)
+                key = (7, seed, sorted(CLASSES).index(name))
+                made = simulate(dataclasses.replace(CLASSES[name], duration_s=duration_s), key)
                 yield Recorded(
                     name=f"{name} {seed}",
                     kind=kind,
@@ -85,11 +75,6 @@ def simulated(seeds: int) -> Iterator[Recorded]:
                     child=made.child,
                     truth=made.T_parent_child,
                 )
-
-
-def _simulated(name: str, duration_s: float, seed: int) -> Simulated:
-    kind = dataclasses.replace(CLASSES[name], duration_s=duration_s)
-    return simulate(kind, (7, seed, sorted(CLASSES).index(name)))
 
 
 def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
@@ -109,12 +94,11 @@ def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
             )
 
 
-def steps(recorded: Recorded, method: str) -> list[Step]:
+def steps(recorded: Recorded) -> list[Step]:
     """Calibrations of the prefixes; those that cannot be solved are left out."""
-    options = dict(recorded.options)
-    config = CalibratorConfig(
-        **{"method": method, **prior_fields(options.pop("prior", {})), **options}
-    )
+    options: dict[str, Any] = dict(recorded.options)
+    options |= prior_fields(options.pop("prior", {}))
+    config = CalibratorConfig(**options)
     start_ns, end_ns = recorded.parent.stamps_ns[[0, -1]]
     child = recorded.child
     # Clocks of their own: the child's prefix is the same share of its recording.
@@ -153,13 +137,12 @@ def _until(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
     )
 
 
-def save(path: Path, recorded: Recorded, found: Sequence[Step]) -> None:
-    """Append the steps of a recording to a file, one line of JSON."""
-    document = {
+def solved(recorded: Recorded) -> dict[str, Any]:
+    """The steps of a recording as plain values."""
+    return {
         "name": recorded.name,
         "kind": recorded.kind,
         "truth_sigmas": [None if np.isinf(s) else s for s in recorded.truth_sigmas.tolist()],
-        "duration_s": float(np.ptp(recorded.parent.stamps_ns)) * 1e-9,
         "steps": [
             {
                 "end_s": step.end_s,
@@ -168,40 +151,32 @@ def save(path: Path, recorded: Recorded, found: Sequence[Step]) -> None:
                 "rotation": step.seen.rotation.tolist(),
                 "motion_s": step.seen.motion_s,
             }
-            for step in found
+            for step in steps(recorded)
         ],
     }
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(document, allow_nan=False) + "\n")
 
 
 @dataclass(frozen=True)
 class Kept:
-    """The steps of a recording, from a file."""
+    """The steps of a recording, from plain values."""
 
     name: str
     kind: str
-    duration_s: float
     truth_sigmas: FloatArray
     steps: tuple[Step, ...]
 
-
-def load(path: Path) -> list[Kept]:
-    """What :func:`save` has written."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    return [_kept(json.loads(line)) for line in lines]
-
-
-def _kept(document: Mapping[str, Any]) -> Kept:
-    nothing = LeverArms.of(np.zeros((1, 3, 3)))
-    steps = tuple(
-        Step(
-            each["end_s"],
-            np.array(each["error"]),
-            Calibration.from_dict(each["calibration"]),
-            Excitation(2, np.array(each["rotation"]), nothing, 0.0, each["motion_s"]),
+    @classmethod
+    def from_plain(cls, document: Mapping[str, Any]) -> Kept:
+        """What :func:`solved` has given."""
+        nothing = LeverArms.of(np.zeros((1, 3, 3)))
+        steps = tuple(
+            Step(
+                each["end_s"],
+                np.array(each["error"]),
+                Calibration.from_dict(each["calibration"]),
+                Excitation(2, np.array(each["rotation"]), nothing, 0.0, each["motion_s"]),
+            )
+            for each in document["steps"]
         )
-        for each in document["steps"]
-    )
-    sigmas = np.array([np.inf if s is None else s for s in document["truth_sigmas"]])
-    return Kept(document["name"], document["kind"], document["duration_s"], sigmas, steps)
+        sigmas = np.array([np.inf if s is None else s for s in document["truth_sigmas"]])
+        return cls(document["name"], document["kind"], sigmas, steps)

@@ -5,16 +5,17 @@ changed outside the directory of the results.
 """
 
 import contextlib
+import functools
 import io
 import os
 import tempfile
 from pathlib import Path
 
-from fuzz import bag_inputs, text_inputs
+from fuzz import text_inputs
 from fuzz.chaos import Chaos
 
-from hand_eye_calib.cli import batch
-from hand_eye_calib.cli.batch.store import stored
+from hand_eye_calib.cli.batch.results import stored
+from hand_eye_calib.cli.batch.tasks import read_batch
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -22,6 +23,8 @@ from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.journal import count_poses, has_session, read_journal
 from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.ros.session_journal import give
+from hand_eye_calib.simulation.drive import simulate_drive
 
 SOLVE = ("--method", "park", "--reference", "B3", "--scale", "1", "--time-offset", "0")
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -52,18 +55,29 @@ def command(*arguments):
     return code
 
 
+@functools.cache
+def whole_bag(suffix):
+    """Bytes of a storage file, to be damaged."""
+    storage = {".mcap": "mcap", ".db3": "sqlite3", ".bag": "rosbag1"}[suffix]
+    drive = simulate_drive(0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / ("bag.bag" if suffix == ".bag" else "bag")
+        write_bag(path, {"/a": (drive.parent, ODOMETRY), "/b": (drive.child, ODOMETRY)}, storage)
+        return (path if path.is_file() else path / f"bag{suffix}").read_bytes()
+
+
 # ---- what is done with each kind
 
 
 def bag(chaos, folder, name):
     """List a bag, and calibrate from it."""
     path = folder / name
-    if name.endswith(".mcap"):
-        path.write_bytes(bag_inputs.mcap(chaos))
-    elif name.endswith(".bag"):
-        path.write_bytes(bag_inputs.rosbag1(chaos))
-    else:
-        bag_inputs.write_sqlite3(chaos, path)
+    data = whole_bag(path.suffix)
+    if chaos.random.random() < 0.5:
+        data = chaos.flipped(data, chaos.choice([1, 10, 100]))
+    if chaos.random.random() < 0.5:
+        data = data[: chaos.random.randrange(len(data))]
+    path.write_bytes(data)
     listed = command("replay", path, "--list", "--json")
     topics = ("--parent-topic", "/a", "--child-topic", "/b", "--child-frame", "b")
     saved = ("--out", folder / "out") if chaos.random.random() < 0.01 else ()
@@ -118,7 +132,7 @@ def batches(chaos, folder):
     (folder / "bag.mcap").touch()
     path.write_bytes(text_inputs.yaml_text(chaos, "batch"))
     try:
-        tasks = batch.read_batch(path, {}, {})
+        tasks = read_batch(path, {}, {})
     except HandEyeCalibError as error:
         if "\n" in str(error):
             raise Finding(f"an error of several lines: {error}") from None
@@ -144,41 +158,25 @@ def metadata(chaos, folder):
 
 def journal(chaos, folder):
     """Resume a session."""
-    (folder / "session-000001.journal").write_bytes(text_inputs.journal(chaos))
+    for stream in ("parent", "child"):
+        (folder / f"{stream}.tum").write_bytes(text_inputs.journal(chaos, stream))
     return resume(folder)
 
 
 def resume(folder):
     """Resume the session in a folder."""
     if not has_session(folder):
-        raise Finding("the segment is not seen")
+        raise Finding("the journal is not seen")
     count_poses(folder)
     calibrator = Calibrator(CalibratorConfig(reference="B3", method="park"))
     try:
-        state, events, _ = read_journal(folder)
-        calibrator.restore(state)
-        for event in events:
-            if event[0] == "pose":
-                calibrator.add_pose(*event[1:])
-            else:
-                calibrator.set_frame(*event[1:])
+        give(read_journal(folder), folder, calibrator)
         calibrator.estimate()
     except HandEyeCalibError as error:
         if "\n" in str(error):
             raise Finding(f"an error of several lines: {error}") from None
         return 1
     return 0
-
-
-def again(path, folder):
-    """Read a file that was once found to do what must not be."""
-    (folder / path.name).write_bytes(path.read_bytes())
-    if path.suffix == ".journal":
-        (folder / path.name).rename(folder / "session-000001.journal")
-        return resume(folder)
-    if path.suffix == ".yaml":
-        return command("info", folder / path.name)
-    return command("replay", folder / path.name, "--list", "--json")
 
 
 FORMATS = {
@@ -231,7 +229,7 @@ def exercise(name, seed, folder):
     changed = {path for path in snapshot(case) if "/inside/" not in path} - before.keys()
     changed |= {path for path in before if snapshot(case).get(path) != before[path]}
     inputs = ("bag", "a%31#?.db3", "parent", "child", "times", "file.yaml", "extrinsic.yaml",
-              "fleet.yaml", "session-000001.journal")  # fmt: skip
+              "fleet.yaml", "parent.tum", "child.tum")  # fmt: skip
     changed |= {path.name for path in (case / "inside").iterdir()
                 if path.stem != "bag" and path.name not in (*inputs, "out")}  # fmt: skip
     if changed:

@@ -2,14 +2,11 @@
 
 import faulthandler
 import shutil
-from pathlib import Path
 
 import pytest
-from fuzz.inputs import FORMATS, again, exercise
+from fuzz.inputs import FORMATS, exercise
 
 SEEDS = {name: range(1, 25) for name in FORMATS}
-# Files that were found to do what must not be.
-FOUND = sorted((Path(__file__).parent / "found").iterdir())
 
 
 @pytest.fixture(autouse=True)
@@ -30,8 +27,3 @@ def test_structured_inputs_end_in_an_answer_or_in_one_line(tmp_path, name):
     # The fuzzer makes both: inputs that are read and inputs that are refused.
     if name != "metadata":  # whatever that says, the bag beside it is read
         assert {code == 0 for code in codes} == {True, False}, codes
-
-
-@pytest.mark.parametrize("path", FOUND, ids=lambda path: path.name)
-def test_files_that_once_failed(tmp_path, path):
-    again(path, tmp_path)

@@ -111,10 +111,16 @@ def fed_at_once(names, stamps_ns, poses, cuts):
 
 
 def assert_same_state(first, second):
-    first, second = first.state(), second.state()
-    assert first.keys() == second.keys()
-    for name in first:
-        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+    """The same statistics, pairs and poses that wait."""
+    for stream in ("parent", "child"):
+        assert first.statistics(stream) == second.statistics(stream)
+    first, second = first.snapshot(), second.snapshot()
+    assert first.paired_at == second.paired_at
+    for name in ("kept", "buffered_parent", "buffered_child"):
+        found, expected = (vars(getattr(each, name)) for each in (first, second))
+        assert found.keys() == expected.keys()
+        for part, values in expected.items():
+            np.testing.assert_array_equal(found[part], values, err_msg=f"{name} {part}")
 
 
 NUMBERS = st.one_of(st.floats(-5, 5), st.sampled_from([np.nan, np.inf, 1.7e308]))
@@ -172,7 +178,7 @@ def test_many_poses_of_a_long_session_are_the_same_as_one_by_one():
         min(
             statistics.refused_late,
             statistics.dropped_unpaired,
-            len(one_by_one.state()["kept.stamps_ns"]),
+            len(one_by_one.snapshot().kept),
         )
         > 10
     )

@@ -3,15 +3,20 @@
 import numpy as np
 import pytest
 import real_data
+from motions import as_trajectory
 from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
-from hand_eye_calib.calibration import DofVerdict, SolveStatus
+from hand_eye_calib.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.checks.check import check_streams
+from hand_eye_calib.checks.lengths import check_lengths
 from hand_eye_calib.checks.streams import tidy
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
+
+SENSORS = ("lidar", "radar")
 
 
 def rpy_deg(T):
@@ -102,6 +107,14 @@ class TestBoreas:
         z = result.observability[2]
         assert "z" in result.unobservable() or abs(result.T_parent_child[2, 3] - 0.21) < 4 * z.sigma
 
+    def test_the_files_themselves_are_read_by_one_convention(self):
+        folder = real_data.data_folder() / "boreas" / "boreas-2021-08-05-13-34"
+        files = [{"path": folder / f"{name}_poses.csv", "format": AUTO} for name in SENSORS]
+        result = calibrate(*(reading.trajectory for reading in read_trajectory_files(files)))
+        error = np.linalg.inv(real_data.BOREAS_TRUTH) @ result.T_parent_child
+        assert np.linalg.norm(error[:3, 3]) < 0.001
+        assert np.degrees(np.linalg.norm(Rotation.from_matrix(error[:3, :3]).as_rotvec())) < 0.01
+
     def test_microseconds_among_nanoseconds_are_noticed(self):
         recording = real_data.boreas()
         as_read = Trajectory(recording.parent.stamps_ns // 1000, recording.parent.poses)
@@ -109,8 +122,43 @@ class TestBoreas:
         assert (finding.code, finding.stream) == ("stamp_unit", "parent")
         assert "microseconds" in finding.what
 
+    def test_two_streams_from_one_ins_are_not_independent(self):
+        recording = real_data.boreas()
+        findings = check_streams(recording.parent, recording.child).findings
+        assert [finding.code for finding in findings] == ["not_independent"]
+
+
+@pytest.mark.parametrize(
+    "recording",
+    [
+        real_data.boreas,
+        lambda: real_data.tango_pairs()[0],
+        lambda: real_data.robot_arm("complete"),
+        lambda: real_data.kitti("short"),
+    ],
+)
+def test_lengths_in_millimetres_are_noticed_whatever_carries_the_sensors(recording):
+    parent = recording().parent
+    assert check_lengths(parent) == []
+    assert [finding.code for finding in check_lengths(parent.scaled(1000.0))] == ["lengths"]
+
 
 class TestArms:
+    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("interval_s", [0.2, 1.0, 5.0])
+    def test_stops_have_no_error(self, seed, interval_s):
+        parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.stops(seed))
+        result = calibrate(parent, child)
+        assert [f["code"] for f in result.findings if f["severity"] == "error"] == []
+        assert result.verdict is not Verdict.DO_NOT_USE
+
+    @pytest.mark.parametrize("interval_s", [0.2, 1.0, 5.0])
+    def test_a_fixed_camera_beside_an_arm_may_have_inverse_poses(self, interval_s):
+        parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.eye_to_hand())
+        (finding,) = calibrate(parent, child).findings
+        assert (finding["code"], finding["severity"]) == ("inverse_both", "warning")
+        assert finding["confidence"] == "possible"
+
     def test_the_axis_of_one_axis_motion_is_named(self):
         recording = real_data.robot_arm("sim")
         result = calibrate(recording.parent, recording.child, time_offset="estimate")
@@ -148,6 +196,36 @@ class TestArms:
             np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:], "parent"
         )
         assert "duplicates" in [finding.code for finding in findings]
+
+
+def test_the_height_above_a_flat_drive_is_unobservable_with_an_estimated_offset():
+    recording = real_data.zxl19_raw()
+    result = calibrate(recording.parent, recording.child, time_offset="estimate")
+    assert result.unobservable() == ["z"]
+    assert result.T_method[2, 3] > 1.0  # what noise gives
+
+
+_AT_1_HZ = {
+    "tango": lambda: real_data.tango_pairs()[0],
+    "zxl19": lambda: real_data.zxl19(2, "LO"),
+    "primesense": real_data.primesense,
+    "arm": lambda: real_data.robot_arm("complete"),
+    "kitti": lambda: real_data.kitti("long"),
+}
+
+
+@pytest.mark.parametrize("rig", _AT_1_HZ)
+def test_streams_of_1_hz_have_no_error(rig):
+    recording = _AT_1_HZ[rig]()
+    child = real_data.thinned(recording.corrected(), 1.0)
+    inside = (child.stamps_ns >= recording.parent.stamps_ns[0]) & (
+        child.stamps_ns <= recording.parent.stamps_ns[-1]
+    )
+    child = child[inside]
+    parent = Trajectory(child.stamps_ns, recording.parent.at(child.stamps_ns))
+    for faster in (parent, recording.parent):
+        found = calibrate(faster, child).findings
+        assert [each["code"] for each in found if each["severity"] == "error"] == []
 
 
 def test_kitti_long_scale():

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from ros_harness import NodeProcess, Peer, free_domain
+from ros_harness import NodeProcess, Peer, free_domain, stop_forks
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -13,6 +13,7 @@ def _quick_discovery():
             "FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("discovery.xml"))
         )
         yield
+        stop_forks()
 
 
 @pytest.fixture
@@ -25,8 +26,9 @@ def start_node(domain, tmp_path):
     """Function that starts the node with ROS arguments such as ``"-p method:=dnl"``."""
     running = []
 
-    def start(*ros_arguments):
-        running.append(NodeProcess(domain, tmp_path / f"node{len(running)}.log", ros_arguments))
+    def start(*ros_arguments, before=""):
+        log = tmp_path / f"node{len(running)}.log"
+        running.append(NodeProcess(domain, log, ros_arguments, before))
         return running[-1]
 
     yield start

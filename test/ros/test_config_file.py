@@ -16,7 +16,9 @@ PROJECT = Path(__file__).resolve().parents[2]
 HEADER = """\
 # Parameters of the node calibrator: all there are, at their defaults.
 # Numbers with a decimal point must keep it: to ROS, 2 and 2.0 are of different types.
+# time_offset and scale are not set here: what is set counts as known, even if it is the default.
 """
+ONLY_SHOWN = ("time_offset", "scale")
 
 
 def fields():
@@ -37,7 +39,7 @@ def expected_file():
         indent = " " * (6 if outer else 4)
         comment = textwrap.wrap(comment_of(field), width=120 - len(indent) - 2)
         lines += [f"{indent}# {line}" for line in comment]
-        lines.append(f"{indent}{key}: {value_of(field)}")
+        lines.append(f"{indent}{'# ' * (key in ONLY_SHOWN)}{key}: {value_of(field)}")
     return "\n".join(lines) + "\n"
 
 
@@ -76,7 +78,9 @@ def flat(mapping, prefix=""):
 def test_config_file_has_every_parameter_with_its_default_and_type():
     document = yaml.safe_load((PROJECT / "config" / "calibrator.yaml").read_text(encoding="utf-8"))
     written = dict(flat(document["/**"]["ros__parameters"]))
-    wanted = {option_name(field): field.default for field in fields()}
+    wanted = {
+        option_name(field): field.default for field in fields() if field.name not in ONLY_SHOWN
+    }
     assert written == wanted
     assert {name: type(value) for name, value in written.items()} == {
         name: type(value) for name, value in wanted.items()

@@ -13,8 +13,8 @@ from hand_eye_calib import config
 from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import POSE_TYPES
-from hand_eye_calib.io.bags.parts import PART_TYPES, MessageReader
+from hand_eye_calib.io.bags.messages import MESSAGE_TYPES
+from hand_eye_calib.io.bags.topics import MessageReader
 from hand_eye_calib.ros import conversions
 from hand_eye_calib.ros.log import NodeLog
 
@@ -42,7 +42,7 @@ def calibration(covariance, T_parent_child=T_PARENT_CHILD):
 
 def test_every_pose_type_of_the_options_can_be_read():
     assert {*conversions.MESSAGES, "auto"} == set(config.POSE_TYPES)
-    assert set(conversions.MESSAGES) == {*POSE_TYPES, *PART_TYPES}
+    assert set(conversions.MESSAGES) == set(MESSAGE_TYPES)
 
 
 def test_control_characters_in_names_of_frames_are_escaped():
@@ -158,7 +158,6 @@ def test_covariance_is_about_the_fixed_axes_of_the_parent():
 
 
 def test_a_fix_becomes_metres_from_the_first():
-    pytest.importorskip("pymap3d")
     read = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
     fixes = [NavSatFix(latitude=60.0 + k / 1000, longitude=25.0) for k in range(2)]
     fixes[0].header.frame_id = "antenna"

@@ -14,6 +14,7 @@ import pytest
 import hand_eye_calib
 from hand_eye_calib.cli import demo
 from hand_eye_calib.cli.demo import DRIVE, TOPICS
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros.player import Player
@@ -44,7 +45,12 @@ def errors(T_parent_child, truth):
     )
 
 
-def test_demo_recovers_the_truth_offline_and_live(tmp_path, domain):
+def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
+    tmp_path, domain, capsys
+):
+    (tmp_path / "demo_bag").mkdir()
+    (tmp_path / "demo_bag" / "metadata.yaml").write_text("of an earlier demo")
+    (tmp_path / "mine.txt").write_text("not of a demo")
     done = run("-m", "hand_eye_calib", "demo", "--out", tmp_path, "--json", domain=domain)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
@@ -72,35 +78,22 @@ def test_demo_recovers_the_truth_offline_and_live(tmp_path, domain):
 
     # The replay command finds the same in the bag that is left behind.
     topics = ["--parent-topic", TOPICS["parent"], "--child-topic", TOPICS["child"]]
-    replayed = run("-m", "hand_eye_calib", "replay", document["bag"], *topics, "--json")
-    assert replayed.returncode == 0, replayed.stderr
-    np.testing.assert_array_equal(json.loads(replayed.stdout)["T_parent_child"]["matrix"], offline)
+    assert main(["replay", document["bag"], *topics, "--json"]) == 0
+    replayed = json.loads(capsys.readouterr().out)
+    np.testing.assert_array_equal(replayed["T_parent_child"]["matrix"], offline)
+    left = ["demo_bag", "mine.txt", "node.log", "report.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
 
-
-def test_demo_prints_both_directions_and_replaces_an_earlier_demo(tmp_path, domain):
-    (tmp_path / "demo_bag").mkdir()
-    (tmp_path / "demo_bag" / "metadata.yaml").write_text("of an earlier demo")
-    (tmp_path / "mine.txt").write_text("not of a demo")
-    done = run("-m", "hand_eye_calib", "demo", "--out", tmp_path, "--seed", 3, domain=domain)
-    assert done.returncode == 0, done.stderr
-    for title in (
-        "Pose of camera in lidar",
-        "Pose of lidar in camera",
-        "Error of the pose of camera in lidar",
-    ):
-        (line,) = [
-            number for number, line in enumerate(done.stdout.splitlines()) if line.startswith(title)
-        ]
-        rows = [row.strip() for row in done.stdout.splitlines()[line + 1 : line + 4]]
+    # Without --json, both directions are in a text.
+    text = demo._text(document)
+    lines = text.splitlines()
+    titles = ("Pose of camera in lidar", "Pose of lidar in camera")
+    for title in (*titles, "Error of the pose of camera in lidar"):
+        (line,) = [number for number, line in enumerate(lines) if line.startswith(title)]
+        rows = [row.strip() for row in lines[line + 1 : line + 4]]
         assert any(row.startswith("replay of the bag") for row in rows)
         assert any(row.startswith("live node") for row in rows)
-    assert "Offline and online differ by" in done.stdout
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "demo_bag",
-        "mine.txt",
-        "node.log",
-        "report.html",
-    ]
+    assert "Offline and online differ by" in text
 
 
 def test_demo_without_ros_says_what_to_install(tmp_path):

@@ -188,7 +188,7 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, heard):
     assert status.level == DiagnosticStatus.ERROR
 
 
-def test_repeated_stamps_gaps_and_rates_are_counted(start_node, peer, heard):
+def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_node, peer, heard):
     start_node(*RELIABLE_INPUTS, "-p max_gap:=0.3")
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
@@ -206,6 +206,9 @@ def test_repeated_stamps_gaps_and_rates_are_counted(start_node, peer, heard):
     assert (found["messages"], found["poses taken"]) == ("55", "50")
     assert (found["longest gap (s)"], found["gaps above max_gap"]) == ("1.100", "1")
     assert float(found["rate (Hz)"]) > 0
+    assert peer.set_enabled(False).success
+    disabled = "not accepting poses: call ~/set_enabled"
+    wait(peer, heard, "extrinsic", lambda status: disabled in status.message)
 
 
 def test_simulated_time_that_does_not_run_is_said(start_node, peer, heard):
@@ -222,17 +225,6 @@ def test_a_journal_that_cannot_be_written_is_an_error(start_node, peer, heard, t
     start_node(f"-p output_directory:={tmp_path / 'a_file' / 'out'}")
     status = wait(peer, heard, "journal", lambda status: status.level == DiagnosticStatus.ERROR)
     assert "a crash would lose the session" in status.message
-
-
-def test_disabled_is_said(start_node, peer, heard):
-    start_node()
-    assert peer.set_enabled(False).success
-    wait(
-        peer,
-        heard,
-        "extrinsic",
-        lambda status: "not accepting poses: call ~/set_enabled" in status.message,
-    )
 
 
 class TestStreamChecks:

@@ -101,11 +101,29 @@ def test_a_monitor_without_what_is_installed_does_not_start(start_node):
     assert node.log == ("calibrator: monitor needs installed: what the mount is watched against\n")
 
 
-def test_what_cannot_be_read_is_said(start_node, peer, status, tmp_path):
+@pytest.mark.parametrize("monitor", ["true", "false"])
+def test_a_wrong_path_to_what_is_installed_ends_the_start_in_one_line(
+    start_node, tmp_path, monitor
+):
+    path = tmp_path / "robot.urdf"
+    node = start_node(f"-p monitor:={monitor}", f"-p installed:={path}")
+    assert node.wait() == 1
+    assert node.log == (
+        "calibrator: what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or "
+        "six numbers in m and rad: installed must be X Y Z ROLL PITCH YAW; "
+        f"got '{path}'\n"
+    )
+
+
+def test_frames_that_are_not_in_what_is_installed_are_said(start_node, peer, status, tmp_path):
+    (tmp_path / "robot.urdf").write_text(
+        '<robot name="r"><link name="base"/><link name="lidar"/><joint name="j" type="fixed">'
+        '<parent link="base"/><child link="lidar"/></joint></robot>'
+    )
     start_node("-p monitor:=true", f"-p installed:={tmp_path / 'robot.urdf'}", *RELIABLE_INPUTS)
     early, _ = status("mount", lambda each: True)
     assert early.message == "no poses yet"
     peer.feed(peer.publishers(), *drive(100))
     mount, _ = status("mount", lambda each: "what is installed is not known" in each.message)
     assert mount.level == DiagnosticStatus.WARN
-    assert "file that exists" in mount.message
+    assert "no frame 'camera'" in mount.message

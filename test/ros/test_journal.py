@@ -46,7 +46,7 @@ def test_a_killed_session_goes_on_where_it_ended(start_node, peer, tmp_path):
     assert "60 poses" in answer.message
     assert "camera in lidar" in answer.message
     peer.spin_until(lambda: heard, "the resumed result")
-    np.testing.assert_allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-6)
+    np.testing.assert_allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3)
 
 
 def test_an_earlier_session_is_kept_aside_once_and_an_empty_one_is_not(start_node, peer, tmp_path):
@@ -84,11 +84,10 @@ def test_nothing_to_resume_and_a_damaged_journal_begin_a_new_session(start_node,
     node = start_node(*QUIET, *into(tmp_path, "resume"))
     node.wait_for_log(f"no session to resume in {tmp_path / 'journal'}: a new one begins")
     assert node.stop()[0] == 0
-    (segment,) = (tmp_path / "journal").glob("*.journal")
-    segment.write_bytes(b"something else")
+    (tmp_path / "journal" / "parent.tum").write_text("something else")
     node = start_node(*QUIET, *into(tmp_path, "resume"))
     node.wait_for_log(
-        "cannot resume: ", "damaged from its first byte", "a damaged session is kept in"
+        "cannot resume: ", "damaged from its first byte", "a session that cannot be read is kept in"
     )
     wait_written(peer, tmp_path, 0)
 
@@ -110,9 +109,9 @@ def test_a_signal_saves_the_newest_result_and_the_whole_journal(start_node, peer
     code, _ = node.stop(number)
     assert (code, "Traceback" in node.log) == (0, False), node.log
     assert f"result saved to {tmp_path}" in node.log
-    np.testing.assert_allclose(load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    np.testing.assert_allclose(load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-3)
     assert count_poses(tmp_path / "journal") == 240
-    assert read_journal(tmp_path / "journal")[2] == 0
+    assert read_journal(tmp_path / "journal").lost_bytes == 0
 
 
 def test_results_of_an_earlier_session_are_kept_when_they_are_replaced(start_node, peer, tmp_path):
@@ -174,17 +173,12 @@ def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(
     node = start_node(*QUIET, *into(blocked / "out"))
     node.wait_for_log("cannot write the session journal in")
     assert peer.solve(peer.publishers(), *drive())[0].success
+    refused = peer.trigger("save")
+    assert (refused.success, str(blocked) in refused.message) == (False, True)
+    assert peer.trigger("solve").success
     code, _ = node.stop()  # the result is lost, which the exit code says
     assert (code, "Traceback" in node.log) == (1, False), node.log
     assert "cannot save to" in node.log
-
-
-def test_the_journal_follows_the_output_directory(start_node, peer, tmp_path):
-    start_node(*QUIET)
-    peer.feed(peer.publishers(), *drive(30))
-    peer.spin_until(lambda: "30 poses" in peer.trigger("solve").message, "all poses")
-    assert peer.set_parameter("output_directory", str(tmp_path / "out")).successful
-    wait_written(peer, tmp_path / "out", 60)
 
 
 def fingerprints(folder):
@@ -212,16 +206,21 @@ def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):
     third.wait_for_log("no pose yet on /parent_odom")
 
 
-def test_a_directory_in_use_is_refused_as_a_parameter(start_node, peer, tmp_path):
+def test_the_journal_follows_the_output_directory_but_not_into_one_in_use(
+    start_node, peer, tmp_path
+):
     node = start_node(*QUIET)
+    peer.feed(peer.publishers(), *drive(30))
+    peer.spin_until(lambda: "30 poses" in peer.trigger("solve").message, "all poses")
     assert peer.set_parameter("output_directory", str(tmp_path / "mine")).successful
+    wait_written(peer, tmp_path / "mine", 60)
     lock = DirectoryLock(tmp_path / "theirs")
     result = peer.set_parameter("output_directory", str(tmp_path / "theirs"))
     assert not result.successful
     assert f"is in use by another calibrator (process {os.getpid()})" in result.reason
     lock.release()
     assert peer.set_parameter("output_directory", str(tmp_path / "theirs")).successful
-    wait_written(peer, tmp_path / "theirs", 0)
+    wait_written(peer, tmp_path / "theirs", 60)
     DirectoryLock(tmp_path / "mine").release()  # left to others
     assert node.stop()[0] == 0
 
@@ -235,6 +234,9 @@ def test_participants_choose_a_directory_below_that_of_the_start_only(start_node
         refused = peer.set_parameter("output_directory", str(tmp_path / outside))
         assert not refused.successful, outside
         assert f"must be {tmp_path / 'mine'} or below it" in refused.reason
+    refused = peer.set_parameter("output_directory", "~nosuchuser/x")
+    assert (refused.successful, "~nosuchuser/x" in refused.reason) == (False, True)
+    assert peer.parameter("output_directory") == str(tmp_path / "mine")
     assert peer.set_parameter("output_directory", str(tmp_path / "mine" / "truck")).successful
     wait_written(peer, tmp_path / "mine" / "truck", 0)
     assert not list((tmp_path / "elsewhere").iterdir())
@@ -253,21 +255,6 @@ def test_a_directory_that_is_removed_is_reported_and_the_journal_comes_back(
     node.wait_for_log("cannot write the session journal in", "No such file or directory")
     wait_written(peer, tmp_path / "out", 240)
     node.wait_for_log("is being written again")
-
-
-def test_a_copy_of_a_segment_is_not_taken_for_one(start_node, peer, tmp_path):
-    node = start_node(*QUIET, *into(tmp_path))
-    peer.feed(peer.publishers(), *drive(30))
-    wait_written(peer, tmp_path, 60)
-    node.process.kill()
-    node.wait()
-    (segment,) = (tmp_path / "journal").glob("*.journal")
-    shutil.copy(segment, segment.with_name("session-000001 (copy).journal"))
-    again = start_node(*QUIET, *into(tmp_path, "resume"))
-    again.wait_for_log("60 poses")
-    assert peer.trigger("reset").success
-    wait_written(peer, tmp_path, 0)
-    assert "cannot write" not in again.log
 
 
 def test_an_earlier_result_that_is_no_text_is_kept_and_replaced(start_node, peer, tmp_path):

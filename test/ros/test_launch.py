@@ -13,8 +13,6 @@ from ros_harness import PATIENCE_S
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 
-pytest.importorskip("launch_ros")
-
 PROJECT = Path(__file__).resolve().parents[2]
 
 # Of every parameter a value that is not its default, as typed on the command line and as a ROS
@@ -51,7 +49,19 @@ GIVEN = {
     "output_directory": ("{folder}/out", "{folder}/out"),
     "journal": ("off", "off"),
     "publish_tf": ("true", True),
+    "parent_measures": ("poses", "poses"),
+    "child_measures": ("poses", "poses"),
+    "parent_tf": ("odom:lidar", "odom:lidar"),
+    "child_tf": ("vision:camera", "vision:camera"),
+    "other_children": ("2", 2),
+    "report": ("false", False),
+    "installed": ("1 0 0 0 0 0", "1 0 0 0 0 0"),
+    "base_frame": ("base_link", "base_link"),
+    "monitor": ("true", True),
 }
+
+# monitor watches one child sensor.
+TOGETHER = [set(GIVEN) - {"monitor"}, {"monitor", "installed"}]
 
 LAUNCH = """
 import sys
@@ -71,6 +81,7 @@ sys.exit(service.run())
 @pytest.fixture
 def prefix(tmp_path):
     """An installed package, as far as launch looks."""
+    pytest.importorskip("launch_ros")
     marker = tmp_path / "share" / "ament_index" / "resource_index" / "packages" / "hand_eye_calib"
     program = tmp_path / "lib" / "hand_eye_calib" / "calibrator"
     for path in (marker, program):
@@ -120,10 +131,12 @@ def start_launch(prefix, domain, tmp_path):
                 os.killpg(process.pid, signal.SIGKILL)
 
 
-def test_every_parameter_is_an_argument_and_arrives(start_launch, peer, tmp_path):
-    texts = {name: text.format(folder=tmp_path) for name, (text, _) in GIVEN.items()}
+@pytest.mark.parametrize("names", TOGETHER, ids=["most", "monitor"])
+def test_every_parameter_is_an_argument_and_arrives(start_launch, peer, tmp_path, names):
+    given = {name: GIVEN[name] for name in names}
+    texts = {name: text.format(folder=tmp_path) for name, (text, _) in given.items()}
     start_launch(*(f"{name}:={text}" for name, text in texts.items()))
-    for name, (_, value) in GIVEN.items():
+    for name, (_, value) in given.items():
         expected = value.format(folder=tmp_path) if isinstance(value, str) else value
         assert peer.parameter(name) == expected, name
 
@@ -158,4 +171,5 @@ def test_debug_is_of_this_node_only(start_launch, peer):
 
 
 def test_every_parameter_is_tried():
+    assert set().union(*TOGETHER) == set(GIVEN)
     assert set(GIVEN) == {*CalibratorConfig().to_options(), *NodeConfig().to_options()}

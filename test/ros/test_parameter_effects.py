@@ -136,11 +136,15 @@ def solve_period_is_used(start_node, peer, tmp_path):
 
 def output_directory_is_used(start_node, peer, tmp_path):
     start_node(*QUIET)
+    assert "output_directory" in peer.trigger("save").message
     peer.solve(peer.publishers(), *drive())
     assert not peer.trigger("save").success
     assert peer.set_parameter("output_directory", str(tmp_path / "out")).successful
-    assert peer.trigger("save").success
+    saved = peer.trigger("save")
+    assert saved.success, saved.message
     assert (tmp_path / "out" / "extrinsic.yaml").exists()
+    assert peer.trigger("reset").success
+    assert "no result" in peer.trigger("save").message
 
 
 def journal_is_used(start_node, peer, tmp_path):
@@ -168,7 +172,7 @@ def others_are_solved_together(start_node, peer, tmp_path):
     node.wait_for_log("first pose on /child2_odom")
     peer.solve(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
     assert peer.trigger("save").message.endswith("rig/ follows")
-    node.wait_for_text("rig/report.html\n")
+    node.wait_for_log("rig/report.html\n", may_have_ended=True)
     for name, T in (("camera", T_PARENT_CHILD), ("rear", T_PARENT_REAR)):
         found = hec.load(tmp_path / "out/rig" / name)
         np.testing.assert_allclose(found.T_parent_child, T, atol=1e-3)
@@ -187,7 +191,7 @@ def report_is_used(start_node, peer, tmp_path):
     assert answer.success
     code, _ = node.stop()
     assert code == 0
-    node.wait_for_text("report.html follows", "wrote", "report.html\n")
+    node.wait_for_log("report.html follows", "wrote", "report.html\n", may_have_ended=True)
     page = (out / "report.html").read_text()
     assert "/parent_odom" in page
     saved = yaml.safe_load((out / "extrinsic.yaml").read_text())

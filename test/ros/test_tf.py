@@ -9,15 +9,14 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from motions import as_trajectory, child_of, feed, wandering_poses
-from ros_harness import LATCHED, RELIABLE_INPUTS, drive
+from ros_harness import LATCHED, RELIABLE_INPUTS, drive, matrix
 
-from hand_eye_calib.calibration import DofVerdict
+from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros import tf
 from hand_eye_calib.ros.log import NodeLog
-from hand_eye_calib.ros.settled import RESULTS, SPAN_S, SettledRule
 from hand_eye_calib.ros.tf import FrameTree
 
 
@@ -62,46 +61,30 @@ def calibration():
     return calibrator.estimate()
 
 
-class TestSettledRule:
+class TestWhatIsUnknown:
     @staticmethod
-    def later(calibration, k, shift_sigmas=0.0):
-        shift = np.zeros(6)
-        shift[2] = shift_sigmas * np.sqrt(calibration.covariance[2, 2])
-        step_ns = round(k * SPAN_S / (RESULTS - 1) * 1e9)
-        return dataclasses.replace(
-            calibration,
-            T_parent_child=calibration.T_parent_child @ se3.exp(shift),
-            stamp_ns=calibration.stamp_ns + step_ns,
-        )
+    def with_z(calibration, verdict, sigma):
+        dofs = [*calibration.observability]
+        dofs[2] = dataclasses.replace(dofs[2], verdict=verdict, sigma=sigma)
+        return dataclasses.replace(calibration, observability=tuple(dofs))
 
-    def rule(self, calibration, shifts):
-        made = SettledRule()
-        for k, shift in enumerate(shifts):
-            made.add(self.later(calibration, k, shift))
-        return made
+    @pytest.mark.parametrize(
+        ("verdict", "sigma", "expected"),
+        [
+            (DofVerdict.OBSERVED, 0.01, ""),
+            (DofVerdict.WEAK, 0.06, "z not known to the target"),
+            (DofVerdict.PRIOR, 0.06, ""),
+            (DofVerdict.UNOBSERVABLE, np.inf, "z not known to the target"),
+        ],
+    )
+    def test_each_axis_is_known_to_its_target_or_by_hand(
+        self, calibration, verdict, sigma, expected
+    ):
+        assert tf.what_is_unknown(self.with_z(calibration, verdict, sigma)) == expected
 
-    def test_results_that_agree_settle(self, calibration):
-        assert self.rule(calibration, [0, 0.5, -0.4, 0.3, 0]).what_is_missing() == ""
-
-    def test_too_few_do_not(self, calibration):
-        missing = self.rule(calibration, [0] * (RESULTS - 1)).what_is_missing()
-        assert missing == f"{RESULTS - 1} results over 8 s, it takes {RESULTS} over 10 s"
-
-    def test_results_that_wander_do_not(self, calibration):
-        assert "differ" in self.rule(calibration, [0, 1.5, 0, 0, 0]).what_is_missing()
-
-    def test_a_weak_axis_does_not(self, calibration):
-        rule = self.rule(calibration, [0] * RESULTS)
-        weak = dataclasses.replace(calibration.observability[2], verdict=DofVerdict.WEAK)
-        dofs = (*calibration.observability[:2], weak, *calibration.observability[3:])
-        rule.add(dataclasses.replace(self.later(calibration, RESULTS), observability=dofs))
-        assert rule.what_is_missing() == "z only weakly observable"
-
-    def test_faulty_streams_do_not_and_a_new_session_begins_anew(self, calibration):
-        rule = self.rule(calibration, [0] * RESULTS)
-        assert "the child's lengths" in rule.what_is_missing(("the child's lengths are feet",))
-        rule.restart()
-        assert rule.what_is_missing() == "no result yet"
+    def test_a_result_that_may_not_be_used_is_not_broadcast(self, calibration):
+        failed = dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED)
+        assert tf.what_is_unknown(failed).startswith("DO NOT USE: the solver did not converge")
 
 
 class TestNode:
@@ -166,19 +149,30 @@ class TestNode:
 
     ON = ("-p publish_tf:=true", "-p solve_period:=0.5", *RELIABLE_INPUTS)
 
-    def test_a_settled_result_is_broadcast_and_a_reset_withdraws_it(
-        self, start_node, peer, listen, robot
+    def test_what_is_done_is_broadcast_to_who_stops_then_and_a_reset_withdraws_it(
+        self, start_node, peer, listen, robot, said
     ):
         robot(("base_link", "lidar"))
         heard, extrinsics = listen(), peer.listen(TransformStamped, "extrinsic")
-        start_node(*self.ON)
+        start_node("-p publish_tf:=true", "-p solve_period:=1000.0", *RELIABLE_INPUTS)
 
         def edges(found):
             return [each for each in found if each.child_frame_id == "camera"]
 
-        self.play(peer, lambda: edges(heard), "the edge")
+        def state(part="extrinsic", key="broadcast on /tf_static"):
+            return {pair.key: pair.value for pair in said[part].values}[key]
+
+        publishers, poses = peer.publishers(), drive(450)
+        peer.solve(publishers, *(part[:400] for part in poses))
+        waiting = "not yet: the goal is not reached"
+        peer.spin_until(lambda: said and state() == waiting, "the state")
+        peer.solve(publishers, *(part[400:] for part in poses))
+        peer.spin_until(lambda: state("progress", "done") == "true", "the goal")
+        # Nothing comes in any more: the two results that reached the goal suffice.
+        peer.spin_until(lambda: edges(heard), "the edge")
+        peer.spin_until(lambda: state() == "broadcast", "the state")
         assert edges(heard)[0].header.frame_id == "lidar"
-        assert len(extrinsics) >= RESULTS  # those before were not broadcast
+        assert matrix(edges(heard)[0]) == pytest.approx(matrix(extrinsics[-1]))
         assert peer.trigger("reset").success
         late = listen()
         peer.spin_until(lambda: late, "the robot's edge")
@@ -210,7 +204,7 @@ class TestNode:
 
     @pytest.fixture
     def broadcaster(self, kind, peer, calibration, monkeypatch):
-        """In the peer's own node, switched on, with a result that has settled."""
+        """In the peer's own node, switched on, without looking at the tree first."""
         monkeypatch.setattr(tf, "LOOK_S", 0.0)
         made = tf.TfBroadcaster(peer.node, NodeLog(peer.node.get_logger()))
         made.switch(True)
@@ -219,8 +213,7 @@ class TestNode:
 
     @staticmethod
     def settle(broadcaster, calibration):
-        for k in range(RESULTS):
-            broadcaster.add(TestSettledRule.later(calibration, k), ())
+        broadcaster.add(calibration, is_done=True)
 
     @staticmethod
     def frames_of_new_listener(peer, listen, until):
@@ -232,9 +225,8 @@ class TestNode:
         rear, side = (
             dataclasses.replace(calibration, child_frame=name) for name in ("rear", "side")
         )
-        weak = dataclasses.replace(calibration.observability[2], verdict=DofVerdict.WEAK)
-        dofs = (*calibration.observability[:2], weak, *calibration.observability[3:])
-        broadcaster.add_others([rear, dataclasses.replace(side, observability=dofs)])
+        rough = TestWhatIsUnknown.with_z(side, DofVerdict.WEAK, 0.06)
+        broadcaster.add_others([rear, rough])
         assert broadcaster.state == "not yet: no result yet"
         self.settle(broadcaster, calibration)
         child = calibration.child_frame

@@ -162,8 +162,9 @@ def test_white_errors_have_the_covariance_of_the_model(centre):
         both = disturbed(parent, 2 * run, sigma_m, sigma_rad)
         return both, disturbed(child, 2 * run + 1, sigma_m, sigma_rad)
 
+    runs = 1000
     samples = np.array(
-        [linearised(streams_of(*noisy(run))).residuals.ravel() for run in range(4000)]
+        [linearised(streams_of(*noisy(run))).residuals.ravel() for run in range(runs)]
     )
     streams = streams_of(parent, child)
     model = NoiseModel((), "time", centre, Extent(0.1, 0.1, 0.6))
@@ -181,10 +182,12 @@ def test_white_errors_have_the_covariance_of_the_model(centre):
     expected = Covariance(space, np.log(variances)).products(identity)
     found = np.cov(samples.T)
     scale = np.sqrt(np.diag(expected))
-    # A correlation of 4000 samples has a standard error of 0.016; 900 of them stay in 5 sigma.
-    np.testing.assert_allclose(
-        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.08
-    )
+    apart = (found - expected) / np.outer(scale, scale)
+    # The standard error of each correlation is at most this, that of their RMS far smaller: 900 of
+    # them stay in 5 of it, and all together in 1.3.
+    error = np.sqrt(2 / runs)
+    assert np.abs(apart).max() < 5 * error
+    assert np.sqrt(np.mean(apart**2)) < 1.3 / np.sqrt(runs)
 
 
 def disturbed_about_origin(poses, seed, sigma_m, sigma_rad):
@@ -204,12 +207,19 @@ def noisy_drive(seed, n_poses=150, white=(0.004, 0.006), drift=(0.0, 0.0)):
     return disturbed(parent, 2 * seed + 5, *white), disturbed(np.array(poses), 2 * seed + 6, *white)
 
 
+@pytest.fixture(scope="module")
+def solved_drives():
+    """Drives with white noise, and the solution of each."""
+    drives = [noisy_drive(seed) for seed in range(24)]
+    return [(drive, estimator.solve(stamps(150), *drive)) for drive in drives]
+
+
 @pytest.mark.parametrize(
     ("white", "drift"), [((0.004, 0.006), (0.0, 0.0)), ((0.001, 0.001), (0.004, 0.003))]
 )
 def test_the_noise_levels_are_recovered(white, drift):
     found = []
-    for seed in range(12):
+    for seed in range(8):
         parent, child = noisy_drive(seed, white=white, drift=drift)
         levels = estimator.solve(stamps(150), parent, child, systematic=("none",)).noise
         found.append(
@@ -266,8 +276,7 @@ def test_errors_that_last_are_found_and_told_apart(kind):
         kinds.append(strongest.kind)
         assert strongest.sigma == pytest.approx(0.01, rel=0.5)
         assert strongest.tau_s == pytest.approx(2.0, rel=0.8)
-        xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
-        squared.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
+        squared.append(squared_distance(solution))
     assert kinds.count(kind) >= 5
     assert 2.0 < np.median(squared) < 12.0
 
@@ -298,33 +307,32 @@ def test_noise_as_large_as_the_motion_does_not_draw_the_answer():
         parent = wandering_poses(800, seed, step_m=0.02, step_rad=0.01)
         child = disturbed(child_of(parent), 300 + seed, 0.002, 0.015)
         solution = estimator.solve(stamps(800), disturbed(parent, seed, 0.002, 0.015), child)
-        xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
-        squared.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
+        squared.append(squared_distance(solution))
     assert np.median(squared) < 25.0
 
 
-def test_errors_are_as_large_as_stated():
-    squared_distances = []
-    for seed in range(40):
-        parent, child = noisy_drive(seed)
-        solution = estimator.solve(stamps(150), parent, child)
-        xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
-        squared_distances.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
-    # the median of chi-squared with 6 degrees of freedom is 5.35; its standard error over 40 draws
-    # is 0.7
-    assert 3.2 < np.median(squared_distances) < 8.0
+def squared_distance(solution):
+    """Of the error of a solution, in the covariance that it states."""
+    xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
+    return xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi)
 
 
-def test_it_beats_dnl_where_the_noise_is_white():
+def test_errors_are_as_large_as_stated(solved_drives):
+    found = [squared_distance(solution) for _, solution in solved_drives]
+    # Chi-squared with 6 degrees of freedom has mean 6 and variance 12: the mean of 24 draws has a
+    # standard error of 0.7.
+    assert 6.0 - 3 * 0.7 < np.mean(found) < 6.0 + 3 * 0.7
+
+
+def test_it_beats_dnl_where_the_noise_is_white(solved_drives):
     from hand_eye_calib.pairing.motion_pairs import motion_pairs
     from hand_eye_calib.solvers import dnl
 
     errors = []
-    for seed in range(15):
-        parent, child = noisy_drive(seed)
-        answers = [estimator.solve(stamps(150), parent, child).T_parent_child]
+    for drive, solution in solved_drives[:15]:
+        answers = [solution.T_parent_child]
         answers += [
-            dnl.solve(motion_pairs(parent, child, reference)).T_parent_child
+            dnl.solve(motion_pairs(*drive, reference)).T_parent_child
             for reference in ("B1", "B5", "B20")
         ]
         errors.append([np.linalg.norm(T[:3, 3] - T_PARENT_CHILD[:3, 3]) for T in answers])
@@ -374,12 +382,12 @@ def test_a_lag_is_not_taken_for_a_lever():
 
 @pytest.mark.parametrize("slipping", ["bias", "parent bias"])
 def test_on_flat_ground_no_sideways_slip_is_assumed(slipping):
-    # It could not be told from a child that is mounted askew.
+    # It could not be told from a child that is mounted askew; forwards and upwards it can.
     parent, child = systematic(planar_poses(400), slipping, [0.0, 0.05, 0.0])
     solution = estimator.solve(
         stamps(400), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3)
     )
-    assert "bias" not in solution.systematic
+    np.testing.assert_array_equal(solution.parameters[[1, 2, 3, 5]], 0.0)
 
 
 def test_the_sensor_whose_path_is_off_is_named():
@@ -419,8 +427,7 @@ def test_heavy_tails_leave_the_answer_near():
         tails = np.sqrt(3 / random.chisquare(3, (2, 200, 1)))
         noise = se3.exp(random.normal(size=(2, 200, 6)) * tails * np.repeat([0.003, 0.004], 3))
         solution = estimator.solve(stamps(200), parent @ noise[0], child_of(parent) @ noise[1])
-        xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
-        errors.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
+        errors.append(squared_distance(solution))
     assert np.median(errors) < 10.0
 
 
@@ -479,8 +486,7 @@ def test_a_camera_that_sees_a_target_swings_about_it(centre):
             parent = disturbed_about_origin(parent, 300 + seed, 0.003, 0.004)
         solution = estimator.solve(stamps(200), parent, child)
         assert solution.noise.centre == centre
-        xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
-        distances.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
+        distances.append(squared_distance(solution))
     assert 2.0 < np.median(distances) < 11.0
 
 

@@ -17,7 +17,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.bags import PoseBag, write_bag
 
-PLACES = 200
+PLACES = 100
 ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 POSES = wandering_poses(60)
 STREAMS = {
@@ -93,22 +93,26 @@ def test_cut_off_anywhere(bag, capsys):
     for number, size in enumerate(places(len(data), seed=1)):
         path.write_bytes(data[:size])
         poses, warnings = read(path)
-        assert len(warnings) == 1, size
-        assert "\n" not in warnings[0]
-        assert path.suffix == ".mcap" or poses is None
+        # A database may be opened and fail later, which is said too.
+        assert len(warnings) in ((1, 2) if path.suffix == ".db3" else (1,)), size
+        assert "\n" not in "".join(warnings)
         outcomes.add("refused" if poses is None else "recovered")
         if poses is not None:
-            assert poses == whole[: len(poses)]
+            if path.suffix == ".db3":  # rows of other pages may be missing
+                assert set(stamped(poses)) <= set(stamped(whole))
+            else:
+                assert poses == whole[: len(poses)]
         if number % 20 == 0:
             code, document, errors = replay(path, capsys)
-            if code:
-                assert (document, len(errors)) == (None, 1)
-            else:
-                assert any("what came later is lost" in warning for warning in document["warnings"])
+            if document is None:
+                assert (code, len(errors)) == (1, 1)
+                continue
+            assert any("lost" in warning for warning in document["warnings"])
+            if document["verdict"] != "DO NOT USE":
                 np.testing.assert_allclose(
                     document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
                 )
-    assert outcomes == ({"refused", "recovered"} if path.suffix == ".mcap" else {"refused"})
+    assert outcomes == {"refused", "recovered"}
 
 
 @pytest.mark.slow
@@ -139,6 +143,10 @@ def test_a_bit_flipped_anywhere(bag, capsys):
                 err_msg=str(place),
             )
     assert harmed >= 10
+
+
+def stamped(poses):
+    return [(pose.stream, pose.stamp_ns, pose.position, pose.quat_xyzw) for pose in poses]
 
 
 def without_bag_times(poses):

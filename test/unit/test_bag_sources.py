@@ -16,7 +16,7 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
-from hand_eye_calib.io.bags.messages import POSE_TYPES
+from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, POSE_TYPES
 from hand_eye_calib.io.bags.writer import write_streams
 from hand_eye_calib.io.transforms import TfSource
 
@@ -46,7 +46,7 @@ def test_every_type_of_stamped_pose(tmp_path, storage, message_type):
     assert_same_motion(trajectory, PARENT.stamps_ns, PARENT.poses)
     assert (trajectory.world_frame, trajectory.sensor_frame) == (
         "map",
-        "lidar" if POSE_TYPES[message_type] else "",
+        "lidar" if MESSAGE_TYPES[message_type].has_child_frame else "",
     )
 
 
@@ -416,34 +416,6 @@ def test_mcap_files_without_index_and_without_chunks_are_whole(tmp_path, change)
     with PoseBag(tmp_path / "changed.mcap") as bag:
         assert list(bag.poses("/a", "/b")) == expected
         assert bag.warnings == []
-
-
-def test_of_chunks_with_other_topics_only_the_wanted_bytes_are_read(tmp_path):
-    """Images between the poses: their bytes are not touched."""
-    from bag_making import JAZZY
-
-    with rosbag2.Writer(
-        tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
-    ) as writer:
-        image = writer.add_connection("/image", "sensor_msgs/msg/CompressedImage", typestore=JAZZY)
-        blob = JAZZY.types["sensor_msgs/msg/CompressedImage"](
-            JAZZY.types["std_msgs/msg/Header"](
-                JAZZY.types["builtin_interfaces/msg/Time"](0, 0), "camera"
-            ),
-            "jpeg",
-            np.zeros(300_000, np.uint8),
-        )
-        raw = JAZZY.serialize_cdr(blob, "sensor_msgs/msg/CompressedImage")
-        for stamp_ns in PARENT.stamps_ns[::5]:
-            writer.write(image, int(stamp_ns), raw)
-        write_streams(writer, {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)}, "mcap")
-    write_bag(tmp_path / "plain", {"/a": (PARENT, ODOMETRY), "/b": (CHILD, ODOMETRY)})
-    with PoseBag(tmp_path / "bag") as bag:
-        mcap = bag._files.storages[0]
-        sizes, read = [], mcap._read
-        mcap._read = lambda offset, size: sizes.append(size) or read(offset, size)
-        assert list(bag.poses("/a", "/b")) == read_all(tmp_path / "plain")
-    assert sum(sizes) < 300_000
 
 
 # ---- poses that cannot be right

@@ -1,7 +1,7 @@
 """Bags: all storages give the same poses, and a bag that cannot be read says so in one line."""
 
 import re
-import zlib
+import sys
 
 import numpy as np
 import pytest
@@ -10,11 +10,10 @@ from published_data import data_folder
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
-from hand_eye_calib.io.bags.mcap import McapFile
 from hand_eye_calib.io.bags.writer import stamped_messages, write_streams
 
 ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
@@ -169,52 +168,51 @@ def one_line(error):
     return str(error.value)
 
 
-@pytest.mark.parametrize("storage", ["sqlite3", "rosbag1"])
-@pytest.mark.parametrize("share", [0.01, 0.5, 0.9])
-def test_a_bag_cut_off_is_refused(new_bag, storage, share):
-    path = new_bag(storage)
-    cut_off(path, share)
-    with pytest.raises(
-        InputError, match="it is cut off, damaged or of an unsupported kind"
-    ) as caught:
-        read(path)
-    assert str(path) in one_line(caught)
-
-
 def cut_off(path, share):
     data = storage_file(path).read_bytes()
     storage_file(path).write_bytes(data[: int(len(data) * share)])
 
 
-@pytest.mark.parametrize("compression", ["none", "zstd"])
-@pytest.mark.parametrize("share", [0.3, 0.5, 0.9])
-def test_an_mcap_cut_off_gives_what_came_before(tmp_path, compression, share):
+LONG = {topic: (trajectory(1_000, count=4000), ODOMETRY) for topic in STREAMS}
+
+
+@pytest.mark.parametrize(
+    ("storage", "compression", "share"),
+    [
+        *((storage, "", share) for storage in ("mcap", "rosbag1") for share in (0.3, 0.5, 0.9)),
+        *(("mcap", "zstd", share) for share in (0.3, 0.5, 0.9)),
+        *(("sqlite3", "", share) for share in (0.5, 0.9)),
+    ],
+)
+def test_a_bag_cut_off_gives_what_came_before(tmp_path, storage, compression, share):
     """The recorder lost power: no index, the last chunk incomplete, no metadata.yaml."""
-    streams = {
-        topic: (trajectory(1_000, count=4000), ODOMETRY)
-        for topic in ("/lidar/odom", "/camera/pose")
-    }
-    path = tmp_path / "bag"
-    writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
-    if compression == "zstd":
-        writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
-    with writer:
-        write_streams(writer, streams, "mcap")
+    path = tmp_path / ("bag.bag" if storage == "rosbag1" else "bag")
+    if compression:
+        write_compressed(path, LONG)
+    else:
+        write_bag(path, LONG, storage)
     whole = read(path)
     cut_off(path, share)
-    (path / "metadata.yaml").unlink()
+    if path.is_dir():
+        (path / "metadata.yaml").unlink()
     with PoseBag(path) as bag:
         recovered = list(bag.poses("/lidar/odom", "/camera/pose"))
         (warning,) = bag.warnings
         assert sum(topic.count for topic in bag.topics()) == len(recovered)
-    # Chunks are of 1 MiB, an uncompressed one can be used up to its last whole message.
-    assert 0.9 * share - 0.2 * (compression == "zstd") < len(recovered) / len(whole) < share + 0.1
+    # Chunks are of 1 MiB, an uncompressed one can be used up to its last whole message. What leads
+    # to the rows of a table may lie behind the cut.
+    lost = 0.2 * (compression == "zstd") + 0.25 * (storage == "sqlite3")
+    assert 0.9 * share - lost < len(recovered) / len(whole) < share + 0.1
     assert recovered == whole[: len(recovered)]
-    assert re.search(
-        rf"recovered are {len(recovered)} messages covering [0-9.]+ s, from the first "
-        r"\d+% of its \d+ bytes",
-        warning,
-    )
+    assert re.search(r"cut off or damaged .* lost", warning)
+    assert re.search(rf"recovered are {len(recovered)} messages covering [0-9.]+ s$", warning)
+
+
+def write_compressed(path, streams):
+    writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        write_streams(writer, streams, "mcap")
 
 
 def test_an_mcap_of_which_nothing_can_be_recovered_is_refused(new_bag):
@@ -226,37 +224,30 @@ def test_an_mcap_of_which_nothing_can_be_recovered_is_refused(new_bag):
 
 
 def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):
-    """Recorders write a checksum of every chunk; a file of several chunks loses one."""
     path = tmp_path / "bag"
-    streams = {
-        topic: (trajectory(1_000, count=4000), ODOMETRY)
-        for topic in ("/lidar/odom", "/camera/pose")
-    }
-    write_bag(path, streams)
+    write_compressed(path, LONG)
     whole = read(path)
-    data = bytearray(storage_file(path).read_bytes())
-    with McapFile(storage_file(path)) as mcap:
-        offsets = mcap._chunks.rows()[:, 0].tolist()
-    assert len(offsets) > 2
-    # 9 bytes of record header, 3 x 8 of times and size, 4 of checksum, 4 of no compression, 8 of
-    # size.
-    for offset in offsets:
-        size = int.from_bytes(data[offset + 25 : offset + 33], "little")
-        data[offset + 33 : offset + 37] = zlib.crc32(
-            data[offset + 49 : offset + 49 + size]
-        ).to_bytes(4, "little")
-    storage_file(path).write_bytes(data)
-    assert read(path) == whole
-    data[offsets[1] + 1000] ^= 1
-    storage_file(path).write_bytes(data)
+    file = storage_file(path)
+    data = bytearray(file.read_bytes())
+    data[100_000:100_100] = bytes(100)  # in the second of six chunks
+    file.write_bytes(data)
     with PoseBag(path) as bag:
         poses = list(bag.poses("/lidar/odom", "/camera/pose"))
-        (warning,) = bag.warnings
+        warnings = bag.warnings
     assert len(whole) * 0.5 < len(poses) < len(whole)
-    assert {(pose.stream, pose.stamp_ns) for pose in poses} < {
-        (pose.stream, pose.stamp_ns) for pose in whole
-    }
-    assert f"at byte {offsets[1]} is damaged (its checksum is wrong) and was left out" in warning
+    found = {(pose.stream, pose.stamp_ns) for pose in poses}
+    assert found < {(pose.stream, pose.stamp_ns) for pose in whole}
+    assert len(found) == len(poses)
+    assert re.search(r"the chunk at byte \d+ is damaged", " ".join(warnings))
+
+
+def test_an_mcap_that_needs_the_library_mcap_says_so(new_bag, monkeypatch):
+    path = new_bag()
+    cut_off(path, 0.9)
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    with pytest.raises(MissingDependencyError, match="needs mcap, .*: pip install mcap") as caught:
+        read(path)
+    one_line(caught)
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -443,7 +434,7 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
         try:
             with PoseBag(path) as bag:
                 topics = bag.topics()
-                assert sum(map(len, bag._messages([topic.name for topic in topics]))) == sum(
+                assert len(list(bag._messages([topic.name for topic in topics]))) == sum(
                     topic.count for topic in topics
                 )
         except InputError as error:

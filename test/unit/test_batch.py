@@ -2,27 +2,36 @@
 say together.
 """
 
+import contextlib
 import csv
 import functools
 import http.server
 import json
+import os
 import re
+import select
+import signal
+import subprocess
 import sys
+import tempfile
 import threading
+import types
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from fleet_making import always_dies, dies_once, outcome, recordings_of
-from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 
-from hand_eye_calib.cli import batch
-from hand_eye_calib.cli.batch import calibrating
 from hand_eye_calib.cli.batch import run as batch_run
-from hand_eye_calib.cli.batch.rows import COLUMNS, content_hash, row_of
-from hand_eye_calib.cli.batch.summary import vehicles_of
-from hand_eye_calib.cli.batch.workers import on_cores, on_dask
+from hand_eye_calib.cli.batch import workers
+from hand_eye_calib.cli.batch.results import COLUMNS, content_hash, row_of, write_rows
+from hand_eye_calib.cli.batch.tasks import Task, read_batch
+from hand_eye_calib.cli.batch.vehicles import vehicles_of
+from hand_eye_calib.cli.batch.workers import on_cores, on_dask, work
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.cli.reporting import REPORT
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io import remote
@@ -54,7 +63,10 @@ def write_drive(path, n_poses, seed):
     poses = wandering_poses(n_poses, seed=seed)
     streams = {
         "/a": (as_trajectory(poses, sensor_frame="lidar"), ODOMETRY),
-        "/b": (as_trajectory(child_of(poses), sensor_frame="camera"), ODOMETRY),
+        "/b": (
+            as_trajectory(disturbed(child_of(poses), 1, 5e-5, 5e-5), sensor_frame="camera"),
+            ODOMETRY,
+        ),
     }
     write_bag(path, streams)
 
@@ -89,7 +101,7 @@ def assert_is_result_of_the_fleet(code, out, err):
     for name, row in rows.items():
         if name != "gone":
             np.testing.assert_allclose(
-                row["calibration"]["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+                row["calibration"]["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3
             )
             assert row["calibration"]["reference"] == ("B1" if name == "again" else "B5")
 
@@ -98,7 +110,7 @@ def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, mon
     out_dir = tmp_path / "out"
     assert_is_result_of_the_fleet(*run("--batch", fleet, "--out", out_dir, "--json", "--jobs", "2"))
     np.testing.assert_allclose(
-        load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-6
+        load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-3
     )
     assert (out_dir / "drive1" / "static_transform.launch.py").exists()
     assert "Both streams before any solve" in (out_dir / "drive1" / "report.html").read_text(
@@ -130,7 +142,7 @@ def here(done):
     def outcomes(tasks):
         for task in tasks:
             done.append(task.name)
-            yield task, batch.work(task)
+            yield task, work(task)
 
     return nullcontext(outcomes)
 
@@ -175,9 +187,9 @@ def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
 
 
 def test_a_defect_in_one_bag_leaves_the_others_alone(fleet, monkeypatch):
-    tasks = batch.read_batch(fleet, {}, {})
-    monkeypatch.setattr(calibrating, "replay", lambda *_, **__: 1 / 0)
-    outcome = batch.work(tasks[0])
+    tasks = read_batch(fleet, {}, {})
+    monkeypatch.setattr(workers, "replay", lambda *_, **__: 1 / 0)
+    outcome = work(tasks[0])
     assert outcome["error"] == "unexpected ZeroDivisionError: division by zero"
     assert "ZeroDivisionError" in outcome["traceback"]
 
@@ -216,7 +228,7 @@ def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
         "{parent_tf: 'odom:lidar', options: {method: dnl}, bags: [a, {bag: b/a, "
         "parent_topic: /p, options: {reference: A}}]}"
     )
-    first, second = batch.read_batch(
+    first, second = read_batch(
         path, {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"}
     )
     assert first.options == {"method": "dnl", "max_gap": 0.3}
@@ -232,7 +244,7 @@ def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
         (tmp_path / folder / "bag").mkdir(parents=True)
     path = tmp_path / "fleet.yaml"
     path.write_text("bags: ['*/bag', other, other, {bag: monday/bag, name: first}]")
-    names = [task.name for task in batch.read_batch(path, {}, {})]
+    names = [task.name for task in read_batch(path, {}, {})]
     assert names == ["monday", "tuesday", "other", "other_2", "first"]
 
 
@@ -252,18 +264,18 @@ def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
 def test_names_come_from_the_folders_that_differ(tmp_path, bags, names):
     path = tmp_path / "fleet.yaml"
     path.write_text(yaml.safe_dump({"bags": bags}))
-    assert [task.name for task in batch.read_batch(path, {}, {})] == names
+    assert [task.name for task in read_batch(path, {}, {})] == names
 
 
 # ---- workers
 
 
 def tasks_of(*names, **options):
-    return [batch.Task(name=name, bags=(), options=options.get(name, {})) for name in names]
+    return [Task(name=name, bags=(), options=options.get(name, {})) for name in names]
 
 
-def done_by(workers, tasks):
-    with workers as do:
+def done_by(some_workers, tasks):
+    with some_workers as do:
         return {task.name: found["error"] for task, found in do(tasks)}
 
 
@@ -295,11 +307,47 @@ def test_a_dask_cluster_does_what_a_worker_that_dies_had_to_do(tmp_path):
     assert (tmp_path / "marker").exists()
 
 
+def ended(pidfd, within_s=120):
+    """Wait for a process to end."""
+    return bool(select.select([pidfd], [], [], within_s)[0])
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="processes are awaited by Linux's pidfd")
+def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
+    code = (
+        "from fleet_making import never_ends; from hand_eye_calib.cli.batch.tasks import Task\n"
+        "from hand_eye_calib.cli.batch.workers import on_cores\n"
+        "if __name__ == '__main__':\n"
+        "    tasks = [Task(name=name, bags=(), options={'pipe': PIPE}) for name in 'ab']\n"
+        "    with on_cores(2, never_ends) as do: list(do(tasks))\n"
+    )
+    pipe = tmp_path / "pids"
+    os.mkfifo(pipe)
+    script = tmp_path / "batch.py"
+    script.write_text(code.replace("PIPE", repr(str(pipe))))
+    paths = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    with subprocess.Popen(
+        [sys.executable, script], env=os.environ | {"PYTHONPATH": paths}
+    ) as batch:
+        # Open for writing too: the pipe has no end between the lines of the workers.
+        with pipe.open("r+b", buffering=0) as lines:
+            workers = [os.pidfd_open(int(lines.readline())) for _ in range(2)]
+        batch.kill()
+    try:
+        assert [ended(worker) for worker in workers] == [True, True]
+    finally:
+        for worker in workers:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(worker, signal.SIGKILL)
+            os.close(worker)
+
+
 # ---- rows
 
 
 def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path, monkeypatch):
-    monkeypatch.setattr(batch_run, "can_draw", lambda _: False)  # no reports: they take long
+    monkeypatch.setattr(batch_run, "can_draw", lambda page: page != REPORT)  # they take long
+    fleet.write_text("vehicle: truck\n" + fleet.read_text())
     tables = {}
     for jobs in ("1", "2"):
         out_dir = tmp_path / jobs
@@ -314,14 +362,11 @@ def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path, monkeypatc
     assert rows[0]["start"] == "2023-11-14T22:13:20+00:00"
     assert rows[0]["sha256"] == rows[4]["sha256"] != rows[1]["sha256"]
     assert (rows[3]["x_m"], rows[3]["error"][:10]) == ("", "no bag at ")
-    np.testing.assert_allclose(float(rows[0]["z_m"]), T_PARENT_CHILD[2, 3], atol=1e-6)
-    pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
-    table = pq.read_table(tmp_path / "1" / "rows.parquet").to_pylist()
-    assert [row["x_m"] for row in table[:3]] == [float(row["x_m"]) for row in rows[:3]]
-    assert table[3]["x_m"] is None
+    np.testing.assert_allclose(float(rows[0]["z_m"]), T_PARENT_CHILD[2, 3], atol=1e-3)
     page = (tmp_path / "1" / "index.html").read_text(encoding="utf-8")
     assert "report.html" not in page
     assert "The 4 recordings agree within their standard deviations" in page
+    assert not list(tmp_path.rglob("*.parquet"))
 
 
 def test_the_digest_of_a_recording_is_that_of_sha256sum():
@@ -333,11 +378,18 @@ def test_the_digest_of_a_recording_is_that_of_sha256sum():
     assert content_hash([one, two]).startswith("d82160c1")
 
 
-def test_a_cell_cannot_become_a_formula(tmp_path):
-    from hand_eye_calib.io.tables import write_table
-
-    write_table(tmp_path, "rows", {"name": str, "x": float}, [{"name": "=1+1", "x": -1.5}])
-    assert (tmp_path / "rows.csv").read_text() == "name,x\n'=1+1,-1.5\n"
+@pytest.mark.parametrize("name", ["=cmd()", " +1", "\t-1", "@SUM(A1)", "＝1+1", "a;=cmd()"])
+def test_a_cell_cannot_become_a_formula(tmp_path, name):
+    (one,) = fleet_outcomes("truck", 1, 1)
+    write_rows(tmp_path / "rows.csv", [{**one, "name": name}])
+    text = (tmp_path / "rows.csv").read_text()
+    (row,) = csv.DictReader(text.splitlines())
+    assert row["name"] == (name if name[0] == "a" else f"'{name}")
+    # In quotes, so that a semicolon does not end the cell where it is the separator.
+    assert f'"{row["name"]}"' in text
+    # Numbers stay numbers.
+    assert f",{row['x_m']},{row['y_m']},{row['z_m']}," in text
+    assert float(row["y_m"]) < 0
 
 
 # ---- bags at URLs
@@ -347,8 +399,8 @@ def outcomes_of(path, bags, **common):
     path.write_text(
         yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": bags, **common})
     )
-    tasks = batch.read_batch(path, {"reference": "B5"}, {}, with_fingerprints=True)
-    return tasks, [batch.work(task) for task in tasks]
+    tasks = read_batch(path, {"reference": "B5"}, {}, with_fingerprints=True)
+    return tasks, [work(task) for task in tasks]
 
 
 @pytest.fixture
@@ -411,12 +463,37 @@ def test_bags_on_a_web_server(tmp_path):
     assert "\n" not in absent["error"]
 
 
+def test_a_bag_at_a_url_is_replayed_alone(run, tmp_path, memory, monkeypatch):
+    local = json.loads(run(tmp_path / "drive0", *STREAMS, "--json")[1])
+    url = "memory://fleet/run0/drive"
+    code, out, err = run(url, *STREAMS, "--json")
+    remotely = json.loads(out)
+    assert code == 0
+    assert remotely["T_parent_child"] == local["T_parent_child"]
+    assert remotely["inputs"]["bag"] == url
+    assert json.loads(run(url, "--list", "--json")[1])["bag"] == url
+    assert run(url, "--parent-topic", "/none")[2].count(url) == 1
+    (name,) = memory.glob("/fleet/run0/drive/*.mcap")
+    memory.pipe(name, b"no bag")
+    code, _, err = run(url, *STREAMS)
+    assert (code, "/hand_eye_calib_" in err) == (1, False)
+
+
+def test_a_remote_bag_may_not_fill_the_disk(tmp_path, memory, monkeypatch):
+    monkeypatch.setattr(remote.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000))
+    _, (found,) = outcomes_of(tmp_path / "fleet.yaml", ["memory://fleet/run0/drive"])
+    assert found["error"] == (
+        "cannot read memory://fleet/run0/drive: it is larger than 1e-05 GB, half of the free space "
+        f"of {tempfile.gettempdir()}; set TMPDIR to a folder with more space"
+    )
+
+
 def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
     class Hostile:
         def ls(self, path, detail):
             return [{"name": "bag/../../../../outside.mcap", "type": "file"}]
 
-        def get_file(self, name, target):
+        def get_file(self, name, target, callback):
             copied.append(target)
 
     copied = []
@@ -491,6 +568,21 @@ def test_recordings_are_compared_with_those_of_their_vehicle():
     assert found["d"].newest is None
     document = json.loads(json.dumps(found["b"].to_dict(), allow_nan=False))
     assert document["apart"] == ["b_4", "b_5"]
+
+
+def test_recordings_without_a_vehicle_are_not_judged_together(run, fleet, tmp_path, monkeypatch):
+    many = [one for seed in range(30) for one in fleet_outcomes("", 1, seed, shift=(0,), by=seed)]
+    assert vehicles_of(many) == []
+    monkeypatch.setattr(batch_run, "can_draw", lambda page: page != REPORT)  # they take long
+    document = yaml.safe_load(fleet.read_text())
+    fleet.write_text(yaml.safe_dump(document | {"bags": ["bags/drive0", "bags/drive1", "absent"]}))
+    _, out, err = run("--batch", fleet, "--jobs", "1")
+    assert "2 of 3 bags calibrated, 1 failed" in out
+    assert "agree" not in out
+    assert (
+        "note: 2 recordings are not compared with each other: name their vehicles with 'vehicle:' "
+        f"in {fleet}"
+    ) in err
 
 
 def test_the_index_page_shows_each_vehicle(tmp_path):

@@ -1,19 +1,25 @@
 """What a stream check is certain of is used, and said."""
 
+import pickle
 from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
 import pytest
 from motions import as_trajectory, child_of, disturbed, wandering_poses
+from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
 from hand_eye_calib.calibration import Verdict
-from hand_eye_calib.checks.aligned import ByModel
 from hand_eye_calib.checks.check import check_streams
+from hand_eye_calib.checks.lengths import check_lengths
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checked import at_clear_offset, checked, mend
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.engine.snapshot import noise_fits
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from reproduction.coverage.classes import make
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +49,26 @@ def test_a_unit_that_is_certain_is_used_and_said(streams):
     assert result.findings == ()
 
 
+@pytest.mark.parametrize("of_child", [1000.0, 1.0])
+def test_a_parent_in_millimetres_is_never_used(streams, of_child):
+    """Both streams agree, and a child in metres would be scaled to millimetres."""
+    parent, child, _ = streams
+    result = hec.calibrate(parent.scaled(1000.0), child.scaled(of_child))
+    assert result.verdict is Verdict.DO_NOT_USE
+    (finding,) = result.findings
+    assert (finding["code"], finding["stream"]) == ("lengths", "parent")
+    assert "its lengths can hardly be in metres" in result.headline
+    assert "give the lengths of both streams in metres" in finding["advice"]
+    assert finding["evidence"]["speed_m_s"] > 1000
+
+
+def test_a_slow_arm_in_millimetres_is_noticed_and_a_drone_in_metres_is_not():
+    arm = as_trajectory(wandering_poses(1200, step_m=0.006))
+    drone = as_trajectory(wandering_poses(1200, step_m=1.0))
+    assert check_lengths(arm) == check_lengths(drone) == []
+    assert [finding.code for finding in check_lengths(arm.scaled(1000.0))] == ["lengths"]
+
+
 def test_what_was_given_is_kept_and_spoils_the_verdict(streams):
     parent, child, _ = streams
     result = hec.calibrate(parent, child.scaled(1000.0), reference="B5", scale="none")
@@ -51,11 +77,39 @@ def test_what_was_given_is_kept_and_spoils_the_verdict(streams):
     assert result.reasons[0].options == (("scale", 0.001),)
 
 
+@pytest.mark.parametrize("scale", [1.0, "none"])
+def test_a_scale_that_was_given_is_left_by_the_noise_model_too(streams, scale):
+    parent, child, _ = streams
+    longer = child.scaled(1.03)
+    assert hec.calibrate(parent, longer).scale == pytest.approx(1 / 1.03, abs=0.002)
+    result = hec.calibrate(parent, longer, scale=scale)
+    assert (result.scale, result.scale_sigma) == (1.0, 0.0)
+    assert "scale" in {finding["code"] for finding in result.findings}
+
+
+def test_a_clock_that_was_given_as_right_is_left_by_the_noise_model_too(late):
+    shifted = replace(late, buffered_child=late.child.shifted(0.04))  # 0.01 s remain
+    found = hec.calibrate(late.parent, shifted.child)
+    assert found.time_offset_s == pytest.approx(0.01, abs=0.003)
+    result = hec.calibrate(late.parent, shifted.child, time_offset=0.0)
+    assert (result.time_offset_s, result.time_offset_sigma_s) == (0.0, 0.0)
+
+
+def test_options_that_are_passed_are_given_even_if_they_are_the_defaults():
+    assert CalibratorConfig().given == set()
+    config = CalibratorConfig.from_options({"time_offset": 0.0, "prior.z": ""})
+    assert config.given == {"time_offset", "prior_z"}
+    assert replace(config, scale="estimate", time_offset="estimate").given == config.given
+    assert pickle.loads(pickle.dumps(config)).given == config.given
+    assert config.is_known("time_offset")
+    assert not config.is_known("scale")
+
+
 def test_good_streams_are_left_alone(streams):
     parent, child, _ = streams
     snapshot = whole_snapshot(offline_config(parent, child, {"reference": "B5"}), parent, child)
     plain = snapshot.estimate()
-    result, same = checked(plain, snapshot, ())
+    result, same = checked(plain, snapshot)
     assert same is snapshot
     assert (result.warnings, result.findings) == (plain.warnings, ())
 
@@ -68,7 +122,7 @@ def test_a_scale_with_which_the_noise_model_does_not_fit_is_not_used():
     steps[:, 0, 3] += 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1)
     drifting = np.stack(list(accumulate(steps, np.matmul, initial=child[0])))
     result = hec.calibrate(as_trajectory(poses), as_trajectory(drifting))
-    assert {"scale"} == {finding["code"] for finding in result.findings}
+    assert {finding["code"] for finding in result.findings} == {"scale", "not_independent"}
     assert (result.method, result.scale) == ("adaptive", 1.0)
     assert result.noise["systematic"] == "bias"
 
@@ -84,11 +138,11 @@ def late():
 
 class TestClearOffset:
     def test_it_is_estimated_before_the_first_solve(self, late, monkeypatch):
-        ahead = at_clear_offset(late, ())
+        ahead = at_clear_offset(late)
         assert ahead.config.time_offset == "estimate"
-        in_turn = mend(late.estimate(), late, ())
+        in_turn = mend(late.estimate(), late)
         result = ahead.estimate()
-        found = mend(result, ahead, ())
+        found = mend(result, ahead)
         assert found.snapshot.config == in_turn.snapshot.config
         assert found.told == in_turn.told
         expected = in_turn.calibration
@@ -98,47 +152,47 @@ class TestClearOffset:
         assert expected.time_offset_s == pytest.approx(0.05, abs=0.003)
         # If something speaks against it, the streams are solved as they are, too.
         monkeypatch.setattr("hand_eye_calib.engine.checked._is_sound", lambda found: False)
-        assert (
-            mend(result, ahead, ()).check.findings == mend(late.estimate(), late, ()).check.findings
-        )
+        assert mend(result, ahead).check.findings == mend(late.estimate(), late).check.findings
 
     @pytest.mark.parametrize(
         "options", [{"time_offset": 0.0}, {"method": "dnlo"}, {"reference": "B5"}]
     )
     def test_it_stays_as_it_is_if_the_model_would_not_find_it(self, late, options):
-        config = late.config.from_options(late.config.to_options() | options)
-        other = replace(late, config=config)
-        assert at_clear_offset(other, options) is other
+        other = replace(late, config=replace(late.config, given=options, **options))
+        assert at_clear_offset(other) is other
 
     def test_none_is_left_alone(self, late):
         level = replace(late, buffered_child=late.child.shifted(0.05))
-        assert at_clear_offset(level, ()) is level
+        assert at_clear_offset(level) is level
 
     def test_none_is_clear_if_motions_over_other_times_tell_another(self, late, monkeypatch):
-        spread = replace(at_clear_offset(late, ()).time_offset, spread_s=0.04)
+        spread = replace(at_clear_offset(late).time_offset, spread_s=0.04)
         monkeypatch.setattr(
             "hand_eye_calib.engine.checked.refine_time_offset", lambda *given, **more: spread
         )
-        assert at_clear_offset(late, ()) is late
+        assert at_clear_offset(late) is late
 
 
-def test_the_check_takes_the_correlation_and_a_model_s_offset_as_they_are(late, monkeypatch):
+def test_the_check_takes_the_correlation_as_it_is(late):
     known, child = 0.049, late.child
     found = check_streams(late.parent, child, known)
     same = check_streams(late.parent, child, known, correlation=late.correlation)
     assert same.findings == found.findings
     assert same.correlation.offset_s == pytest.approx(found.correlation.offset_s, abs=1e-9)
-    apart = se3.from_rotation_translation(np.eye(3), np.array([0.3, 0.0, 0.0]))
-    model = ByModel(T_parent_child=apart, offset_sigma_s=0.0005, is_steady=False)
-    # An offset that a model has missed is found by the model of the check.
-    (missed,) = check_streams(late.parent, child, 0.0, model=model).findings
-    assert missed.code == "time_offset"
-    assert dict(missed.options)["time_offset"] == pytest.approx(0.05, abs=0.002)
-    # Unless the first one leaves no doubt: then there is no second one.
-    monkeypatch.setattr("hand_eye_calib.checks.aligned.estimator", None)
-    steady = replace(model, is_steady=True)
-    sure = check_streams(late.parent, child, known, model=steady)
-    assert [each.code for each in sure.findings] == [each.code for each in found.findings]
-    same = replace(steady, T_parent_child=np.eye(4))
-    given = replace(steady, offset_sigma_s=0.0)
-    assert not any(each.leaves_no_doubt for each in (same, given, model))
+
+
+@pytest.mark.parametrize(
+    ("kind", "span_s", "code"),
+    [("car_lever", 1.0, "position_clock"), ("car_ins_lidar", 0.5, "smoothed_positions")],
+)
+def test_a_model_that_fits_does_not_rule_out_smoothing_without_a_delay(kind, span_s, code):
+    drive = make(kind, 932)
+    poses = drive.child.poses.copy()
+    poses[:, :3, 3] = uniform_filter1d(
+        poses[:, :3, 3], round(span_s / drive.dt), axis=0, mode="nearest"
+    )
+    smoothed = Trajectory(drive.child.stamps_ns, poses)
+    result = hec.calibrate(drive.parent, smoothed)
+    assert noise_fits(result)
+    assert code in [finding["code"] for finding in result.findings]
+    assert result.verdict is Verdict.DO_NOT_USE

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from motions import disturbed
 
 from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.cli import main as cli
@@ -40,11 +41,14 @@ PARENT_TOPIC, CHILD_TOPIC = "/lidar/odom", "/camera/odom"
 TOPICS = ["--parent-topic", PARENT_TOPIC, "--child-topic", CHILD_TOPIC]
 START_NS = 1_700_000_000_000_000_000
 TRUTH = se3.exp(np.array([0.4, -0.1, 0.25, 0.3, -0.2, 1.1]))
+NOISE = 5e-5, 5e-5  # m, rad
 OTHER_WORLD = se3.exp(np.array([5.0, -3.0, 1.0, 0.1, 0.4, -2.0]))
 
 
 def drive(count=120, planar=False, first_ns=START_NS):
-    """Noise-free trajectories of two sensors whose extrinsic is TRUTH, 10 Hz."""
+    """Trajectories of two sensors whose extrinsic is TRUTH, 10 Hz. Without noise they would be one
+    stream computed from the other.
+    """
     time = 0.1 * np.arange(count)
     twists = np.zeros((count, 6))
     twists[:, 0], twists[:, 5] = 0.1, 0.08 * np.sin(0.9 * time)
@@ -55,7 +59,8 @@ def drive(count=120, planar=False, first_ns=START_NS):
         poses.append(poses[-1] @ step)
     stamps_ns = first_ns + 100_000_000 * np.arange(count)
     parent = Trajectory(stamps_ns, np.array(poses), "lidar", "map")
-    return parent, Trajectory(stamps_ns, OTHER_WORLD @ parent.poses @ TRUTH, "camera", "odom")
+    child = disturbed(OTHER_WORLD @ parent.poses @ TRUTH, 1, *NOISE)
+    return parent, Trajectory(stamps_ns, child, "camera", "odom")
 
 
 @pytest.fixture
@@ -128,7 +133,7 @@ def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag,
     assert "\nlidar in camera: maps coordinates of lidar into camera\n" in out
     rows = re.findall(r"^  [xyz] +(\S+) \+/- \d\S* m$", out, flags=re.MULTILINE)
     truth = np.concatenate([TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]])
-    np.testing.assert_allclose(np.array(rows, dtype=float), truth, atol=2e-6)
+    np.testing.assert_allclose(np.array(rows, dtype=float), truth, atol=1e-3)
     assert re.search(r"^  yaw +\S+ \+/- \d\S* deg$", out, flags=re.MULTILINE)
     assert "axes of lidar: x, y, z, roll, pitch and yaw observed\n" in out
     assert "\nNext\n" not in out
@@ -140,7 +145,7 @@ def test_json_is_one_document_on_stdout(run, new_bag):
     code, out, err = run("replay", bag, *TOPICS, "--json", "--method", "dnl", "--reference", "B2")
     document = json.loads(out)
     assert (code, err) == (0, "")
-    np.testing.assert_allclose(document["T_parent_child"]["matrix"], TRUTH, atol=1e-6)
+    np.testing.assert_allclose(document["T_parent_child"]["matrix"], TRUTH, atol=1e-3)
     assert (document["method"], document["reference"], document["status"]) == ("dnl", "B2", "ok")
     assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
     assert document["inputs"]["bag"] == bag
@@ -158,7 +163,7 @@ def test_topics_may_be_left_out_where_there_are_only_two(run, new_bag):
         f"hand_eye_calib: note: parent is {PARENT_TOPIC}, child is {CHILD_TOPIC}; "
         "to change that, give --parent-topic and --child-topic\n"
     )
-    np.testing.assert_allclose(json.loads(out)["T_parent_child"]["matrix"], TRUTH, atol=1e-6)
+    np.testing.assert_allclose(json.loads(out)["T_parent_child"]["matrix"], TRUTH, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -267,6 +272,21 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
 # ---- what is printed
 
 
+def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
+    """The headline of planar motion names the second reason, too."""
+    assert run("replay", new_bag(*drive(planar=True)), *TOPICS, "--out", tmp_path / "out")[0] == 3
+    jumps = {"code": "jumps", "what": "many jumps", "advice": "find out why", "severity": "warning"}
+    calibration = dataclasses.replace(load_result(tmp_path / "out"), findings=(jumps,))
+    lines = as_text(calibration).splitlines()
+    assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"
+    assert lines[1:5] == [
+        "- z cannot be determined from this motion",
+        "  -> measure it by hand and give --prior-z VALUE+/-SIGMA",
+        "- many jumps",
+        "  -> find out why",
+    ]
+
+
 def some_calibration(run, new_bag, tmp_path, **changes):
     assert run("replay", new_bag(), *TOPICS, "--out", tmp_path / "result")[0] == 0
     return dataclasses.replace(load_result(tmp_path / "result"), **changes)
@@ -317,13 +337,14 @@ def test_missing_bag(refused, tmp_path):
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "rosbag1"])
-def test_bag_cut_in_half(refused, new_bag, storage):
+def test_a_bag_cut_in_half_says_what_is_lost(run, new_bag, storage):
     path = Path(new_bag(storage=storage))
     file = (
         path if path.is_file() else next(part for part in path.iterdir() if part.suffix != ".yaml")
     )
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    assert f"cannot read bag {path}" in refused("replay", path, *TOPICS)
+    code, _, err = run("replay", path, *TOPICS)
+    assert f"cannot read bag {path}" in err if code == 1 else "recovered are" in err
 
 
 def test_missing_topic_lists_those_that_are_there(refused, new_bag):
@@ -430,7 +451,7 @@ def test_results_that_cannot_be_saved(refused, new_bag, tmp_path):
 
 @pytest.mark.parametrize("command", ["replay", "calibrate"])
 def test_help_lists_every_option_with_its_default(run, command):
-    code, out, _ = run(command, "--help-all")
+    code, out, _ = run(command, "--help")
     assert code == 0
     words = " ".join(out.partition("\nexamples:")[0].split())
     for field in dataclasses.fields(CalibratorConfig):
@@ -658,12 +679,20 @@ def test_a_missing_optional_package_breaks_only_its_command(
     refused, run, new_bag, tmp_path, monkeypatch
 ):
     bag = new_bag()
+    assert run("replay", bag, *TOPICS, "--out", tmp_path / "result")[0] == 0
     monkeypatch.setitem(sys.modules, "rosbags", None)
     assert "writing bags needs rosbags, which is not installed" in refused(
         "simulate", "--out", tmp_path / "runs", "--poses", "30", "--bag", "mcap"
     )
-    assert run("replay", bag, *TOPICS, "--out", tmp_path / "result")[0] == 0
     assert run("info", tmp_path / "result")[0] == 0
+
+
+def test_commands_that_need_ros_say_how_to_get_it(refused, monkeypatch):
+    for module in [name for name in sys.modules if name.startswith("hand_eye_calib.ros")]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    line = refused("watch")
+    assert "this needs ROS 2's Python packages (rclpy is missing): source the setup file" in line
 
 
 def test_a_defect_keeps_its_traceback(new_bag, monkeypatch):
@@ -806,15 +835,14 @@ def test_control_characters_in_names_do_not_reach_the_terminal(run, new_bag, tmp
     assert capsys.readouterr().err == "hand_eye_calib: error: cam\\x1b[2Jera\\nStatus: ok\n"
 
 
-def test_help_is_short_and_help_all_is_whole(run):
-    short, whole = run("replay", "--help")[1], run("replay", "--help-all")[1]
-    assert "--help-all" in short
-    assert "--method" in short
-    assert "--max-gap" not in short
-    assert "--max-gap" in whole
-    for text in (short, whole):
-        assert "\nexamples:\n  hand_eye_calib replay " in text
-    assert len(short.splitlines()) < 92
+def test_help_shows_common_options_before_rare_ones_and_a_short_usage(run):
+    out = run("replay", "--help")[1]
+    assert out.startswith("usage: hand_eye_calib replay [OPTION ...] BAG ...\n")
+    assert out.index("--method") < out.index("rarely needed") < out.index("--max-gap")
+    assert "\nexamples:\n  hand_eye_calib replay " in out
+    assert run("simulate", "--help")[1].startswith(
+        "usage: hand_eye_calib simulate [OPTION ...] --out DIR\n"
+    )
 
 
 def test_near_gimbal_lock_the_rotation_vector_is_printed(run, new_bag, tmp_path):

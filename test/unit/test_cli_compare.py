@@ -54,7 +54,11 @@ def run(capsys, *words):
     [
         (["first", "--with", NUMBERS], 0, "Mount of camera on lidar: same: a change of "),
         (["third", "--with", "robot.urdf"], 4, "moved: y by "),
-        (["flat", "--with", "first"], 3, "cannot tell about z; x, y, roll, pitch and yaw the same"),
+        (
+            ["flat", "--with", "first"],
+            3,
+            "cannot tell about x, y and z; roll, pitch",
+        ),
         (["first", "second"], 0, "same: none of 2 differs"),
         (["first", "second", "third"], 4, "moved: third differs, the others agree"),
         (["first", "third", "--with", "second"], 4, "moved: third of 2"),
@@ -81,12 +85,17 @@ def test_json_has_it_all(saved, capsys):
         (["first", "first"], 1, "expected different results"),
         (["first", "--with", "absent.urdf"], 2, "file that exists"),
         (["absent", "first"], 1, "cannot read absent"),
+        (["first", "--with", "1e400 0 0 0 0 0"], 2, "must be at most 1e+06 m; got '1e400'"),
+        (["first", "--with", "0 0 0 0 1e300 0"], 2, "must be at most 1e+06 rad; got '1e300'"),
+        (["first", "--with", "x" * 5000], 2, "xxx..."),
+        (["first", "n" * 256], 1, "n...: File name too long; give a shorter name"),
     ],
 )
 def test_what_cannot_be_compared_is_one_line(saved, capsys, words, code, text):
     found, out, err = run(capsys, "compare", *words)
     assert (found, out, err.count("\n")) == (code, "", 1)
     assert text in err
+    assert len(err) < 400
 
 
 def test_info_writes_the_result_into_the_description(saved, capsys):
@@ -121,7 +130,9 @@ def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, capsys):
     document = json.loads(out)
     assert code == 0
     assert document["comparison"]["verdict"] == "same"
-    in_base = se3.from_rotation_translation(np.eye(3), [1.0, 0.0, 2.0]) @ T
+    base = se3.from_rotation_translation(np.eye(3), [1.0, 0.0, 2.0])
+    in_base = base @ document["T_parent_child"]["matrix"]
+    np.testing.assert_allclose(in_base, base @ T, atol=5e-3)
     np.testing.assert_allclose(document["T_base_child"]["matrix"], in_base, atol=1e-6)
     saved_result = hec.Calibration.from_dict(document)
     hec.save(saved_result, "in_base")

@@ -1,6 +1,7 @@
 """``replay``: sources, listing and convergence."""
 
 import copy
+import dataclasses
 import json
 import re
 
@@ -11,10 +12,10 @@ from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wanderin
 from published_data import data_folder
 
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.cli.replaying import replay_journal
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags import write_bag
-from hand_eye_calib.io.journal import ABOUT_NAME, JournalWriter, write_about
+from hand_eye_calib.io.journal import JournalWriter
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]
@@ -53,13 +54,21 @@ def matrix(text):
 # ---- sources
 
 
-def write_session(directory, options):
+def write_session(directory, options, *given):
     """The journal of a node that has heard both trajectories."""
-    calibrator = Calibrator()
-    writer = JournalWriter(directory, calibrator.state())
-    write_about(directory, {"options": options, "topics": {"parent": "/a", "child": "/b"}})
-    for stream, trajectory in (("parent", PARENT), ("child", CHILD)):
-        writer.set_frame(stream, trajectory.sensor_frame)
+    trajectories = {"parent": PARENT, "child": CHILD}
+    topics = {"parent": "/a", "child": "/b"}
+    about = {
+        stream: {
+            "options": options,
+            "given": given,
+            "topic": topics[stream],
+            "frame": trajectory.sensor_frame,
+        }
+        for stream, trajectory in trajectories.items()
+    }
+    writer = JournalWriter(directory, about)
+    for stream, trajectory in trajectories.items():
         quats = se3.to_quat_xyzw(trajectory.poses).tolist()
         positions = trajectory.poses[:, :3, 3].tolist()
         for message in zip(trajectory.stamps_ns.tolist(), positions, quats, strict=True):
@@ -82,15 +91,21 @@ def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
     assert np.array_equal(matrix(out), matrix(of_bag))
 
 
+def test_what_was_set_in_a_session_counts_as_set_in_its_replay(tmp_path):
+    write_session(tmp_path, {"time_offset": 0.0, "scale": "none"}, "time_offset")
+    config = replay_journal(tmp_path, {"reference": "B5"}).calibrator.config
+    assert config.given == {"time_offset", "reference"}
+
+
 def test_what_does_not_go_with_a_journal(run, tmp_path):
     write_session(tmp_path, {})
     code, out, err = run(tmp_path, *STREAMS)
     assert (code, out) == (2, "")
-    assert "is the journal of a session, which has its two streams" in err
-    (tmp_path / ABOUT_NAME).write_text("options: [1]")
+    assert "is the journal of a session, which has two streams; it cannot be combined" in err
+    (tmp_path / "parent.tum").write_text('# {"options": [1]}')
     code, out, err = run(tmp_path)
     assert (code, out) == (1, "")
-    assert "expected a mapping of names to mappings" in err
+    assert "damaged from its first byte" in err
 
 
 def test_frames_stand_for_topics(run, bag, tmp_path):
@@ -151,7 +166,10 @@ def test_a_topic_and_frames_together(run, bag, tmp_path):
         (["bag", "--every", "soon"], "argument --every: expected a duration such as 5s"),
         (["bag", "--every", "0s"], "argument --every: expected a duration such as 5s"),
         (["bag", "--jobs", "2"], "--jobs and --dask are for --batch"),
-        (["--batch", "fleet.yaml", "bag"], "--batch names its bags in its file"),
+        (
+            ["--batch", "fleet.yaml", "bag"],
+            "--batch cannot be combined with BAG, --list or --every",
+        ),
         ([], "the following arguments are required: BAG, or --batch FILE"),
     ],
 )
@@ -180,7 +198,7 @@ def test_a_bag_cut_in_half_gives_what_came_before_and_a_warning(run, bag):
     assert code in (0, 3)
     (warning,) = [text for text in json.loads(out)["warnings"] if "recovered" in text]
     assert re.search(
-        r"the file ends at byte \d+, in the middle of a .*; recovered are \d+ messages "
+        r"cut off or damaged .* lost; recovered are \d+ messages "
         r"covering [\d.]+ s",
         warning,
     )
@@ -200,6 +218,64 @@ def test_absurd_positions_end_in_one_line(run, bag, tmp_path):
         r"more than 1e\+08 m from the origin",
         err,
     )
+
+
+# ---- several bags
+
+
+def parts_of(tmp_path, slices, **changes):
+    """Bags of parts of the drive; ``changes`` of the parent's poses by the part's number."""
+    paths = []
+    for number, part in enumerate(slices):
+        paths.append(tmp_path / f"part_{number}")
+        parent = changes.get(f"part_{number}", lambda each: each)(PARENT)
+        write_bag(paths[-1], {"/a": (parent[part], ODOMETRY), "/b": (CHILD[part], ODOMETRY)})
+    return paths
+
+
+def later(seconds):
+    return lambda each: dataclasses.replace(
+        each, stamps_ns=each.stamps_ns + round(seconds * 1_000_000_000)
+    )
+
+
+def elsewhere(each):
+    """The same drive in another world."""
+    return as_trajectory(se3.inverse(POSES[50]) @ POSES, sensor_frame="lidar", world_frame="map")
+
+
+def test_parts_that_continue_each_other_or_repeat_poses_are_one_recording_in_any_order(
+    run, bag, tmp_path
+):
+    parts = parts_of(tmp_path, [slice(0, 50), slice(30, 80), slice(80, 100)])
+    whole = run(bag, *STREAMS, "--json")[1]
+    for order in (parts, parts[::-1]):
+        code, out, _ = run(*order, *STREAMS, "--json")
+        assert code == 0
+        assert np.array_equal(matrix(out), matrix(whole))
+
+
+@pytest.mark.parametrize(
+    ("change", "part", "reason"),
+    [
+        (elsewhere, slice(0, 100), "has different poses in both for 9.9 s of the same time"),
+        (later(0.03), slice(0, 100), "has different poses in both for 9.9 s of the same time"),
+        (later(3600), slice(0, 100), "pauses for 3590 s between them"),
+        (elsewhere, slice(52, 100), "m away after 0.3 s, as if it had started again"),
+    ],
+)
+def test_recordings_are_not_joined(run, tmp_path, change, part, reason):
+    first = slice(0, 100) if part.start == 0 else slice(0, 50)
+    paths = parts_of(tmp_path, [first, part], part_1=change)
+    for order in (paths, paths[::-1]):
+        code, out, err = run(*order, *STREAMS)
+        assert (code, out) == (1, "")
+        assert "are two recordings, not parts of one: /a" in err
+        assert reason in err
+        assert "--batch FILE" in err
+    code, out, err = run(*paths, "--topics", "/a", "/b", "/a")
+    assert (code, out) == (1, "")
+    assert reason in err
 
 
 # ---- listing

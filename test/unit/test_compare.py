@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+import real_data
 import scipy.stats
 from result_making import SHIFTED_FROM as X
 from result_making import shift
@@ -30,7 +31,7 @@ def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told
     found = compare([result(seed=1), result(seed=2), result(seed=3)])
     assert (found.verdict, found.moved) == (Change.SAME, ())
     one = found.differences[0]
-    assert one.sentence == "same: a change of 1.8 cm or 0.18 deg would have been seen"
+    assert one.sentence == "same: a change of 5.4 cm or 0.8 deg would have been seen"
     np.testing.assert_allclose(
         one.values, deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child)
     )
@@ -75,29 +76,54 @@ def test_axes_that_only_together_have_moved_are_told_without_those_that_are_unkn
     together = np.array([1.0, 0.0, 1.0, 0, 0, 0]) / np.sqrt(2)
     loose = np.diag(np.r_[9.0, 1e-6, 9.0, np.full(3, 1e-8)])
     tight = np.linalg.inv(np.linalg.inv(loose) + 1e6 * np.outer(together, together))
-    off = shift("x", 0.05) + shift("z", 0.05)
+    off = shift("x", 0.2) + shift("z", 0.2)
     moved = dataclasses.replace(result(off), covariance=to_child @ tight @ to_child.T)
     found = compare([moved], Extrinsic(X, "drawing")).differences[0]
     assert found.verdict is Change.MOVED
     assert found.sigmas[[0, 2]].tolist() == [np.inf, np.inf]
     assert found.sentence == "moved: by what the axes show together, none of them alone"
     some = compare([dataclasses.replace(moved, T_parent_child=nudged(moved))], Extrinsic(X, "d"))
-    assert some.differences[0].sentence.startswith("moved: y by 2.0 mm +/- 1.4 mm")
+    assert some.differences[0].sentence.startswith("moved: y by 3 cm +/- 2 cm")
 
 
 def nudged(moved):
     T = moved.T_parent_child.copy()
-    T[1, 3] += 0.002
+    T[1, 3] += 0.03
     return T
 
 
 def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recording():
-    floor = np.diag(np.r_[np.zeros(3), np.full(3, np.radians(0.15) ** 2)])
-    first, second = result(floor=floor), result(shift("yaw", np.radians(0.3)), floor=floor)
+    floor = np.diag(np.r_[np.zeros(3), np.full(3, np.radians(0.2) ** 2)])
+    first, second = result(floor=floor), result(shift("yaw", np.radians(0.6)), floor=floor)
     assert compare([second], Extrinsic(X, "drawing")).verdict is Change.SAME
     assert compare([first, second]).verdict is Change.MOVED
     known = Extrinsic(X, "earlier result", first.covariance, is_calibration=True)
     assert compare([second], known).differences[0].axes(Change.MOVED) == ["yaw"]
+
+
+def test_what_a_flight_alone_is_off_by_is_no_move():
+    """Its truth is 15 mm off in y: of other flights of the same rig it is not."""
+    flight = real_data.euroc("vio_stereo", "v2_01")
+    published = Extrinsic(real_data.EUROC_TRUTH, "published")
+    found = compare([hec.calibrate(flight.parent, flight.child)], published).differences[0]
+    assert found.values[1] == pytest.approx(0.015, abs=0.002)
+    assert found.verdict is Change.SAME
+
+
+@pytest.mark.parametrize("sigma_z", [0.002, 0.05], ids=["in hand", "vehicle"])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_mount_that_moved_by_3_cm_and_1_deg_is_found(sigma_z, axis):
+    sigmas = np.r_[0.002, 0.002, sigma_z, np.full(3, np.radians(0.05))]
+    moved = shift(AXES[axis], 0.03) + shift(AXES[axis + 3], np.radians(1.0))
+    floor = np.diag(np.r_[np.full(3, 0.005**2), np.full(3, np.radians(0.15) ** 2)])
+    for seed in range(5):
+        first, second = (
+            result(sigmas=sigmas, seed=seed, floor=floor),
+            result(moved, sigmas=sigmas, seed=100 + seed, floor=floor),
+        )
+        assert AXES[axis + 3] in compare([first, second]).differences[0].axes(Change.MOVED)
+        against = compare([second], Extrinsic(X, "drawing")).differences[0]
+        assert AXES[axis + 3] in against.axes(Change.MOVED)
 
 
 def test_an_axis_is_the_same_by_its_own_target():

@@ -14,7 +14,6 @@ from reproduction.coverage import classes, measures, mixed, motions, study
 from reproduction.coverage.bound import ideal_estimate
 from reproduction.coverage.measures import Row, pooled, worsened
 from reproduction.coverage.page import page
-from reproduction.coverage.real_sets import CYCLE, Truth, real_rigs
 from reproduction.coverage.scores import misclosure, truth_cases
 from reproduction.coverage.sensor_errors import (
     GaussMarkov,
@@ -23,6 +22,7 @@ from reproduction.coverage.sensor_errors import (
     mixture_information,
     sigmas,
 )
+from reproduction.recordings import CYCLE, Truth, real_rigs
 
 # White, walk, scale and slow errors fixed to body and world: every term of the state space.
 SMALL = classes.RecordingClass(

@@ -9,7 +9,7 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 import hand_eye_calib as hec
 from hand_eye_calib import calibrate
-from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict
+from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.engine.cross_check import cross_check
 from hand_eye_calib.engine.scatter import compare_answers
 from hand_eye_calib.geometry import se3
@@ -59,7 +59,7 @@ def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(answe
     calibration, others, _ = answers
     (sentence,) = contradictions(calibration, [moved(other, 0.3) for other in others])
     # 0.3 m is the median: 0.44 m for a normal variable.
-    assert sentence.startswith("other methods and references scatter in x by 44 cm, and")
+    assert sentence.startswith("other methods and references disagree about x by 44 cm; this")
 
 
 def test_halves_that_lie_apart_are_named(answers):
@@ -68,7 +68,7 @@ def test_halves_that_lie_apart_are_named(answers):
     found = compare_answers(calibration, others, halves)
     assert found.of_halves[0] == pytest.approx(0.2, abs=0.02)
     (sentence,) = contradictions(calibration, others, halves)
-    assert sentence.startswith("the two halves of the recording scatter in x by")
+    assert sentence.startswith("the two halves of the recording disagree about x by")
 
 
 def test_an_answer_under_other_assumptions_that_lies_elsewhere_is_named(answers):
@@ -77,7 +77,7 @@ def test_an_answer_under_other_assumptions_that_lies_elsewhere_is_named(answers)
     beside = dataclasses.replace(calibration, other_answer=elsewhere)
     assert compare_answers(beside).of_model[0] == pytest.approx(0.1)
     (sentence,) = contradictions(beside)
-    assert "which assume different noise, differ in x by 10 cm" in sentence
+    assert "which assume different noise, disagree about x by 10 cm" in sentence
     near = moved(calibration, 0.1 * calibration.sigmas[0]).T_parent_child, calibration.covariance
     assert contradictions(dataclasses.replace(calibration, other_answer=near)) == []
 
@@ -100,6 +100,38 @@ def test_axes_that_an_answer_does_not_know_are_not_compared():
     assert np.isinf(found.sigma[2])
     assert np.isfinite(found.of_methods[:2]).all()
     assert set(found.to_dict()["z"].values()) == {None}
+
+
+def gentle_ramps(degrees):
+    """Streams of a vehicle that pitches, and rolls half as much, by so many degrees."""
+    k = np.arange(500)
+    rolled, pitched = np.radians(degrees / 2) * np.sin(k / 31), np.radians(degrees) * np.sin(k / 40)
+    turned = 1.2 * np.sin(k / 25 + 1.0) + 0.01 * k
+    rotation = se3.rotation_from_rpy(np.c_[rolled, pitched, turned])
+    position = np.cumsum(0.5 * rotation[:, :, 0], axis=0)
+    parent = se3.from_rotation_translation(rotation, position)
+    mount = se3.from_rotation_translation(se3.rotation_exp(np.array([0, 0, 0.4])), [0.6, -0.3, 0.3])
+    child = child_of(parent, mount)
+    noise = 0.005, 0.0005
+    return as_trajectory(disturbed(parent, 21, *noise)), as_trajectory(disturbed(child, 11, *noise))
+
+
+def test_an_axis_that_no_other_reference_reveals_is_unobservable():
+    hidden, shown = (calibrate(*gentle_ramps(degrees)) for degrees in (1.5, 4.0))
+    assert (hidden.method, shown.method) == ("adaptive", "adaptive")
+    assert (hidden.unobservable(), shown.unobservable()) == (["z"], [])
+    assert hidden.status is SolveStatus.UNOBSERVABLE
+    assert hidden.T_parent_child[2, 3] == pytest.approx(0.0, abs=1e-6)
+    assert hidden.T_method[2, 3] == pytest.approx(0.3, abs=0.1)
+    assert set(hidden.cross_check["z"].values()) == {None}
+    assert shown.T_parent_child[2, 3] == pytest.approx(0.3, abs=0.03)
+    np.testing.assert_allclose(hidden.T_parent_child[:2, 3], [0.6, -0.3], atol=0.02)
+
+
+def test_a_prior_holds_for_an_axis_that_no_other_reference_reveals():
+    found = calibrate(*gentle_ramps(1.5), prior={"z": (0.9, 0.02)})
+    assert found.observability[2].verdict is DofVerdict.PRIOR
+    assert found.T_parent_child[2, 3] == pytest.approx(0.9, abs=0.005)
 
 
 def test_two_other_answers_are_too_few(answers):

@@ -46,7 +46,7 @@ def test_files_are_calibrated_and_saved(tmp_path, capsys):
     result = imported("calibrate_files").main(*map(str, files))
     assert (tmp_path / "result" / "extrinsic.yaml").exists()
     truth = np.loadtxt(run / "T_S2_S1.txt")[1:4]
-    np.testing.assert_allclose(result.T_parent_child[:3, 3], truth, atol=1e-3)
+    np.testing.assert_allclose(result.T_parent_child[:3, 3], truth, atol=4e-3)
     assert result.headline in capsys.readouterr().out
 
 

@@ -27,7 +27,7 @@ from reproduction.catalogue import ARTEFACTS, EXPERIMENTS
 from reproduction.command import STUDIES, main
 from reproduction.kitti_truth import RECTIFIED
 from reproduction.published import LEVELS, REFERENCES, check_folder
-from reproduction.rows import ALI_AS_PUBLISHED, METRICS, Cell, Row, solve_cell
+from reproduction.rows import ALI_AS_PUBLISHED, METRICS, Cell, Row, solve_cell, solve_plain
 from reproduction.sources import SimulatedSource
 from reproduction.tables import PRINTED
 
@@ -39,19 +39,9 @@ CELLS = [
     Cell("outliers", 10.0, ALI_AS_PUBLISHED),
 ]
 
-A_ROW = Row(
-    "noise",
-    0.002,
-    "run_01",
-    "dnl",
-    "B1",
-    (0.01, 0.5, 0.02, 0.3),
-    1.0,
-    True,
-    tuple(np.eye(4).ravel()),
-    (0.01, 0.5, 0.02, 0.3),
-    1.0,
-)
+ERRORS = (0.01, 0.5, 0.02, 0.3)
+SOLVED = (ERRORS, 1.0, True, tuple(np.eye(4).ravel()), ERRORS, 1.0)
+A_ROW = Row("noise", 0.002, "run_01", "dnl", "B1", *SOLVED)
 
 
 @pytest.fixture(autouse=True)
@@ -118,32 +108,22 @@ def test_best_reference_is_by_mean_over_levels_and_by_median_in_the_mixture():
     assert table.best_reference("mixture", "dnl") == "C5"
 
 
+OFF = {"errors": (0.01, 0.5, 0.021, 0.3)}
+WITHOUT_OBJECTIVE = {**OFF, "published_objective": None}
+
+
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
         ({}, ""),
         ({"errors": (0.01, 0.5, 0.020019, 0.3)}, ""),
-        ({"errors": (0.01, 0.5, 0.021, 0.3), "objective": 0.9}, "lower objective"),
-        ({"errors": (0.01, 0.5, 0.021, 0.3), "objective": 1.0 + 5e-7}, "flat"),
-        ({"errors": (0.01, 0.5, 0.021, 0.3), "objective": 1.0 + 2e-6}, "our objective is higher"),
-        (
-            {"errors": (0.01, 0.5, 0.021, 0.3), "method": "ali", "published_objective": None},
-            "never normalised",
-        ),
-        (
-            {
-                "errors": (0.01, 0.5, 0.021, 0.3),
-                "method": "zhuang",
-                "published_objective": None,
-                "converged": False,
-            },
-            "not settle",
-        ),
-        (
-            {"errors": (0.01, 0.5, 0.021, 0.3), "method": "park", "published_objective": None},
-            "unexplained",
-        ),
-        ({"errors": (0.01, 0.5, 0.021, 0.3), "published": None}, ""),
+        ({**OFF, "objective": 0.9}, "lower objective"),
+        ({**OFF, "objective": 1.0 + 5e-7}, "flat"),
+        ({**OFF, "objective": 1.0 + 2e-6}, "our objective is higher"),
+        ({**WITHOUT_OBJECTIVE, "method": "ali"}, "never normalised"),
+        ({**WITHOUT_OBJECTIVE, "method": "zhuang", "converged": False}, "not settle"),
+        ({**WITHOUT_OBJECTIVE, "method": "park"}, "unexplained"),
+        ({**OFF, "published": None}, ""),
     ],
 )
 def test_every_row_that_differs_says_why(changes, why):
@@ -183,56 +163,63 @@ def test_labels_keep_their_distance_and_order(positions):
         np.testing.assert_allclose(placed, positions)
 
 
+def kept_in(folder, source=SOURCE):
+    return runner.Store(folder / "solved.jsonl", source.configuration())
+
+
+def solved(folder, jobs, on_done=lambda name: None):
+    tasks = {cell.name: (SOURCE, cell) for cell in CELLS}
+    found = runner.solve(solve_plain, tasks, jobs, kept_in(folder), on_done)
+    assert list(found) == list(tasks)
+    return [Row.from_plain(row) for rows in found.values() for row in rows]
+
+
 def test_the_number_of_processes_does_not_matter(tmp_path, rows):
     for jobs in (1, 2):
-        solved = runner.run(
-            SOURCE, CELLS, runner.Store(tmp_path / str(jobs), SOURCE.configuration()), jobs
-        )
-        assert list(solved) == CELLS
-        assert [row for cell in CELLS for row in solved[cell]] == rows
+        assert solved(tmp_path / str(jobs), jobs) == rows
 
 
 def test_an_interrupted_run_goes_on_where_it_ended(tmp_path, rows):
-    def interrupt(cell):
+    def interrupt(name):
         raise KeyboardInterrupt
 
     others = set(multiprocessing.active_children())
     with pytest.raises(KeyboardInterrupt):
-        runner.run(SOURCE, CELLS, runner.Store(tmp_path, SOURCE.configuration()), 1, interrupt)
+        solved(tmp_path, 1, interrupt)
     assert not set(multiprocessing.active_children()) - others
-    store = runner.Store(tmp_path, SOURCE.configuration())
-    kept = [cell for cell in CELLS if store.load(cell) is not None]
-    assert len(kept) == 1
+    (kept,) = kept_in(tmp_path).found
     # That the kept cell is not solved again shows in a mark that no solver makes.
-    marked = [dataclasses.replace(row, run="kept") for row in store.load(kept[0])]
-    store.save(kept[0], marked)
-    solved = runner.run(SOURCE, CELLS, store, 2)
-    assert solved[kept[0]] == marked
-    others = [cell for cell in CELLS if cell not in kept]
-    assert [solved[cell] for cell in others] == [solve_cell(SOURCE, cell) for cell in others]
+    path = tmp_path / "solved.jsonl"
+    path.write_text(path.read_text().replace("run_01", "kept"))
+    marks = {row.method for row in solved(tmp_path, 2) if row.run == "kept"}
+    assert len(marks) == 1
+    assert kept.endswith(marks.pop())
+    assert len(kept_in(tmp_path).found) == len(CELLS)
 
 
 def test_a_changed_configuration_starts_anew(tmp_path):
-    store = runner.Store(tmp_path / "solved", SOURCE.configuration())
-    store.save(CELLS[0], [A_ROW])
-    assert runner.Store(tmp_path / "solved", SOURCE.configuration()).load(CELLS[0]) == [A_ROW]
-    other = dataclasses.replace(SOURCE, seed=4)
-    assert runner.Store(tmp_path / "solved", other.configuration()).load(CELLS[0]) is None
+    kept_in(tmp_path).keep("a cell", [1.5])
+    assert kept_in(tmp_path).found == {"a cell": [1.5]}
+    assert kept_in(tmp_path, dataclasses.replace(SOURCE, seed=4)).found == {}
 
 
-def test_a_damaged_file_is_solved_again(tmp_path):
-    store = runner.Store(tmp_path, SOURCE.configuration())
-    store.save(CELLS[0], [A_ROW])
-    (path,) = tmp_path.glob("noise*.json")
-    path.write_text(path.read_text()[:-20])
-    assert store.load(CELLS[0]) is None
+def test_a_line_that_was_cut_off_is_solved_again(tmp_path):
+    store = kept_in(tmp_path)
+    for name in ("whole", "cut"):
+        store.keep(name, [1.5])
+    path = tmp_path / "solved.jsonl"
+    path.write_text(path.read_text()[:-5])
+    again = kept_in(tmp_path)
+    assert again.found == {"whole": [1.5]}
+    again.keep("next", [2.5])
+    assert kept_in(tmp_path).found == {"whole": [1.5], "next": [2.5]}
 
 
-def test_a_folder_that_is_not_ours_is_left_alone(tmp_path):
-    (tmp_path / "solved").mkdir()
-    (tmp_path / "solved" / "thesis.tex").write_text("years of work")
-    runner.Store(tmp_path / "solved", SOURCE.configuration())
-    assert (tmp_path / "solved" / "thesis.tex").read_text() == "years of work"
+def test_a_file_that_is_not_ours_is_left_alone(tmp_path):
+    (tmp_path / "solved.jsonl").write_text("years of work")
+    with pytest.raises(InputError, match="move it"):
+        kept_in(tmp_path)
+    assert (tmp_path / "solved.jsonl").read_text() == "years of work"
 
 
 def test_simulated_cases_have_the_noise_of_their_level():
@@ -283,19 +270,8 @@ def test_printed_gains_are_those_of_variants_other_than_b1():
 
 
 def test_command_draws_and_says_what_it_has_no_numbers_for(tmp_path, capsys):
-    arguments = [
-        "fig3",
-        "--data",
-        "simulated",
-        "--runs",
-        "3",
-        "--seed",
-        "1",
-        "--out",
-        str(tmp_path),
-        "--json",
-    ]
-    assert main(arguments) == 0
+    arguments = ["fig3", "--data", "simulated", "--runs", "3", "--seed", "1", "--json"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["experiment"], document["data"], document["runs"]) == ("fig3", "simulated", 3)
     assert document["rows"] == 19 * 3 * 6
@@ -360,33 +336,23 @@ def test_options_of_simulated_drives_are_refused_for_the_published_ones(tmp_path
 
 
 def test_ctrl_c_ends_the_command_at_once_and_keeps_what_is_solved(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "reproduction",
-        "fig3",
-        "--data",
-        "simulated",
-        "--runs",
-        "20",
-        "--jobs",
-        "2",
-    ]
+    arguments = ["fig3", "--data", "simulated", "--runs", "20", "--jobs", "2", "--out"]
     # As from a terminal: all processes get the signal.
     running = subprocess.Popen(
-        [*command, "--out", str(tmp_path)],
+        [sys.executable, "-m", "reproduction", *arguments, str(tmp_path)],
         cwd=ROOT,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     )
+    path = tmp_path / "solved.jsonl"
     with running as process:
-        while not list(tmp_path.glob("solved/*dnlo.json")):
+        while not path.exists() or len(path.read_text().splitlines()) < 2:
             assert process.poll() is None, process.stderr.read()
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
         errors = process.communicate()[1]
     assert (process.returncode, errors) == (130, "")
-    kept = list(tmp_path.glob("solved/*dnlo.json"))
+    _, *kept = path.read_text().splitlines()
     assert 0 < len(kept) < 19
-    assert all(json.loads(path.read_text()) for path in kept)
+    assert all(json.loads(line)["name"].endswith("dnlo") for line in kept)

@@ -10,6 +10,7 @@ from hand_eye_calib.assessment.floor import (
     FLOOR_ROTATION,
     FLOOR_SCALE,
     FLOOR_TILT,
+    axes_lost_by_tilt,
     common_mode_floor,
 )
 from hand_eye_calib.geometry import se3
@@ -24,6 +25,21 @@ def streams(scale=1.0):
 
 
 class TestFloor:
+    def test_a_height_that_a_tilted_axis_would_move_too_far_is_unobservable(self):
+        rng = np.random.default_rng(4)
+        vectors = rng.normal(size=(2000, 3)) * [0.01, 0.01, 0.4]
+        motions = se3.exp(np.c_[np.zeros((2000, 3)), vectors])
+        pairs = MotionPairs(motions, motions, np.arange(2000), np.arange(2000) + 1)
+
+        def lost(height, sigma):
+            T = se3.from_rotation_translation(np.eye(3), [0.3, 0.2, height])
+            return axes_lost_by_tilt(pairs, np.ones(2000), T, np.array([0.01, 0.01, sigma]))
+
+        assert lost(3.0, 0.01) == ["z"]
+        assert lost(0.5, 0.01) == []
+        assert lost(0.5, 0.29) == ["z"]
+        assert lost(3.0, np.inf) == []  # it is unobservable already
+
     def test_its_translation_is_the_shift_that_a_wrong_scale_causes(self):
         parent, child = streams()
         answers = []

@@ -3,31 +3,26 @@ traceback, never a hang, and nothing outside the directory of the results.
 """
 
 import os
-import struct
+import tracemalloc
 import xml.dom.minidom
-import zipfile
-import zlib
-from io import BytesIO
 
-import numpy as np
 import pytest
 import yaml
-from motions import as_trajectory, child_of, wandering_poses
+from motions import as_trajectory, child_of, disturbed, wandering_poses
 from result_making import calibration
 
-from hand_eye_calib.cli import batch
-from hand_eye_calib.cli.batch.store import stored
+from hand_eye_calib.cli.batch.results import stored
+from hand_eye_calib.cli.batch.tasks import Task, read_batch
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.bags import write_bag
-from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
 from hand_eye_calib.io.results import keep_earlier_results, load_result, save_result
 from hand_eye_calib.io.trajectory_files import read_trajectory_file, write_trajectory
 
 PARENT = as_trajectory(wandering_poses(30), sensor_frame="lidar")
-CHILD = as_trajectory(child_of(wandering_poses(30)), sensor_frame="camera")
+CHILD = as_trajectory(
+    disturbed(child_of(wandering_poses(30)), 1, 1e-4, 1e-4), sensor_frame="camera"
+)
 
 
 @pytest.fixture
@@ -132,7 +127,12 @@ def test_dates_are_read_as_text(run, tmp_path):
     """A value that YAML takes for a date, impossible ones included, is like any other text."""
     path = tmp_path / "fleet.yaml"
     path.write_text("[{bag: absent, name: 2024-02-30}]")
-    assert [task.name for task in batch.read_batch(path, {}, {})] == ["2024-02-30"]
+    assert [task.name for task in read_batch(path, {}, {})] == ["2024-02-30"]
+
+
+INF, NAN = float("inf"), float("nan")
+AXES = calibration().to_dict()["observability"]
+SCATTER = {"sigma": 0.1, "of_methods": 0.1, "of_halves": 0.1}
 
 
 @pytest.mark.parametrize(
@@ -168,6 +168,21 @@ def test_dates_are_read_as_text(run, tmp_path):
         {"status": ["ok"]},
         {"reference_reason": [1]},
         {"time_offset_sigma_s": "x"},
+        {"objective": float("inf")},
+        {"target_axes": {"x": None}},
+        {"target_axes": {"up": 0.1}},
+        {"contradictions": {"w": 5.0}},
+        {"method": "guess"},
+        {"floor": {"matrix": [[None] * 6] * 6}},
+        {"covariance": {"matrix": [[1e18, *[0.0] * 5], *[[0.0] * 6] * 5]}},
+        {"covariance": {"matrix": [[-1.0, *[0.0] * 5], *[[0.0] * 6] * 5]}},
+        {"covariance": {"matrix": [[0.0, 5.0, *[0.0] * 4], *[[0.0] * 6] * 5]}},
+        *({"cross_check": {"x": SCATTER | {"of_halves": value}}} for value in (INF, -INF, NAN)),
+        {"cross_check": {"up": SCATTER}},
+        {"observability": AXES[:5]},
+        {"observability": AXES[::-1]},
+        {"observability": [AXES[0] | {"name": "up"}, *AXES[1:]]},
+        {"observability": [AXES[0] | {"sigma": NAN}, *AXES[1:]]},
     ],
     ids=repr,
 )
@@ -178,10 +193,25 @@ def test_altered_results_are_refused_or_shown(run, tmp_path, change):
     if "consistency" in change:  # the older name
         del document["cross_check"]
     path.write_text(yaml.safe_dump(document | change))
-    for command in (["info", tmp_path], ["info", tmp_path, "--json"]):
+    save_result(calibration(), tmp_path / "other")
+    for command in (
+        ["info", tmp_path],
+        ["info", tmp_path, "--json"],
+        ["compare", tmp_path, tmp_path / "other"],
+        ["compare", tmp_path / "other", "--with", tmp_path, "--json"],
+    ):
         code, out, err = run(*command)
         assert code in (0, 1, 3)
         assert (code == 1) == (len(err.splitlines()) == 1 and not out)
+
+
+@pytest.mark.parametrize("command", ["info", "check", "replay", "calibrate"])
+def test_a_name_that_is_too_long_for_a_file_is_one_line(run, tmp_path, command):
+    name = tmp_path / ("n" * 256)
+    code, out, err = run(command, name, *[name][: command == "calibrate"])
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "File name too long; give a shorter name" in err
+    assert len(err) < 200
 
 
 # ---- batches
@@ -244,7 +274,7 @@ def test_a_folder_that_is_a_link_out_of_the_directory_is_refused(run, tmp_path, 
 def test_a_name_with_slashes_is_one_folder(tmp_path):
     fleet = tmp_path / "fleet.yaml"
     fleet.write_text("[{bag: bag, name: ../../x}]")
-    assert [task.name for task in batch.read_batch(fleet, {}, {})] == [".._.._x"]
+    assert [task.name for task in read_batch(fleet, {}, {})] == [".._.._x"]
 
 
 @pytest.mark.parametrize(
@@ -252,7 +282,7 @@ def test_a_name_with_slashes_is_one_folder(tmp_path):
               '{"key": "K", "outcome": {"error": null, "calibration": {"status": 5}}}']
 )  # fmt: skip
 def test_a_damaged_state_of_a_batch_is_done_again(tmp_path, state):
-    task = batch.Task(name="a", bags=("absent",))
+    task = Task(name="a", bags=("absent",))
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "batch.json").write_text(state.replace("K", task.key()))
     assert stored(task, tmp_path) is None
@@ -270,6 +300,29 @@ def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
         one_line(caught)
     with pytest.raises(InputError, match="is not a regular file"):
         load_result(path)
+
+
+@pytest.mark.parametrize("format", ["auto", "csv", "euroc"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "#\n"])
+def test_empty_lines_take_no_memory_beside_that_of_the_text(tmp_path, format, end):
+    path = tmp_path / "empty.txt"
+    path.write_bytes(end.encode() * 500_000)
+    tracemalloc.start()
+    with pytest.raises(InputError, match="no poses in it"):
+        read_trajectory_file(path, format)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 4 * path.stat().st_size
+
+
+def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix(tmp_path):
+    write_trajectory(tmp_path / "poses.tum", as_trajectory(wandering_poses(5_000)))
+    tracemalloc.start()
+    reading = read_trajectory_file(tmp_path / "poses.tum")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(reading.trajectory) == 5_000
+    assert peak / 5_000 < 900  # bytes; 1,120 with lists of lines and of numbers
 
 
 def test_a_csv_cell_of_any_length_is_one_line(tmp_path):
@@ -382,110 +435,3 @@ def test_control_characters_do_not_reach_the_terminal(run, tmp_path):
     assert "a\\x1b[2J\\nb" in out
     error = InputError("frame 'a\x1b[2J\nb'")
     assert str(error) == "frame 'a\\x1b[2J\\nb'"
-
-
-# ---- journals
-
-
-def record_of(kind, payload):
-    return struct.pack("<cII", kind, len(payload), zlib.crc32(payload, zlib.crc32(kind))) + payload
-
-
-@pytest.fixture
-def journal(tmp_path):
-    """A journal of ten poses."""
-    calibrator = Calibrator(CalibratorConfig(reference="B3"))
-    writer = JournalWriter(tmp_path / "journal", calibrator.state())
-    for k in range(10):
-        writer.add_pose("parent", 10**9 + k, (k, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    writer.close()
-    return tmp_path / "journal"
-
-
-def test_stray_files_in_the_journals_directory_are_left_alone(journal):
-    data = (journal / "session-000001.journal").read_bytes()
-    strays = ("session-000001 (copy).journal", "session-.journal", "session--1.journal",
-              "session-x.journal", "session-1e3.journal", "notes.journal")  # fmt: skip
-    for name in strays:
-        (journal / name).write_bytes(data[:100])
-    assert has_session(journal)
-    assert len(read_journal(journal)[1]) == 10
-    assert count_poses(journal) == 10
-    calibrator = Calibrator(CalibratorConfig(reference="B3"))
-    writer = JournalWriter(journal, calibrator.state())
-    writer.add_pose("parent", 5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    writer.rotate(calibrator.state())
-    writer.close()
-    names = {path.name for path in journal.iterdir()}
-    assert names == {*strays, "session-000003.journal"}
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        record_of(b"P", b"short"),
-        record_of(b"P", struct.pack("<Bq7d", 9, 5, *range(7))),
-        record_of(b"F", b""),
-        record_of(b"F", b"\x09lidar"),
-        record_of(b"F", b"\x00\xff\xfe"),
-        record_of(b"F", b"\x00" + b"x" * 5000),
-        record_of(b"X", b"new"),
-    ],
-)
-def test_records_with_right_checksums_and_wrong_content_are_one_line(journal, bad):
-    path = journal / "session-000001.journal"
-    path.write_bytes(path.read_bytes() + bad)
-    with pytest.raises(InputError, match="cannot use the session journal") as caught:
-        read_journal(journal)
-    one_line(caught)
-    assert count_poses(journal) is None
-
-
-ARRAY = "{'descr': '%s', 'fortran_order': False, 'shape': (%s)}"
-
-
-def archive(compression=zipfile.ZIP_STORED, **members):
-    packed = BytesIO()
-    with zipfile.ZipFile(packed, "w", compression) as file:
-        for name, data in members.items():
-            file.writestr(name + ".npy", data)
-    return packed.getvalue()
-
-
-def array_file(header, data=b""):
-    text = header.encode() + b" " * (117 - len(header)) + b"\n"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
-
-
-@pytest.mark.parametrize(
-    "checkpoint",
-    [
-        b"",
-        b"PK\x03\x04 nothing",
-        archive(zipfile.ZIP_DEFLATED, a=array_file(ARRAY % ("<f8", "99,"), bytes(792))),
-        archive(a=array_file(ARRAY % ("<f8", "99999999999,"))),
-        archive(a=array_file(ARRAY % ("|O", "1,"), bytes(8))),
-        archive(a=array_file(ARRAY % ("<f8", "-1,"), bytes(9))),
-        archive(a=array_file("__import__('os').system('true')")),
-        archive(a=b"nothing"),
-    ],
-    ids=range(8),
-)  # fmt: skip
-def test_checkpoints_with_right_checksums_and_wrong_content_are_one_line(tmp_path, checkpoint):
-    path = tmp_path / "session-000001.journal"
-    path.write_bytes(b"hand_eye_calib journal 1\n" + record_of(b"C", checkpoint))
-    with pytest.raises(InputError, match="its checkpoint cannot be right") as caught:
-        read_journal(tmp_path)
-    one_line(caught)
-    assert count_poses(tmp_path) is None
-
-
-def test_a_checkpoint_comes_back_as_it_was(tmp_path):
-    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array(["x", "yz"]), "c": np.array(True)}
-    writer = JournalWriter(tmp_path, arrays)
-    writer.close()
-    found, _, _ = read_journal(tmp_path)
-    assert found.keys() == arrays.keys()
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(found[name], array)
-        assert found[name].dtype == array.dtype

@@ -1,3 +1,4 @@
+import json
 import os
 import signal
 import subprocess
@@ -7,15 +8,17 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, wandering_poses
 
+import hand_eye_calib as hec
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.journal import JournalWriter, has_session, read_journal
-from hand_eye_calib.ros.session_journal import resume, takers, whole_state
+from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
+from hand_eye_calib.ros.session_journal import give, poses_so_far, takers
 
 CONFIG = CalibratorConfig(reference="B3")
+BOTH = {"parent": {}, "child": {}}
 
 
 def messages(n_poses=60):
@@ -34,122 +37,168 @@ def _rows(trajectory):
     )
 
 
-def record(writer, calibrator, sequence):
-    for message in sequence:
+def record(writer, calibrator, sequence, flush_every=25):
+    for count, message in enumerate(sequence, 1):
         if calibrator.add_pose(*message):
             writer.add_pose(*message)
+        if count % flush_every == 0:
+            writer.flush()
 
 
-def resumed(directory):
-    checkpoint, events, lost_bytes = read_journal(directory)
-    calibrator = Calibrator(CONFIG)
-    calibrator.restore(checkpoint)
-    for kind, *event in events:
-        calibrator.add_pose(*event) if kind == "pose" else calibrator.set_frame(*event)
-    return calibrator, len(events), lost_bytes
+def resumed(directory, limits=None):
+    calibrator, journal = Calibrator(CONFIG, limits), read_journal(directory)
+    give(journal, directory, calibrator)
+    return calibrator, journal
 
 
-def test_a_resumed_session_is_the_session(tmp_path):
-    calibrator = Calibrator(CONFIG)
-    writer = JournalWriter(tmp_path / "journal", calibrator.state())
+@pytest.mark.parametrize("n_poses", [60, 600])
+def test_a_resumed_session_is_the_session(tmp_path, n_poses):
+    limits = BufferLimits(capacity=400, pairing_starts=200)  # pairs are made of 600 poses
+    calibrator = Calibrator(CONFIG, limits)
+    writer = JournalWriter(tmp_path / "journal", BOTH)
     calibrator.set_frame("parent", "lidar")
-    writer.set_frame("parent", "lidar")
-    record(writer, calibrator, messages())
+    writer.describe({"parent": {"frame": "lidar"}})
+    record(writer, calibrator, messages(n_poses))
     writer.close()
-    again, n_events, lost_bytes = resumed(tmp_path / "journal")
-    assert (n_events, lost_bytes) == (121, 0)
-    assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
+    again, journal = resumed(tmp_path / "journal", limits)
+    assert (len(journal.stamps_ns), journal.lost_bytes) == (2 * n_poses, 0)
     assert again.snapshot().parent_frame == "lidar"
     assert again.statistics("child") == calibrator.statistics("child")
+    for name, value in vars(calibrator.snapshot().pose_pairs()).items():
+        np.testing.assert_array_equal(vars(again.snapshot().pose_pairs())[name], value)
+    assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
 
 
-def test_the_engine_state_goes_round_after_pairs_were_made():
-    limits = BufferLimits(capacity=50)
-    calibrator = Calibrator(CONFIG, limits)
-    sequence = list(messages(150))
-    for message in sequence[:200]:
+def test_its_files_are_trajectories_that_every_program_reads(tmp_path):
+    writer = JournalWriter(tmp_path, {"parent": {"topic": "/lidar"}, "child": {"topic": "/camera"}})
+    calibrator = Calibrator(CONFIG)
+    record(writer, calibrator, messages())
+    writer.close()
+    parent, child = (hec.read_trajectory(tmp_path / f"{each}.tum") for each in BOTH)
+    found = hec.calibrate(parent, child, method="dnl", reference="B3")
+    expected = calibrator.snapshot().streams
+    np.testing.assert_array_equal(parent.stamps_ns, expected[0].stamps_ns)
+    np.testing.assert_allclose(child.poses, expected[1].poses, atol=1e-15)
+    assert found.n_poses == 60
+    first, *lines = (tmp_path / "parent.tum").read_text().splitlines()
+    assert json.loads(first.removeprefix("# "))["topic"] == "/lidar"
+    assert np.loadtxt(lines).shape == (60, 8)
+
+
+def test_poses_are_read_in_the_order_in_which_they_came_whatever_their_clocks(tmp_path):
+    writer = JournalWriter(tmp_path, BOTH)
+    pose = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+    for batch in range(3):
+        for stream, offset in (("parent", 0), ("child", 10**12)):
+            writer.add_pose(stream, offset + batch, *pose)
+        writer.flush()
+    writer.close()
+    journal = read_journal(tmp_path)
+    assert journal.streams.tolist() == ["parent", "child"] * 3
+    assert journal.stamps_ns.tolist() == [0, 10**12, 1, 10**12 + 1, 2, 10**12 + 2]
+
+
+def test_a_session_goes_on_after_the_last_whole_line(tmp_path):
+    calibrator, sequence = Calibrator(CONFIG), list(messages())
+    writer = JournalWriter(tmp_path, BOTH)
+    record(writer, calibrator, sequence[:60])
+    writer.close()
+    with (tmp_path / "child.tum").open("a") as file:
+        file.write("1.5000")
+    journal = read_journal(tmp_path)
+    assert journal.lost_bytes == 6
+    writer = JournalWriter(tmp_path, BOTH | {"child2": {}}, resumed=journal)
+    record(writer, calibrator, sequence[60:])
+    writer.close()
+    again, journal = resumed(tmp_path)
+    assert journal.lost_bytes == 0
+    assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
+
+
+def test_a_journal_that_begins_late_has_the_poses_so_far(tmp_path):
+    calibrator, sequence = Calibrator(CONFIG), list(messages())
+    for message in sequence[:60]:
         calibrator.add_pose(*message)
-    again = Calibrator(CONFIG, limits)
-    again.restore(calibrator.state())
-    for each in (calibrator, again):
-        for message in sequence[200:]:
-            each.add_pose(*message)
-    assert np.array_equal(
-        again.snapshot().pose_pairs().stamps_ns, calibrator.snapshot().pose_pairs().stamps_ns
-    )
-    assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
-    assert again.statistics("parent") == calibrator.statistics("parent")
-
-
-def test_a_new_segment_replaces_the_old_ones(tmp_path):
-    calibrator = Calibrator(CONFIG)
-    writer = JournalWriter(tmp_path, calibrator.state(), segment_bytes=20_000)
-    rotations = 0
-    for message in messages(400):
-        record(writer, calibrator, [message])
-        if writer.is_full:
-            writer.rotate(calibrator.state())
-            rotations += 1
+    writer = JournalWriter(tmp_path, BOTH, poses_so_far(calibrator, {}))
+    record(writer, calibrator, sequence[60:])
     writer.close()
-    assert rotations > 0
-    assert len(list(tmp_path.iterdir())) == 1
-    again, _, _ = resumed(tmp_path)
-    assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
+    again, _ = resumed(tmp_path)
+    assert again.statistics("child") == calibrator.statistics("child")
+    T = calibrator.estimate().T_parent_child
+    np.testing.assert_allclose(again.estimate().T_parent_child, T, atol=1e-12)
 
 
-def test_whatever_byte_the_file_ends_at_the_whole_records_before_it_are_read(tmp_path):
-    calibrator = Calibrator(CONFIG)
-    writer = JournalWriter(tmp_path, calibrator.state())
-    beginning = (tmp_path / "session-000001.journal").stat().st_size
-    record(writer, calibrator, messages(4))
+def test_whatever_byte_the_file_ends_at_the_whole_lines_before_it_are_read(tmp_path):
+    writer = JournalWriter(tmp_path, BOTH)
+    record(writer, Calibrator(CONFIG), messages(4))
     writer.close()
-    path = tmp_path / "session-000001.journal"
+    path = tmp_path / "child.tum"
     data = path.read_bytes()
-    for end in range(beginning, len(data)):
+    ends = [index + 1 for index, byte in enumerate(data) if byte == ord("\n")]
+    for end in range(ends[0], len(data)):
         path.write_bytes(data[:end])
-        _, events, lost_bytes = read_journal(tmp_path)
-        assert len(events) == (end - beginning) // ((len(data) - beginning) // 8)
-        assert lost_bytes == (end - beginning) % ((len(data) - beginning) // 8)
+        journal = read_journal(tmp_path)
+        whole = max(each for each in ends if each <= end)
+        assert journal.lost_bytes == end - whole
+        expected = [line for line in data[:whole].splitlines() if not line.startswith(b"#")]
+        assert (journal.streams == "child").sum() == len(expected)
 
 
-def test_a_damaged_record_ends_the_session_before_it(tmp_path):
-    calibrator = Calibrator(CONFIG)
-    writer = JournalWriter(tmp_path, calibrator.state())
-    record(writer, calibrator, messages(4))
+def test_a_line_that_cannot_be_read_ends_its_stream_before_it(tmp_path):
+    writer = JournalWriter(tmp_path, BOTH)
+    record(writer, Calibrator(CONFIG), messages(4))
     writer.close()
-    path = tmp_path / "session-000001.journal"
-    data = path.read_bytes()
-    record_size = 9 + 65
-    for position in range(len(data) - 8 * record_size, len(data)):
-        damaged = bytearray(data)
-        damaged[position] ^= 0x10
-        path.write_bytes(damaged)
-        _, events, _ = read_journal(tmp_path)
-        assert len(events) <= (position - (len(data) - 8 * record_size)) // record_size
+    path = tmp_path / "child.tum"
+    *lines, _ = path.read_bytes().split(b"\n")
+    wrong = (b"\0" * 80, b"1.5 0 0 0 0 0 0 1", b"x.000000001 0 0 0 0 0 0 1", b"9" * 70_000,
+             b"99999999999.000000000 0 0 0 0 0 0 1", b"# {" + b"[" * 9000,
+             b'# {"parent_poses": "7"}', b'# {"frame": 7}', b"1.000000001 0 0 0 0 0 0")  # fmt: skip
+    for line in wrong:
+        path.write_bytes(b"\n".join([*lines[:-2], line, *lines[-2:], b""]))
+        journal = read_journal(tmp_path)
+        assert (journal.streams == "child").sum() == 2, line[:40]
+        assert journal.lost_bytes > len(line)
+
+
+def test_a_pose_that_the_engine_refuses_is_one_line(tmp_path):
+    writer = JournalWriter(tmp_path, BOTH)
+    writer.add_pose("parent", 1, (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    writer.close()
+    with pytest.raises(InputError, match=r"cannot use the session journal .*not finite"):
+        resumed(tmp_path)
 
 
 def test_what_is_no_journal_is_said(tmp_path):
     assert not has_session(tmp_path)
     with pytest.raises(InputError, match="no session journal in"):
         read_journal(tmp_path)
-    (tmp_path / "session-000001.journal").write_bytes(b"something else")
-    with pytest.raises(InputError, match="damaged from its first byte"):
+    (tmp_path / "session-000001.journal").write_bytes(b"hand_eye_calib journal 1\n")
+    assert has_session(tmp_path)
+    with pytest.raises(InputError, match="is of version 0.1, whose binary format is not read any"):
         read_journal(tmp_path)
+    for text, what in (("something else\n", "damaged from its first byte"),
+                       ('# {"format": "hand_eye_calib/journal", "version": 3}\n',
+                        "is of format version 3, this program reads 2")):  # fmt: skip
+        (tmp_path / "parent.tum").write_text(text)
+        with pytest.raises(InputError, match=what):
+            read_journal(tmp_path)
+        assert count_poses(tmp_path) is None
 
 
-def test_a_half_written_new_segment_leaves_the_old_one_in_force(tmp_path):
-    calibrator = Calibrator(CONFIG)
-    writer = JournalWriter(tmp_path, calibrator.state())
-    record(writer, calibrator, messages(20))
-    writer.close()
-    (tmp_path / "session-000002.tmp").write_bytes(b"hand_eye")
-    assert resumed(tmp_path)[1] == 40
+def test_a_file_that_was_replaced_is_not_written_to(tmp_path):
+    writer = JournalWriter(tmp_path, BOTH)
+    (tmp_path / "parent.tum").rename(tmp_path / "copy.tum")
+    (tmp_path / "parent.tum").write_text("mine")
+    writer.add_pose("parent", 1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with pytest.raises(OSError, match="another program has replaced its file"):
+        writer.flush()
+    assert (tmp_path / "parent.tum").read_text() == "mine"
 
 
 def test_a_journal_renamed_while_it_is_looked_for_is_no_error(tmp_path):
     journal = tmp_path / "journal"
     journal.mkdir()
-    (journal / "session-000001.journal").write_bytes(b"")
+    (journal / "parent.tum").write_bytes(b"")
     rename = "import os, sys\nwhile True:\n    os.rename(sys.argv[1], sys.argv[1] + 'x')\n"
     rename += "    os.rename(sys.argv[1] + 'x', sys.argv[1])\n"
     with subprocess.Popen([sys.executable, "-c", rename, journal]) as process:
@@ -160,102 +209,60 @@ def test_a_journal_renamed_while_it_is_looked_for_is_no_error(tmp_path):
     assert True in answers
 
 
-def test_kill_at_any_moment_costs_only_what_was_not_flushed(tmp_path):
-    """A child process journals with small segments and reports each flush; it is killed at moments
-    of its own making.
-    """
-    program = """
-import sys
-sys.path[:0] = sys.argv[3:]
-from test_journal import CONFIG, messages
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.pose_buffer import BufferLimits
+# Journals into each directory that it is given, in a fork of its own; reports its id, each flush,
+# and its end.
+JOURNALS = """
+import os, sys
+sys.path[:0] = sys.argv[1:]
+from test_journal import BOTH, messages
 from hand_eye_calib.io.journal import JournalWriter
-calibrator = Calibrator(CONFIG)
-writer = JournalWriter(sys.argv[1], calibrator.state(), segment_bytes=30_000)
 sequence = list(messages(4000))
-print("ready", flush=True)
-for count, message in enumerate(sequence, 1):
-    calibrator.add_pose(*message)
-    writer.add_pose(*message)
-    if count % 10 == 0:
-        writer.flush()
-        print(count, flush=True)
-    if writer.is_full:
-        writer.rotate(calibrator.state())
+for line in sys.stdin:
+    if os.fork():
+        os.wait()
+        print("ended", flush=True)
+        continue
+    print(os.getpid(), flush=True)
+    writer = JournalWriter(line.strip(), BOTH)
+    for count, message in enumerate(sequence, 1):
+        writer.add_pose(*message)
+        if count % 10 == 0:
+            writer.flush()
+            print(count, flush=True)
+    os._exit(0)
 """
+
+
+def test_kill_at_any_moment_costs_only_what_was_not_flushed(tmp_path):
     random = np.random.default_rng(0)
     folders = [os.path.dirname(__file__), os.path.dirname(os.path.dirname(__file__))]
-    for attempt in range(20):
-        directory = tmp_path / str(attempt)
-        command = [sys.executable, "-c", program, str(directory), "-", *folders]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            flushed = 0
-            for line in process.stdout:
-                if line.strip() != "ready":
-                    flushed = int(line)
-                if flushed >= random.integers(10, 4000):
-                    process.send_signal(signal.SIGKILL)
-                    break
-            # what was still in the pipe was flushed too
-            for line in process.stdout:
-                if line.strip().isdigit():
-                    flushed = int(line)
-        calibrator, _, _ = resumed(directory)
-        recovered = (
-            calibrator.statistics("parent").received + calibrator.statistics("child").received
-        )
-        assert flushed <= recovered <= flushed + 10
-
-
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("parent.stamps_ns", lambda _: np.array(5)),
-        ("parent.stamps_ns", lambda array: array[::-1]),
-        ("parent.stamps_ns", lambda array: array.astype(float)),
-        ("child.poses", lambda array: array[:-1]),
-        ("child.poses", lambda array: array * np.nan),
-        ("child.frame", lambda _: np.array(["a", "b"])),
-        ("child.statistics", lambda array: array - 10**6),
-        ("child.statistics", lambda _: None),
-        ("kept.Ts_pw_p", lambda _: np.ones((0, 3, 3))),
-        ("kept.stamps_ns", lambda _: np.array([3, 2])),
-        ("base", lambda _: np.array(7)),
-        ("unknown.part", lambda _: np.array(7)),
-        ("offset.unknown", lambda _: np.array(7)),
-    ],
-)
-def test_a_state_that_no_calibrator_gave_is_refused(name, change):
-    calibrator = Calibrator(CONFIG)
-    for message in messages():
-        calibrator.add_pose(*message)
-    state = calibrator.state()
-    changed = state | {name: change(state.get(name))}
-    changed = {key: value for key, value in changed.items() if value is not None}
-    again = Calibrator(CONFIG)
-    again.add_pose(*next(messages()))
-    with pytest.raises(InputError, match="the saved state"):
-        again.restore(changed)
-    assert again.statistics("parent").received == 1
-    again.restore(state)
-    assert again.statistics("parent") == calibrator.statistics("parent")
+    command = [sys.executable, "-c", JOURNALS, *folders]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
+    with subprocess.Popen(command, **pipes) as process:
+        for attempt in range(20):
+            directory, flushed = tmp_path / str(attempt), 0
+            process.stdin.write(f"{directory}\n")
+            child, at = int(process.stdout.readline()), random.integers(10, 400)
+            while (line := process.stdout.readline()) != "ended\n":
+                flushed = int(line)
+                if flushed == 10 * at:
+                    os.kill(child, signal.SIGKILL)
+            assert flushed <= count_poses(directory) <= flushed + 10
+        process.stdin.close()
 
 
 def test_further_child_sensors_are_resumed_too(tmp_path):
     calibrator, others = Calibrator(CONFIG), {"child2": Calibrator(CONFIG)}
-    writer = JournalWriter(tmp_path / "journal", whole_state(calibrator, others))
-    for number, (stream, *pose) in enumerate(messages()):
-        if number == 60:  # half of it is in a checkpoint
-            writer.rotate(whole_state(calibrator, others))
+    writer = JournalWriter(tmp_path, BOTH | {"child2": {}})
+    for stream, *pose in messages():
         for name in [stream, "child2"] if stream == "child" else [stream]:
             writer.add_pose(name, *pose)
             for own_stream, each in takers(name, calibrator, others):
                 each.add_pose(own_stream, *pose)
     writer.close()
-    again = {"child2": Calibrator(CONFIG)}
-    assert resume(tmp_path / "journal", Calibrator(CONFIG), again) == 120
-    assert again["child2"].statistics("child").received == 60
+    again, others = Calibrator(CONFIG), {"child2": Calibrator(CONFIG)}
+    give(read_journal(tmp_path), tmp_path, again, others)
+    assert others["child2"].statistics("child").received == 60
     T = calibrator.estimate().T_parent_child
-    assert np.array_equal(again["child2"].estimate().T_parent_child, T)
-    assert resume(tmp_path / "journal", Calibrator(CONFIG)) == 120
+    assert np.array_equal(others["child2"].estimate().T_parent_child, T)
+    assert np.array_equal(again.estimate().T_parent_child, T)

@@ -22,7 +22,6 @@ from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.engine.snapshot import downsample
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
 
 # 10 s at 10 Hz, so that a short drive outgrows the buffers many times; half a second for late
@@ -157,24 +156,6 @@ def test_downsampling_keeps_both_ends_and_the_limit():
         assert len(left) <= limit
         assert (left.stamps_ns[0], left.stamps_ns[-1]) == (0, 2999)
         assert (np.diff(left.stamps_ns) > 0).all()
-
-
-def test_an_estimated_time_offset_is_part_of_the_state():
-    parent, child = drive(1500)
-    late = Trajectory(child.stamps_ns - 2_000_000_000, child.poses)
-    calibrator = Calibrator(CalibratorConfig(reference="B3", time_offset="estimate"))
-    feed(calibrator, "parent", parent[:450])
-    feed(calibrator, "child", late[:450])
-    feed(calibrator, "parent", parent[450:600])
-    again = Calibrator(calibrator.config)
-    again.restore(calibrator.state())
-    for each in (calibrator, again):
-        feed(each, "child", late[450:])
-        feed(each, "parent", parent[600:])
-    first, second = calibrator.estimate(), again.estimate()
-    assert first.time_offset_s == second.time_offset_s == pytest.approx(2.0, abs=1e-3)
-    assert np.array_equal(first.T_parent_child, second.T_parent_child)
-    assert np.array_equal(first.covariance, second.covariance)
 
 
 def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):

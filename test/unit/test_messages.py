@@ -11,14 +11,15 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from hand_eye_calib.errors import printable
 from hand_eye_calib.io.bags.messages import (
     MALFORMED,
+    MESSAGE_TYPES,
     POSE_TYPES,
     MalformedMessage,
-    PoseFields,
+    unpack_one,
     unpack_path,
-    unpack_pose,
     unpack_poses,
     unpack_transforms,
 )
+from hand_eye_calib.io.bags.poses import PoseFields
 
 JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 NOETIC.register(
@@ -86,7 +87,8 @@ def encoded(encoding, message_type, pose, seq=7):
 
 def assert_fields(fields, pose, message_type):
     stamp_ns, world, sensor, values = pose
-    frames = printable(world), printable(sensor) if POSE_TYPES[message_type] else None
+    has_frame = MESSAGE_TYPES[message_type].has_child_frame
+    frames = printable(world), printable(sensor) if has_frame else None
     assert fields[:3] == (stamp_ns, *frames)
     np.testing.assert_array_equal([*fields.position, *fields.quat_xyzw], values)
 
@@ -96,16 +98,9 @@ def assert_fields(fields, pose, message_type):
 @given(pose=poses)
 def test_a_pose(encoding, message_type, pose):
     """The length of the frames' names shifts what follows: alignment is where readers go wrong."""
-    assert_fields(
-        unpack_pose(*_order(encoded(encoding, message_type, pose), message_type)),
-        pose,
-        message_type,
-    )
-
-
-def _order(data_and_kind, message_type):
-    data, is_ros1 = data_and_kind
-    return data, message_type, is_ros1
+    data, is_ros1 = encoded(encoding, message_type, pose)
+    *fields, values = unpack_one(data, message_type, is_ros1)
+    assert_fields(PoseFields(*fields, values[:3], values[3:]), pose, message_type)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -216,4 +211,4 @@ def test_bytes_that_are_no_message_are_malformed_and_nothing_else(unpack, data, 
 
 def test_an_encoding_that_is_not_plain_cdr_is_named():
     with pytest.raises(ValueError, match="expected plain CDR, found encoding 0x0007"):
-        unpack_pose(b"\x00\x07\x00\x00" + bytes(100), "geometry_msgs/msg/PoseStamped", False)
+        unpack_one(b"\x00\x07\x00\x00" + bytes(100), "geometry_msgs/msg/PoseStamped", False)

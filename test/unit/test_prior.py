@@ -68,6 +68,9 @@ class TestOption:
             ("prior_z", "1.85deg+/-0.02", "numbers in m or cm or mm"),
             ("prior_z", "high+/-0.02", "numbers in m or cm or mm"),
             ("prior_yaw", "-90+/-2", "write -90deg"),
+            ("prior_x", "1e999+/-1", r"at most 1e\+06 m; got '1e999'"),
+            ("prior_x", "1+/-1e200", r"at most 1e\+06 m; got '1e200'"),
+            ("prior_yaw", "1+/-1e999", r"at most 1e\+06 rad; got '1e999'"),
             ("prior_transform", "1 2 3+/-0.1", "X Y Z ROLL PITCH YAW"),
         ],
     )

@@ -16,8 +16,8 @@ from motions import (
 )
 
 import hand_eye_calib as hec
-from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, prior_fields
-from hand_eye_calib.engine.offline import offline_config
+from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig
+from hand_eye_calib.engine.offline import offline_config, prior_fields, whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.methods import BACKENDS, METHODS
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -93,6 +93,16 @@ class TestOptionsOfCalibrate:
         assert result.n_poses <= 20
         assert offline_config(parent, child, {}).max_pairs == 60
 
+    def test_of_two_files_of_a_million_poses_one_in_ten_is_used(self):
+        poses = np.broadcast_to(np.eye(4), (1_000_000, 4, 4))
+        long = hec.Trajectory(np.arange(1_000_000), poses)
+        config = offline_config(long, long, {})
+        assert config.max_pairs == 100_000
+        assert "100,000 pose pairs are used at most" in " ".join(
+            whole_snapshot(config, long, long).warnings
+        )
+        assert offline_config(long, long, {"max_pairs": 2_000_000}).max_pairs == 2_000_000
+
     def test_other_objects_are_refused_by_name(self):
         parent, child = streams()
         with pytest.raises(InputError, match="child must be a Trajectory; found ndarray: build"):
@@ -121,6 +131,8 @@ class TestOptionsOfCalibrate:
 
 
 class _Unsolved:
+    config = CalibratorConfig(time_offset=0.0)
+
     def estimate(self):
         return None
 

@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 import pytest
+from bag_making import JAZZY, fix, imu
 from motions import T_PARENT_CHILD, child_of, planar_poses, wandering_poses
 from rosbags.rosbag2 import Writer
-from rosbags.typesys import Stores, get_typestore
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
@@ -18,16 +18,14 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import RateIntegrator, integrated
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
-from hand_eye_calib.io.bags.messages import FIX_TYPE, IMU_TYPE, unpack_part
-from hand_eye_calib.io.bags.parts import MessageReader, PartReader, measured_as
+from hand_eye_calib.io.bags.messages import FIX_TYPE, IMU_TYPE, unpack_one
+from hand_eye_calib.io.bags.topics import MessageReader, measured_as
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
 
 BIAS = np.array([0.02, -0.01, 0.03])
 OFFSET_S = 0.02
 STEP_NS = 50_000_000
 START_NS = 1_700_000_000_000_000_000
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-TYPES = STORE.types
 
 
 def smooth_streams(n_poses=300, noise_rad=2e-4, seed=1):
@@ -112,7 +110,7 @@ class TestRates:
         found = hec.calibrate(parent, child)
         assert found.unobservable() == ["x", "y", "z", "yaw"]
         assert found.status is hec.SolveStatus.UNOBSERVABLE
-        assert "the motion does not show yaw" in found.reasons[0].sentence
+        assert "the rotation about z cannot be determined" in found.reasons[0].sentence
 
     def test_a_sensor_that_stands_still_is_not_to_be_used(self, streams):
         parent, _ = streams
@@ -297,51 +295,14 @@ class TestCheck:
         assert ("frozen", "error", {}) in found
 
 
-def message(kind, stamp_ns=12_000_000_005, **fields):
-    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-    header = TYPES["std_msgs/msg/Header"](
-        stamp=TYPES["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec), frame_id="imu_link"
-    )
-    return bytes(STORE.serialize_cdr(TYPES[kind](header=header, **fields), kind))
-
-
-def imu(rates, first_covariance=0.0, stamp_ns=12_000_000_005):
-    covariance = np.zeros(9)
-    of_rates = np.zeros(9)
-    of_rates[0] = first_covariance
-    vector = TYPES["geometry_msgs/msg/Vector3"]
-    return message(
-        "sensor_msgs/msg/Imu",
-        stamp_ns,
-        orientation=TYPES["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.6, w=0.8),
-        orientation_covariance=covariance,
-        angular_velocity=vector(*rates),
-        angular_velocity_covariance=of_rates,
-        linear_acceleration=vector(0.0, 0.0, 9.81),
-        linear_acceleration_covariance=covariance,
-    )
-
-
-def fix(status, latitude=60.0):
-    return message(
-        "sensor_msgs/msg/NavSatFix",
-        status=TYPES["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
-        latitude=latitude,
-        longitude=25.0,
-        altitude=30.0,
-        position_covariance=np.zeros(9),
-        position_covariance_type=0,
-    )
-
-
 def test_a_bag_with_an_imu(tmp_path, capsys):
     parent, stamps_ns, rates = smooth_streams(n_poses=150)
-    kind = TYPES["sensor_msgs/msg/Imu"].__msgtype__
     bag = tmp_path / "bag"
     write_bag(bag, {"/odom": (parent, "nav_msgs/msg/Odometry")}, "mcap")
     with Writer(tmp_path / "imu", version=9) as writer:
         connections = [
-            writer.add_connection(topic, kind, typestore=STORE) for topic in ("/imu", "/imu_again")
+            writer.add_connection(topic, IMU_TYPE, typestore=JAZZY)
+            for topic in ("/imu", "/imu_again")
         ]
         for stamp_ns, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
             for connection in connections:
@@ -365,17 +326,17 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
 
 class TestMessages:
     def test_an_imu(self):
-        found = unpack_part(imu((0.1, 0.2, 0.3)), IMU_TYPE, is_ros1=False)
-        assert (found.stamp_ns, found.frame) == (12_000_000_005, "imu_link")
-        assert found.values == [0.0, 0.0, 0.6, 0.8, 0.1, 0.2, 0.3]
-        assert np.isnan(unpack_part(imu((0, 0, 0), -1.0), IMU_TYPE, is_ros1=False).values[4:]).all()
+        stamp_ns, frame, _, values = unpack_one(imu((0.1, 0.2, 0.3)), IMU_TYPE, is_ros1=False)
+        assert (stamp_ns, frame) == (12_000_000_005, "imu_link")
+        assert values == [0.0, 0.0, 0.6, 0.8, 0.1, 0.2, 0.3]
+        assert np.isnan(unpack_one(imu((0, 0, 0), -1.0), IMU_TYPE, is_ros1=False)[-1][4:]).all()
 
     def test_a_fix(self):
-        assert unpack_part(fix(2), FIX_TYPE, is_ros1=False).values == [60.0, 25.0, 30.0]
-        assert np.isnan(unpack_part(fix(-1), FIX_TYPE, is_ros1=False).values).all()
+        assert unpack_one(fix(2), FIX_TYPE, is_ros1=False)[-1] == [60.0, 25.0, 30.0]
+        assert np.isnan(unpack_one(fix(-1), FIX_TYPE, is_ros1=False)[-1]).all()
 
     def test_without_a_fix_a_message_is_left_out(self):
-        reader = PartReader("sensor_msgs/msg/NavSatFix", "positions")
+        reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
         messages = [fix(0), fix(-1), fix(2, latitude=60.001)]
         columns = reader.columns(messages, is_ros1=False)
         assert reader.n_left_out == 1
@@ -385,7 +346,7 @@ class TestMessages:
         assert columns.sensor_frames[0] == "imu_link"
 
     def test_a_latitude_beyond_the_pole_is_refused_and_named(self):
-        reader = PartReader("sensor_msgs/msg/NavSatFix", "positions")
+        reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
         with pytest.raises(InputError, match="latitude 139.7 and longitude 25.*swapped") as caught:
             reader.columns([fix(0), fix(0, latitude=139.7)], is_ros1=False)
         assert caught.value.index == 1
@@ -394,7 +355,7 @@ class TestMessages:
             read(fix(0, latitude=139.7))
 
     def test_an_imu_can_be_read_as_rotations(self):
-        reader = PartReader("sensor_msgs/msg/Imu", "rotations")
+        reader = MessageReader("sensor_msgs/msg/Imu", "rotations")
         assert reader.columns([imu((1, 1, 1))], False).poses[0, 3:].tolist() == [0, 0, 0.6, 0.8]
 
     def test_what_a_type_does_not_have_is_refused(self):

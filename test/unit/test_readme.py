@@ -122,6 +122,14 @@ def test_readme_is_short():
     assert FEWEST_WORDS <= len(PAGES["README.md"].split()) <= MOST_WORDS
 
 
+def test_readme_names_its_two_commands_and_shows_the_report():
+    readme = PAGES["README.md"]
+    assert "`make demo`" in readme
+    assert "`make test`" in readme
+    assert (ROOT / "docs" / "images" / "report.png").stat().st_size < 200_000
+    assert "](docs/images/report.png)" in readme
+
+
 def shell_lines(text):
     """Lines of the shell blocks, and commands in running text that have no placeholder."""
     blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
@@ -183,7 +191,7 @@ def test_launch_arguments_exist(page):
 
 def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["simulate", "--out", "drives", "--seed", "3"]) == 0
+    assert main(["simulate", "--out", "drives", "--seed", "3", "--noise-free"]) == 0
     for sensor, name in ((1, "lidar"), (2, "camera")):
         (tmp_path / f"{name}.tum").write_bytes(
             (tmp_path / "drives" / "run_01" / f"T_S{sensor}_W{sensor}.txt").read_bytes()

@@ -13,7 +13,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from reproduction import repeats, unlike
 from reproduction.command import main
-from reproduction.recordings import RecordedSet, Recording, recorded_sets
+from reproduction.recordings import Recording, Rig
 from reproduction.writing import put_into_page
 
 
@@ -23,11 +23,15 @@ def recording(seed, noise=0.004):
     return Recording(as_trajectory(parent), as_trajectory(child))
 
 
+def rig(*drives):
+    options = {"time_offset": "estimate", "scale": "auto"}
+    return Rig(name="ours", recordings=dict(enumerate(drives)), options=options)
+
+
 def test_ratios_of_right_sigmas_lie_in_the_band():
     ratios = []
     for seed in range(5):
-        found = RecordedSet("ours", (recording(seed),))
-        ratios += repeats._set_ratios(found, "adaptive")
+        ratios += repeats.axis_ratios("ours", rig(recording(seed)), "adaptive")
     assert {ratio.axis for ratio in ratios} == {"x", "y", "z", "roll", "pitch", "yaw"}
     assert {ratio.freedom for ratio in ratios} == {3}
     pooled = np.sqrt(np.mean([ratio.ratio**2 for ratio in ratios]))
@@ -37,17 +41,16 @@ def test_ratios_of_right_sigmas_lie_in_the_band():
 
 
 def test_drives_are_repeats_of_each_other_and_a_changed_mount_shows():
-    still = RecordedSet("still", (recording(0), recording(1)))
+    still = rig(recording(0), recording(1))
     shifted = dataclasses.replace(
         recording(1),
         child=as_trajectory(
             child_of(wandering_poses(400, 1), T_PARENT_CHILD @ se3.exp([0.3, 0, 0, 0, 0, 0]))
         ),
     )
-    moved = RecordedSet("moved", (recording(0), shifted))
     by_axis = [
-        {ratio.axis: ratio for ratio in repeats._set_ratios(found, "dnlo B10")}
-        for found in (still, moved)
+        {ratio.axis: ratio for ratio in repeats.axis_ratios("ours", drives, "dnlo B10")}
+        for drives in (still, rig(recording(0), shifted))
     ]
     assert {ratio.freedom for found in by_axis for ratio in found.values()} == {1}
     assert by_axis[0]["x"].ratio < 3
@@ -79,24 +82,23 @@ def test_band_is_that_of_chi_square():
     ],
 )
 def test_reasons_of_large_z_scores(error, of_thirds, of_others, said):
-    reason = repeats._reason(error, 0.01, np.array(of_thirds), np.array(of_others))
+    reason = repeats.reason(error, 0.01, np.array(of_thirds), np.array(of_others))
     assert said in reason
     assert bool(reason) == bool(said)
 
 
 def test_sets_that_are_absent_are_named(tmp_path):
-    assert recorded_sets(tmp_path) == ([], ["valimaki2023", "zxl19", "asl_tango_easy"])
+    assert repeats.recorded_sets(tmp_path) == ({}, ["valimaki2023", "zxl19", "asl_tango_easy"])
 
 
-def test_real_sets_are_read():
-    sets, absent = recorded_sets(data_folder())
-    names = [found.name for found in sets]
-    assert {"kitti_short", "kitti_long"} <= set(names)
-    assert not any(name in names for name in absent)
-    for found in sets:
-        for drive in found.drives:
-            assert len(drive.parent) > 100
-            assert len(drive.child) > 100
+def test_every_set_of_the_study_is_among_the_rigs():
+    sets, absent = repeats.recorded_sets(data_folder())
+    assert absent == []
+    assert list(sets) == [
+        *("kitti_short", "kitti_long", "zxl19"),
+        *("tango C<-M", "tango M<-N", "tango N<-C"),
+    ]
+    assert [len(found.recordings) for found in sets.values()] == [1, 1, 3, 1, 1, 1]
 
 
 @pytest.mark.parametrize("scenario", unlike.SCENARIOS)

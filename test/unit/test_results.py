@@ -12,17 +12,25 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml
-from result_making import calibration, good_calibration
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from result_making import NAMES, calibration, good_calibration
 
 from hand_eye_calib.calibration import (
     Calibration,
     DofObservability,
     DofVerdict,
     SolveStatus,
+    Verdict,
 )
+from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.findings import Severity
+from hand_eye_calib.checks.response import Biased
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import fingerprint, load_result, save_result
+from hand_eye_calib.plain import json_text
 
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 
@@ -49,9 +57,116 @@ def test_a_calibration_survives_its_dictionary_and_json():
     )
 
 
-def test_numpy_numbers_can_be_saved(tmp_path):
-    save_result(calibration(objective=np.float64(0.25)), tmp_path)
-    assert load_result(tmp_path).objective == 0.25
+NUMBERS = st.one_of(
+    st.floats(width=32, allow_nan=False, allow_infinity=False).flatmap(
+        lambda value: st.sampled_from([value, np.float64(value), np.float32(value)])
+    ),
+    st.integers(-(2**31), 2**31 - 1).flatmap(
+        lambda value: st.sampled_from([value, np.int64(value), np.int32(value)])
+    ),
+    st.booleans().flatmap(lambda value: st.sampled_from([value, np.bool_(value)])),
+    st.sampled_from([np.str_("word"), "word", None, SolveStatus.OK, Verdict.USE]),
+)
+DATA = st.recursive(
+    NUMBERS,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.lists(inner, max_size=3).map(tuple),
+        st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
+        st.lists(st.floats(-1e3, 1e3), max_size=3).map(np.array),
+    ),
+    max_leaves=8,
+)
+
+
+def as_expected(value):
+    """The same with lists for arrays and tuples, by other means than the package's."""
+    if isinstance(value, dict):
+        return {key: as_expected(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [as_expected(each) for each in value]
+    return getattr(value, "value", value)
+
+
+@settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=30
+)
+@given(data=DATA)
+def test_numbers_of_numpy_anywhere_in_a_result_are_plain_in_yaml_and_json(tmp_path, data):
+    finding = {"code": "c", "severity": "note", "what": "w", "advice": "a", "evidence": data}
+    found = calibration(
+        findings=(finding,),
+        noise={"in_words": [], "of": data},
+        objective=np.float64(0.25),
+        n_pairs=np.int64(438),
+    )
+    path = save_result(found, tmp_path, {"options": {"prior": data}})
+    saved = yaml.safe_load(path.read_text(encoding="utf-8"))
+    for document in (saved, json.loads(json.dumps(found.to_dict(), allow_nan=False))):
+        assert document["findings"][0]["evidence"] == as_expected(data)
+        assert document["noise"]["of"] == as_expected(data)
+        assert (document["objective"], document["n_pairs"]) == (0.25, 438)
+    assert saved["provenance"]["parameters"]["prior"] == as_expected(data)
+    assert json.loads(json_text(found.to_dict())) == found.to_dict()
+
+
+def test_a_result_with_a_finding_of_the_checks_can_be_saved(tmp_path):
+    gain = Biased(np.float64(1.02), np.float64(0.001), np.float64(0.0))
+    finding = wording.rotation_gain(gain, np.eye(3)[2], Severity.ERROR)
+    save_result(calibration(findings=(finding.to_dict(),)), tmp_path)
+    (read,) = load_result(tmp_path).findings
+    assert read["evidence"] == {"gain": 1.02, "sigma": 0.001}
+
+
+def test_an_axis_that_is_not_known_has_no_number_in_json_and_yaml(tmp_path):
+    written = calibration()
+    path = save_result(written, tmp_path)
+    saved = yaml.safe_load(path.read_text(encoding="utf-8"))
+    for document in (saved, json.loads(json_text(written.to_dict()))):
+        transform = document["T_parent_child"]
+        x, y, _ = written.T_parent_child[:3, 3]
+        assert transform["translation"] == [x, y, None]
+        assert [sigma is None for sigma in transform["sigma_translation"]] == [False, False, True]
+        assert transform["matrix"] == written.T_parent_child.tolist()
+        inverse = document["T_child_parent"]
+        assert inverse["translation"] == inverse["sigma_translation"] == [None] * 3
+    assert_same(load_result(path), written)
+
+
+def test_a_rotation_that_is_not_known_has_no_quaternion(tmp_path):
+    yaw = DofVerdict.UNOBSERVABLE
+    dofs = tuple(
+        DofObservability(name, yaw if name == "yaw" else DofVerdict.OBSERVED, sigma)
+        for name, sigma in zip(NAMES, [0.01] * 5 + [np.inf], strict=True)
+    )
+    covariance = np.diag([1e-4] * 5 + [1e4])
+    written = calibration(
+        T_parent_child=se3.exp(np.array([1.0, 2, 3, 0, 0, 0.3])),
+        covariance=covariance,
+        observability=dofs,
+    )
+    transform = yaml.safe_load(save_result(written, tmp_path).read_text())["T_parent_child"]
+    assert transform["quat_xyzw"] is None
+    assert transform["rpy_deg"][2] is None
+    np.testing.assert_allclose(transform["rpy_deg"][:2], [0, 0], atol=1e-9)
+    assert_same(load_result(tmp_path), written)
+
+
+@pytest.mark.parametrize("words", [["info"], ["info", "--json"], ["compare", "--json"]])
+def test_a_file_with_an_unknown_axis_is_read_by_the_commands(tmp_path, capsys, words):
+    for name in ("one", "two"):
+        save_result(calibration(status=SolveStatus.UNOBSERVABLE), tmp_path / name)
+    paths = [str(tmp_path / name) for name in ("one", "two")]
+    code = main([words[0], *paths[: 1 if words[0] == "info" else 2], *words[1:]])
+    told = capsys.readouterr()
+    assert (code, told.err) == (0 if words[0] == "info" else 3, "")
+    if "--json" not in words:
+        assert re.search(r"z +unknown m", told.out)
+    elif words[0] == "info":
+        assert json.loads(told.out)["T_parent_child"]["translation"][2] is None
+    else:
+        (difference,) = json.loads(told.out)["differences"]
+        assert difference["axes"]["z"]["verdict"] == "cannot tell"
 
 
 def test_the_file_says_where_it_came_from(tmp_path):

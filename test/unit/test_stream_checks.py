@@ -12,7 +12,7 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.checks.findings import Severity
+from hand_eye_calib.checks.findings import Confidence, Severity
 from hand_eye_calib.checks.streams import (
     check_stamps,
     check_stream,
@@ -107,7 +107,8 @@ def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
         axis=1,
     )
     poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
-    parent, child = as_trajectory(poses, 20), as_trajectory(child_of(poses, T_cw_pw=np.eye(4)), 20)
+    noisy = disturbed(child_of(poses, T_cw_pw=np.eye(4)), 1, 1e-4, 2e-4)
+    parent, child = as_trajectory(poses, 20), as_trajectory(noisy, 20)
     assert grave(check_streams(parent, child)) == []
     assert grave(check_streams(inverted(parent), inverted(child))) == [("inverse_both", "both")]
 
@@ -388,3 +389,59 @@ def test_findings_are_plain_values():
 def test_stamps_of_files_are_exact_to_the_nanosecond():
     stamps = Trajectory(np.array([1, 2, 3, 4]) * 10**18, np.tile(np.eye(4), (4, 1, 1))).stamps_ns
     assert check_stamps(stamps, stamps) == []
+
+
+class TestSlowStreams:
+    """Nothing is interpolated between poses that are a second or more apart."""
+
+    @pytest.mark.parametrize("interval_s", [1.0, 20.0])
+    def test_equal_stamps_have_motions_in_common(self, interval_s):
+        parent, child = (as_trajectory(each.poses[::5], 1 / interval_s) for each in drive())
+        assert grave(check_streams(parent, child)) == []
+
+    def test_a_clock_offset_is_found_between_poses(self):
+        parent, child = (as_trajectory(each.poses, 1.0) for each in drive(wander=planar_poses))
+        assert [code for code, _ in grave(check_streams(parent, child.shifted(-3.0)))] == [
+            "time_offset"
+        ]
+
+
+def around_a_target(n_poses, seed):
+    """Poses of a camera that an arm moves around a target at the origin, and looks at it."""
+    random = np.random.default_rng(seed)
+    angles = random.uniform([-0.9, 0.3, -0.5], [0.9, 1.2, 0.5], (n_poses, 3))
+    azimuth, elevation, roll = angles.T
+    ahead = -np.c_[
+        np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    ]
+    right = np.cross([0.0, 0.0, 1.0], ahead)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    axes = np.stack([right, np.cross(ahead, right), ahead], axis=2)
+    rolls = se3.rotation_exp(np.c_[np.zeros((n_poses, 2)), roll])
+    return se3.from_rotation_translation(
+        axes @ rolls, -random.uniform(0.4, 0.6, (n_poses, 1)) * ahead
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_arm_about_its_base_may_have_inverse_poses_and_that_is_no_error(seed):
+    camera = around_a_target(40, seed)
+    hand = child_of(camera, se3.exp(np.array([0.03, -0.05, 0.08, 0.1, -0.2, 1.5])), np.eye(4))
+    hand[:, :3, 3] -= [0.05, 0.05, -0.1]
+    parent = as_trajectory(disturbed(hand, seed, 2e-4, 2e-4), 1.0)
+    child = as_trajectory(disturbed(camera, seed + 9, 1e-3, 2e-3), 1.0)
+    found = check_streams(parent, child).findings
+    assert [(each.code, each.severity) for each in found] == [("inverse_both", Severity.WARNING)]
+    assert found[0].confidence is Confidence.POSSIBLE
+
+
+def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
+    poses = wandering_poses(600, 5, 0.02)
+    severities = []
+    for length_m, noise in ((0.0005, 1e-4), (0.004, 1e-4), (0.016, 0.004), (0.016, 0.02)):
+        X = se3.from_rotation_translation(se3.rotation_exp([0.4, -0.8, 0.3]), [length_m, 0.0, 0.0])
+        parent = as_trajectory(disturbed(poses, 1, noise, noise))
+        child = as_trajectory(disturbed(child_of(poses, X), 2, noise, noise))
+        found = check_streams(parent, child).findings
+        severities.append({each.severity for each in found if each.code == "same_position"})
+    assert severities == [{Severity.ERROR}, {Severity.WARNING}, set(), set()]

@@ -106,7 +106,7 @@ def test_a_shift_between_parts_counts_with_half_of_it():
     np.testing.assert_allclose(np.sqrt(np.diag(found.spread)), np.abs(SHIFT) / 2, atol=4e-3)
     np.testing.assert_allclose(found.xi, SHIFT, atol=8e-3)
     assert (found.probability > 0.99, found.share) == (True, 0.4)
-    assert "the first 40% of the recording" in found.warnings[0]
+    assert "The first 40% and the last 60%" in found.warnings[0]
     assert possible_shift(products_of(moved[:7]), 1.0) is None
 
 

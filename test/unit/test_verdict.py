@@ -107,6 +107,32 @@ def test_each_rule_alone_decides(rule):
     assert result.headline.startswith(f"{rule.verdict.value}: ")
 
 
+@pytest.mark.parametrize(
+    ("rule", "sentence"),
+    [
+        (
+            "methods",
+            "other methods and references disagree about the rotation about z by 0.57 deg; this "
+            "result claims +/- 0.057 deg",
+        ),
+        (
+            "floor",
+            "a constant odometry error (1 % in scale, 0.15 deg) would change x by 3 cm. No "
+            "recording can show it, and it is above your target of 2 cm",
+        ),
+    ],
+)
+def test_sentences_name_axes_values_and_targets(rule, sentence):
+    (reason,) = good(**CASES[rule]).reasons
+    assert reason.sentence == sentence
+
+
+def test_axes_that_cannot_be_determined_are_named_together():
+    result = good(observability=observed(z=np.inf, roll=np.inf, yaw=np.inf))
+    sentence = "z and the rotations about x and z cannot be determined from this motion"
+    assert result.reasons[0].sentence == sentence
+
+
 def test_a_large_scatter_of_references_is_not_excused_by_their_own_uncertainty():
     check = checked("x", 0.05, 2.9, "methods")
     assert good(cross_check=check).reasons == ()
@@ -125,7 +151,7 @@ def test_nothing_against_it_is_use():
     result = good()
     assert (result.verdict, result.reasons) == (Verdict.USE, ())
     assert result.headline == (
-        "USE: all six axes are known to 3.0 mm and 0.057 deg or better, one standard deviation"
+        "USE: all six axes are known to 3 mm and 0.057 deg or better, one standard deviation"
     )
 
 

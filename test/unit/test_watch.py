@@ -19,6 +19,7 @@ from hand_eye_calib.watch.html import fragment
 from hand_eye_calib.watch.web import WebServer
 
 NODE = "/calibrator"
+PATIENCE_S = 120.0  # how long a hang takes to fail a test, on a busy machine
 POSE = Pose("lidar", "camera", (0.42, -0.13, -0.35, 0.01, -0.02, 1.5))
 
 
@@ -140,6 +141,7 @@ def test_the_comparison_has_its_figures_and_a_sign():
     assert view_of(progress(comparison="same")).result[1].tone is Tone.GOOD
     assert view_of(progress(comparison="cannot tell")).result[1].tone is Tone.UNKNOWN
     assert "nothing to compare with" in view_of(progress()).result[1].text
+    assert len(view_of(progress()).result) == 2
     waiting = {"comparison": "not yet", "comparison_sentence": "not compared yet: no result yet"}
     assert view_of(progress(**waiting)).result[1].text == "not compared yet: no result yet"
 
@@ -202,11 +204,11 @@ def test_an_answer_is_shown_for_a_while():
         (0.0099, "m", "9.9 mm"),
         (0.0123, "m", "1.2 cm"),
         (0.5, "m", "50 cm"),
-        (12.3, "m", "12 m"),
+        (12.3, "m", "12.3 m"),
         (0.001, "rad", "0.057 deg"),
-        (0.0001, "rad", "0.006 deg"),
+        (0.0001, "rad", "0.0057 deg"),
         (-0.0003, "m", "-0.3 mm"),
-        (-0.000001, "rad", "0 deg"),
+        (-0.000001, "rad", "less than 0.001 deg"),
         (float("nan"), "m", ""),
     ],
 )
@@ -359,7 +361,7 @@ def server():
 
 
 def fetch(server, method, path):
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE_S)
     connection.request(method, path)
     return connection.getresponse()
 
@@ -394,7 +396,7 @@ def test_without_the_key_there_is_nothing_to_see(server, path):
 
 def test_buttons_are_passed_on_with_the_key_only(server):
     assert fetch(server, "POST", "/save?key=word").status == 200
-    assert server.requests.get(timeout=5) == (NODE, "save")
+    assert server.requests.get(timeout=PATIENCE_S) == (NODE, "save")
     assert fetch(server, "POST", "/reset").status == 403
     assert fetch(server, "POST", "/shutdown?key=word").status == 404
     assert fetch(server, "GET", "/save?key=word").status == 404
@@ -410,7 +412,7 @@ def test_a_browser_that_leaves_makes_room_for_another(monkeypatch):
         assert events.readline().startswith(b"data: <p")
         assert fetch(server, "GET", "/events?key=word").status == 503
         events.close()
-        end = time.monotonic() + 30
+        end = time.monotonic() + PATIENCE_S
         while fetch(server, "GET", "/events?key=word").status == 503:
             assert time.monotonic() < end
             time.sleep(0.05)
@@ -421,3 +423,19 @@ def test_a_browser_that_leaves_makes_room_for_another(monkeypatch):
 def test_a_port_in_use_is_said_in_one_line(server):
     with pytest.raises(ConfigError, match="choose another with --web PORT"):
         WebServer(Board(), print, ("127.0.0.1", server.port))
+
+
+@pytest.mark.parametrize(
+    ("state", "tone"),
+    [
+        ("broadcast", Tone.GOOD),
+        ("not yet: the goal is not reached", Tone.BUSY),
+        ("refused: camera has the parent base_link on /tf_static already", Tone.ACT),
+    ],
+)
+def test_whether_the_result_is_broadcast_is_shown_where_that_was_asked_for(state, tone):
+    said = Status("extrinsic", 0, "USE", {"broadcast on /tf_static": state})
+    line = view_of(progress(), said).result[2]
+    assert (line.tone, line.name, line.text) == (tone, "on /tf_static", state)
+    off = Status("extrinsic", 0, "USE", {"broadcast on /tf_static": "off"})
+    assert len(view_of(progress(), off).result) == 2

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hand_eye_calib.report import words
+from hand_eye_calib import text as words
 
 
 @pytest.mark.parametrize(
@@ -29,4 +29,4 @@ def test_lists_counts_and_lengths():
     assert words.counted(1500, "gap") == "1,500 gaps"
     assert words.length(0.0123) == "1.2 cm"
     assert words.length(1234.5) == "1,234 m"
-    assert words.size(0.0174533, "yaw") == "1.0°"
+    assert words.amount("yaw", 0.0174533) == "1 deg"

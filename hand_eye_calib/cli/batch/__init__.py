@@ -18,9 +18,3 @@ holds for all of them::
 
 What is given for a bag goes before what holds for all, and that before the command line.
 """
-
-from hand_eye_calib.cli.batch.calibrating import work
-from hand_eye_calib.cli.batch.run import run_batch
-from hand_eye_calib.cli.batch.tasks import Task, read_batch
-
-__all__ = ["Task", "read_batch", "run_batch", "work"]

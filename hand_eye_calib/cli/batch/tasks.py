@@ -18,9 +18,9 @@ from hand_eye_calib.errors import ConfigError
 SOURCES = ("parent_topic", "child_topic", "parent_tf", "child_tf")
 _KEYS = ("bag", "name", "vehicle", "options", *SOURCES)
 STATE = "batch.json"
-SUMMARY, TABLE, COLUMNS, INDEX = "summary.json", "rows.csv", "rows.parquet", "index.html"
+SUMMARY, TABLE, INDEX = "summary.json", "rows.csv", "index.html"
 # Names of files in the folder of the results, which a recording cannot have.
-_TAKEN = (SUMMARY, STATE, TABLE, COLUMNS, INDEX)
+_TAKEN = (SUMMARY, STATE, TABLE, INDEX)
 # Bytes of the name of a folder.
 _LONGEST_NAME = 200
 
@@ -36,7 +36,7 @@ class Task:
     bags : tuple of str
         Paths or URLs.
     vehicle : str
-        The rig; recordings of one are compared with each other. May be empty.
+        The rig; recordings of one are compared with each other. Empty if it is not known.
     options, sources : dict
     with_fingerprints, with_report : bool
     """

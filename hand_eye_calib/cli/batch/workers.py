@@ -1,18 +1,30 @@
-"""Where the tasks are done: in processes of this machine, or on a Dask cluster."""
+"""The work of one task, and where tasks are done: in processes of this machine, or on a Dask
+cluster.
+"""
 
 import multiprocessing
 import os
 import signal
-from collections import Counter, deque
+import threading
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from queue import SimpleQueue
+from typing import Any
 
-from hand_eye_calib.cli.batch.calibrating import Outcome, failed, work
 from hand_eye_calib.cli.batch.tasks import Task
-from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.cli.replaying import fingerprints, replay
+from hand_eye_calib.cli.reporting import rendered, with_cross_check
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
+from hand_eye_calib.io.limits import ReadingMemory
+from hand_eye_calib.io.remote import local_copies, public
 
+# What came of a task, in plain values.
+Outcome = dict[str, Any]
 # Does a task.
 Work = Callable[[Task], Outcome]
 # Does tasks, and yields each with its outcome.
@@ -22,79 +34,141 @@ Workers = Callable[[Sequence[Task]], Iterable[tuple[Task, Outcome]]]
 _MOST_DEATHS = 3
 
 
+def work(task: Task) -> Outcome:
+    """Do a task; what goes wrong becomes part of the outcome, so that the others go on.
+
+    Returns
+    -------
+    dict
+        ``name``, ``vehicle``, ``bags``, ``calibration`` (Calibration.to_dict or None), ``findings``
+        of the stream checks, ``inputs``, ``error`` (text or None), the ``page`` of the report if
+        the task wants one, and a ``traceback`` for errors that are defects of the program.
+    """
+    try:
+        with local_copies(task.bags) as (paths, as_given):
+            return failed(task, None) | as_given(_calibrated(task, paths))
+    except HandEyeCalibError as error:
+        return failed(task, str(error))
+    except Exception as error:
+        text = " ".join(f"unexpected {type(error).__name__}: {error}".split())
+        return failed(task, text) | {"traceback": traceback.format_exc()}
+
+
+def failed(task: Task, reason: str | None) -> Outcome:
+    """The outcome of a task that gave no calibration."""
+    return {
+        "name": task.name,
+        "vehicle": task.vehicle,
+        "bags": [public(bag) for bag in task.bags],
+        "calibration": None,
+        "findings": [],
+        "inputs": {},
+        "error": reason,
+    }
+
+
+def _calibrated(task: Task, paths: list[str]) -> Outcome:
+    """What a task adds to its outcome if nothing goes wrong."""
+    config = CalibratorConfig.from_options(task.options)
+    sources = (_source(task, "parent"), _source(task, "child"))
+    ReadingMemory.switch_on()  # this may be a process of its own
+    replayed = replay(paths, *sources, config=config, quiet=True)
+    if task.with_fingerprints:
+        replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
+    snapshot = replayed.calibrator.snapshot()
+    calibration, snapshot = checked(replayed.calibration, snapshot)
+    calibration, evidence = with_cross_check(calibration, snapshot)
+    inputs = replayed.inputs | {"options": snapshot.config.to_options()}
+    found: Outcome = {
+        "calibration": calibration.to_dict(),
+        "findings": [dict(finding) for finding in calibration.findings],
+        "inputs": inputs,
+    }
+    if calibration.status.failure:
+        found["error"] = calibration.status.failure
+    if task.with_report:
+        found["page"] = rendered(calibration, evidence, snapshot.config, inputs)
+    return found
+
+
+def _source(task: Task, stream: str) -> Any:
+    """Topic, pair of frames or nothing."""
+    from hand_eye_calib.io.transforms import TfSource
+
+    if frames := task.sources.get(f"{stream}_tf"):
+        return TfSource.parse(frames)
+    return task.sources.get(f"{stream}_topic")
+
+
 @contextmanager
 def on_cores(jobs: int, do: Work = work) -> Iterator[Workers]:
-    """Processes of this machine. If one dies, the others of its pool end with it; their tasks are
-    done again, one at a time.
+    """Processes of this machine. What a process that dies had to do is done again at the end, one
+    task at a time: it may have died for lack of memory.
     """
     # One thread each: the matrices are small, and all cores are taken already.
     threads = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = threads or "1"
-    pool = _Pool(jobs)
+    processes: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
+    for _ in range(jobs):
+        processes.put(_process())
+
+    def attempt(task: Task) -> Outcome | None:
+        process = processes.get()
+        try:
+            return process.submit(do, task).result()
+        except BrokenProcessPool:
+            process = _process()
+            return None
+        finally:
+            processes.put(process)
+
+    def outcomes(tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
+        futures = {lanes.submit(attempt, task): task for task in tasks}
+        died = []
+        for future in as_completed(futures):
+            task = futures.pop(future)
+            if found := future.result():
+                yield task, found
+            else:
+                died.append(task)
+        for task in died:
+            tries = (attempt(task) for _ in range(_MOST_DEATHS - 1))
+            reason = "worker processes die of it, perhaps for lack of memory"
+            yield task, next(filter(None, tries), failed(task, reason))
+
+    lanes = ThreadPoolExecutor(jobs)
     try:
-        yield lambda tasks: _outcomes(pool, tasks, do)
+        yield outcomes
     except BaseException:
-        pool.kill()
+        lanes.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.terminate()
         raise
     finally:
-        pool.close()
+        lanes.shutdown()
+        for _ in range(jobs):
+            processes.get().shutdown()
         if threads is None:
             del os.environ["OMP_NUM_THREADS"]
 
 
-class _Pool:
-    """Worker processes, spawned: forking a program with threads is not safe."""
-
-    def __init__(self, jobs: int) -> None:
-        self.jobs = jobs
-        self._executor = self._started()
-
-    def _started(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.jobs, context, initializer=_ignore_interrupts)
-
-    def submit(self, do: Work, task: Task) -> "Future[Outcome]":
-        """Start a task, in new processes if the old ones have died."""
-        try:
-            return self._executor.submit(do, task)
-        except BrokenProcessPool:
-            self.close()
-            self._executor = self._started()
-            return self._executor.submit(do, task)
-
-    def kill(self) -> None:
-        """End the processes at once."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-
-    def close(self) -> None:
-        """End the processes when their tasks are done."""
-        self._executor.shutdown()
+def _process() -> ProcessPoolExecutor:
+    """A worker process, spawned: forking a program with threads is not safe."""
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_begin)
 
 
-def _outcomes(pool: _Pool, tasks: Sequence[Task], do: Work) -> Iterator[tuple[Task, Outcome]]:
-    waiting, suspects = deque(tasks), deque[Task]()
-    deaths: Counter[str] = Counter()
-    running: dict[Future[Outcome], Task] = {}
-    while waiting or suspects or running:
-        while waiting and len(running) < pool.jobs:
-            task = waiting.popleft()
-            running[pool.submit(do, task)] = task
-        if not running:
-            # Alone, so that a task of which processes die takes no other along.
-            task = suspects.popleft()
-            running[pool.submit(do, task)] = task
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            task = running.pop(future)
-            if not isinstance(future.exception(), BrokenProcessPool):
-                yield task, future.result()
-                continue
-            deaths[task.name] += 1
-            if deaths[task.name] < _MOST_DEATHS:
-                suspects.append(task)
-            else:
-                yield task, failed(task, "worker processes die of it, perhaps for lack of memory")
+def _begin() -> None:
+    """Ctrl-C is for the process that waits for the workers; when that ends, they end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Wait until the parent has ended, even if it was killed, and end with it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "a worker is started by another process"
+    parent.join()
+    os._exit(1)
 
 
 @contextmanager
@@ -119,19 +193,12 @@ def on_dask(address: str, do: Work = work) -> Iterator[Workers]:
 
     def outcomes(tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
         futures = {client.submit(do, task, pure=False): task for task in tasks}
-        for future in as_completed_on_dask(futures):
-            task = futures[future]
-            error = future.exception()
-            if error:
-                reason = f"the cluster lost it: {' '.join(str(error).split())}"
-                yield task, failed(task, reason)
+        for future in as_completed_on_dask(list(futures)):
+            task = futures.pop(future)
+            if error := future.exception():
+                yield task, failed(task, f"the cluster lost it: {' '.join(str(error).split())}")
             else:
                 yield task, future.result()
 
     with client:
         yield outcomes
-
-
-def _ignore_interrupts() -> None:
-    """Ctrl-C is for the process that waits for the workers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

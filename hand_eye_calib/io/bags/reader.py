@@ -1,9 +1,10 @@
 """Reading the poses of two streams from bags."""
 
 import heapq
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, compress
+from operator import itemgetter
 from pathlib import Path
 from typing import Self
 
@@ -15,42 +16,41 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import Frames, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.blocks import (
-    Message,
-    MessageKind,
-    PoseBlock,
-    StampedPose,
-    blocks_of,
-    message_blocks,
-)
-from hand_eye_calib.io.bags.decompression import ZSTD_MAGIC, Budget, unpack
-from hand_eye_calib.io.bags.files import BagFiles, reading
 from hand_eye_calib.io.bags.messages import (
     MALFORMED,
+    MESSAGE_TYPES,
     PATH_TYPE,
     POSE_TYPES,
     TF_TYPES,
     MalformedMessage,
-    PoseColumns,
-    PoseFields,
     unpack_path,
-    unpack_poses,
     unpack_transforms,
 )
-from hand_eye_calib.io.bags.parts import PART_TYPES, PartReader, measured_as
-from hand_eye_calib.io.bags.storage import Storage
+from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns, PoseFields, StampedPose
+from hand_eye_calib.io.bags.recovery import Message, MessageKind
+from hand_eye_calib.io.bags.storage import (
+    BLOCK_SIZE,
+    BagFiles,
+    MessageBlock,
+    Storage,
+    message_blocks,
+)
 from hand_eye_calib.io.bags.topics import (
+    MessageReader,
     Source,
     TopicDescription,
     TopicInfo,
-    TopicScan,
     check_source,
+    measured_as,
     select_sources,
+    stamps_and_frames,
     unreadable,
 )
-from hand_eye_calib.io.limits import LARGEST_MESSAGE
 from hand_eye_calib.io.plausibility import PoseWatch
 from hand_eye_calib.io.transforms import TfSource, TransformTree
+
+# Different frames of one topic that are listed.
+_MOST_FRAMES = 1_000
 
 
 class PoseBag:
@@ -73,7 +73,7 @@ class PoseBag:
         self.paths = [Path(path) for path in paths]
         self._files = BagFiles()
         self._watches: dict[str, PoseWatch] = {}
-        self._readers: dict[str, PartReader] = {}
+        self._readers: dict[str, MessageReader] = {}
         self._gaps: list[str] = []
         try:
             for path in self.paths:
@@ -99,9 +99,7 @@ class PoseBag:
     def warnings(self) -> list[str]:
         """What could not be read, and poses that cannot be right; complete after reading."""
         losses = [
-            f"{storage.path}: {loss}"
-            for storage in self._files.storages
-            for loss in storage.losses.texts()
+            f"{storage.path}: {loss}" for storage in self._files.storages for loss in storage.losses
         ]
         watched = [text for name, watch in self._watches.items() for text in watch.warnings(name)]
         without = [
@@ -164,16 +162,25 @@ class PoseBag:
             If a message cannot be read.
         """
         infos = self.topics()
+        frames: dict[str, dict[tuple[str, str | None], None]] = {each.name: {} for each in infos}
+        stamps_ns: dict[str, tuple[int, int]] = {}
+        counts = dict.fromkeys(frames, 0)
         known_types = (*POSE_TYPES, PATH_TYPE, *TF_TYPES)
-        scans = {info.name: TopicScan() for info in infos if info.type in known_types}
-        counts = dict.fromkeys(scans, 0)
-        for block in self._messages(scans):
-            for kind in {message[0] for message in block}:
-                messages = [message[2] for message in block if message[0] == kind]
-                scans[kind.topic].take(kind, counts[kind.topic] + 1, messages)
-                counts[kind.topic] += len(messages)
-        duration_s = self.duration_s
-        return [scans.get(info.name, TopicScan()).describe(info, duration_s) for info in infos]
+        blocks = self._blocks([info.name for info in infos if info.type in known_types])
+        for kind, _, messages in chain.from_iterable(map(_by_kind, blocks)):
+            name = kind.topic
+            found_ns, pairs = stamps_and_frames(kind, messages, counts[name] + 1)
+            counts[name] += len(messages)
+            if len(frames[name]) < _MOST_FRAMES:
+                frames[name] |= pairs
+            if len(found_ns):
+                first_ns, last_ns = int(found_ns.min()), int(found_ns.max())
+                before = stamps_ns.get(name, (first_ns, last_ns))
+                stamps_ns[name] = (min(first_ns, before[0]), max(last_ns, before[1]))
+        return [
+            info.described(frames[info.name], stamps_ns.get(info.name), self.duration_s)
+            for info in infos
+        ]
 
     def select_topics(
         self, parent: Source | None = None, child: Source | None = None
@@ -217,7 +224,7 @@ class PoseBag:
         for source in sources:
             if not isinstance(source, str) or source not in topics:
                 return None
-            if topics[source].type not in (*POSE_TYPES, *PART_TYPES):
+            if topics[source].type not in MESSAGE_TYPES:
                 return None
             count += topics[source].count
         return count
@@ -284,63 +291,57 @@ class PoseBag:
         for stream, source in sources.items():
             if isinstance(source, TfSource):
                 transforms[stream] = source
-            elif source is not None and types.get(source) in (*POSE_TYPES, *PART_TYPES):
+            elif source is not None and types.get(source) in MESSAGE_TYPES:
                 direct[source] = stream
                 measured = self.measured(source, (measures or {}).get(stream, "auto"))
-                if measured != "poses":
-                    self._readers[source] = PartReader(types[source], measured)
+                self._readers[source] = MessageReader(types[source], measured)
             elif source is not None and types.get(source) == PATH_TYPE:
                 paths[stream] = source
-        streams: list[Iterator[PoseBlock]] = [self._direct_blocks(direct)] if direct else []
-        if transforms:
-            streams += [iter([each]) for each in self._transformed_poses(transforms, max_gap_s)]
-        streams += [iter([self._path_poses(*each)]) for each in paths.items()]
-        if len(streams) == 1:
-            yield from filter(len, streams[0])
-        else:
-            rows = [chain.from_iterable(map(PoseBlock.rows, blocks)) for blocks in streams]
-            yield from map(PoseBlock.of_rows, blocks_of(heapq.merge(*rows, key=_bag_time)))
+        blocks = self._direct_blocks(direct) if direct else iter(())
+        if paths or transforms:
+            of_others = self._transformed_poses(transforms, max_gap_s) if transforms else []
+            of_others += [self._path_poses(*each) for each in paths.items()]
+            whole = PoseBlock.concatenate([*blocks, *of_others])
+            whole = whole[np.argsort(whole.bag_ns, kind="stable")]
+            blocks = (whole[k : k + BLOCK_SIZE] for k in range(0, len(whole), BLOCK_SIZE))
+        yield from filter(len, blocks)
 
     def _direct_blocks(self, streams: dict[str, str]) -> Iterator[PoseBlock]:
         """Poses of topics that carry one in each message."""
         counts = dict.fromkeys(streams, 0)
-        for messages in self._messages(streams):
-            rows_of: dict[MessageKind, list[int]] = {}
-            for row, message in enumerate(messages):
-                rows_of.setdefault(message[0], []).append(row)
+        for block in self._blocks(streams):
             parts, kept_rows = [], []
-            for kind, rows in rows_of.items():
-                chosen = [messages[row] for row in rows]
-                first_number = counts[kind.topic] + 1
-                part, keep = self._unpacked_poses(kind, streams[kind.topic], first_number, chosen)
+            for kind, rows, messages in _by_kind(block):
+                numbers = counts[kind.topic] + 1 + np.arange(len(rows))
                 counts[kind.topic] += len(rows)
+                part, keep = self._unpacked_poses(
+                    kind, streams[kind.topic], numbers, messages, block.bag_ns[rows]
+                )
                 parts.append(part[keep])
-                kept_rows.append(np.array(rows)[keep])
+                kept_rows.append(rows[keep])
             yield PoseBlock.concatenate(parts)[np.argsort(np.concatenate(kept_rows))]
 
     def _unpacked_poses(
-        self, kind: MessageKind, stream: str, first_number: int, messages: Sequence[Message]
+        self,
+        kind: MessageKind,
+        stream: str,
+        message_numbers: IntArray,
+        messages: Sequence[bytes],
+        bag_ns: IntArray,
     ) -> tuple[PoseBlock, BoolArray]:
         """PoseBlock of messages, and which of them to keep."""
+        reader, first_number = self._readers[kind.topic], int(message_numbers[0])
         try:
-            columns = self._columns(kind, [message[2] for message in messages])
+            columns = reader.columns(messages, kind.encoding == "ros1")
         except MalformedMessage as error:
             raise unreadable(kind, first_number + error.index, error) from error
         except InputError as error:
             number = first_number + getattr(error, "index", 0)
             raise InputError(f"{kind.topic}, message {number}: {error}") from None
-        message_numbers = first_number + np.arange(len(messages))
-        bag_ns = np.array([message[1] for message in messages], dtype=np.int64)
         keep = self._watches[kind.topic].believable(first_number, columns.stamps_ns, bag_ns)
-        keep &= ~np.isnan(columns.poses).any(axis=1) | (kind.topic not in self._readers)
+        keep &= reader.is_measured(columns.poses)
         self._watch(kind.topic, message_numbers, columns, keep)
         return PoseBlock.of_columns(stream, message_numbers, columns, bag_ns), keep
-
-    def _columns(self, kind: MessageKind, messages: list[bytes]) -> PoseColumns:
-        reader = self._readers.get(kind.topic)
-        if reader is not None:
-            return reader.columns(messages, kind.is_ros1)
-        return unpack_poses(messages, kind.type, kind.is_ros1)
 
     def _watch(
         self, name: str, message_numbers: IntArray, columns: PoseColumns, keep: BoolArray
@@ -368,10 +369,10 @@ class PoseBag:
         """
         stamps_ns, bag_ns = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
         poses, world_frame = np.empty((0, 7)), ""
-        messages = chain.from_iterable(self._messages([topic]))
+        messages = self._messages([topic])
         for number, (kind, message_ns, data) in enumerate(messages, start=1):
             try:
-                world_frame, new_stamps_ns, new_poses = unpack_path(data, kind.is_ros1)
+                world_frame, new_stamps_ns, new_poses = unpack_path(data, kind.encoding == "ros1")
             except MALFORMED as error:
                 raise unreadable(kind, number, error) from error
             if not len(new_stamps_ns):
@@ -425,10 +426,7 @@ class PoseBag:
         InputError
             If the transforms form no tree or are damaged.
         """
-        tree = TransformTree()
-        for transform, is_static, _ in self._transforms():
-            tree.note(transform, is_static)
-        return tree
+        return self._tree_and_static()[0]
 
     def static_frames(self) -> Frames:
         """The frames of the bag and their static transforms; of repeated ones the last.
@@ -438,30 +436,34 @@ class PoseBag:
         InputError
             If the transforms form no tree or are damaged.
         """
-        tree = TransformTree()
-        poses = {}
+        tree, static = self._tree_and_static()
+        fixed, moving = {}, {}
+        for frame, edge in tree.edges.items():
+            if edge.is_static:
+                last = static[frame]
+                fixed[frame] = edge.parent, checked_pose(last.position, last.quat_xyzw)
+            else:
+                moving[frame] = edge.parent
+        return Frames(fixed, moving)
+
+    def _tree_and_static(self) -> tuple[TransformTree, dict[str, PoseFields]]:
+        """All edges, and the last static transform of each frame."""
+        tree, static = TransformTree(), dict[str, PoseFields]()
         for transform, is_static, _ in self._transforms():
             tree.note(transform, is_static)
             if is_static:
-                pose = checked_pose(transform.position, transform.quat_xyzw)
-                poses[transform.sensor_frame or ""] = pose
-        fixed = {
-            frame: (edge.parent, poses[frame])
-            for frame, edge in tree.edges.items()
-            if edge.is_static
-        }
-        moving = {frame: edge.parent for frame, edge in tree.edges.items() if not edge.is_static}
-        return Frames(fixed, moving)
+                static[transform.sensor_frame or ""] = transform
+        return tree, static
 
     def _transforms(
         self, frames: Container[str] | None = None
     ) -> Iterator[tuple[PoseFields, bool, int]]:
         """Transforms, whether each is static, and its bag time; of some frames, or of all."""
         names = [topic.name for topic in self.topics() if topic.type in TF_TYPES]
-        messages = chain.from_iterable(self._messages(names))
+        messages = self._messages(names)
         for number, (kind, bag_ns, data) in enumerate(messages, start=1):
             try:
-                for transform in unpack_transforms(data, kind.is_ros1):
+                for transform in unpack_transforms(data, kind.encoding == "ros1"):
                     if frames is None or transform.sensor_frame in frames:
                         yield transform, kind.topic.endswith("tf_static"), bag_ns
             except MALFORMED as error:
@@ -469,15 +471,19 @@ class PoseBag:
 
     # ---- messages
 
-    def _messages(self, topics: Container[str]) -> Iterator[list[Message]]:
+    def _messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Messages of some topics in the order of bag time."""
+        return chain.from_iterable(map(_rows, self._blocks(topics)))
+
+    def _blocks(self, topics: Collection[str]) -> Iterator[MessageBlock]:
         """Messages of some topics in the order of bag time, many at once."""
         for group in _overlapping(self._files.storages):
-            streams = [_storage_messages(storage, topics) for storage in group]
-            if len(streams) == 1:
-                yield from streams[0]
+            if len(group) == 1:
+                yield from group[0].blocks(topics)
             else:
-                merged = heapq.merge(*map(chain.from_iterable, streams), key=_recorded)
-                yield from message_blocks(merged)
+                streams = (map(_rows, storage.blocks(topics)) for storage in group)
+                merged = heapq.merge(*map(chain.from_iterable, streams), key=itemgetter(1))
+                yield from message_blocks(merged, self._gaps.append)
 
 
 def read_bag_trajectory(
@@ -555,12 +561,16 @@ def _first_seen(
     return first_ns
 
 
-def _bag_time(pose: StampedPose) -> int:
-    return pose.bag_ns
+def _rows(block: MessageBlock) -> Iterator[Message]:
+    """Messages of a block one by one."""
+    return zip(block.kinds, block.bag_ns.tolist(), block.contents, strict=True)
 
 
-def _recorded(message: Message) -> int:
-    return message[1]
+def _by_kind(block: MessageBlock) -> Iterator[tuple[MessageKind, IntArray, list[bytes]]]:
+    """Each kind of messages in a block, their rows and their bytes."""
+    for kind in {id(each): each for each in block.kinds}.values():
+        is_of_kind = [each is kind for each in block.kinds]
+        yield kind, np.flatnonzero(is_of_kind), list(compress(block.contents, is_of_kind))
 
 
 def _overlapping(storages: list[Storage]) -> Iterator[list[Storage]]:
@@ -577,22 +587,3 @@ def _overlapping(storages: list[Storage]) -> Iterator[list[Storage]]:
         group.append(storage)
     if group:
         yield group
-
-
-def _storage_messages(storage: Storage, topics: Container[str]) -> Iterator[list[Message]]:
-    """Messages of a storage; those that are compressed one by one are unpacked."""
-    with reading(storage.path):
-        budget = Budget(storage.path.stat().st_size)
-        for block in storage.messages(topics):
-            # Plain CDR never begins with the mark of zstd.
-            if any(message[2][:4] == ZSTD_MAGIC for message in block):
-                yield from message_blocks(_unpacked(message, budget) for message in block)
-            else:
-                yield block
-
-
-def _unpacked(message: Message, budget: Budget) -> Message:
-    kind, bag_ns, data = message
-    if data[:4] == ZSTD_MAGIC:
-        data = unpack(data, "zstd", LARGEST_MESSAGE, budget)
-    return kind, bag_ns, data

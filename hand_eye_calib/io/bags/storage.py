@@ -1,146 +1,462 @@
-"""What the readers of all storages have in common: their interface, their losses, and messages in
-the order of time from chunks that may overlap.
+"""The storage files of bags: found, unpacked, and read through the library rosbags.
+
+A file that rosbags cannot open, or not read to its end, is read record by record: see recovery.py.
 """
 
 import heapq
-from bisect import bisect_left
-from collections.abc import Callable, Container, Iterator, Sequence
-from itertools import count
-from pathlib import Path
-from typing import Protocol
+import re
+import sys
+import tempfile
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import compress, count, dropwhile, islice
+from operator import itemgetter, methodcaller
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
 
-from hand_eye_calib.io.bags.blocks import Message
-from hand_eye_calib.io.limits import LARGEST_OVERLAP, MOST_TOPICS
+import numpy as np
 
-LATEST_NS = (1 << 63) - 1
+from hand_eye_calib.arrays import IntArray
+from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.io.bags import indexed
+from hand_eye_calib.io.bags.recovery import (
+    Lose,
+    Message,
+    MessageKind,
+    reason_of,
+    recovered_messages,
+)
+from hand_eye_calib.io.limits import (
+    BLOCK_BYTES,
+    LARGEST_DISORDER,
+    LARGEST_RATIO,
+    MOST_BAG_FILES,
+    MOST_TOPICS,
+    SMALLEST_UNPACKED,
+    ReadingMemory,
+)
+from hand_eye_calib.io.yaml_files import read_yaml
 
+#: Messages that are unpacked at once, and a part of them.
+BLOCK_SIZE, _PIECE_SIZE = 2048, 64
+
+_EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
+_REPAIRS = {
+    ".mcap": "'mcap recover'",
+    ".db3": "sqlite3's '.recover'",
+    ".bag": "'rosbag reindex'",
+}
+_ENCODINGS = ("cdr", "ros1")
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_PIECE_BYTES = 1 << 20
 _MOST_LOSSES = 10
-# What a message takes beside its bytes.
-_OVERHEAD = 200
 
 
-class Storage(Protocol):
+class MessageBlock(NamedTuple):
+    """N messages in columns: kinds, bag times (N,) in ns, and bytes."""
+
+    kinds: Sequence[MessageKind]
+    bag_ns: IntArray
+    contents: Sequence[bytes]
+
+
+class Storage:
     """A storage file opened for reading.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Its name, for a person.
+    file : pathlib.Path
+        Where it is, unpacked.
+    memory : ReadingMemory
+        Of the whole bag.
 
     Attributes
     ----------
-    path : pathlib.Path
     topics : dict of str to (str, int)
         Message type and number of messages by topic. The type is empty if publishers disagree.
     start_ns, end_ns : int or None
         Bag time of the first and last message; None if there is none.
-    losses : Losses
-        What could not be read; complete after reading.
+    losses : list of str
+        What could not be read, one line each; complete after reading.
+
+    Raises
+    ------
+    InputError
+        If nothing in it can be read.
     """
 
-    path: Path
-    start_ns: int | None
-    end_ns: int | None
-    losses: "Losses"
+    def __init__(self, path: Path, file: Path, memory: ReadingMemory) -> None:
+        self.path, self._file, self._memory = path, file, memory
+        self._reader: Any = None
+        self.losses: list[str] = []
+        self._clear()
+        with self._errors_in_one_line(), self._memory:
+            try:
+                self._open()
+            except MissingDependencyError:
+                raise
+            except Exception as error:
+                self.close()
+                self._clear()
+                self._search(error)
+        log = file.with_name(file.name + "-wal")
+        if log.exists() and log.stat().st_size:
+            self._lose(
+                "what the recorder had not yet moved out of its log beside it (-wal) is left out; "
+                "open the file once with sqlite3 to have it moved"
+            )
 
-    @property
-    def topics(self) -> dict[str, tuple[str, int]]: ...
-
-    def messages(self, topics: Container[str]) -> Iterator[list[Message]]:
-        """Iterate over the messages of some topics in the order of bag time, many at once."""
+    def _clear(self) -> None:
+        self.topics: dict[str, tuple[str, int]] = {}
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
 
     def close(self) -> None:
         """Close the file."""
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None
+
+    def _open(self) -> None:
+        self._reader = reader = indexed.opened(self._file)
+        if not indexed.knows_all_messages(reader):
+            raise ValueError("it has no index")
+        for connection in reader.connections:
+            self._add(indexed.kind_of(connection), connection.msgcount)
+        if reader.message_count:
+            self._cover(reader.start_time)
+            self._cover(reader.end_time - 1)
+
+    def _search(self, reason: Exception) -> None:
+        """Go through a file that rosbags cannot open."""
+        n_messages, losses = 0, list[str]()
+        for kind, bag_ns, _ in recovered_messages(self._file, losses.append):
+            self._add(kind, 1)
+            self._cover(bag_ns)
+            n_messages += 1
+        if not n_messages and losses:
+            raise ValueError(f"{losses[0]}, and nothing before that can be recovered") from reason
+        if losses:
+            seconds = ((self.end_ns or 0) - (self.start_ns or 0)) * 1e-9
+            said = "; ".join(losses[:_MOST_LOSSES])
+            self._lose(f"{said}; recovered are {n_messages} messages covering {seconds:.1f} s")
+
+    def _add(self, kind: MessageKind, n_messages: int) -> None:
+        known, before = self.topics.get(kind.topic, (kind.type, 0))
+        self.topics[kind.topic] = (kind.type if kind.type == known else "", before + n_messages)
+        if len(self.topics) > MOST_TOPICS:
+            raise ValueError(f"it has more than {MOST_TOPICS} topics")
+
+    def _cover(self, bag_ns: int) -> None:
+        if not 0 <= bag_ns < 1 << 63:
+            raise ValueError("it has times that cannot be right")
+        self.start_ns = bag_ns if self.start_ns is None else min(bag_ns, self.start_ns)
+        self.end_ns = bag_ns if self.end_ns is None else max(bag_ns, self.end_ns)
+
+    def _lose(self, text: str) -> None:
+        if text not in self.losses and len(self.losses) < _MOST_LOSSES:
+            self.losses.append(text)
+
+    # ---- messages
+
+    def blocks(self, topics: Collection[str]) -> Iterator[MessageBlock]:
+        """Iterate over the messages of some topics in the order of bag time, many at once.
+
+        Raises
+        ------
+        InputError
+            If they are not encoded as CDR or as ROS 1 does, or take too much memory.
+        """
+        blocks = self._blocks(topics)
+        while True:
+            with self._errors_in_one_line(), self._memory:
+                block = next(blocks, None)
+            if block is None:
+                return
+            yield block
+
+    def _blocks(self, topics: Collection[str]) -> Iterator[MessageBlock]:
+        """Messages as rosbags has them; from where it fails, as far as they can be recovered."""
+        last_ns: IntArray = np.empty(0, dtype=np.int64)
+        lose: Lose = _say_nothing
+        if self._reader is not None:
+            connections = self._reader.connections
+            kinds = {each.id: indexed.kind_of(each) for each in connections}
+            wanted = {key: kind for key, kind in kinds.items() if self._is_wanted(kind, topics)}
+            try:
+                n_missing = sum(each.msgcount for each in connections if each.id in wanted)
+                for block in message_blocks(indexed.messages_of(self._reader, wanted), self._lose):
+                    yield block
+                    last_ns = block.bag_ns
+                    n_missing -= len(last_ns)
+                if n_missing:
+                    self._lose(f"{n_missing} of the messages that its index has are missing")
+                return
+            except Exception as error:
+                if _is_out_of_memory(error):
+                    raise
+                self._lose(f"it is damaged ({reason_of(error)}), and was read record by record")
+                lose = self._lose
+        found = recovered_messages(self._file, lose)
+        ordered = _in_order(each for each in found if self._is_wanted(each[0], topics))
+        if len(last_ns):  # those before, and these at the last time, were given already
+            end_ns = int(last_ns[-1])
+            later = dropwhile(lambda message: message[1] < end_ns, ordered)
+            ordered = islice(later, int((last_ns == end_ns).sum()), None)
+        yield from message_blocks(ordered, self._lose)
+
+    def _is_wanted(self, kind: MessageKind, topics: Collection[str]) -> bool:
+        """Whether it is of one of the topics, whose messages must be encoded as CDR or of ROS 1."""
+        if kind.topic in topics and kind.encoding not in _ENCODINGS:
+            raise InputError(
+                f"cannot read bag {self.path}: messages of {kind.topic} are encoded as "
+                f"{kind.encoding[:40]!r}, expected 'cdr'"
+            )
+        return kind.topic in topics
+
+    @contextmanager
+    def _errors_in_one_line(self) -> Iterator[None]:
+        """Turn whatever a reader stumbles over into one line.
+
+        Damaged files make the libraries raise errors of many kinds. Only their code and that of the
+        recovery runs inside, so no defect of the rest is hidden.
+        """
+        try:
+            yield
+        except (InputError, MissingDependencyError):
+            raise
+        except Exception as error:
+            if _is_out_of_memory(error):
+                raise InputError(
+                    f"cannot read bag {self.path}: reading it takes more memory than any bag "
+                    "should; it is damaged, or was made to do harm"
+                ) from error
+            raise InputError(
+                f"cannot read bag {self.path}: it is cut off, damaged or of an unsupported kind "
+                f"({reason_of(error)}); repair it with {_REPAIRS[_suffix(self.path)]}, or record "
+                "it again"
+            ) from error
 
 
-class Losses:
-    """What could not be read of a file, for a person; every text once, and not endlessly many."""
+def message_blocks(messages: Iterable[Message], lose: Lose) -> Iterator[MessageBlock]:
+    """Messages in blocks that are neither long nor, if they do not grow suddenly, large; those that
+    are not bytes with a time are left out, and those compressed one by one unpacked.
+    """
+    iterator = iter(messages)
+    while rows := _next_rows(iterator):
+        kinds, times_ns, contents = zip(*rows, strict=True)
+        bag_ns = np.array(times_ns)
+        if {*map(type, contents)} != {bytes} or bag_ns.dtype != np.int64 or bag_ns.min() < 0:
+            lose("messages that are not bytes with a time were left out")
+            rows = [each for each in rows if type(each[1]) is int and type(each[2]) is bytes]
+            rows = [each for each in rows if 0 <= each[1] < 1 << 63]
+            if not rows:
+                continue
+            kinds, times_ns, contents = zip(*rows, strict=True)
+            bag_ns = np.array(times_ns)
+        # Plain CDR never begins so.
+        if any(map(methodcaller("startswith", _ZSTD_MAGIC), contents)):
+            contents = tuple(map(_unpacked, contents))
+            good = [data is not None for data in contents]
+            if not all(good):
+                lose("compressed messages that are damaged were left out")
+            kinds, contents = tuple(compress(kinds, good)), tuple(compress(contents, good))
+            bag_ns = bag_ns[good]
+        yield MessageBlock(kinds, bag_ns, contents)
+
+
+def _unpacked(data: bytes) -> bytes | None:
+    """A message, unpacked if it is compressed; None if it is damaged."""
+    zstd = _zstd()
+    try:
+        is_packed = data.startswith(_ZSTD_MAGIC)
+        return bytes(zstd.decompress(data)) if is_packed else data
+    except zstd.ZstdError:
+        return None
+
+
+def _next_rows(messages: Iterator[Message]) -> list[Message]:
+    rows: list[Message] = []
+    size = 0
+    while len(rows) < BLOCK_SIZE and size < BLOCK_BYTES:
+        piece = list(islice(messages, _PIECE_SIZE))
+        if not piece:
+            break
+        rows += piece
+        size += sum(map(sys.getsizeof, map(itemgetter(2), piece)))
+    return rows
+
+
+def _in_order(messages: Iterable[Message]) -> Iterator[Message]:
+    """Messages that are nearly in the order of time, in that order, with little memory."""
+    waiting: list[tuple[int, int, Message]] = []
+    sequence, size = count(), 0
+    for message in messages:
+        heapq.heappush(waiting, (message[1], next(sequence), message))
+        size += len(message[2])
+        while size > LARGEST_DISORDER:
+            first = heapq.heappop(waiting)[2]
+            size -= len(first[2])
+            yield first
+    while waiting:
+        yield heapq.heappop(waiting)[2]
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Also in SQLite as rosbags uses it, whose error is of a kind of its own."""
+    return isinstance(error, MemoryError) or type(error).__name__ == "NoMemError"
+
+
+def _say_nothing(_: str) -> None:
+    """The losses were noted when the file was opened."""
+
+
+def _zstd() -> Any:
+    """The zstd module: Python's own from 3.14 on, its backport before."""
+    if sys.version_info >= (3, 14):
+        from compression import zstd as module
+    else:
+        import backports.zstd as module
+    return module
+
+
+# ---- files
+
+
+class BagFiles:
+    """The storage files of bags, opened; those compressed as a whole are unpacked first.
+
+    Attributes
+    ----------
+    storages : list of Storage
+        In the order of their start.
+    notes : list of str
+        What a person should know.
+    """
 
     def __init__(self) -> None:
-        self._texts: dict[str, None] = {}
-        self._more = 0
+        self.storages: list[Storage] = []
+        self.notes: list[str] = []
+        self._memory = ReadingMemory()
+        self._temporary: tempfile.TemporaryDirectory[str] | None = None
 
-    def add(self, text: str) -> None:
-        """Note a loss."""
-        if text in self._texts:
-            return
-        if len(self._texts) < _MOST_LOSSES:
-            self._texts[text] = None
-        else:
-            self._more += 1
+    def open(self, path: Path) -> None:
+        """Open the files of a bag.
 
-    def texts(self) -> list[str]:
-        """List the losses, one line each."""
-        more = [f"and {self._more} more losses of this kind"] if self._more else []
-        return [*self._texts, *more]
+        Raises
+        ------
+        InputError
+            If there is no bag or it cannot be read; one line that names the path.
+        """
+        _check_path(path)
+        for file in [path] if path.is_file() else self._files_in(path):
+            self.storages.append(Storage(file, self._readable(file), self._memory))
+            if len(self.storages) > MOST_BAG_FILES:
+                raise InputError(f"{path} has more than {MOST_BAG_FILES} files; read it in parts")
+        self.storages.sort(key=lambda storage: (storage.start_ns is None, storage.start_ns or 0))
 
+    def close(self) -> None:
+        """Close the files, and remove what was unpacked."""
+        for storage in self.storages:
+            storage.close()
+        if self._temporary:
+            self._temporary.cleanup()
 
-def add_topic(
-    topics: dict[str, tuple[str, int]], name: str, message_type: str, n_messages: int
-) -> None:
-    """Add a connection to the topics of a file.
-
-    Raises
-    ------
-    ValueError
-        If there are too many topics.
-    """
-    known, before = topics.get(name, (message_type, 0))
-    topics[name] = (message_type if message_type == known else "", before + n_messages)
-    if len(topics) > MOST_TOPICS:
-        raise ValueError(f"it has more than {MOST_TOPICS} topics")
-
-
-def check_encoding(topic: str, encoding: str) -> None:
-    """Refuse messages that are not encoded as CDR.
-
-    Raises
-    ------
-    ValueError
-    """
-    if encoding != "cdr":
-        raise ValueError(f"messages of {topic} are encoded as {encoding[:40]!r}, expected 'cdr'")
-
-
-def in_order(
-    starts_ns: Sequence[int], read: Callable[[int], list[Message]]
-) -> Iterator[list[Message]]:
-    """Messages of chunks in the order of bag time.
-
-    Of what has been read, only that which no later chunk can precede is passed on.
-
-    Parameters
-    ----------
-    starts_ns : sequence of int
-        Bag time at which each chunk begins, in increasing order.
-    read : callable
-        ``index -> messages`` of a chunk, in any order.
-
-    Raises
-    ------
-    ValueError
-        If the chunks overlap so much that too many messages have to wait.
-    """
-    overlap: list[tuple[int, int, Message]] = []
-    sequence, waiting = count(), 0
-    for index in range(len(starts_ns)):
-        found = sorted(read(index), key=_bag_time)
-        next_ns = starts_ns[index + 1] if index + 1 < len(starts_ns) else LATEST_NS + 1
-        ready = []
-        while overlap and overlap[0][0] < next_ns:
-            ready.append(heapq.heappop(overlap)[2])
-        waiting -= sum(map(_size, ready))
-        split = bisect_left(found, next_ns, key=_bag_time)
-        if ready or split:
-            yield sorted(ready + found[:split], key=_bag_time) if ready else found[:split]
-        for message in found[split:]:
-            heapq.heappush(overlap, (message[1], next(sequence), message))
-            waiting += _size(message)
-        if waiting > LARGEST_OVERLAP:
-            raise ValueError(
-                f"its chunks overlap in time by more than {LARGEST_OVERLAP} bytes of messages; "
-                "sort the file by time"
+    def _files_in(self, path: Path) -> list[Path]:
+        """The files that hold a bag's messages, in order."""
+        files = self._listed_files(path) if (path / "metadata.yaml").exists() else None
+        if files is None:
+            found = (file for file in path.iterdir() if _suffix(file) and file.is_file())
+            files = sorted(islice(found, MOST_BAG_FILES + 1), key=_natural_order)
+        if not files:
+            raise InputError(
+                f"no bag in {path}: expected metadata.yaml or files that end in "
+                f"{', '.join(_REPAIRS)}; check the path"
             )
+        return files
+
+    def _listed_files(self, path: Path) -> list[Path] | None:
+        """The files that metadata.yaml names; None if it cannot be used."""
+        metadata = path / "metadata.yaml"
+        try:
+            names = read_yaml(metadata)["rosbag2_bagfile_information"]["relative_file_paths"]
+            named = [path / PurePath(name).name for name in dict.fromkeys(names)]
+        except (InputError, LookupError, TypeError) as error:
+            why = error if isinstance(error, InputError) else f"it names no files: {error!r}"
+            self.notes.append(
+                f"{metadata} is damaged ({why}); the files beside it were read instead"
+            )
+            return None
+        found = [file for file in named if file.is_file() and _suffix(file)]
+        if not found:
+            self.notes.append(
+                f"{metadata} names none of the files beside it; they were read instead"
+            )
+            return None
+        missing = [file.name for file in named if not file.is_file()]
+        if missing:
+            self.notes.append(
+                f"{path}: {', '.join(missing[:10])} of {len(named)} files in metadata.yaml is "
+                "missing; its messages are left out"
+            )
+        return found
+
+    def _readable(self, file: Path) -> Path:
+        """The file as rosbags can read it: unpacked, and under a name that is not read as an
+        address (``?``, ``#`` and ``%`` have a meaning for SQLite).
+        """
+        is_packed = file.suffix == ".zstd"
+        if not is_packed and not re.search("[?#%]", str(file.absolute())):
+            return file
+        self._temporary = self._temporary or tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
+        target = Path(self._temporary.name, f"{len(self.storages)}{_suffix(file)}")
+        if is_packed:
+            self._unpack(file, target)
+        else:
+            target.symlink_to(file.absolute())
+        return target
+
+    def _unpack(self, file: Path, target: Path) -> None:
+        """Unpack a file that is compressed as a whole, as far as it goes."""
+        zstd, left = _zstd(), SMALLEST_UNPACKED + LARGEST_RATIO * file.stat().st_size
+        with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
+            while left >= 0:
+                try:
+                    piece = packed.read(_PIECE_BYTES)
+                except (EOFError, zstd.ZstdError) as error:
+                    self.notes.append(f"{file}: its compression is damaged ({reason_of(error)})")
+                    return
+                if not piece:
+                    return
+                left -= len(piece)
+                unpacked.write(piece)
+        raise InputError(
+            f"cannot read bag {file}: its content unpacks to more than {LARGEST_RATIO} times its "
+            "size, which is not believable"
+        )
 
 
-def _bag_time(message: Message) -> int:
-    return message[1]
+def _suffix(file: Path) -> str:
+    """.mcap, .db3 or .bag, also of a compressed file; empty for any other."""
+    suffix = PurePath(file.name.removesuffix(".zstd")).suffix
+    return suffix if suffix in _REPAIRS else ""
 
 
-def _size(message: Message) -> int:
-    return len(message[2]) + _OVERHEAD
+def _natural_order(file: Path) -> list[tuple[int, str]]:
+    """Sort part 10 after part 9."""
+    parts = re.split(r"(\d{1,18})", file.name)
+    return [(int(text), "") if text.isdecimal() else (-1, text) for text in parts]
+
+
+def _check_path(path: Path) -> None:
+    """Refuse mistakes that are easily made and easily explained."""
+    if not path.exists():
+        raise InputError(f"no bag at {path}; expected {_EXPECTED}")
+    if not path.is_dir() and not _suffix(path):
+        raise InputError(f"{path} is not a bag; expected {_EXPECTED}")
+    if not path.is_dir() and not path.is_file():
+        raise InputError(f"{path} is not a regular file; expected {_EXPECTED}")
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(f"bag {path} is an empty file; record it again")

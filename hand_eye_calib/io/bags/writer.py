@@ -1,4 +1,4 @@
-"""Bags written from trajectories, with the library rosbags; the only module that imports it."""
+"""Bags written from trajectories, with the library rosbags."""
 
 import heapq
 from collections.abc import Iterator, Mapping

@@ -28,6 +28,7 @@ from hand_eye_calib.io.trajectory_files.reading import (
     layout_of_file,
     read_trajectory,
     read_trajectory_file,
+    read_trajectory_files,
 )
 from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
@@ -38,5 +39,6 @@ __all__ = [
     "layout_of_file",
     "read_trajectory",
     "read_trajectory_file",
+    "read_trajectory_files",
     "write_trajectory",
 ]

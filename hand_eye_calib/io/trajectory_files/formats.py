@@ -3,14 +3,15 @@
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from itertools import chain, repeat
 from pathlib import Path
 
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.files import read_text
-from hand_eye_calib.io.limits import LARGEST_TEXT, LONGEST_LINE, MOST_COLUMNS
+from hand_eye_calib.io.limits import LARGEST_TEXT, MOST_COLUMNS
 from hand_eye_calib.io.trajectory_files.columns import QUATERNION, choose_columns, listed
 from hand_eye_calib.io.trajectory_files.layout import header_of
-from hand_eye_calib.io.trajectory_files.table import Line, Table, cells_of, data_lines, is_number
+from hand_eye_calib.io.trajectory_files.table import Lines, Table, cells_of, data_lines, is_number
 
 _Path = str | Path
 
@@ -25,20 +26,16 @@ _NS_PER_S = 1_000_000_000
 _MATLAB = b"MATLAB 5.0 MAT-file"
 
 
-def lines_of(path: _Path, expected: str) -> list[Line]:
+def lines_of(path: _Path, expected: str) -> Lines:
     """The lines of a text file with their numbers.
 
     Raises
     ------
     InputError
-        If it cannot be read, or a line is too long.
+        If it cannot be read.
     """
     _refuse_binary_of_matlab(Path(path))
-    lines = read_text(path, f"lines of {expected}", LARGEST_TEXT).splitlines()
-    for number, line in enumerate(lines, start=1):
-        if len(line) > LONGEST_LINE:
-            raise InputError(f"{path}, line {number}: longer than {LONGEST_LINE} characters")
-    return list(enumerate(lines, start=1))
+    return Lines(path, read_text(path, f"lines of {expected}", LARGEST_TEXT))
 
 
 def _refuse_binary_of_matlab(path: Path) -> None:
@@ -54,7 +51,7 @@ def _refuse_binary_of_matlab(path: Path) -> None:
         )
 
 
-def read_tum(path: _Path, lines: Sequence[Line], is_named: bool = True) -> Table:
+def read_tum(path: _Path, lines: Lines, is_named: bool = True) -> Table:
     """Stamp, position, quaternion with the scalar last; if not ``is_named``, in unknown order."""
     quantities = _POSITION + (QUATERNION if is_named else UNNAMED)
     table = Table(path, f"8 numbers, {TUM_COLUMNS}", quantities)
@@ -66,7 +63,7 @@ def read_tum(path: _Path, lines: Sequence[Line], is_named: bool = True) -> Table
     return table
 
 
-def read_euroc(path: _Path, lines: Sequence[Line]) -> Table:
+def read_euroc(path: _Path, lines: Lines) -> Table:
     """Stamp in nanoseconds, position, quaternion with the scalar first, and what follows."""
     quantities = (*_POSITION, "qw", "qx", "qy", "qz")
     table = Table(path, _EUROC_COLUMNS, quantities, stamp_unit="ns")
@@ -79,7 +76,7 @@ def read_euroc(path: _Path, lines: Sequence[Line]) -> Table:
     return table
 
 
-def read_kitti(path: _Path, lines: Sequence[Line], times: _Path | None) -> Table:
+def read_kitti(path: _Path, lines: Lines, times: _Path | None) -> Table:
     """Three rows of a matrix in each line, and the stamps in a file of their own.
 
     Raises
@@ -95,23 +92,22 @@ def read_kitti(path: _Path, lines: Sequence[Line], times: _Path | None) -> Table
             f"{path}: the poses of format kitti have no stamps; name their file with `times`"
         )
     stamps = [text.strip() for _, text in data_lines(lines_of(times, "stamps"))]
-    rows = list(data_lines(lines))
-    for (number, text), stamp in zip(rows, [*stamps, *["0"] * len(rows)], strict=False):
+    for (number, text), stamp in zip(data_lines(lines), chain(stamps, repeat("0")), strict=False):
         fields = text.split()
         if len(fields) != 12:
             raise table.unexpected((number, text), len(fields))
         table.add(number, stamp, fields)
-    if len(stamps) != len(rows):
+    if len(stamps) != len(table.stamps):
         raise InputError(
-            f"{path}: {len(rows)} poses, but {times} has {len(stamps)} stamps; they belong to "
-            "different recordings"
+            f"{path}: {len(table.stamps)} poses, but {times} has {len(stamps)} stamps; they belong "
+            "to different recordings"
         )
     return table
 
 
 def read_csv(
     path: _Path,
-    lines: Sequence[Line],
+    lines: Lines,
     columns: str | None,
     may_guess: bool = False,
     measures: str = "auto",
@@ -121,7 +117,7 @@ def read_csv(
     Parameters
     ----------
     path : path-like
-    lines : list of (int, str)
+    lines : Lines
     columns : str or None
         Names, separated by commas; None for those of the header.
     may_guess : bool
@@ -138,7 +134,7 @@ def read_csv(
     header, rows = header_of(lines)
     names = [name.strip() for name in columns.split(",")] if columns is not None else header
     if columns is not None:
-        rows = _without_header(list(data_lines(lines)))
+        rows = _without_header(lines)
     if names is None:
         return _read_unnamed(path, rows, may_guess)
     if len(names) > MOST_COLUMNS:
@@ -150,37 +146,40 @@ def read_csv(
         tuple(chosen.quantities),
         chosen.stamp_unit,
         chosen.units,
+        header=tuple(names),
     )
     at = list(chosen.quantities.values())
     _fill(table, rows, len(names), chosen.stamp, at)
     return table
 
 
-def _without_header(rows: list[Line]) -> list[Line]:
-    """Rows without a first one that has no number in it."""
-    is_header = bool(rows) and not any(is_number(cell) for cell in cells_of(rows[0][1]))
-    return rows[1:] if is_header else rows
+def _without_header(lines: Lines) -> Lines:
+    """Lines without a first row that has no number in it."""
+    number, row = next(data_lines(lines), (0, ""))
+    is_header = not any(is_number(cell) for cell in cells_of(row))
+    return lines.after(number) if is_header else lines
 
 
-def _read_unnamed(path: _Path, rows: Sequence[Line], may_guess: bool) -> Table:
-    n_columns = len(cells_of(rows[0][1])) if rows else 8
-    if rows and not (may_guess and n_columns == 8):
+def _read_unnamed(path: _Path, lines: Lines, may_guess: bool) -> Table:
+    row = next((text for _, text in data_lines(lines)), "")
+    n_columns = len(cells_of(row)) if row else 8
+    if not (may_guess and n_columns == 8) and row:
         raise InputError(
             f"{path}: the first line names no columns, so the order of the quaternion is unknown; "
             "name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
             f"{n_columns}"
         )
     table = Table(path, "8 columns: a stamp, a position and a quaternion", _POSITION + UNNAMED)
-    _fill(table, rows, 8, [0], range(1, 8))
+    _fill(table, lines, 8, [0], range(1, 8))
     return table
 
 
 def _fill(
-    table: Table, rows: Sequence[Line], n_columns: int, stamp_at: list[int], at: Sequence[int]
+    table: Table, lines: Lines, n_columns: int, stamp_at: list[int], at: Sequence[int]
 ) -> None:
     """Add all rows: the stamp from its one or two columns, the values from theirs."""
     stamp_of: Callable[[Table, int, list[str]], str] = _joined if len(stamp_at) > 1 else _single
-    for number, text in rows:
+    for number, text in data_lines(lines):
         cells = cells_of(text)
         if len(cells) != n_columns:
             raise table.unexpected((number, text), len(cells))

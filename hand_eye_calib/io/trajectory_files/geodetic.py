@@ -1,11 +1,18 @@
-"""Latitude, longitude and height as metres east, north and up of the first position."""
+"""Latitude, longitude and height as metres east, north and up of the first position.
+
+The formulas are those of the coordinate operations 9602 and 9837 of the EPSG (IOGP publication
+373-7-2).
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import MissingDependencyError
+
+# The ellipsoid of WGS 84: equatorial radius (m), and the square of its eccentricity.
+_RADIUS_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
+_ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
 
 
 class LocalPositions(NamedTuple):
@@ -31,11 +38,6 @@ def local_positions(
     Parameters
     ----------
     lat_rad, lon_rad, height_m : (N,) ndarray
-
-    Raises
-    ------
-    MissingDependencyError
-        If pymap3d is not installed.
     """
     positions = LocalOrigin().local(lat_rad, lon_rad, height_m)
     axes = _axes(lat_rad, lon_rad)
@@ -55,25 +57,15 @@ class LocalOrigin:
         self.geodetic: tuple[float, float, float] | None = None
 
     def local(self, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
-        """Metres (N, 3) east, north and up of the first position of all that were asked for.
-
-        Raises
-        ------
-        MissingDependencyError
-            If pymap3d is not installed.
-        """
-        try:
-            with np.errstate():  # importing it makes NumPy raise where it warns, for good
-                from pymap3d import geodetic2enu
-        except ModuleNotFoundError:
-            raise MissingDependencyError(
-                "latitude and longitude need the package pymap3d, which is not installed: "
-                "pip install 'hand_eye_calib[gnss]'"
-            ) from None
+        """Metres (N, 3) east, north and up of the first position of all that were asked for."""
         if self.geodetic is None:
             self.geodetic = float(lat_rad[0]), float(lon_rad[0]), float(height_m[0])
-        east_north_up = geodetic2enu(lat_rad, lon_rad, height_m, *self.geodetic, deg=False)
-        return np.stack(east_north_up, axis=1)
+        origin = np.array(self.geodetic)[:, None]
+        from_origin = _earth_centred(lat_rad, lon_rad, height_m) - _earth_centred(*origin)
+        # Term by term: a matrix product would round a single position, as live, in another way
+        # than many.
+        terms = from_origin[:, :, None] * _axes(*origin[:2])
+        return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
 
 
 def wrong_latitude(lat: float, lon: float) -> str:
@@ -82,6 +74,15 @@ def wrong_latitude(lat: float, lon: float) -> str:
         f"found latitude {lat:.7g} and longitude {lon:.7g}, and no latitude is beyond 90 deg: they "
         "seem to be swapped; swap them at their source"
     )
+
+
+def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
+    """Positions (N, 3) along the axes of the earth, from its centre (m)."""
+    sin_lat, cos_lat = np.sin(lat_rad), np.cos(lat_rad)
+    normal = _RADIUS_M / np.sqrt(1.0 - _ECCENTRICITY_2 * sin_lat**2)
+    from_axis = (normal + height_m) * cos_lat
+    along_axis = ((1.0 - _ECCENTRICITY_2) * normal + height_m) * sin_lat
+    return np.stack([from_axis * np.cos(lon_rad), from_axis * np.sin(lon_rad), along_axis], axis=1)
 
 
 def _axes(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:

@@ -2,13 +2,11 @@
 
 import re
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import NamedTuple
 
 from hand_eye_calib.io.trajectory_files.columns import are_columns
-from hand_eye_calib.io.trajectory_files.table import Line, cells_of, data_lines, is_number
-
-# Lines that are looked at.
-_MOST_LINES = 1000
+from hand_eye_calib.io.trajectory_files.table import Lines, cells_of, data_lines, is_number
 
 # A stamp in nanoseconds since 1970 has at least so many digits.
 _DIGITS_OF_NS = 17
@@ -35,15 +33,14 @@ class Layout(NamedTuple):
     is_named: bool
 
 
-def layout_of(lines: Sequence[Line]) -> Layout:
+def layout_of(lines: Lines) -> Layout:
     """The layout that the first lines of a file have.
 
     Parameters
     ----------
-    lines : list of (int, str)
-        All lines with their numbers.
+    lines : Lines
+        All lines.
     """
-    lines = lines[:_MOST_LINES]
     data = next((text for _, text in data_lines(lines)), "").strip()
     separator = next((mark for mark in ",;" if mark in data), None)
     n_cells = len(cells_of(data))
@@ -61,23 +58,22 @@ def layout_of(lines: Sequence[Line]) -> Layout:
     return Layout("euroc" if is_ns and n_cells >= _FEWEST_COLUMNS else "csv", False)
 
 
-def header_of(lines: Sequence[Line]) -> tuple[list[str] | None, list[Line]]:
-    """Names of the columns, if the file has any, and the lines with data.
+def header_of(lines: Lines) -> tuple[list[str] | None, Lines]:
+    """Names of the columns, if the file has any, and the lines after a header.
 
     The header is the first line that is no comment, unless it is a row of numbers; otherwise the
     last comment above the data that has as many cells, or the first.
     """
-    rows = list(data_lines(lines))
-    if rows and not _is_row(rows[0][1]):
-        return _names(rows[0][1]), rows[1:]
-    first_row = rows[0][0] if rows else len(lines) + 1
-    comments = [_names(text) for number, text in lines if number < first_row and text.strip()]
-    if not comments:
-        return None, rows
-    n_cells = len(cells_of(rows[0][1])) if rows else 0
-    fitting = [names for names in comments if len(names) == n_cells]
-    names = fitting[-1] if fitting else comments[0]
-    return names if _is_header(names) else None, rows
+    number, row = next(data_lines(lines), (0, ""))
+    if number and not _is_row(row):
+        return _names(row), lines.after(number)
+    n_cells, opening, fitting = len(cells_of(row)), None, None
+    for _, text in takewhile(lambda line: line[0] != number, lines):
+        names = _names(text)
+        opening = names if opening is None and text.strip() else opening
+        fitting = names if len(names) == n_cells and text.strip() else fitting
+    found = opening if fitting is None else fitting
+    return found if found is not None and _is_header(found) else None, lines
 
 
 def _names(text: str) -> list[str]:

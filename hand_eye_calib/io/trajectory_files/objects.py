@@ -2,6 +2,7 @@
 libraries is imported.
 """
 
+from array import array
 from collections.abc import Iterable, Sequence
 from typing import Any, Protocol, TypeAlias
 
@@ -127,14 +128,14 @@ def _of_table(
     is_indexed = getattr(getattr(index, "dtype", None), "kind", "") == "M"
     chosen = choose_columns("the table", names, has_stamps=needs_times and not is_indexed)
     cells = [source[key] for key in source.columns]
-    numbers = [np.asarray(cells[at], float).tolist() for at in chosen.quantities.values()]
+    numbers = [np.asarray(cells[at], float) for at in chosen.quantities.values()]
     table = Table(
         "the table",
         f"{len(names)} columns: {listed(names)}",
         tuple(chosen.quantities),
         units=chosen.units,
-        values=[[*row] for row in zip(*numbers, strict=True)],
-        line_numbers=list(range(len(cells[0]))),
+        line_numbers=array("q", range(len(cells[0]))),
+        numbers=array("d", np.stack(numbers, axis=1).tobytes()),
     )
     values = np.hstack(poses_of(table))
     if not chosen.stamp:

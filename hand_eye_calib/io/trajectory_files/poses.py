@@ -29,6 +29,13 @@ _SCALAR_FIRST = [1, 2, 3, 0]  # indices that put the scalar last
 
 _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
+# The inverse rotation in roll, pitch and yaw, as pyboreas has it.
+_INVERSE = "that of the world in the sensor's frame"
+_AXES = {
+    _COMPASS: "x forward, y left, z up",
+    _MATHEMATICAL: "x forward, y left, z up",
+    _INVERSE: "x, y, z of the world where all angles are 0",
+}
 
 # Values of each quantity.
 _Columns = dict[str, FloatArray]
@@ -59,9 +66,9 @@ def poses_of(table: Table) -> Poses:
 
 
 def _finite_values(table: Table) -> FloatArray:
-    values = np.array(table.values)
+    values = table.values
     table.refuse(
-        ~np.isfinite(values).all(axis=1),
+        np.asarray(~np.isfinite(values).all(axis=1)),
         lambda _: "found a value that is not finite; remove the line or repair its source",
     )
     return values
@@ -222,27 +229,34 @@ def _from_angles(table: Table, columns: _Columns, positions: FloatArray) -> Floa
     roll, pitch = (
         columns[name] * factors[name] if name in columns else zero for name in ("roll", "pitch")
     )
-    named, other = (_COMPASS, _MATHEMATICAL) if "heading" in columns else (_MATHEMATICAL, _COMPASS)
+    usual, other = (_COMPASS, _MATHEMATICAL) if "heading" in columns else (_MATHEMATICAL, _COMPASS)
     angles = columns[given[-1]] * factors[given[-1]]
-    ways = {sense: _turned(roll, pitch, angles, sense) for sense in (named, other)}
-    is_other = fits_better(positions, ways[named], ways[other])
-    sense = other if is_other else named
-    if is_other or sense == _COMPASS:
-        why = ", because the motion fits that and not the opposite" if is_other else ""
-        _guess(
-            table,
-            f"{given[-1]} read as {sense}{why}; axes of the sensor: x forward, y left, z up",
-        )
-    return ways[sense]
+    ways = {each: _turned(roll, pitch, angles, each) for each in (usual, other, _INVERSE)}
+    table.conventions = [
+        each
+        for each, quats in ways.items()
+        if not any(fits_better(positions, quats, others) for others in ways.values())
+    ]
+    way = table.convention or table.conventions[0]
+    if way != _MATHEMATICAL or usual != way:
+        if table.convention:
+            why = ", because that fits the other file with the same columns, too"
+        else:
+            why = "" if way == usual else ", because the motion fits that and not the usual"
+        _guess(table, f"{given[-1]} read as {way}{why}; axes of the sensor: {_AXES[way]}")
+    return ways[way]
 
 
-def _turned(roll: FloatArray, pitch: FloatArray, angle: FloatArray, sense: str) -> FloatArray:
+def _turned(roll: FloatArray, pitch: FloatArray, angle: FloatArray, convention: str) -> FloatArray:
     """Quaternions of a body with x forward, y left and z up, in a frame with z up.
 
     With a compass heading, a positive pitch is nose up, as on aircraft and in INS; with a yaw it
     is about y, as in REP 103.
     """
-    is_compass = sense == _COMPASS
+    if convention == _INVERSE:
+        in_sensor = se3.rotation_from_rpy(np.stack([roll, pitch, angle], axis=1))
+        return _quats_of(np.swapaxes(in_sensor, 1, 2))
+    is_compass = convention == _COMPASS
     yaw = np.pi / 2 - angle if is_compass else angle
     rpy = np.stack([roll, -pitch if is_compass else pitch, yaw], axis=1)
     return _quats_of(se3.rotation_from_rpy(rpy))

@@ -1,9 +1,10 @@
 """Reading a trajectory from a text file in any format."""
 
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -23,7 +24,7 @@ from hand_eye_calib.io.trajectory_files.layout import Layout, layout_of
 from hand_eye_calib.io.trajectory_files.objects import PoseObject, trajectory_from_object
 from hand_eye_calib.io.trajectory_files.poses import poses_of, rates_of
 from hand_eye_calib.io.trajectory_files.stamps import in_order, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import Line, Table, cells_of, data_lines
+from hand_eye_calib.io.trajectory_files.table import Lines, Table, cells_of, data_lines
 
 _Path = str | Path
 
@@ -113,8 +114,6 @@ def read_trajectory(
         was found.
     ConfigError
         For a format or unit that is not known, and options that do not go together.
-    MissingDependencyError
-        For latitude and longitude without pymap3d.
     """
     if topic or tf:
         of_text = (format != _USUAL, columns, times is not None, stamp_unit, repair)
@@ -151,9 +150,61 @@ def read_trajectory_file(
     measures: str = AUTO,
 ) -> FileReading:
     """Read a text file as :func:`read_trajectory`, without warnings."""
+    return _read(path, format, columns, times, stamp_unit, repair, measures)[0]
+
+
+def read_trajectory_files(files: Sequence[Mapping[str, Any]]) -> list[FileReading]:
+    """Read text files that belong together: those with the same columns, which come from one
+    exporter, by one convention of their angles.
+
+    Parameters
+    ----------
+    files : sequence of mapping
+        The arguments of :func:`read_trajectory_file` for each, by their names.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, or no convention fits the motion of all with the same columns.
+    """
+    read = [_read(**each) for each in files]
+    for header in {table.header for _, table in read if table.conventions}:
+        rows = [row for row, (_, table) in enumerate(read) if table.header == header]
+        tables = [read[row][1] for row in rows]
+        if len({table.conventions[0] for table in tables}) < 2:
+            continue
+        common = [
+            each
+            for each in tables[0].conventions
+            if all(each in table.conventions for table in tables)
+        ]
+        if not common:
+            raise InputError(
+                f"{' and '.join(str(table.path) for table in tables)} have the same columns, but "
+                "no convention of their angles fits the motion of all; write quaternions instead, "
+                "or name the column of one yaw (counterclockwise) and of the other heading "
+                "(clockwise from north) if that is what they are"
+            )
+        for row in rows:
+            read[row] = _read(**files[row], convention=common[0])
+    return [reading for reading, _ in read]
+
+
+def _read(
+    path: _Path,
+    format: str = _USUAL,
+    columns: str | None = None,
+    times: _Path | None = None,
+    stamp_unit: str | None = None,
+    repair: bool = False,
+    measures: str = AUTO,
+    convention: str = "",
+) -> tuple[FileReading, Table]:
+    """The trajectory of a file, and the table it was made from."""
     _check_options(format, columns, times, stamp_unit)
     lines = lines_of(path, "a trajectory")
     table = _table(path, lines, format, columns, times, measures)
+    table.convention = convention
     if not table.stamps:
         raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
     stamps_ns = stamps_in_ns(table, stamp_unit)
@@ -162,7 +213,7 @@ def read_trajectory_file(
         rates = rates_of(table)
         keep, repairs = in_order(table, stamps_ns, repair)
         trajectory = Trajectory.from_rates(stamps_ns[keep], rates[keep])
-        return FileReading(trajectory, repairs, table.guesses)
+        return FileReading(trajectory, repairs, table.guesses), table
     positions, quats_xyzw = poses_of(table)
     keep, repairs = in_order(table, stamps_ns, repair)
     trajectory = Trajectory.from_quat_xyzw(stamps_ns[keep], positions[keep], quats_xyzw[keep])
@@ -171,7 +222,7 @@ def read_trajectory_file(
     kind = found if measures == AUTO else measures
     if kind != "poses":
         trajectory = replace(trajectory, measures=kind)
-    return FileReading(trajectory, repairs, table.guesses)
+    return FileReading(trajectory, repairs, table.guesses), table
 
 
 def layout_of_file(path: _Path) -> Layout:
@@ -185,7 +236,7 @@ def layout_of_file(path: _Path) -> Layout:
     return layout_of(lines_of(path, "a trajectory"))
 
 
-def _n_columns(lines: list[Line]) -> int:
+def _n_columns(lines: Lines) -> int:
     """Number of cells in the first line with data."""
     first = next((text for _, text in data_lines(lines)), "")
     return len(cells_of(first))
@@ -210,7 +261,7 @@ def _check_options(
 
 def _table(
     path: _Path,
-    lines: list[Line],
+    lines: Lines,
     format: str,
     columns: str | None,
     times: _Path | None,
@@ -226,7 +277,7 @@ def _table(
 
 
 def _recognised(
-    path: _Path, lines: list[Line], columns: str | None, times: _Path | None, measures: str
+    path: _Path, lines: Lines, columns: str | None, times: _Path | None, measures: str
 ) -> Table:
     """The table of a file in the format that it looks like."""
     found, is_named = layout_of(lines)

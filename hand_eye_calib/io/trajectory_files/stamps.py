@@ -102,7 +102,8 @@ def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray,
 def _contradictions(table: Table, order: IntArray, repeated: IntArray) -> list[str]:
     """How many of the dropped rows differ from the one that is kept."""
     dropped = np.flatnonzero(repeated)
-    differing = sum(table.values[order[row]] != table.values[order[row - 1]] for row in dropped)
+    values = table.values
+    differing = int((values[order[dropped]] != values[order[dropped - 1]]).any(axis=1).sum())
     return [f"{differing} of these with another pose"] if differing else []
 
 

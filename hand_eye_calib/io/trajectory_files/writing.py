@@ -1,5 +1,6 @@
 """Writing a trajectory to a text file."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -48,8 +49,16 @@ def write_trajectory(
 
 
 def _tum_text(trajectory: Trajectory) -> str:
+    return "\n".join([f"# {TUM_COLUMNS}", *tum_lines(trajectory), ""])
+
+
+def tum_lines(trajectory: Trajectory) -> list[str]:
+    """A line of text for each pose."""
     quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
     values = np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1).tolist()
-    rows = zip(trajectory.stamps_ns.tolist(), values, strict=True)
-    lines = [f"{seconds(stamp)} {' '.join(map(repr, row))}" for stamp, row in rows]
-    return "\n".join([f"# {TUM_COLUMNS}", *lines, ""])
+    return [*map(tum_line, trajectory.stamps_ns.tolist(), values)]
+
+
+def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:
+    """The line of a pose x y z qx qy qz qw, which keeps every digit."""
+    return f"{seconds(stamp_ns)} {' '.join(map(repr, pose))}"

@@ -1,18 +1,14 @@
-"""What all recordings say together: rows, recordings of one vehicle compared, the index page."""
+"""What the recordings of one vehicle say together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.calibration import Calibration, SolveStatus
-from hand_eye_calib.cli.batch.calibrating import Outcome
-from hand_eye_calib.cli.batch.rows import COLUMNS, Row, row_of
-from hand_eye_calib.cli.batch.store import write
-from hand_eye_calib.cli.batch.tasks import INDEX, SUMMARY, TABLE
-from hand_eye_calib.cli.reporting import REPORT, can_draw, save_page
+from hand_eye_calib.cli.batch.results import Row, row_of
+from hand_eye_calib.cli.batch.workers import Outcome
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.session.agreement import Agreement, agreement_of, sentence
 from hand_eye_calib.session.compare import Comparison, compare
@@ -27,7 +23,6 @@ class Vehicle:
     Attributes
     ----------
     name : str
-        Empty if the batch file names none.
     frames : (str, str)
         Of parent and child.
     rows : tuple of dict
@@ -68,16 +63,22 @@ class Vehicle:
 def vehicles_of(outcomes: Sequence[Outcome]) -> list[Vehicle]:
     """The calibrated recordings of each vehicle, compared with each other.
 
-    Recordings of other frames are another rig. What failed, and what must not be used, is left out.
+    Recordings of other frames are another rig. What failed, what must not be used, and recordings
+    whose vehicle is not known are left out.
     """
     groups: dict[tuple[str, tuple[str, str]], list[tuple[Row, Calibration]]] = {}
     for outcome in outcomes:
-        if outcome["calibration"]:
+        if outcome["calibration"] and outcome["vehicle"]:
             row, calibration = row_of(outcome), Calibration.from_dict(outcome["calibration"])
             if calibration.status not in _FAILURES:
                 frames = (calibration.parent_frame, calibration.child_frame)
                 groups.setdefault((row["vehicle"], frames), []).append((row, calibration))
     return [_vehicle(name, frames, group) for (name, frames), group in sorted(groups.items())]
+
+
+def n_without_vehicle(outcomes: Sequence[Outcome]) -> int:
+    """Number of calibrated recordings whose vehicle is not known."""
+    return sum(bool(one["calibration"] and not one["vehicle"]) for one in outcomes)
 
 
 def _vehicle(name: str, frames: tuple[str, str], group: list[tuple[Row, Calibration]]) -> Vehicle:
@@ -106,30 +107,6 @@ def _newest(calibrations: Sequence[Calibration], name: str) -> Comparison | None
     covariance = to_child @ found.covariance @ to_child.T
     common = Extrinsic(found.T_parent_child, "earlier recordings", covariance, is_calibration=True)
     return compare([newest], common, [name])
-
-
-def write_summary(
-    directory: Path, batch: str, outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]
-) -> list[Path]:
-    """Write the rows as tables, everything as JSON, and the index page; returns their paths.
-
-    Raises
-    ------
-    InputError
-        If they cannot be written.
-    """
-    from hand_eye_calib.io.tables import write_table
-
-    rows = [row_of(outcome) for outcome in outcomes]
-    write(directory / SUMMARY, document_of(batch, outcomes, vehicles))
-    paths = write_table(directory, Path(TABLE).stem, COLUMNS, rows)
-    if can_draw(INDEX):
-        from hand_eye_calib.report.batch_page import render_batch
-
-        with_report = [(directory / row["name"] / REPORT).exists() for row in rows]
-        page = render_batch(batch, rows, [vars(vehicle) for vehicle in vehicles], with_report)
-        paths.append(save_page(directory / INDEX, page))
-    return paths
 
 
 def document_of(
