@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 # The home of every public name and, if it differs, its name there.
 _HOMES = {
-    "Calibration": "calibration",
+    "Calibration": "results.calibration",
     "Calibrator": "engine.calibrator",
     "CalibratorConfig": "config",
     "HandEyeCalibError": "errors",
-    "Reason": "verdict",
-    "Residuals": "calibration",
+    "Reason": "results.verdict",
+    "Residuals": "results.calibration",
     "RigCalibration": "rig.result",
-    "SolveStatus": "status",
+    "SolveStatus": "results.status",
     "Trajectory": "geometry.trajectory",
-    "Verdict": "verdict",
+    "Verdict": "results.verdict",
     "calibrate": "engine.offline",
     "calibrate_rig": "rig.calibrate",
     "compare": "session.compare",
@@ -62,7 +62,6 @@ __all__ = [
 
 if TYPE_CHECKING:
     # The same for editors and type checkers.
-    from hand_eye_calib.calibration import Calibration, Residuals
     from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.engine.calibrator import Calibrator
     from hand_eye_calib.engine.compare_methods import compare_methods
@@ -75,11 +74,12 @@ if TYPE_CHECKING:
     from hand_eye_calib.io.trajectory_files.reading import read_trajectory
     from hand_eye_calib.io.trajectory_files.writing import write_trajectory
     from hand_eye_calib.report.plot import plot
+    from hand_eye_calib.results.calibration import Calibration, Residuals
+    from hand_eye_calib.results.status import SolveStatus
+    from hand_eye_calib.results.verdict import Reason, Verdict
     from hand_eye_calib.rig.calibrate import calibrate_rig
     from hand_eye_calib.rig.result import RigCalibration
     from hand_eye_calib.session.compare import compare
-    from hand_eye_calib.status import SolveStatus
-    from hand_eye_calib.verdict import Reason, Verdict
 
     __version__: str
 else:

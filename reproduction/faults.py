@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
 from hand_eye_calib.config import CalibratorConfig
@@ -24,6 +23,7 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction import clean_recordings

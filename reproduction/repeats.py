@@ -19,8 +19,8 @@ from scipy.stats import chi2
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.engine.offline import calibrate
+from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from reproduction.recordings import PARTS, Recording, Rig, real_rigs
 from reproduction.results import Results
 from reproduction.runner import in_parallel

@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 from result_making import calibration
 
-from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.cli.batch.workers import failed
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 DAY_NS = 86_400_000_000_000

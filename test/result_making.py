@@ -4,8 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
 
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
 

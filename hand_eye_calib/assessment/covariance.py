@@ -28,10 +28,10 @@ from hand_eye_calib.assessment.lever_arm import (
     LeverArms,
     weighted_products,
 )
-from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict
 from hand_eye_calib.solvers.solution import Solution
 
 # (B, K) mask of the pairs to leave out to the answers (B, 4, 4) without them.

@@ -15,9 +15,9 @@ from hand_eye_calib.assessment.covariance import (
     WEAK_TRANSLATION,
 )
 from hand_eye_calib.assessment.lever_arm import LeverArms
-from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration, DofObservability, DofVerdict
 from hand_eye_calib.text import amount, angle, length, listing
 
 # Most poses that are looked at, evenly over the session: enough to see curves, and few enough to

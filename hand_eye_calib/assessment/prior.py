@@ -22,8 +22,8 @@ from hand_eye_calib.assessment.covariance import (
     Assessment,
     judged,
 )
-from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 
 # Axis name to (value, standard deviation), in m and rad.
 Prior: TypeAlias = Mapping[str, tuple[float, float]]

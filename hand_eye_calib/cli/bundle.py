@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.replaying import journal_in, replay_journal
 from hand_eye_calib.errors import HandEyeCalibError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.results import FILE_NAME, load_result
 from hand_eye_calib.io.yaml_files import read_yaml
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.version import package_version
 
 # Bytes of poses in both files together, before they are compressed.

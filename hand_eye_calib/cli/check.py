@@ -213,7 +213,7 @@ def _lines(
 
 def _verdict(findings: "Sequence[Finding]") -> str:
     """What the findings mean for a calibration with these streams, in one sentence."""
-    from hand_eye_calib.verdict import Verdict
+    from hand_eye_calib.results.verdict import Verdict
 
     serious = [finding for finding in findings if finding.severity.value != "note"]
     if not serious:

@@ -11,7 +11,7 @@ from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import InputError, printable
 
 if TYPE_CHECKING:
-    from hand_eye_calib.calibration import Calibration
+    from hand_eye_calib.results.calibration import Calibration
     from hand_eye_calib.session.compare import Comparison, Difference
 
 EXIT_SAME, EXIT_CANNOT_TELL, EXIT_MOVED = 0, 3, 4

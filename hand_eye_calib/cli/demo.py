@@ -23,7 +23,7 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 
 if TYPE_CHECKING:
     from hand_eye_calib.arrays import FloatArray
-    from hand_eye_calib.calibration import Calibration
+    from hand_eye_calib.results.calibration import Calibration
     from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import SimulatedDrive
 

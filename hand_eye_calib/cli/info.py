@@ -10,7 +10,7 @@ from hand_eye_calib.cli.robot import add_description_arguments, write_descriptio
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
-    from hand_eye_calib.calibration import Calibration
+    from hand_eye_calib.results.calibration import Calibration
 
 _TEXT = (".tum", ".txt")
 

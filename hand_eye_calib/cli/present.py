@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hand_eye_calib.calibration import Calibration, DofVerdict, Reason, Verdict
 from hand_eye_calib.cli.console import as_typed, fail, note, typed_options, waiting_for
 from hand_eye_calib.cli.reporting import (
     static_transform_command,
@@ -21,6 +20,8 @@ from hand_eye_calib.cli.robot import with_robot, write_description
 from hand_eye_calib.errors import printable
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import json_text
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Reason, Verdict
+from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import (
     amount,
     angle,
@@ -29,7 +30,6 @@ from hand_eye_calib.text import (
     listing,
     with_sigma,
 )
-from hand_eye_calib.verdict import shown
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.evidence import Evidence

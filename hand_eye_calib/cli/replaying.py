@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import IntArray
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.console import note, waiting_for, with_progress
 from hand_eye_calib.cli.present import convergence_line
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.bags import PoseBag, PoseBlock

@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import HandEyeCalibError, InputError
+from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.evidence import Evidence

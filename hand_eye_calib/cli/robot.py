@@ -9,9 +9,9 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.text import listing
 
 if TYPE_CHECKING:
-    from hand_eye_calib.calibration import Calibration
     from hand_eye_calib.geometry.extrinsic import Extrinsic
     from hand_eye_calib.geometry.frames import Frames
+    from hand_eye_calib.results.calibration import Calibration
 
 
 def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,9 +79,9 @@ def write_description(calibration: "Calibration", arguments: argparse.Namespace)
     """
     if not arguments.write:
         return
-    from hand_eye_calib.calibration import SolveStatus, Verdict
     from hand_eye_calib.io.files import write_atomically
     from hand_eye_calib.io.urdf import RobotDescription
+    from hand_eye_calib.results.calibration import SolveStatus, Verdict
 
     if calibration.status is not SolveStatus.OK:
         unknown = listing(calibration.unobservable()) or "the whole result"

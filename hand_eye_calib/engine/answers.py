@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import estimate_beside
 from hand_eye_calib.engine.estimators import ESTIMATORS, Estimator
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration
 
 # Methods that a result is compared with, at these baselines and with at most so many poses; and the
 # method without a reference.

@@ -14,7 +14,6 @@ import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import BufferLimits, PoseBuffer, StreamStatistics
@@ -29,6 +28,7 @@ from hand_eye_calib.engine.snapshot import (
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
+from hand_eye_calib.results.calibration import Calibration
 
 # Bounds of a quaternion's squared length.
 _MIN_NORM2 = (1 - QUATERNION_NORM_TOLERANCE) ** 2

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hand_eye_calib.alignment.time_offset import refine_time_offset
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
@@ -16,6 +15,7 @@ from hand_eye_calib.engine.snapshot import GAP_INTERVALS, Snapshot, noise_fits
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration
 
 # Options that a check can be certain of.
 _MENDED = ("time_offset", "scale")

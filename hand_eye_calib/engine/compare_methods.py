@@ -5,12 +5,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import Progress, offline_config, whole_snapshot
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.tables import data_frame
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.tables import data_frame
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -21,13 +21,13 @@ from hand_eye_calib.assessment.floor import axes_lost_by_tilt, common_mode_floor
 from hand_eye_calib.assessment.mount_change import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
-from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
 

@@ -11,7 +11,6 @@ from hand_eye_calib.alignment.angular_rates import angular_rates, speeds
 from hand_eye_calib.alignment.scale import child_scaled
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, median
 from hand_eye_calib.assessment.excitation import Excitation, excitation
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.streams import are_gaps
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import Answer, OtherAnswers
@@ -20,6 +19,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+from hand_eye_calib.results.calibration import Calibration
 
 # Most samples of the angular rates, and the shortest window of each (s).
 _MAX_RATES, _MIN_WINDOW_S = 1500, 0.2

@@ -15,7 +15,6 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
 from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
 from hand_eye_calib.assessment.prior import fuse
-from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.checks.check import unit_of
 from hand_eye_calib.checks.findings import (
     Finding,
@@ -29,6 +28,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 
 # Two streams of which more than this share of the path stays unexplained are not of one body. Of
 # one body it is 0.05 at most, of two 0.5 and more.

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, Prior
 from hand_eye_calib.engine.checked import at_clear_offset, checked
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration
 
 #: Called with the share that is done, 0 to 1, and the step that begins.
 Progress: TypeAlias = Callable[[float, str], None]

@@ -10,12 +10,12 @@ from typing import Any
 
 from hand_eye_calib.alignment.angular_rates import MIN_VARIATION, Correlation
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.check import CheckResult, check_offset
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
 from hand_eye_calib.engine.snapshot import FOUND_BY_SOLVE_S, Snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.results.calibration import Calibration, SolveStatus
 
 
 def check_partial(snapshot: Snapshot) -> CheckResult:

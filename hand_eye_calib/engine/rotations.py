@@ -20,12 +20,12 @@ from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
-from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.checks.findings import Finding, rate_unit, unrelated_parts
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 
 # Two streams of which more than this share of the rotation stays unexplained are not of one body.
 _UNRELATED = 0.5

@@ -15,13 +15,13 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, median
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import OtherAnswers
 from hand_eye_calib.engine.estimation import Solved
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.plain import plain
+from hand_eye_calib.results.calibration import Calibration
 
 # Fewest other answers that have a scatter.
 _MIN_OTHERS = 3

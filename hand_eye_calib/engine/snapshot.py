@@ -18,7 +18,6 @@ from hand_eye_calib.alignment.time_offset import (
     estimate_time_offset,
     time_offset_of_speeds,
 )
-from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.checks.check import CheckResult, check_offset, check_parts, check_streams
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
@@ -29,6 +28,7 @@ from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.keyframes import select_keyframes
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+from hand_eye_calib.results.calibration import Calibration, DofVerdict
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.pose_buffer import RawPoses

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
 from hand_eye_calib.io.limits import LARGEST_TEXT
 from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
-from hand_eye_calib.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.version import package_version
 
 FILE_NAME = "extrinsic.yaml"

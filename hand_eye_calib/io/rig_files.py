@@ -9,11 +9,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.files import write_atomically
 from hand_eye_calib.io.results import LAUNCH_NAME, RIG_NAME, launch_text, provenance, save_result
 from hand_eye_calib.io.yaml_files import yaml_text
+from hand_eye_calib.results.calibration import Calibration, Verdict
 
 
 def save_rig(

@@ -25,9 +25,9 @@ from hand_eye_calib.report.report_figures import (
     page_style,
 )
 from hand_eye_calib.report.style import new_figure
+from hand_eye_calib.results.verdict import Verdict
 from hand_eye_calib.session.agreement import Agreement, Kind
 from hand_eye_calib.text import counted, with_sigma
-from hand_eye_calib.verdict import Verdict
 
 Plain = Mapping[str, Any]
 

@@ -7,10 +7,10 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.engine.answers import Answer
 from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.methods import METHODS
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import amount, angle, counted, length, listing, share
 
 Caption = Callable[[Calibration, Evidence], str]

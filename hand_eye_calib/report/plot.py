@@ -8,7 +8,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.report.style import (
     BLUE,
     LIGHT_GREY,
@@ -17,6 +16,7 @@ from hand_eye_calib.report.style import (
     house_style,
     plain_decades,
 )
+from hand_eye_calib.results.calibration import Calibration
 
 _CM_DEG = (100.0, float(np.degrees(1.0)))
 # Smallest residual that is drawn (cm, deg): a logarithm has no zero.

@@ -12,7 +12,6 @@ import jinja2
 import numpy as np
 
 from hand_eye_calib.assessment.excitation import what_is_missing
-from hand_eye_calib.calibration import Calibration, DofVerdict, Reason, Verdict
 from hand_eye_calib.checks.streams import summarise
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import Evidence
@@ -20,7 +19,9 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, captions
 from hand_eye_calib.report.report_figures import draw_all
-from hand_eye_calib.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Reason, Verdict
+from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.text import (
     amount,
     angle,
@@ -33,7 +34,6 @@ from hand_eye_calib.text import (
     listing,
     with_sigma,
 )
-from hand_eye_calib.verdict import shown, target_of
 
 Plain = Mapping[str, Any]
 

@@ -17,7 +17,6 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import MIN_ROTATION
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.errors import printable
 from hand_eye_calib.report.captions import (
@@ -27,6 +26,7 @@ from hand_eye_calib.report.captions import (
     time_axis,
 )
 from hand_eye_calib.report.style import drawing_style, house_style, plain_decades
+from hand_eye_calib.results.calibration import Calibration
 
 # Colours as drawn, each with the name of the page's own colour that replaces it.
 INK, MUTED, GRID, PAPER = "#1b1f24", "#5c6670", "#d9dee3", "#fefefd"

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import AXES, TRANSLATIONS
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.report.report import environment, verdict_of
 from hand_eye_calib.report.report_figures import (
     BAD,
@@ -23,6 +22,7 @@ from hand_eye_calib.report.report_figures import (
     page_style,
 )
 from hand_eye_calib.report.style import GREEN, new_figure
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.rig.result import RigCalibration
 from hand_eye_calib.text import angle, counted, length, with_sigma
 

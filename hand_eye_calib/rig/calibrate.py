@@ -10,7 +10,6 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import basis, combined, noise_driven
-from hand_eye_calib.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checked import at_clear_offset, checked
 from hand_eye_calib.engine.estimation import estimate_extrinsic
@@ -18,6 +17,7 @@ from hand_eye_calib.engine.offline import Progress, offline_config, whole_snapsh
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 from hand_eye_calib.rig import solution as joint
 from hand_eye_calib.rig.increments import Aligned
 from hand_eye_calib.rig.result import RigCalibration, closures

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.rig.solution import RigSolution
 from hand_eye_calib.text import angle, length
 

@@ -16,9 +16,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import NodeConfig, other_names
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
 from hand_eye_calib.ros.inputs import PoseInput, TopicInput, qos_parameter_names

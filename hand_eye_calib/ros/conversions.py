@@ -17,8 +17,8 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import Calibration
 
 _Triple = TypeVar("_Triple", Point, Vector3)
 

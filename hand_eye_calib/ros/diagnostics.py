@@ -10,8 +10,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
-from hand_eye_calib.calibration import Calibration, Verdict
 from hand_eye_calib.config import NodeConfig
+from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.conversions import to_time
 from hand_eye_calib.ros.input_monitor import InputMonitor

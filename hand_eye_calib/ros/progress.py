@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.assessment.covariance import AXES
-from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.status import OK, WARN, Report
 from hand_eye_calib.session.goal import Progress

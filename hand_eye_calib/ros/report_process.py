@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.results.calibration import Calibration
 
 _COMMAND = "from hand_eye_calib.cli.reporting import write_session; write_session()"
 

@@ -10,10 +10,10 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import keep_earlier_results, save_result
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.conversions import to_pose_with_covariance, to_transform
 from hand_eye_calib.ros.live_session import output_path
 

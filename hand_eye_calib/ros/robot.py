@@ -6,12 +6,12 @@ from typing import Any, Protocol
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import HandEyeCalibError, InputError, printable
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.frames import Frames, checked_pose
 from hand_eye_calib.io.installed import of_frames, open_installed
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.tf import STATIC_TOPIC, message_type
 from hand_eye_calib.session.compare import with_comparison

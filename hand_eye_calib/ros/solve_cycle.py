@@ -9,9 +9,9 @@ from typing import Any
 from rclpy.task import Future
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
-from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.engine.checked import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.live_session import LiveSession
 from hand_eye_calib.ros.log import NodeLog

@@ -18,11 +18,11 @@ from typing import Any, BinaryIO
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.checks.check import CheckResult, can_check
 from hand_eye_calib.engine.checked import mend, with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
+from hand_eye_calib.results.calibration import Calibration
 
 # Every other program goes first, the node's callbacks above all.
 _NICENESS = 10

@@ -13,12 +13,12 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from hand_eye_calib.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Verdict
+from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.ros.conversions import to_mounting
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.text import listing
-from hand_eye_calib.verdict import target_of
 
 STATIC_TOPIC = "/tf_static"
 DYNAMIC_TOPIC = "/tf"

@@ -20,12 +20,12 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.calibration import Calibration, DofVerdict
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.results.calibration import Calibration, DofVerdict
+from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.text import amount, listing
-from hand_eye_calib.verdict import target_of
 
 # Scatter between recordings of one rig, per axis (m, rad): of flights and hand-held recordings, and
 # of vehicles. A vehicle turns about one axis, and knows the translation along it so many times

@@ -16,8 +16,8 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.covariance import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.assessment.excitation import MIN_ROTATION, Excitation
-from hand_eye_calib.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.plain import plain
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.text import amount, angle, length
 
 # An axis is known if its standard deviation is below this share of its target ...

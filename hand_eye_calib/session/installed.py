@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.calibration import Calibration
+from hand_eye_calib.results.calibration import Calibration
 
 
 def with_base(result: Calibration, base_frame: str, T_base_parent: FloatArray) -> Calibration:

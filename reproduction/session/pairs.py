@@ -12,10 +12,10 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray
 from hand_eye_calib.assessment.covariance import AXES
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.compare import Change, Difference, compare
 from reproduction.recordings import Rig
 from reproduction.writing import markdown_table

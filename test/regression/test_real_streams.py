@@ -7,7 +7,6 @@ from motions import as_trajectory
 from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
-from hand_eye_calib.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.lengths import check_lengths
 from hand_eye_calib.checks.streams import tidy
@@ -15,6 +14,7 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
+from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 
 SENSORS = ("lidar", "radar")
 

@@ -10,11 +10,11 @@ from ros_harness import parts_of
 from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib import config
-from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import MESSAGE_TYPES
 from hand_eye_calib.io.bags.topics import MessageReader
+from hand_eye_calib.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.ros import conversions
 from hand_eye_calib.ros.log import NodeLog
 

@@ -11,10 +11,10 @@ from geometry_msgs.msg import TransformStamped
 from motions import as_trajectory, child_of, feed, wandering_poses
 from ros_harness import LATCHED, RELIABLE_INPUTS, drive, matrix
 
-from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.ros import tf
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.tf import FrameTree

@@ -26,9 +26,9 @@ from hand_eye_calib.adaptive.outliers import Outliers, chi_square_quantile, judg
 from hand_eye_calib.adaptive.relinearise import SensorWhite, corrected
 from hand_eye_calib.adaptive.state_space import Covariance
 from hand_eye_calib.assessment.covariance import assess_adaptive
-from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import DofVerdict
 
 PARAMETERS = {
     "none": np.zeros(0),

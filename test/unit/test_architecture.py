@@ -27,34 +27,22 @@ ENGINE = {
     "methods": {"errors"},
     "config": {"errors", "methods"},
     "geometry": GROUND,
-    "status": set(),
-    "verdict": {"methods", "status", "text"},
-    "tables": {"errors"},
-    "documents": GROUND | {"geometry", "status"},
-    "calibration": GROUND | {"documents", "geometry", "status", "tables", "verdict"},
+    "results": GROUND | {"geometry"},
     "pairing": GROUND | {"geometry"},
 }
 ENGINE["solvers"] = GROUND | {"geometry", "pairing"}
-ENGINE["adaptive"] = ENGINE["solvers"] | {"solvers"}
-ENGINE["assessment"] = ENGINE["adaptive"] | {"calibration", "status", "verdict", "adaptive"}
+ENGINE["adaptive"] = ENGINE["solvers"] | {"results", "solvers"}
+ENGINE["assessment"] = ENGINE["adaptive"] | {"adaptive"}
 ENGINE["alignment"] = ENGINE["solvers"] | {"solvers"}
-ENGINE["checks"] = ENGINE["alignment"] | {
-    "adaptive",
-    "calibration",
-    "status",
-    "verdict",
-    "assessment",
-    "alignment",
-}
+ENGINE["checks"] = ENGINE["alignment"] | {"results", "adaptive", "assessment", "alignment"}
 ENGINE["engine"] = set(ENGINE)
 ENGINE["rig"] = set(ENGINE)
 ENGINE["session"] = set(ENGINE)
 ALLOWED = ENGINE | {
-    "io": GROUND | {"geometry", "calibration", "status", "verdict"},
+    "io": GROUND | {"geometry", "results"},
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
-    "root": GROUND
-    | {"geometry", "calibration", "status", "verdict", "engine", "rig", "session", "io", "report"},
+    "root": GROUND | {"geometry", "results", "engine", "rig", "session", "io", "report"},
     "watch": {"errors", "text"},
     "ros": {"io", "watch", *ENGINE},
     "cli": {"io", "report", "simulation", "watch", "ros", *ENGINE},
@@ -84,7 +72,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "fsspec": "io/remote.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
-    "pandas": ("calibration.py", "engine/compare_methods.py", "tables.py"),
+    "pandas": ("results/calibration.py", "engine/compare_methods.py", "results/tables.py"),
     "jinja2": "report/",
 }
 

@@ -18,10 +18,10 @@ from hand_eye_calib.assessment.covariance import (
 from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.prior import widened
 from hand_eye_calib.assessment.reference_selection import select_reference
-from hand_eye_calib.calibration import DofVerdict
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import DofVerdict
 from hand_eye_calib.solvers.registry import Method
 
 DNL = Method("dnl")

@@ -24,8 +24,8 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.verdict import Verdict
 from hand_eye_calib.solvers.registry import Method
-from hand_eye_calib.verdict import Verdict
 
 
 def noisy_streams(n_poses=150):

@@ -13,12 +13,12 @@ from motions import (
 )
 
 import hand_eye_calib as hec
-from hand_eye_calib.calibration import SolveStatus
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator, UnusablePose
 from hand_eye_calib.engine.offline import calibrate, offline_config, whole_snapshot
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.results.calibration import SolveStatus
 
 IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 

@@ -10,7 +10,6 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
-from hand_eye_calib.calibration import Verdict
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.lengths import check_lengths
 from hand_eye_calib.config import CalibratorConfig
@@ -19,6 +18,7 @@ from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.snapshot import noise_fits
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.results.calibration import Verdict
 from reproduction.coverage.classes import make
 
 

@@ -20,7 +20,6 @@ import pytest
 import yaml
 from motions import disturbed
 
-from hand_eye_calib.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.console import waiting_for, with_progress
 from hand_eye_calib.cli.main import main
@@ -32,6 +31,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 

@@ -9,9 +9,9 @@ from result_making import shift
 from result_making import shifted as result
 
 import hand_eye_calib as hec
-from hand_eye_calib.calibration import SolveStatus
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import SolveStatus
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 

@@ -7,8 +7,13 @@ import pytest
 from published_data import data_folder
 
 from hand_eye_calib.assessment.covariance import AXES
-from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
 from reproduction.coverage import __main__ as command
 from reproduction.coverage import classes, measures, mixed, motions, study
 from reproduction.coverage.bound import ideal_estimate

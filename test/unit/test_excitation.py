@@ -7,10 +7,10 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
 
 from hand_eye_calib.assessment.excitation import excitation, what_is_missing
-from hand_eye_calib.calibration import DofObservability, DofVerdict
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict
 
 
 def seen_in(poses):

@@ -10,12 +10,12 @@ import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.assessment.lever_arm import LeverArms
-from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.cli.present import as_text
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.session.goal import Goal, helpful_motion
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3

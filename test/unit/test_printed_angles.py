@@ -3,13 +3,18 @@
 import numpy as np
 import pytest
 
-from hand_eye_calib.calibration import Calibration, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.printed_angles import (
     inverse_covariance,
     printed_rotation,
     sigmas_rpy,
     sigmas_translation,
+)
+from hand_eye_calib.results.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
 )
 
 SAMPLES = 20_000

@@ -6,7 +6,6 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 from hand_eye_calib.assessment.covariance import AXES, UNKNOWN_TRANSLATION, Assessment
 from hand_eye_calib.assessment.prior import fuse
-from hand_eye_calib.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig, parse_prior
 from hand_eye_calib.engine.offline import calibrate
@@ -14,6 +13,7 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 

@@ -17,7 +17,6 @@ pytest.importorskip("matplotlib")
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE
 from hand_eye_calib.cli.present import static_transform_command
@@ -31,6 +30,7 @@ from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.report.report import render
+from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.session.compare import with_comparison
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import REALISTIC

@@ -16,13 +16,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from result_making import NAMES, calibration, good_calibration
 
-from hand_eye_calib.calibration import (
-    Calibration,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-    Verdict,
-)
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Severity
 from hand_eye_calib.checks.response import Biased
@@ -31,6 +24,13 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import fingerprint, load_result, save_result
 from hand_eye_calib.plain import json_text
+from hand_eye_calib.results.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
 
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 

@@ -11,7 +11,6 @@ import pytest
 from published_data import data_folder
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.calibration import Verdict
 from hand_eye_calib.cli import main
 from hand_eye_calib.cli import simulate as simulate_command
 from hand_eye_calib.engine.offline import calibrate
@@ -19,6 +18,7 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.trajectory_files import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.results.calibration import Verdict
 from hand_eye_calib.simulation import noise, terrain
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import (

@@ -7,12 +7,12 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
-from hand_eye_calib.calibration import Verdict
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
 from hand_eye_calib.checks.streams import check_stream
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.results.calibration import Verdict
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction.fault_cases import FAULTS

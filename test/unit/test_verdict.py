@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from result_making import NAMES, calibration
 
-from hand_eye_calib import verdict as rules
-from hand_eye_calib.calibration import (
+from hand_eye_calib.results import verdict as rules
+from hand_eye_calib.results.calibration import (
     Calibration,
     DofObservability,
     DofVerdict,
     SolveStatus,
     Verdict,
 )
-from hand_eye_calib.verdict import RULES
+from hand_eye_calib.results.verdict import RULES
 
 OTHERS = ("model", "methods", "halves")
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "verdict.md"

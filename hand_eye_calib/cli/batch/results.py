@@ -12,12 +12,12 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.batch.tasks import STATE, Task
 from hand_eye_calib.cli.batch.workers import Outcome
 from hand_eye_calib.cli.reporting import REPORT, save_page
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.plain import json_text
+from hand_eye_calib.results.calibration import Calibration
 
 Row = dict[str, Any]
 

@@ -5,7 +5,6 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from hand_eye_calib.calibration import Calibration
 from hand_eye_calib.cli.batch.results import (
     row_of,
     store,
@@ -22,6 +21,7 @@ from hand_eye_calib.cli.present import exit_code, wrapped
 from hand_eye_calib.cli.reporting import REPORT, can_draw, save_page
 from hand_eye_calib.errors import printable
 from hand_eye_calib.plain import json_text
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import with_sigma
 
 _HEADINGS = ("x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg", "poses", "warnings")

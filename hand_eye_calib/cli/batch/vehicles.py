@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.calibration import Calibration, SolveStatus
 from hand_eye_calib.cli.batch.results import Row, row_of
 from hand_eye_calib.cli.batch.workers import Outcome
 from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.session.agreement import Agreement, agreement_of, sentence
 from hand_eye_calib.session.compare import Comparison, compare
 

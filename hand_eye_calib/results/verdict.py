@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Any, Protocol, TypeAlias
 
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.status import (
+from hand_eye_calib.results.status import (
     ROTATIONS,
     TRANSLATIONS,
     DofObservability,

@@ -9,16 +9,6 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.documents import (
-    PLAIN,
-    PLAIN_LATER,
-    base_parent,
-    check_values,
-    covariance_of,
-    floor_of,
-    numbers,
-    transform_of,
-)
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.printed_angles import (
@@ -30,7 +20,17 @@ from hand_eye_calib.geometry.printed_angles import (
 )
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.plain import plain
-from hand_eye_calib.status import (
+from hand_eye_calib.results.document import (
+    PLAIN,
+    PLAIN_LATER,
+    base_parent,
+    check_values,
+    covariance_of,
+    floor_of,
+    numbers,
+    transform_of,
+)
+from hand_eye_calib.results.status import (
     ROTATIONS,
     TRANSLATIONS,
     DofObservability,
@@ -38,8 +38,8 @@ from hand_eye_calib.status import (
     SolveStatus,
     by_hand,
 )
-from hand_eye_calib.tables import data_frame, html_table
-from hand_eye_calib.verdict import Reason, Verdict, headline, reasons, verdict_of
+from hand_eye_calib.results.tables import data_frame, html_table
+from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -328,7 +328,7 @@ class Calibration:
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
         """Why the result may not be used as it is, the gravest first; empty if it may. The rules
-        are :data:`hand_eye_calib.verdict.RULES`.
+        are :data:`hand_eye_calib.results.verdict.RULES`.
         """
         return reasons(self)
 

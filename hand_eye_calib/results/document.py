@@ -1,7 +1,8 @@
 """Values of a result's document, checked before a result is made of them.
 
 A file may be changed by hand, or damaged. All functions raise KeyError, TypeError or ValueError for
-what was not written so; :meth:`hand_eye_calib.calibration.Calibration.from_dict` says it in words.
+what was not written so; :meth:`~hand_eye_calib.results.calibration.Calibration.from_dict` says it
+in words.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,7 +14,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 
 # Attributes that to_dict holds as they are: those that every file has, and those added later.
 PLAIN = (
