@@ -59,10 +59,11 @@ from hand_eye_calib.adaptive.state_space import (
 )
 from hand_eye_calib.adaptive.systematic_choice import Candidates, columns_of
 from hand_eye_calib.adaptive.world_drift import N_COLUMNS, with_world_columns, world_drift
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, distinct, median
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.stats import distinct, median
 
 # Robust start: DNLO over this reference sees through jumps, and does not need the noise levels.
 _START_REFERENCE = "B3"

@@ -24,9 +24,10 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.adaptive.chunks import chunks
-from hand_eye_calib.arrays import FloatArray, IntArray, median
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import chained
+from hand_eye_calib.stats import median
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
 # of the child's or of the parent's path along the axes of that sensor (m/m), by how much the

@@ -17,8 +17,9 @@ from hand_eye_calib.adaptive.chunks import chunks
 from hand_eye_calib.adaptive.increments import Streams
 from hand_eye_calib.adaptive.reml import walk_covariance
 from hand_eye_calib.adaptive.state_space import WHITE, Posterior
-from hand_eye_calib.arrays import BoolArray, FloatArray, median
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.stats import MEDIAN_CHI2, MEDIAN_LENGTH, STUDENT, chi_square_quantile, median
 
 # False alarms expected in a whole recording.
 _FALSE_ALARMS = 0.01
@@ -27,7 +28,6 @@ _FALSE_ALARMS = 0.01
 # this factor. Tails are heavy from this ratio on of the fourth moment of the steps that are below
 # that level to the square of the second (4/3 for normal ones).
 _DECISIVE, _WALK_KURTOSIS = 2.5, 1.5
-_MEDIAN_OF_CHI_6 = 5.348
 
 # No more than this share of the increments can be jumps: otherwise the noise levels are wrong.
 _MOST_JUMPS = 0.5
@@ -35,7 +35,6 @@ _MOST_JUMPS = 0.5
 # First look for jumps: increments this many robust sigmas out. Wide, for the noise levels are not
 # known yet. More pairs of them than this share are no spikes.
 _FIRST_JUMP_SIGMAS = 5.0
-_MEDIAN_OF_CHI_3 = 1.538
 _LEAST_JUMP = 1e-6
 _MOST_SPIKES = 0.3
 
@@ -46,13 +45,8 @@ _HEAVY_KURTOSIS = 1.7
 # If tails are heavy, a spike exceeds the level of false alarms by this factor.
 _BEYOND_TAILS = 3.0
 
-# Degrees of freedom of Student's t distribution for heavy tails, plus 6.
-_STUDENT = 4.0
-
 # Share of a covariance that keeps differences of covariances away from zero.
 _ROUNDING, _LEAST_VARIANCE = 1e-9, 1e-18
-
-_MAX_STEPS = 20
 
 
 # Poses farther apart than this say nothing of the noise levels: over such a gap a walk of the
@@ -124,7 +118,7 @@ def _limits(residuals: FloatArray) -> list[float]:
     limits = []
     for part in (slice(0, 3), slice(3, 6)):
         sizes = np.linalg.norm(residuals[:, part], axis=1)
-        robust = _FIRST_JUMP_SIGMAS * median(sizes) / _MEDIAN_OF_CHI_3
+        robust = _FIRST_JUMP_SIGMAS * median(sizes) / MEDIAN_LENGTH
         limits.append(max(robust, _LEAST_JUMP))
     return limits
 
@@ -223,7 +217,7 @@ def _decisive(of_walk: FloatArray, alarming: float) -> float:
     ordinary = of_walk[of_walk < alarming]
     if len(ordinary) == 0 or np.mean(ordinary**2) > _WALK_KURTOSIS * np.mean(ordinary) ** 2:
         return _DECISIVE * alarming
-    return float(max(median(ordinary) / _MEDIAN_OF_CHI_6, 1.0)) * alarming
+    return float(max(median(ordinary) / MEDIAN_CHI2[6], 1.0)) * alarming
 
 
 def _is_peak(values: FloatArray) -> BoolArray:
@@ -265,19 +259,4 @@ def student_weights(posterior: Posterior) -> FloatArray:
     weights, free = posterior.space.weights, posterior.space.is_free
     kept = min(float(np.mean((weights * squares)[~free])) / 6.0, 1.0)
     hidden = 6.0 * (1.0 - kept) / np.where(free, 1.0, weights)
-    return (_STUDENT + 6.0) / (_STUDENT + squares + hidden)
-
-
-def chi_square_quantile(tail: float) -> float:
-    """What chi-square with six degrees of freedom exceeds with this probability, from 1e-30 to
-    0.99, without importing scipy.special.
-
-    It exceeds 2 h with probability ``exp(-h) (1 + h + h^2 / 2)``. The negative logarithm of that is
-    convex and grows with h: Newton's method converges from above, in ten steps or fewer.
-    """
-    half = 10.0 - 2.0 * np.log(tail)
-    for _ in range(_MAX_STEPS):
-        series = 1.0 + half + half**2 / 2
-        excess = half - np.log(series) + np.log(tail)
-        half -= excess * series / (half**2 / 2)
-    return 2.0 * float(half)
+    return (STUDENT + 6.0) / (STUDENT + squares + hidden)

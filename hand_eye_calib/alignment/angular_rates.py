@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray, quantile
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.stats import quantile
 
 # Angles are taken over windows of this many sampling steps, so that the noise of single poses does
 # not hide the motion.

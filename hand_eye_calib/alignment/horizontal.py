@@ -4,7 +4,8 @@ swapped, or made metres of wrongly.
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, median
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.stats import median
 
 # Distances are compared between positions that are so many parts of the recording apart: far more
 # than a lever arm is long.

@@ -20,10 +20,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, median
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, quadratic_form
+from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
 _SUBSETS, _SUBSET_SIZES = 32, (12, 24, 48)
 _REFINED_STARTS = 3
@@ -52,9 +53,6 @@ _MIN_SIGMA_ROTATION, _MIN_SIGMA_TRANSLATION = 1e-7, 1e-9
 _DAMPING = 1e-10
 
 _SCALE, _OFFSET, _UNKNOWNS = 6, 7, 8
-
-# Median length of a normal vector in three dimensions, in standard deviations per axis.
-_MEDIAN_LENGTH = 1.538
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,8 +322,8 @@ class _Problem:
 
     def sigmas(self, translations: FloatArray, rotations: FloatArray) -> tuple[float, float]:
         """Robust standard deviations per axis, m and rad, of residuals of these lengths (K,)."""
-        sigma_t = median(translations) / _MEDIAN_LENGTH
-        sigma_r = median(rotations) / _MEDIAN_LENGTH
+        sigma_t = median(translations) / MEDIAN_LENGTH
+        sigma_r = median(rotations) / MEDIAN_LENGTH
         return (
             max(sigma_t, _MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12),
             max(sigma_r, _MIN_SIGMA_ROTATION),

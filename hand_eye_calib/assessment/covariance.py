@@ -33,6 +33,7 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict
 from hand_eye_calib.solvers.solution import Solution
+from hand_eye_calib.stats import CHI2_TENTH, MEDIAN_CHI2
 
 # (B, K) mask of the pairs to leave out to the answers (B, 4, 4) without them.
 SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
@@ -46,13 +47,6 @@ _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 # exceed once in ten times.
 # The same of three.
 _CHANCE = {6: np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28]), 3: np.array([0.64, 1.31, 2.44])}
-
-# What the squared distance of two halves in units of their joint covariance exceeds once in ten
-# recordings: a chi-squared with 6, or 3, degrees of freedom.
-_HALVES_BY_CHANCE = {6: 10.64, 3: 6.25}
-
-# Of one degree of freedom.
-_MEDIAN_OF_CHI_SQUARE_1 = 0.455
 
 # An unseen direction with at least this length in its rotation is not one of translation alone.
 _SHARE_OF_ROTATION = 0.5
@@ -219,7 +213,7 @@ def _white_rotation(Ts: FloatArray) -> float:
     """
     steps = se3.rotation_log(np.swapaxes(Ts[:-1, :3, :3], 1, 2) @ Ts[1:, :3, :3])
     # Differences of steps have six times the variance of white noise.
-    variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / _MEDIAN_OF_CHI_SQUARE_1 / 6.0
+    variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / MEDIAN_CHI2[1] / 6.0
     return float(np.sort(variances)[:2].mean())
 
 
@@ -440,7 +434,7 @@ def widened_by_halves(
     difference = (halves.step[0] - halves.step[1])[part]
     joint = misfit * halves.covariance.sum(axis=0)[part, part]
     away = np.linalg.solve(joint, difference)
-    excess = float(difference @ away) / _HALVES_BY_CHANCE[len(model)]
+    excess = float(difference @ away) / CHI2_TENTH[len(model)]
     if excess <= 1.0:
         return model
     error = model @ away

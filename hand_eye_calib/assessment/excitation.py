@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, median, quantile
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import (
     ROTATIONS,
     TRANSLATIONS,
@@ -18,6 +18,7 @@ from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofObservability, DofVerdict
+from hand_eye_calib.stats import median, quantile
 from hand_eye_calib.text import amount, angle, length, listing
 
 # Most poses that are looked at, evenly over the session: enough to see curves, and few enough to

@@ -28,11 +28,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.adaptive.state_space import NormalEquations
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, median
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.stats import median, robust_sigma, student_weights
 from hand_eye_calib.text import angle, length
 
 # Shifts that are looked for: one standard deviation per axis (m, rad).
@@ -41,12 +42,8 @@ SHIFT_M, SHIFT_RAD = 0.03, float(np.radians(1.0))
 # Motions over this time (s) are compared, so many a second at most.
 _LAG_S, _MOTIONS_PER_S = 1.0, 20.0
 
-# Noise is Student's t with so many degrees of freedom: jumps hardly count.
-_T_DOF, _ROUNDS = 4.0, 4
+_ROUNDS = 4
 _LEAST_SIGMA = np.repeat([1e-6, 1e-7], 3)
-
-# Median length of a normal vector in three dimensions, in standard deviations per axis.
-_MEDIAN_LENGTH = 1.538
 
 # The recording is cut into so many windows of equal duration, whose answers show the long-run
 # variance; a shift separates at least so many of them on either side.
@@ -160,12 +157,11 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Covariance (6, 6) of residuals (K, 6) whose noise is Student's t, and the weight (K,) of
     each: 1 on average, small for jumps.
     """
-    lengths = [np.linalg.norm(part, axis=1) for part in (residuals[:, :3], residuals[:, 3:])]
-    sigmas = np.repeat([median(length) / _MEDIAN_LENGTH for length in lengths], 3)
+    sigmas = np.repeat([robust_sigma(part) for part in (residuals[:, :3], residuals[:, 3:])], 3)
     covariance = np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
     for _ in range(_ROUNDS):
         squared = np.einsum("ki,ki->k", residuals @ np.linalg.inv(covariance), residuals)
-        weights = (_T_DOF + 6.0) / (_T_DOF + squared)
+        weights = student_weights(squared)
         scatter = (weights[:, None] * residuals).T @ residuals / len(residuals)
         covariance = scatter + np.diag(_LEAST_SIGMA**2)
     return covariance, weights
@@ -214,7 +210,7 @@ def information_of(
     else:
         precision = np.linalg.inv(covariance)
         squared = np.einsum("ki,ki->k", residuals @ precision, residuals)
-        weights = (_T_DOF + 6.0) / (_T_DOF + squared)
+        weights = student_weights(squared)
     whitened = np.swapaxes(jacobians, 1, 2) @ precision * weights[:, None, None]
     middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
     block_ns = round(block_s * 1e9)

@@ -11,7 +11,7 @@ from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.adaptive.part_delays import PartDelay
 from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import FloatArray, median
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.mount_change import find_change, information
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Finding, Severity
@@ -19,6 +19,7 @@ from hand_eye_calib.checks.response import Response, response, rotation_gains
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.stats import median
 
 # Significance that every one of these findings needs, in standard deviations, and how many times it
 # must exceed what noise may make of it.

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
-from hand_eye_calib.arrays import FloatArray, median
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Confidence, Finding
 from hand_eye_calib.checks.streams import coarse_poses
@@ -31,6 +31,7 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.solvers.separable import align_rotation_vectors
+from hand_eye_calib.stats import median
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree.
 LAGS_S = (3.0, 1.0, 0.4)

@@ -7,12 +7,13 @@ show it: they follow from the other stream's orientations if the poses do, or if
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, quantile
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import pairs_between
 from hand_eye_calib.solvers.separable import align_rotation_vectors
+from hand_eye_calib.stats import quantile
 
 # Orientations are copies if they agree to this angle, several times better than any two sensors of
 # the recordings at hand, and so many times better than each stream is rough. Neither is enough:

@@ -4,9 +4,9 @@ in millimetres agree, and nothing else tells.
 
 import numpy as np
 
-from hand_eye_calib.arrays import quantile
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.stats import quantile
 
 # No vehicle that calibrates its sensors by motion goes faster than sound (m/s), or bears ten times
 # gravity for a whole second (m/s^2), which is twice what a racing car does. Arms, which move least,

@@ -24,10 +24,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray, median
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
 # Half of the span of a displacement (s); an interval of the poses if that is longer.
 _HALF_SPAN_S = 0.2
@@ -38,7 +39,7 @@ _MAX_INSTANTS, _MIN_INSTANTS = 1500, 150
 _BLOCKS = 10
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
-_TUNING, _ROUNDS, _MEDIAN_LENGTH = 3.0, 4, 1.538
+_TUNING, _ROUNDS = 3.0, 4
 
 # An axis whose root mean square rotation is below this share of the main axis's has no gain.
 _LITTLE = 0.1
@@ -109,7 +110,7 @@ def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Biased, ...
     axes = np.linalg.eigh(x.T @ x)[1][:, ::-1]
     columns = np.concatenate([(x @ axes)[:, None, :] * axes[None], -se3.skew(x)], axis=2)
     found = _regress(columns, y - x)
-    variance = median(((y - x - columns @ found.values) ** 2).sum(axis=1)) / _MEDIAN_LENGTH**2
+    variance = median(((y - x - columns @ found.values) ** 2).sum(axis=1)) / MEDIAN_LENGTH**2
     squared = ((x @ axes) ** 2).mean(axis=0)
     # Little rotation beside much may come from an axis that is slightly off.
     biases = np.where(squared < _LITTLE**2 * squared[0], 1.0, variance / (squared + 1e-300))
@@ -327,7 +328,7 @@ def _regress(columns: FloatArray, target: FloatArray, variance: float = 0.0) -> 
         ridge[:3, :3] -= _of_noise(total[:3, :3], variance * weights.sum())
         values = np.linalg.solve(total[:m, :m] + ridge, total[:m, m])
         lengths = np.linalg.norm(target - columns @ values, axis=1)
-        sigma = max(median(lengths) / _MEDIAN_LENGTH, 1e-12)
+        sigma = max(median(lengths) / MEDIAN_LENGTH, 1e-12)
         weights = 1.0 / (1.0 + (lengths / sigma) ** 2 / (3 * _TUNING**2)) ** 2
     rest = total - blocks
     shares = rest[:, :m, :m] + (1.0 - 1.0 / _BLOCKS) * ridge

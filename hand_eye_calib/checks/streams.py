@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, distinct, median, quantile
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.leaps import find_leap
+from hand_eye_calib.stats import distinct, median, quantile
 
 # Shortest step (s) of a path length: over shorter steps it would be the length of the noise.
 _PATH_STEP_S = 0.2

@@ -9,7 +9,7 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import angular_rates, speeds
 from hand_eye_calib.alignment.scale import child_scaled
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, median
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.streams import are_gaps
 from hand_eye_calib.config import CalibratorConfig
@@ -20,6 +20,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.stats import median
 
 # Most samples of the angular rates, and the shortest window of each (s).
 _MAX_RATES, _MIN_WINDOW_S = 1500, 0.2

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, median
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import OtherAnswers
@@ -22,6 +22,7 @@ from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.stats import MEDIAN_NORMAL, median
 
 # Fewest other answers that have a scatter.
 _MIN_OTHERS = 3
@@ -36,9 +37,6 @@ _FEWEST_INLIERS = 0.55
 
 # Smallest joint standard deviation (m, rad) to divide by: noise-free data has none.
 _ROUNDING = 1e-9
-
-# Median absolute value of a normal variable, in standard deviations.
-_MEDIAN_OF_NORMAL = 0.6745
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +193,7 @@ def _scatter(
     apart = np.array([distance for distance, _ in distances])
     allowed = np.array([joint for _, joint in distances])
     apart[:, np.isfinite(apart).sum(axis=0) < _MIN_OTHERS] = np.nan
-    return _median(apart) / _MEDIAN_OF_NORMAL, _median(apart / allowed) / _MEDIAN_OF_NORMAL
+    return _median(apart) / MEDIAN_NORMAL, _median(apart / allowed) / MEDIAN_NORMAL
 
 
 def _is_sound(other: Calibration) -> bool:
@@ -215,7 +213,7 @@ def _over_own(calibration: Calibration, others: Sequence[Calibration]) -> FloatA
     apart = np.array([_apart(calibration, other)[0] for other in others])
     apart[~as_certain] = np.nan
     apart[:, np.isfinite(apart).sum(axis=0) < _MIN_AS_CERTAIN] = np.nan
-    return _median(apart) / own / _MEDIAN_OF_NORMAL
+    return _median(apart) / own / MEDIAN_NORMAL
 
 
 def _median(values: FloatArray) -> FloatArray:

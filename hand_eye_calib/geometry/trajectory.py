@@ -7,12 +7,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hand_eye_calib.arrays import FloatArray, IntArray, median
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import MEASURES
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.interpolation import corners
 from hand_eye_calib.geometry.rates import integrated
+from hand_eye_calib.stats import median
 
 # A quaternion further from unit length than this is wrong and not just rounded (tf2 has the same
 # bound).

@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from hand_eye_calib.arrays import IntArray, median
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.stats import median
 
 _MAX_PAIRS = 800
 

@@ -6,8 +6,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray, median
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.stats import median
 
 # Streams whose intervals differ by less than this factor count as equally fast: they are paired at
 # the child's stamps.

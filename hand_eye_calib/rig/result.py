@@ -12,12 +12,10 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.rig.solution import RigSolution
+from hand_eye_calib.stats import CHI2_HUNDREDTH
 from hand_eye_calib.text import angle, length
 
 _FORMAT, _VERSION = "hand_eye_calib/rig", 1
-
-# What chi-square with so many degrees of freedom exceeds once in a hundred times.
-_ONCE_IN_A_HUNDRED = {1: 6.63, 2: 9.21, 3: 11.34, 4: 13.28, 5: 15.09, 6: 16.81}
 
 # Variances (m^2, rad^2) of directions that are unknown are larger.
 _UNKNOWN = 1.0
@@ -51,7 +49,7 @@ class Closure:
     @property
     def closes(self) -> bool:
         """Whether chance makes it so large more than once in a hundred times."""
-        return self.dof == 0 or self.chi2 <= _ONCE_IN_A_HUNDRED[self.dof]
+        return self.dof == 0 or self.chi2 <= CHI2_HUNDREDTH[self.dof]
 
     @property
     def sentence(self) -> str:

@@ -25,6 +25,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.verdict import target_of
+from hand_eye_calib.stats import CHI2_THOUSANDTH, LARGEST_OF_SIX, NINE_TIMES_OUT_OF_TEN
 from hand_eye_calib.text import amount, listing
 
 # Scatter between recordings of one rig, per axis (m, rad): of flights and hand-held recordings, and
@@ -33,14 +34,6 @@ from hand_eye_calib.text import amount, listing
 _SCATTER_IN_HAND = np.repeat([0.008, np.radians(0.12)], 3)
 _SCATTER_OF_VEHICLE = np.repeat([0.020, np.radians(0.10)], 3)
 _VEHICLE = 4.0
-
-# Chance makes a change of so many standard deviations on any of six axes with probability 0.005,
-# and one of this chi-square on all of them together with probability 0.001. (In numbers, because
-# scipy.stats takes longer to import than a comparison.)
-SIGMAS, CHI2 = 3.341479, 22.457744
-
-# A change of so many more standard deviations is seen with probability 0.9.
-MORE_SIGMAS = 1.281552
 
 # An axis is the same if changes of so many targets would have been seen.
 _TARGETS = 5.0
@@ -297,7 +290,7 @@ def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Differen
     covariance = first.covariance + second.covariance + scatter
     covariance = covariance + 1e-18 * np.eye(6)
     sigmas = np.sqrt(np.diag(covariance))
-    visible = (SIGMAS + MORE_SIGMAS) * sigmas
+    visible = (LARGEST_OF_SIX + NINE_TIMES_OUT_OF_TEN) * sigmas
     distance = float(values @ np.linalg.solve(covariance, values))
     unknown = sigmas > 0.1 * np.sqrt(np.diag(_UNKNOWN))
     sigmas, visible = np.where(unknown, np.inf, sigmas), np.where(unknown, np.inf, visible)
@@ -305,7 +298,7 @@ def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Differen
         _axis_verdict(abs(value) / sigma, seen <= limit)
         for value, sigma, seen, limit in zip(values, sigmas, visible, limits, strict=True)
     )
-    if Change.MOVED in verdicts or distance > CHI2:
+    if Change.MOVED in verdicts or distance > CHI2_THOUSANDTH[6]:
         verdict = Change.MOVED
     else:
         verdict = Change.CANNOT_TELL if Change.CANNOT_TELL in verdicts else Change.SAME
@@ -322,7 +315,7 @@ def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Differen
 
 
 def _axis_verdict(ratio: float, would_be_seen: bool) -> Change:
-    if ratio > SIGMAS:
+    if ratio > LARGEST_OF_SIX:
         return Change.MOVED
     return Change.SAME if would_be_seen else Change.CANNOT_TELL
 

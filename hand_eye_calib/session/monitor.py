@@ -29,6 +29,7 @@ from hand_eye_calib.assessment.mount_change import (
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
 
 # Log likelihood ratio from which on the mount has moved.
 THRESHOLD = 10.0
@@ -70,12 +71,6 @@ _MOST_OF_TYPICAL = 20.0
 # it beforehand (standard deviation over a stretch) counts as much as so many stretches.
 _STRETCH_S, _ASSUMED_SCALE, _ASSUMED_STRETCHES = 60, 0.003, 2.0
 _LEAST_VARIANCE = 1e-12
-# Student's t weights of the motions, as in the kernel.
-_T_DOF = 4.0
-
-# A shift is said to be seen if the ratio exceeds the threshold nine times out of ten: by so many
-# standard deviations.
-_POWER_SIGMAS = 1.28
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -433,7 +428,7 @@ class MountMonitor:
         # A shift along or about an axis of z standard deviations has the ratio z^2 / 2 less this.
         information = np.linalg.inv(covariance)
         _, log_volumes = np.linalg.slogdet(np.eye(6) + _KNOCKS[:2] @ information)
-        seen_sigmas = np.sqrt(2.0 * THRESHOLD + log_volumes) + _POWER_SIGMAS
+        seen_sigmas = np.sqrt(2.0 * THRESHOLD + log_volumes) + NINE_TIMES_OUT_OF_TEN
         return np.repeat(seen_sigmas, 3) * self._sigmas(covariance)
 
     def _information_of_noise(self) -> FloatArray:
@@ -488,7 +483,7 @@ def _information(
     precision = np.linalg.inv(noise)
     centred = residuals if shift is None else residuals + jacobians @ shift
     squared = np.einsum("ki,ki->k", centred @ precision, centred)
-    weights = (_T_DOF + 6.0) / (_T_DOF + squared)
+    weights = student_weights(squared)
     whitened = np.swapaxes(jacobians, 1, 2) @ precision * weights[:, None, None]
     H = (whitened @ jacobians).sum(axis=0)
     S = -np.einsum("kij,kj->i", whitened, residuals)

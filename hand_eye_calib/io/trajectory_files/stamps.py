@@ -4,10 +4,11 @@ from decimal import Decimal
 
 import numpy as np
 
-from hand_eye_calib.arrays import IntArray, median
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.trajectory_files.table import Table
+from hand_eye_calib.stats import median
 
 _NS_PER_S = 1_000_000_000
 _LARGEST_NS = int(np.iinfo(np.int64).max)
