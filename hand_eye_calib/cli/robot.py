@@ -10,7 +10,7 @@ from hand_eye_calib.text import listing
 
 if TYPE_CHECKING:
     from hand_eye_calib.geometry.extrinsic import Extrinsic
-    from hand_eye_calib.geometry.frames import Frames
+    from hand_eye_calib.geometry.frames import FrameTree
     from hand_eye_calib.results.calibration import Calibration
 
 
@@ -113,7 +113,7 @@ def _installed(calibration: "Calibration", arguments: argparse.Namespace) -> "Ex
     return of_frames(_frames(arguments), *frames, str(arguments.urdf))
 
 
-def _frames(arguments: argparse.Namespace) -> "Frames":
+def _frames(arguments: argparse.Namespace) -> "FrameTree":
     from hand_eye_calib.io.installed import frames_of_bag
     from hand_eye_calib.io.urdf import RobotDescription
 

@@ -1,7 +1,7 @@
-"""Frames that are fixed to each other: a tree of static transforms."""
+"""Frames and their parents: the one tree behind robot descriptions, ``/tf`` and ``/tf_static``."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,8 +10,8 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 
-# Frames that are listed in a message.
-_MOST_LISTED = 20
+# Edges that are listed in a message.
+_MOST_LISTED = 50
 
 
 def checked_pose(position: Sequence[float], quat_xyzw: Sequence[float]) -> FloatArray:
@@ -27,20 +27,52 @@ def checked_pose(position: Sequence[float], quat_xyzw: Sequence[float]) -> Float
     return np.asarray(poses[0])
 
 
-@dataclass(frozen=True)
-class Frames:
+@dataclass
+class Edge:
+    """A frame's parent, whether its pose in it is constant, and that (4, 4) if it is known."""
+
+    parent: str
+    is_static: bool = True
+    pose: FloatArray | None = None
+
+
+class FrameTree:
     """Frames with their parents.
+
+    Parameters
+    ----------
+    origin : str
+        Where the frames come from, for messages.
 
     Attributes
     ----------
-    fixed : mapping of str to (str, (4, 4) array)
-        Frame to its parent, and its pose in it.
-    moving : mapping of str to str
-        Frame to its parent, where the pose is not constant.
+    edges : dict of str to Edge
+        Frame to the edge that leads up from it.
     """
 
-    fixed: Mapping[str, tuple[str, FloatArray]] = field(default_factory=dict)
-    moving: Mapping[str, str] = field(default_factory=dict)
+    def __init__(self, origin: str = "the transforms") -> None:
+        self.edges: dict[str, Edge] = {}
+        self._origin = origin
+
+    def add(
+        self, parent: str, frame: str, pose: FloatArray | None = None, is_static: bool = True
+    ) -> Edge:
+        """Add an edge, or its newest pose. An edge that has ever moved is not static.
+
+        Raises
+        ------
+        InputError
+            If the frame has another parent already.
+        """
+        edge = self.edges.setdefault(frame, Edge(parent))
+        if edge.parent != parent:
+            raise InputError(
+                f"frame {frame!r} has two parents, {edge.parent!r} and {parent!r}: "
+                f"{self._origin} do not form a tree; record only one of their publishers"
+            )
+        edge.is_static &= is_static
+        edge.pose = pose
+        return edge
 
     def pose(self, frame: str, of: str) -> FloatArray:
         """Pose (4, 4) of the frame ``of`` in ``frame``.
@@ -50,38 +82,56 @@ class Frames:
         InputError
             If one of both is not there, or they are not fixed to each other.
         """
-        up, down = self._to_root(frame), self._to_root(of)
+        up, down = self.route(frame, of)
+        T_frame_of = np.eye(4)
+        for each in up + down:
+            edge = self.edges[each]
+            if not edge.is_static or edge.pose is None:
+                raise InputError(f"{frame} and {of} are not fixed to each other: {each} moves")
+            T_frame_of = T_frame_of @ (se3.inverse(edge.pose) if each in up else edge.pose)
+        return T_frame_of
+
+    def route(self, frame: str, of: str) -> tuple[list[str], list[str]]:
+        """Frames whose edges lead up from ``frame``, and those whose edges lead down to ``of``.
+
+        Raises
+        ------
+        InputError
+            If one of both is not there, or they are not connected.
+        """
+        up, down = self.above(frame), self.above(of)
         if up[-1] != down[-1]:
-            moving = [each for each in (up[-1], down[-1]) if each in self.moving]
-            why = f": {moving[0]} moves" if moving else ""
-            raise InputError(f"{frame} and {of} are not fixed to each other{why}")
-        T_root_frame, T_root_of = self._from_root(up), self._from_root(down)
-        return se3.inverse(T_root_frame) @ T_root_of
+            raise InputError(f"frames {frame!r} and {of!r} are not connected; {self.listing()}")
+        shared = {*up} & {*down}
+        down = [each for each in down if each not in shared]
+        return [each for each in up if each not in shared], down[::-1]
 
-    def path(self, frame: str, of: str) -> list[str]:
-        """Frames whose edges lead down from the last frame that both have above them to ``of``."""
-        above = set(self._to_root(frame))
-        return [each for each in self._to_root(of) if each not in above][::-1]
+    def above(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on to the root.
 
-    def _to_root(self, frame: str) -> list[str]:
-        """The frame, and those above it as far as they are fixed."""
-        known = {*self.fixed, *self.moving, *(parent for parent, _ in self.fixed.values())}
-        known |= set(self.moving.values())
-        if frame not in known:
-            names = sorted(known)
-            more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
-            listed = ", ".join(names[:_MOST_LISTED])
-            raise InputError(f"there is no frame {frame!r}; found {listed or 'none'}{more}")
-        found = [frame]
-        while found[-1] in self.fixed:
-            parent = self.fixed[found[-1]][0]
-            if parent in found:
-                raise InputError(f"the frames form a loop through {parent!r}")
-            found.append(parent)
-        return found
+        Raises
+        ------
+        InputError
+            If it is not there, or the frames above it form a loop.
+        """
+        if frame not in self.edges and all(edge.parent != frame for edge in self.edges.values()):
+            raise InputError(f"no frame {frame!r} in {self._origin}; {self.listing()}")
+        found = {frame: None}
+        while frame in self.edges:
+            frame = self.edges[frame].parent
+            if frame in found:
+                raise InputError(f"{self._origin} form a loop through frame {frame!r}")
+            found[frame] = None
+        return [*found]
 
-    def _from_root(self, frames: list[str]) -> FloatArray:
-        T = np.eye(4)
-        for frame in frames[:-1]:
-            T = self.fixed[frame][1] @ T
-        return T
+    def listing(self) -> str:
+        """List the edges in one line."""
+        if not self.edges:
+            return "it has none"
+        edges = sorted(
+            f"{edge.parent}:{frame}{' (static)' * edge.is_static}"
+            for frame, edge in self.edges.items()
+        )
+        n_more = len(edges) - _MOST_LISTED
+        more = [f"and {n_more} more"] if n_more > 0 else []
+        return f"it has {', '.join(edges[:_MOST_LISTED] + more)}"

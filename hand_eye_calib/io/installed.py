@@ -8,7 +8,7 @@ from hand_eye_calib.config import parse_pose
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
-from hand_eye_calib.geometry.frames import Frames
+from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.io.results import FILE_NAME, load_result
 from hand_eye_calib.io.urdf import RobotDescription
 from hand_eye_calib.results.calibration import Calibration
@@ -66,7 +66,7 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     return partial(of_frames, frames, origin=str(path))
 
 
-def of_frames(frames: Frames, parent_frame: str, child_frame: str, origin: str) -> Extrinsic:
+def of_frames(frames: FrameTree, parent_frame: str, child_frame: str, origin: str) -> Extrinsic:
     """The installed pose that a tree of frames has.
 
     Raises
@@ -80,7 +80,7 @@ def of_frames(frames: Frames, parent_frame: str, child_frame: str, origin: str) 
         raise InputError(f"{origin}: {error}") from None
 
 
-def frames_of_bag(path: str | Path) -> Frames:
+def frames_of_bag(path: str | Path) -> FrameTree:
     """The frames of a bag's ``/tf_static``."""
     from hand_eye_calib.io.bags import PoseBag
 

@@ -3,6 +3,7 @@ one frame in another.
 """
 
 from array import array
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
@@ -13,12 +14,10 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import split_frames
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.limits import MOST_FRAMES
 from hand_eye_calib.io.plausibility import check_positions
-
-# Edges that are listed in a message.
-_MOST_LISTED = 50
 
 
 class TfSource(NamedTuple):
@@ -62,11 +61,9 @@ class Transform(Protocol):
 
 
 @dataclass
-class Edge:
-    """A frame's parent, and the frame's poses in it: N bag times, stamps and rows of seven."""
+class _Kept:
+    """The poses of a frame in its parent: N bag times, stamps and rows of seven."""
 
-    parent: str
-    is_static: bool = True
     log_ns: list[int] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
     values: "array[float]" = field(default_factory=lambda: array("d"))
@@ -76,7 +73,7 @@ class Edge:
         return np.array(self.values, dtype=float).reshape(-1, 7)
 
 
-class TransformTree:
+class TransformTree(FrameTree):
     """The frames of a bag and the edges between them.
 
     Edges are noted with :meth:`note` in a first pass over the messages. Poses are kept with
@@ -84,7 +81,8 @@ class TransformTree:
     """
 
     def __init__(self) -> None:
-        self.edges: dict[str, Edge] = {}
+        super().__init__("the bag's transforms")
+        self._kept: defaultdict[str, _Kept] = defaultdict(_Kept)
 
     def note(self, transform: Transform, is_static: bool) -> None:
         """Add an edge, without its pose.
@@ -94,25 +92,18 @@ class TransformTree:
         InputError
             If the frame has another parent already, or there are too many frames.
         """
-        frame = transform.sensor_frame or ""
-        edge = self.edges.setdefault(frame, Edge(transform.world_frame))
+        self.add(transform.world_frame, transform.sensor_frame or "", is_static=is_static)
         if len(self.edges) > MOST_FRAMES:
             raise InputError(f"the transforms have more than {MOST_FRAMES} frames")
-        if edge.parent != transform.world_frame:
-            raise InputError(
-                f"frame {frame!r} has two parents, {edge.parent!r} and "
-                f"{transform.world_frame!r}: the transforms do not form a tree; record only one of "
-                "their publishers"
-            )
-        edge.is_static &= is_static
 
     def keep(self, transform: Transform, is_static: bool, log_ns: int) -> None:
         """Keep the pose of a transform that is needed; static ones of a moving edge are ignored."""
-        edge = self.edges[transform.sensor_frame or ""]
-        if edge.is_static or not is_static:
-            edge.log_ns.append(log_ns)
-            edge.stamps_ns.append(transform.stamp_ns)
-            edge.values.extend((*transform.position, *transform.quat_xyzw))
+        frame = transform.sensor_frame or ""
+        if self.edges[frame].is_static or not is_static:
+            kept = self._kept[frame]
+            kept.log_ns.append(log_ns)
+            kept.stamps_ns.append(transform.stamp_ns)
+            kept.values.extend((*transform.position, *transform.quat_xyzw))
 
     def chain(self, source: TfSource) -> tuple[list[str], list[str]]:
         """Frames whose edges lead up from the world frame, and down to the sensor's.
@@ -122,50 +113,12 @@ class TransformTree:
         InputError
             If a frame is not there, or nothing moves between the two.
         """
-        for frame in source:
-            if frame not in self.edges and frame not in {
-                edge.parent for edge in self.edges.values()
-            }:
-                raise InputError(f"no frame {frame!r} in the bag's transforms; {self.listing()}")
-        up, down = self._to_root(source.world_frame), self._to_root(source.sensor_frame)
-        if self._root(source.world_frame) != self._root(source.sensor_frame):
-            raise InputError(
-                f"frames {source.world_frame!r} and {source.sensor_frame!r} are not connected; "
-                f"{self.listing()}"
-            )
-        shared = set(up) & set(down)
-        up = [frame for frame in up if frame not in shared]
-        down = [frame for frame in down if frame not in shared]
+        up, down = self.route(*source)
         if all(self.edges[frame].is_static for frame in up + down):
             raise InputError(
                 f"{source} does not move: all of its transforms are static; {self.listing()}"
             )
-        return up, down[::-1]
-
-    def listing(self) -> str:
-        """List the edges in one line."""
-        if not self.edges:
-            return "it has none"
-        edges = sorted(
-            f"{edge.parent}:{frame}{' (static)' * edge.is_static}"
-            for frame, edge in self.edges.items()
-        )
-        n_more = len(edges) - _MOST_LISTED
-        more = [f"and {n_more} more"] if n_more > 0 else []
-        return f"it has {', '.join(edges[:_MOST_LISTED] + more)}"
-
-    def _to_root(self, frame: str) -> list[str]:
-        frames: dict[str, None] = {}
-        while frame in self.edges:
-            if frame in frames:
-                raise InputError(f"the transforms form a loop through frame {frame!r}")
-            frames[frame] = None
-            frame = self.edges[frame].parent
-        return list(frames)
-
-    def _root(self, frame: str) -> str:
-        frames = self._to_root(frame)
-        return self.edges[frames[-1]].parent if frames else frame
+        return up, down
 
     def trajectory(self, source: TfSource, max_gap_s: float) -> tuple[Trajectory, IntArray, int]:
         """Poses of the sensor's frame in the world frame, at the stamps of the moving edge with the
@@ -215,15 +168,15 @@ class TransformTree:
     def _static(self, frame: str) -> FloatArray:
         """(4, 4): the last pose of a static edge."""
         stamps_ns = np.zeros(1, dtype=np.int64)
-        pose: FloatArray = self._checked(frame, stamps_ns, self.edges[frame].poses()[-1:]).poses[0]
+        pose: FloatArray = self._checked(frame, stamps_ns, self._kept[frame].poses()[-1:]).poses[0]
         return pose
 
     def _moving(self, frame: str) -> tuple[Trajectory, IntArray]:
         """Trajectory and bag times of an edge; of repeated transforms the first counts."""
-        edge = self.edges[frame]
-        stamps_ns, first = np.unique(np.array(edge.stamps_ns, dtype=np.int64), return_index=True)
-        trajectory = self._checked(frame, stamps_ns, edge.poses()[first])
-        return trajectory, np.array(edge.log_ns, dtype=np.int64)[first]
+        kept = self._kept[frame]
+        stamps_ns, first = np.unique(np.array(kept.stamps_ns, dtype=np.int64), return_index=True)
+        trajectory = self._checked(frame, stamps_ns, kept.poses()[first])
+        return trajectory, np.array(kept.log_ns, dtype=np.int64)[first]
 
     def _checked(self, frame: str, stamps_ns: IntArray, poses: FloatArray) -> Trajectory:
         try:

@@ -16,7 +16,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import Frames
+from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.io.files import read_bytes
 
 LARGEST_URDF = 64 << 20
@@ -80,22 +80,18 @@ class RobotDescription:
         """Name of the joint that :meth:`patched` changes."""
         return self._joint_to_change(parent_frame, child_frame).name
 
-    def _frames(self) -> Frames:
-        fixed, moving = {}, {}
+    def _frames(self) -> FrameTree:
+        found = FrameTree("the robot description")
         for joint in self._joints:
-            if joint.child in fixed or joint.child in moving:
+            if joint.child in found.edges:
                 raise InputError(f"{self._path}: link {joint.child!r} has two parents")
-            if joint.kind == "fixed":
-                assert joint.T_parent_child is not None
-                fixed[joint.child] = (joint.parent, joint.T_parent_child)
-            else:
-                moving[joint.child] = joint.parent
-        return Frames(fixed, moving)
+            found.add(joint.parent, joint.child, joint.T_parent_child, joint.kind == "fixed")
+        return found
 
     def _joint_to_change(self, parent_frame: str, child_frame: str) -> _Joint:
         try:
             self.frames.pose(parent_frame, child_frame)  # raises if they are not fixed
-            path = self.frames.path(parent_frame, child_frame)
+            _, path = self.frames.route(parent_frame, child_frame)
         except InputError as error:
             raise InputError(f"{self._path}: {error}") from None
         joints = [joint for joint in self._joints if joint.child in path]

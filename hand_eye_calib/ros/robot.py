@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import HandEyeCalibError, InputError, printable
 from hand_eye_calib.geometry.extrinsic import Extrinsic
-from hand_eye_calib.geometry.frames import Frames, checked_pose
+from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.io.installed import of_frames, open_installed
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.log import NodeLog
@@ -60,7 +60,7 @@ class Robot:
         self._log, self._own = log, own
         self._source, self._base_frame = options.installed, options.base_frame
         self._installed: Extrinsic | None = None
-        self._fixed: dict[str, Any] = {}
+        self._frames = FrameTree(STATIC_TOPIC)
         self._again_at_s = 0.0
         self.problem = ""
         self._read = self._of_tf if self._source in ("", TF) else open_installed(self._source)
@@ -91,7 +91,7 @@ class Robot:
         if not self._base_frame:
             return calibration
         try:
-            T_base_parent = Frames(self._fixed).pose(self._base_frame, calibration.parent_frame)
+            T_base_parent = self._frames.pose(self._base_frame, calibration.parent_frame)
         except InputError as error:
             self._report(f"base_frame {self._base_frame} is not known from {STATIC_TOPIC}: {error}")
             return calibration
@@ -107,7 +107,7 @@ class Robot:
         return calibration.base_frame != self._base_frame
 
     def _of_tf(self, parent_frame: str, child_frame: str) -> Extrinsic:
-        return of_frames(Frames(self._fixed), parent_frame, child_frame, STATIC_TOPIC)
+        return of_frames(self._frames, parent_frame, child_frame, STATIC_TOPIC)
 
     def _report(self, problem: str) -> None:
         self.problem = problem
@@ -122,11 +122,10 @@ class Robot:
             quat_xyzw = (rotation.x, rotation.y, rotation.z, rotation.w)
             frame = printable(each.child_frame_id).lstrip("/")
             try:
-                pose = checked_pose(position, quat_xyzw)
+                parent = printable(each.header.frame_id).lstrip("/")
+                self._frames.add(parent, frame, checked_pose(position, quat_xyzw))
             except HandEyeCalibError as error:
                 self._report(f"{STATIC_TOPIC} has an unusable transform of {frame}: {error}")
-                continue
-            self._fixed[frame] = (printable(each.header.frame_id).lstrip("/"), pose)
 
 
 def needs_tf(options: NodeConfig) -> bool:

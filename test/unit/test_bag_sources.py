@@ -185,7 +185,7 @@ def test_repeated_transforms_count_once(tmp_path):
         ),
         (
             [("lidar", "odom", PARENT), ("odom", "lidar", PARENT)],
-            "the transforms form a loop through frame",
+            "the bag's transforms form a loop through frame",
         ),
     ],
 )

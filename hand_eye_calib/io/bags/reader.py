@@ -14,7 +14,7 @@ from hand_eye_calib.arrays import BoolArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import Frames, checked_pose
+from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import (
     MALFORMED,
@@ -428,7 +428,7 @@ class PoseBag:
         """
         return self._tree_and_static()[0]
 
-    def static_frames(self) -> Frames:
+    def static_frames(self) -> FrameTree:
         """The frames of the bag and their static transforms; of repeated ones the last.
 
         Raises
@@ -437,14 +437,10 @@ class PoseBag:
             If the transforms form no tree or are damaged.
         """
         tree, static = self._tree_and_static()
-        fixed, moving = {}, {}
-        for frame, edge in tree.edges.items():
-            if edge.is_static:
-                last = static[frame]
-                fixed[frame] = edge.parent, checked_pose(last.position, last.quat_xyzw)
-            else:
-                moving[frame] = edge.parent
-        return Frames(fixed, moving)
+        for frame, last in static.items():
+            if tree.edges[frame].is_static:
+                tree.edges[frame].pose = checked_pose(last.position, last.quat_xyzw)
+        return tree
 
     def _tree_and_static(self) -> tuple[TransformTree, dict[str, PoseFields]]:
         """All edges, and the last static transform of each frame."""
