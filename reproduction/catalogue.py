@@ -11,10 +11,8 @@ from reproduction import (
     figures,
     findings,
     hindsight,
-    repeats,
     runner,
     tables,
-    unlike,
 )
 from reproduction.published import KITTI, METHODS, SIMULATED
 from reproduction.results import SIMULATION_METHODS, Results
@@ -63,9 +61,7 @@ def _artefacts() -> dict[str, Artefact]:
         Artefact("conclusions", everything, conclusions.write),
         Artefact("findings", everything, findings.write),
         Artefact("adaptive", [], hindsight.write),
-        Artefact("repeats", [], repeats.write, ("published",)),
         Artefact("certificate", [], certificate.write),
-        Artefact("unlike", [], unlike.write, ("simulated",)),
     ]
     return {artefact.name: artefact for artefact in found}
 
@@ -77,8 +73,6 @@ EXPERIMENTS = {
     "s-figures": _S_FIGURES,
     "s-tables": tuple(tables.VARIANT_TABLES),
     "adaptive": ("adaptive",),
-    "repeats": ("repeats",),
-    "unlike": ("unlike",),
     "certificate": ("certificate",),
     "all": (
         *("fig3", "fig4", "fig5", *_S_FIGURES, "table1", "table2", *tables.VARIANT_TABLES),

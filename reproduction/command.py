@@ -35,14 +35,12 @@ EXPERIMENTS = {
     "s-figures": "S1-S5: as fig3, for the other methods",
     "s-tables": "S1-S12: every method and reference on both drives",
     "adaptive": "study: adaptive and reference auto against the best choice with hindsight",
-    "repeats": "study: stated sigmas against the spread of repeats on real recordings",
-    "unlike": "study: simulations unlike the paper's (--data simulated)",
     "certificate": "study: which answers are proved to be global minima",
     "faults": "study: faults on purpose, what is found and what the verdict is",
     "all": "all figures and tables of the paper, its conclusions and our findings",
 }
 
-STUDIES = ("adaptive", "repeats", "unlike", "certificate", "faults")
+STUDIES = ("adaptive", "certificate", "faults")
 
 _EPILOG = (
     "\n".join(f"{name:<13}{about}" for name, about in EXPERIMENTS.items())
@@ -51,8 +49,6 @@ _EPILOG = (
 Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV. Beside each,
 *_comparison.csv and *_comparison.md compare it with the published results, cell by cell.
 Solved calibrations are kept in DIR/solved.jsonl: an interrupted run continues from there.
-
-repeats reads zxl19 and asl_tango_easy too, if they lie beside the published data.
 
 Published data: clone github.com/tau-alma/trajectory_calibration_experiments and name its
 folder with --data-folder."""

@@ -6,7 +6,7 @@ that was interrupted goes on from ``faults.jsonl``. ``--clean`` solves the clean
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from itertools import chain
@@ -27,11 +27,9 @@ from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction import clean_recordings
-from reproduction.fault_cases import FAULTS, UNTUNED
-from reproduction.fault_parts import Fault
+from reproduction.fault_cases import GROUPS, Fault
 from reproduction.recordings import Rig, real_rigs
 from reproduction.runner import Store, solve
-from reproduction.unseen_faults import LAST, UNSEEN
 from reproduction.writing import counted, markdown_table, put_into_page
 
 METHODS = ("dnlo", "auto")
@@ -48,13 +46,7 @@ _NO_ANSWER = "no answer"
 # Fault of a case without one, in a recording that the faults are put into, and in a clean one.
 _SOUND, _CLEAN = "none", "clean"
 
-# Titles of the tables of faults that were built later.
-_LATER = {
-    "Twelve faults that were built without a limit for them": UNTUNED,
-    "Ten faults that were built after those": UNSEEN,
-    "Ten faults that were built when all was done, as they came": LAST,
-}
-_FAULTS = {fault.code: fault for fault in chain(FAULTS, *_LATER.values())}
+_FAULTS = {fault.code: fault for fault in chain(*GROUPS.values())}
 
 # Rules of the verdict that state how a recording is, not that something is wrong.
 _PHYSICAL = frozenset(
@@ -157,7 +149,7 @@ def outcome(case: Case, folder: Path | None) -> Outcome:
     if fault:
         random = np.random.default_rng(sum(map(ord, case.recording)))
         parent, child = fault.damage(parent, child, fault.severities[case.severity], random)
-        options = options | fault.options
+        options = {**options, **fault.options}
     try:
         result = calibrate(parent, child, method=case.method, max_pairs=_MAX_PAIRS, **options)
     except HandEyeCalibError:
@@ -248,17 +240,16 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
             f"{len(faulty)} calibrations with `{'` or `'.join(METHODS)}`: of simulated hilly "
             "drives of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), "
             "whose answer without the fault counts as the truth. z is the largest error of an axis "
-            "in its stated standard deviations; z and the error are the largest of all recordings "
-            "and methods. Findings and verdicts are counted over recordings and methods, so that "
-            "the verdicts say how many there are.",
+            "in its stated standard deviations; z and the error are the largest of all. Findings "
+            "and verdicts are counted, the verdicts for each severity in turn.",
             _unsafe_text(faulty),
-            "### Faults\n\n" + _table(FAULTS, by_fault),
             f"Without a fault, these recordings end in {counted(f.verdict for f in sound)}; z is "
             f"at most {max((f.z for f in sound), default=0.0):.1f}.",
         ]
-    for title, faults in _LATER.items():
-        if faults[0].code in by_fault:
-            parts.append(f"### {title}\n\n" + _table(faults, by_fault))
+    for title, faults in GROUPS.items():
+        rows = [_row(fault, by_fault[fault.code]) for fault in faults if fault.code in by_fault]
+        if rows:
+            parts.append(f"### {title}\n\n" + markdown_table(rows))
     if clean:
         parts.append("### No false alarms\n\n" + _clean_text(clean, folder))
     return "\n\n".join(parts)
@@ -276,33 +267,24 @@ def _unsafe_text(faulty: Sequence[Outcome]) -> str:
     )
 
 
-def _table(faults: Sequence[Fault], by_fault: Mapping[str, Sequence[Outcome]]) -> str:
-    rows = []
-    for fault in faults:
-        for index, severity in enumerate(fault.severities):
-            for group in ("hilly", "tango"):
-                start = f"{fault.code} {index} {group}"
-                found = [one for one in by_fault.get(fault.code, ()) if one.key.startswith(start)]
-                if found:
-                    rows.append(_row(fault, severity, group, found))
-    return markdown_table(rows)
-
-
-def _row(fault: Fault, severity: float, group: str, found: Sequence[Outcome]) -> dict[str, str]:
+def _row(fault: Fault, found: Sequence[Outcome]) -> dict[str, str]:
     named = (
         code.removeprefix("note:")
         for one in found
         for code in dict.fromkeys(one.findings)
         if not code.endswith(("gaps", "one_axis"))
     )
+    verdicts = (
+        counted(one.verdict for one in found if one.key.split()[1] == str(index))
+        for index in range(len(fault.severities))
+    )
     answered = [one for one in found if math.isfinite(one.z)]
+    severities = ", ".join(f"{severity:g}" for severity in fault.severities)
     return {
         "": fault.code,
-        "fault": fault.what,
-        "severity": f"{severity:g} {fault.unit}".strip(),
-        "recordings": group,
+        "fault": f"{fault.what}: {severities} {fault.unit}".strip(),
         "findings": counted(named) or "none",
-        "verdict": counted(one.verdict for one in found),
+        "verdicts": "; ".join(filter(None, verdicts)),
         "error": _largest(answered),
         "largest z": f"{max(one.z for one in answered):.1f}" if answered else "",
     }

@@ -1,5 +1,5 @@
 """The figures of Välimäki et al. 2023: errors against the level of noise, box plots, components of
-the motions. And one of ours: scatter of repeats over stated sigma.
+the motions.
 """
 
 from __future__ import annotations
@@ -34,11 +34,6 @@ METHOD_LOOKS = {
     "taylor": (style.BLUE, "x", "-"),
     "zhuang": (style.PURPLE, "P", "--"),
 }
-_AXIS_LOOKS = {
-    "x": (style.VERMILION, "o"), "y": (style.GREEN, "o"), "z": (style.BLUE, "o"),
-    "roll": (style.VERMILION, "x"), "pitch": (style.GREEN, "x"), "yaw": (style.BLUE, "x"),
-}  # fmt: skip
-_RATIOS_SHOWN = (0.05, 10.0)
 
 METRIC_TITLES = {
     "e_rt": "$e_{rt}$ (m)\nrelative translation", "e_rR": "$e_{rR}$ (deg)\nrelative rotation",
@@ -254,51 +249,4 @@ def draw_components(
             row[0].set_yscale("log")
             style.plain_decades(row[0].yaxis)
             row[0].set_ylim(bottom=least)
-        return style.save(figure, stem)
-
-
-def draw_ratios(
-    title: str,
-    ratios: Mapping[str, Mapping[str, Mapping[str, float]]],
-    chance: tuple[float, float],
-    stem: Path,
-) -> list[Path]:
-    """One panel per method, one row per set, one mark per axis; gives the paths. ``chance``: where
-    95 % of the ratios would lie if every sigma were right.
-    """
-    with style.house_style():
-        note = (
-            "1: the sigma was right. Dotted: a factor of two. Grey: 95 % of all marks would "
-            "be here by chance"
-        )
-        figure = style.new_page(2.6, title, note)
-        axes = figure.subplots(1, len(ratios), sharey=True, squeeze=False)[0]
-        for ax, (method, of_sets) in zip(axes, ratios.items(), strict=True):
-            ax.axvspan(*chance, color=style.LIGHT_GREY, alpha=0.5, lw=0)
-            for value, dashes in ((0.5, ":"), (1.0, "-"), (2.0, ":")):
-                ax.axvline(value, color=style.GREY, lw=0.6, ls=dashes)
-            for row, of_axes in enumerate(of_sets.values()):
-                for place, (axis, (colour, marker)) in enumerate(_AXIS_LOOKS.items()):
-                    if axis in of_axes:
-                        shown = min(max(of_axes[axis], _RATIOS_SHOWN[0]), _RATIOS_SHOWN[1])
-                        ax.plot(
-                            shown,
-                            row + 0.1 * (place - 2.5),
-                            marker=marker,
-                            color=colour,
-                            ls="",
-                            mew=0.8,
-                        )
-            ax.set_title(method)
-            ax.set_xscale("log")
-            ax.set_xlim(*_RATIOS_SHOWN)
-            ax.set_yticks(range(len(of_sets)), list(of_sets))
-            style.plain_decades(ax.xaxis, (1, 2, 5))
-        axes[0].invert_yaxis()
-        handles = [
-            style.handle(axis, colour, marker, "") for axis, (colour, marker) in _AXIS_LOOKS.items()
-        ]
-        figure.legend(
-            handles=handles, loc="outside upper right", ncols=len(_AXIS_LOOKS), frameon=False
-        )
         return style.save(figure, stem)

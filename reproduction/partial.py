@@ -19,7 +19,7 @@ from reproduction.coverage import motions
 from reproduction.coverage.classes import VIO, slam, stamps_ns
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
 from reproduction.positions import covers
-from reproduction.repeats import recorded_sets
+from reproduction.recordings import CYCLE, real_rigs
 from reproduction.writing import markdown_table, show, study_parser
 
 _WHITE = SensorErrors(white=sigmas(0.003, 0.2))
@@ -100,8 +100,8 @@ def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
 
 def tango_rows(data_folder: Path) -> Iterator[dict[str, object]]:
     """Rows of the table of recorded devices; none if the recordings are absent."""
-    for name, rig in recorded_sets(data_folder)[0].items():
-        if not name.startswith("tango"):
+    for rig in real_rigs(data_folder)[0]:
+        if rig.name not in CYCLE:
             continue
         (recording,) = rig.recordings.values()
         whole = hec.calibrate(recording.parent, recording.child, time_offset="estimate")
@@ -109,7 +109,7 @@ def tango_rows(data_folder: Path) -> Iterator[dict[str, object]]:
         found = hec.calibrate(recording.parent, rates, time_offset="estimate")
         apart = whole.T_parent_child[:3, :3].T @ found.T_parent_child[:3, :3]
         yield {
-            "Parent <- child": name,
+            "Parent and child": rig.name.removeprefix("tango_"),
             "Apart (deg)": f"{np.degrees(se3.rotation_angle(apart)):.2f}",
             "Sigma, poses (deg)": f"{np.degrees(whole.sigmas[3:].max()):.2f}",
             "Sigma, rates (deg)": f"{np.degrees(found.sigmas[3:].max()):.2f}",

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.main import exit_code_of
-from hand_eye_calib.config import METHODS as KNOWN_METHODS
 from hand_eye_calib.errors import ConfigError
 from reproduction.coverage import study
 from reproduction.coverage.measures import worsened
@@ -18,7 +17,7 @@ from reproduction.coverage.scores import METHODS
 from reproduction.recordings import real_rigs
 from reproduction.writing import study_parser
 
-_METHODS = tuple(name for name in METHODS if name in KNOWN_METHODS)
+_METHODS = tuple(METHODS)
 _SEEDS = 10
 
 
@@ -42,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the study; returns the exit code."""
     plan, absent = _plan(arguments)
     rows = study.measure(plan, arguments.jobs)
-    text = page(rows, study.load(study.VERSION_0_1), absent, arguments.seeds)
+    text = page(rows, absent, arguments.seeds)
     print(text)
     if arguments.page:
         arguments.page.write_text(text, encoding="utf-8")

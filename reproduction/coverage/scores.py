@@ -1,7 +1,7 @@
 """Answers of the calibration, held against what is known."""
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from reproduction.coverage import classes, mixed
 from reproduction.coverage.measures import COVERAGE, Row
 from reproduction.published import load_simulated, path_to
 from reproduction.recordings import CYCLE, PARTS, Rig, Truth
-from reproduction.repeats import spread_and_sigma
 
 # Half the width of an interval, in standard deviations.
 _REACH = float(norm.isf((1.0 - COVERAGE) / 2.0))
@@ -30,7 +29,6 @@ _KNOWN = (DofVerdict.OBSERVED, DofVerdict.WEAK)
 
 METHODS = {
     "auto": {"method": "auto"},
-    "adaptive": {"method": "adaptive"},
     "dnlo": {"method": "dnlo", "reference": "auto"},
 }
 
@@ -225,6 +223,21 @@ def parts_row(rig: Rig, name: str, method: str) -> Row:
         cases |= {f"{label} {key}": value for key, value in _scatter_cases(answers).items()}
     measures = {"scatter": cases} if cases else {}
     return Row("parts", _name_of(rig, name), method, measures, whole.seconds)
+
+
+def spread_and_sigma(
+    calibrations: Sequence[Calibration],
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Variance (6,) of several answers, mean stated variance (6,), and whether all of them observe
+    the axis (6,).
+    """
+    sigmas = np.array([answer.sigmas for answer in calibrations])
+    are_known = [[dof.verdict in _KNOWN for dof in answer.observability] for answer in calibrations]
+    known: BoolArray = np.logical_and.reduce(are_known)
+    first = calibrations[0].T_parent_child
+    deviations = np.array([deviation(answer.T_parent_child, first) for answer in calibrations])
+    stated = np.where(known, (np.where(known, sigmas, 0.0) ** 2).mean(axis=0), np.inf)
+    return deviations.var(axis=0, ddof=1), stated, known
 
 
 def _scatter_cases(answers: list[Calibration | None]) -> dict[str, float]:

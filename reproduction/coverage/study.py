@@ -24,7 +24,7 @@ from reproduction.recordings import CYCLE, Rig
 from reproduction.runner import in_parallel
 
 HERE = Path(__file__).parent
-BASELINE, VERSION_0_1 = HERE / "baseline.json", HERE / "version_0_1.json"
+BASELINE = HERE / "baseline.json"
 
 TABLES = ("simulated", "mixed", "levels", "known answer", "rig", "parts", "cycle", "refused")
 

@@ -1,7 +1,7 @@
 """``python -m reproduction.session``: the studies of docs/measurements.md.
 
 stop: is a session that is told to stop good enough? compare: do recordings of one rig agree, and
-are shifts found? alarms, delays, loops, memory: of the mount monitor.
+are shifts found? alarms, delays, loops: of the mount monitor.
 """
 
 import argparse
@@ -138,21 +138,12 @@ def _delay_row(found: Sequence[mount.Delay]) -> dict[str, object]:
     }
 
 
-def _memory(arguments: argparse.Namespace) -> str:
-    early, late = mount.memory_mb("agv_long", 1000.0)
-    return (
-        f"Largest memory of the process: {early:.0f} MB after 10 hours, {late:.0f} MB after 1,000 "
-        "hours of a robot that drives for a minute of each."
-    )
-
-
 STUDIES: dict[str, Callable[[argparse.Namespace], str]] = {
     "stop": _stop,
     "compare": _compare,
     "alarms": _alarms,
     "loops": _loops,
     "delays": _delays,
-    "memory": _memory,
 }
 
 if __name__ == "__main__":

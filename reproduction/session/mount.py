@@ -1,4 +1,4 @@
-"""The mount monitor: false alarms, delays until a shift is seen, and memory over weeks.
+"""The mount monitor: false alarms and delays until a shift is seen.
 
 Simulated recordings of ten minutes follow each other, with one extrinsic; the motion and the errors
 are drawn anew for each. A shift is put into the child's poses.
@@ -6,7 +6,6 @@ are drawn anew for each. A shift is put into the child's poses.
 
 import copy
 import dataclasses
-import resource
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -35,7 +34,6 @@ SHIFTS = {
     "2 deg": np.radians(2.0), "1 cm": 0.01, "2 cm": 0.02, "5 cm": 0.05,
 }  # fmt: skip
 _BEFORE_S, _AFTER_S = 900.0, 1800.0
-_DRIVE_S = 60.0
 
 # The monitor takes no more poses a second than this.
 _RATE_HZ = 10.0
@@ -159,22 +157,3 @@ def _delay(
             if monitor.alarms > alarms:
                 return Delay(kind, size, float(monitor.seconds - before), announced)
     return Delay(kind, size, np.inf, announced)
-
-
-def memory_mb(name: str, hours: float) -> tuple[float, float]:
-    """Largest memory (MB) of the process after ten hours, and after so many, of a robot that drives
-    for a minute of each hour and stands switched off for the rest.
-    """
-    X = mount(name, 0)
-    monitor = MountMonitor(X, np.zeros((6, 6)))
-    (pairs,) = pieces(name, 0, X, _DRIVE_S)
-    found = []
-    for number in range(round(hours)):
-        feed(monitor, shifted_in_time(pairs, number * 3600 * _SECOND_NS), 30.0)
-        if number == 9:
-            found.append(_largest_mb())
-    return found[0], _largest_mb()
-
-
-def _largest_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

@@ -30,6 +30,7 @@ from reproduction.published import LEVELS, REFERENCES, check_folder
 from reproduction.rows import ALI_AS_PUBLISHED, METRICS, Cell, Row, solve_cell, solve_plain
 from reproduction.sources import SimulatedSource
 from reproduction.tables import PRINTED
+from reproduction.writing import put_into_page
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = SimulatedSource(seed=3, runs=2)
@@ -300,6 +301,21 @@ def test_components_of_the_motions_need_no_solver(tmp_path, capsys):
     assert 0.05 < np.hypot(medians["x", "B5"], medians["y", "B5"]) <= 0.3
     assert medians["z", "B5"] < medians["x", "B5"]
     assert medians["roll", "B5"] < medians["yaw", "B5"]
+
+
+def test_a_text_is_put_between_the_marks_of_its_study(tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("# Ours\n\n<!-- study: begin -->\nold\n<!-- study: end -->\n\nThe rest.\n")
+    put_into_page(page, "study", "# Title\n\n| table |\n")
+    assert page.read_text() == (
+        "# Ours\n\n<!-- study: begin -->\n\n| table |\n\n<!-- study: end -->\n\nThe rest.\n"
+    )
+    with pytest.raises(InputError, match="has no lines <!-- other: begin --> and <!-- other: end"):
+        put_into_page(page, "other", "| table |")
+    with pytest.raises(InputError, match=r"absent\.md: No such file"):
+        put_into_page(tmp_path / "absent.md", "study", "| table |")
+    assert main(["fig4", "--data", "simulated", "--page", str(page)]) == 2
+    assert "--page is for adaptive, certificate, faults; got fig4" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE
 from reproduction import clean_recordings, faults
 from reproduction.command import main
-from reproduction.unseen_faults import LAST
+from reproduction.fault_cases import LAST
 
 
 def test_there_are_more_than_a_hundred_clean_recordings_of_more_than_ten_kinds():
