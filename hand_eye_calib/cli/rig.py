@@ -103,7 +103,7 @@ def add_sensor(found: dict[str, "Trajectory"], name: str, trajectory: "Trajector
 
 def as_lines(rig: "RigCalibration") -> list[str]:
     """What a person needs to see of a rig: tree, extrinsics, closure, noise."""
-    lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors in one solve", "", *rig.tree(), ""]
+    lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", "", *rig.tree(), ""]
     for each in rig.calibrations:
         lines += [f"{each.child_frame} in {each.parent_frame}: {each.headline}"]
         lines += [
@@ -115,7 +115,8 @@ def as_lines(rig: "RigCalibration") -> list[str]:
         lines += [*transform_lines(each.to_dict()["T_parent_child"]), ""]
     lines.append("Answers for two sensors at a time")
     lines += _indented(closure.sentence for closure in rig.closures)
-    lines += ["", "Noise of every sensor", *_indented(rig.noise_in_words())]
+    if noise := rig.noise_in_words():
+        lines += ["", "Noise of every sensor", *_indented(noise)]
     return lines
 
 

@@ -90,10 +90,8 @@ def _noise(rig: RigCalibration) -> list[tuple[str, ...]]:
             angle(noise.rotation_white),
             length(noise.translation_drift),
             angle(noise.rotation_drift),
-            f"{noise.n_jumps}",
-            f"{noise.n_spikes}",
         )
-        for name, noise in zip(rig.sensors, rig.solution.noise, strict=True)
+        for name, noise in rig.noise.items()
     ]
 
 
@@ -101,7 +99,7 @@ def draw_rig(rig: RigCalibration) -> str:
     """SVG of where the sensors are and how they are turned, in two planes of the first one, with
     the standard deviations of their positions.
     """
-    Xs = rig.solution.Xs
+    Xs = rig.Xs
     extent = max(float(np.ptp(Xs[:, :3, 3], axis=0).max()), _LEAST_EXTENT)
     with page_style():
         figure = new_figure(WIDTH, 3.9)

@@ -6,23 +6,15 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import basis, combined, noise_driven
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checked import at_clear_offset, checked
 from hand_eye_calib.engine.estimation import estimate_extrinsic
 from hand_eye_calib.engine.offline import Progress, offline_config, whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
-from hand_eye_calib.rig import solution as joint
-from hand_eye_calib.rig.increments import Aligned
-from hand_eye_calib.rig.result import RigCalibration, closures
-from hand_eye_calib.rig.solution import RigSolution, SensorNoise
-from hand_eye_calib.rig.table import Table, synchronised
+from hand_eye_calib.pairing.synchronise import synchronise
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.rig.result import RigCalibration
 
 # Options that are of one pair of sensors, by their beginnings.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
@@ -39,12 +31,12 @@ def calibrate_rig(
     target_rotation: float | None = None,
     progress: Progress | None = None,
 ) -> RigCalibration:
-    """Estimate the poses of all sensors of a rig in the frame of the first one, in one solve.
+    """Estimate the poses of all sensors of a rig in the frame of the first one.
 
-    First every other sensor is calibrated against the first one, as
-    :func:`~hand_eye_calib.engine.offline.calibrate` does: that gives time offsets, scales and
-    first answers. Then one solve estimates all extrinsics along with the noise of every single
-    sensor. Its answers close: any chain of them between two sensors gives the same.
+    Every other sensor is calibrated against the first one, as
+    :func:`~hand_eye_calib.engine.offline.calibrate` does, and neighbours in the list against each
+    other. What these answers miss closing by tests them. It is then shared among them, so that any
+    chain of extrinsics between two sensors gives the same.
 
     Parameters
     ----------
@@ -67,7 +59,7 @@ def calibrate_rig(
     InputError
         If there are fewer than three trajectories.
     NotEnoughDataError
-        If too few instants have poses of all sensors.
+        If too few instants have poses of two sensors.
     """
     options = {
         "method": method,
@@ -95,27 +87,16 @@ def solve_rig(
     for index, name in enumerate(sensors[1:]):
         tell(0.6 * index / (len(sensors) - 1), f"{name} in {sensors[0]}")
         star.append(_pairwise(first, trajectories[name], sensors[0], name, options))
-    tell(0.6, "all sensors")
     moved = [
         trajectories[each.child_frame].scaled(each.scale).shifted(each.time_offset_s)
         for each in star
     ]
-    table = synchronised([first, *moved], CalibratorConfig.from_options(dict(options)).max_gap)
-    solution = joint.solve(table, _first_answers(star), _aligned(star))
-    tell(0.8, "closure of pairs")
-    chain = [
-        _on_table(table, at, sensors, star[at - 1].method) for at in range(1, len(sensors) - 1)
-    ]
+    chain = []
+    for index, (answer, before, after) in enumerate(zip(star, moved[:-1], moved[1:], strict=False)):
+        tell(0.6 + 0.4 * index / (len(star) - 1), "closure of pairs")
+        chain.append(_neighbours(before, after, sensors[index + 1 : index + 3], answer, options))
     tell(1.0, "done")
-    return RigCalibration(
-        sensors=sensors,
-        calibrations=tuple(
-            _joint(each, at, table, solution) for at, each in enumerate(star, start=1)
-        ),
-        pairwise=tuple(star),
-        closures=closures(sensors, star, chain),
-        solution=solution,
-    )
+    return RigCalibration.of(sensors, star, chain)
 
 
 def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) -> None:
@@ -151,71 +132,20 @@ def _pairwise(
     return checked(snapshot.estimate(), snapshot)[0]
 
 
-def _on_table(table: Table, at: int, sensors: tuple[str, ...], method: str) -> Calibration:
-    """The sensor behind another one in the frame of that, from poses that are aligned."""
-    config = CalibratorConfig.from_options({"method": method, "max_pairs": max(len(table), 10)})
-    found = estimate_extrinsic(table.pair(at, at + 1), config)
-    return dataclasses.replace(found, parent_frame=sensors[at], child_frame=sensors[at + 1])
-
-
-def _first_answers(star: list[Calibration]) -> FloatArray:
-    return np.array([np.eye(4), *(each.T_parent_child for each in star)])
-
-
-def _aligned(star: list[Calibration]) -> Aligned:
-    """The time offsets and scales that were estimated, so that their errors count."""
-    found = list(enumerate(star, start=1))
-    return Aligned(
-        tuple(at for at, each in found if each.time_offset_s and each.time_offset_sigma_s),
-        tuple(at for at, each in found if each.scale != 1.0 and each.scale_sigma),
+def _neighbours(
+    parent: Trajectory,
+    child: Trajectory,
+    names: tuple[str, ...],
+    answer: Calibration,
+    options: Mapping[str, Any],
+) -> Calibration:
+    """One sensor in the frame of another, from trajectories that are aligned; with the method that
+    gave an answer.
+    """
+    max_gap_s = CalibratorConfig.from_options(dict(options)).max_gap
+    pairs = synchronise(parent, child, max_gap_s)
+    config = CalibratorConfig.from_options(
+        {"method": answer.method, "max_pairs": max(len(pairs), 10)}
     )
-
-
-def _joint(pairwise: Calibration, sensor: int, table: Table, solution: RigSolution) -> Calibration:
-    """The calibration of a sensor as the joint solve has it."""
-    T, covariance = solution.T(0, sensor), solution.covariance_of(0, sensor)
-    pairs = motion_pairs(table.poses[0], table.poses[sensor], "B1")
-    noises = (solution.noise[0], solution.noise[sensor])
-    hidden = noise_driven(
-        table.poses[0],
-        T,
-        np.zeros(len(table) - 1, dtype=bool),
-        lambda n: np.asarray(sum(_rotation_variance(noise, n) for noise in noises)),
-    )
-    unknown = basis([*solution.unseen_of(0, sensor).T, *hidden])
-    assessment = combined(T, covariance, None, unknown)
-    translation, rotation = pairs.residuals(T)
-    n = len(translation)
-    is_known = all(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in assessment.observability)
-    status = SolveStatus.OK if is_known else SolveStatus.UNOBSERVABLE
-    return dataclasses.replace(
-        pairwise,
-        T_parent_child=T,
-        T_method=T,
-        covariance=assessment.cov_parent_child_in_child,
-        observability=assessment.observability,
-        status=status if solution.converged else SolveStatus.NOT_CONVERGED,
-        method="adaptive",
-        reference="increments",
-        proved_global="not tried",
-        method_reason=f"rig: one solve for {table.n_sensors} sensors",
-        reference_reason="",
-        objective=solution.objective,
-        noise=None,
-        n_poses=len(table),
-        n_pairs=n,
-        n_inliers=n,
-        motion_residuals=Residuals(
-            translation=translation,
-            rotation=rotation,
-            weights=np.ones(n),
-            start_ns=table.stamps_ns[pairs.i],
-            end_ns=table.stamps_ns[pairs.j],
-        ),
-        other_answer=None,
-    )
-
-
-def _rotation_variance(noise: SensorNoise, n: int) -> float:
-    """Variance (rad^2) per axis of the rotation over so many increments."""
-    return 2.0 * noise.rotation_white**2 + n * noise.rotation_drift**2
+    found = estimate_extrinsic(pairs, config)
+    return dataclasses.replace(found, parent_frame=names[0], child_frame=names[1])

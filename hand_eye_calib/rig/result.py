@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.rig.solution import RigSolution
 from hand_eye_calib.stats import CHI2_HUNDREDTH
 from hand_eye_calib.text import angle, length
 
@@ -19,6 +19,21 @@ _FORMAT, _VERSION = "hand_eye_calib/rig", 1
 
 # Variances (m^2, rad^2) of directions that are unknown are larger.
 _UNKNOWN = 1.0
+
+# Share of an answer's variance that errors of the first sensor explain, at most: no other sensor is
+# without errors.
+_MOST_SHARED = 0.9
+
+# Variance (m^2, rad^2) that no answer is better than: that of poses without noise is zero.
+_ROUNDING = 1e-16
+
+# Of every sensor's noise, as an adaptive answer for two sensors has them.
+_LEVELS = (
+    "rotation_white_rad",
+    "translation_white_m",
+    "rotation_drift_rad_after_a_metre",
+    "translation_drift_m_after_a_metre",
+)
 
 _GRAVITY = (Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE, Verdict.USE)
 
@@ -63,8 +78,26 @@ class Closure:
 
 
 @dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviations per axis of the errors of one sensor's trajectory.
+
+    Attributes
+    ----------
+    rotation_white, translation_white : float
+        Independent error of each pose, rad and m.
+    rotation_drift, translation_drift : float
+        What an error that stays grows to within a metre, rad and m.
+    """
+
+    rotation_white: float
+    translation_white: float
+    rotation_drift: float
+    translation_drift: float
+
+
+@dataclass(frozen=True)
 class RigCalibration:
-    """The extrinsics of all sensors of a rig from one solve.
+    """The extrinsics of all sensors of a rig.
 
     Attributes
     ----------
@@ -72,19 +105,47 @@ class RigCalibration:
         Frames of the S sensors. All extrinsics are stated in the first one's.
     calibrations : tuple of Calibration
         Of every other sensor in the frame of the first one: S - 1.
-    pairwise : tuple of Calibration
-        What each of these pairs gives by itself.
+    neighbours : tuple of Calibration
+        Of every sensor from the third one on in the frame of the one before it: S - 2.
     closures : tuple of Closure
-        Of answers for two sensors at a time, the first and two neighbours in the list each.
-    solution : RigSolution
-        Noise of every sensor and joint covariance.
+        Of answers for two sensors at a time: the first and two neighbours in the list each.
     """
 
     sensors: tuple[str, ...]
     calibrations: tuple[Calibration, ...]
-    pairwise: tuple[Calibration, ...]
+    neighbours: tuple[Calibration, ...]
     closures: tuple[Closure, ...]
-    solution: RigSolution
+
+    @classmethod
+    def of(
+        cls,
+        sensors: tuple[str, ...],
+        star: Sequence[Calibration],
+        neighbours: Sequence[Calibration],
+    ) -> RigCalibration:
+        """From answers for two sensors at a time. What they miss closing by is shared among them,
+        as far as each is uncertain.
+        """
+        found = cls(
+            sensors,
+            tuple(star),
+            tuple(neighbours),
+            tuple(
+                closure((sensors[0], *names), *answers)
+                for names, *answers in zip(
+                    zip(sensors[1:], sensors[2:], strict=False),
+                    star,
+                    neighbours,
+                    star[1:],
+                    strict=False,
+                )
+            ),
+        )
+        calibrations = tuple(
+            replace(each, T_parent_child=se3.exp(step) @ each.T_parent_child)
+            for each, step in zip(star, found._steps(), strict=True)
+        )
+        return replace(found, calibrations=calibrations)
 
     def __repr__(self) -> str:
         lines = [
@@ -99,13 +160,91 @@ class RigCalibration:
         """The gravest verdict of all extrinsics."""
         return min((each.verdict for each in self.calibrations), key=_GRAVITY.index)
 
+    @cached_property
+    def Xs(self) -> FloatArray:
+        """Poses (S, 4, 4) of the sensors in the frame of the first one."""
+        return np.array([np.eye(4), *(each.T_parent_child for each in self.calibrations)])
+
+    def _steps(self) -> FloatArray:
+        """Changes (S - 1, 6) of the extrinsics, in the frame of the first sensor, that make all
+        answers close: weighted least squares.
+        """
+        K = len(self.calibrations)
+        information, pulled = np.zeros((K, 6, K, 6)), np.zeros((K, 6))
+        for at, (each, X) in enumerate(zip(self.calibrations, self.Xs[1:], strict=True)):
+            information[at, :, at] += np.linalg.inv(_moved(each, X))
+        for at, each in enumerate(self.neighbours):
+            before, after = self.Xs[at + 1], self.Xs[at + 2]
+            miss = se3.log(before @ each.T_parent_child @ se3.inverse(after))
+            weight = np.linalg.inv(_moved(each, after))
+            for row, sign in ((at + 1, 1.0), (at, -1.0)):
+                pulled[row] += sign * weight @ miss
+                information[row, :, at + 1] += sign * weight
+                information[row, :, at] -= sign * weight
+        size = 6 * K
+        steps = np.linalg.solve(information.reshape(size, size), pulled.ravel())
+        return np.asarray(steps.reshape(K, 6))
+
+    @cached_property
+    def _own(self) -> FloatArray:
+        """Covariances (S, 6, 6), in the frame of the first sensor, of what the errors of each
+        sensor add to its answers.
+
+        An answer for two sensors has the errors of both, so that half of what two answers with the
+        first sensor have more than the answer for their other sensors is the first one's.
+        """
+        of_first = [_moved(each, X) for each, X in zip(self.calibrations, self.Xs[1:], strict=True)]
+        between = [_moved(each, X) for each, X in zip(self.neighbours, self.Xs[2:], strict=True)]
+        shared = np.mean(
+            [0.5 * (a + b - c) for a, b, c in zip(of_first, of_first[1:], between, strict=False)],
+            axis=0,
+        )
+        own = []
+        for covariance in of_first:
+            root = np.linalg.cholesky(covariance)
+            share = np.linalg.solve(root, np.linalg.solve(root, shared).T)
+            values, axes = np.linalg.eigh(share)
+            axes = root @ axes
+            own.append((axes * (1.0 - np.clip(values, 0.0, _MOST_SHARED))) @ axes.T)
+        return np.array([np.mean(np.array(of_first) - own, axis=0), *own])
+
     def T(self, first: str, second: str) -> FloatArray:
         """Pose (4, 4) of the second sensor in the frame of the first."""
-        return self.solution.T(self.sensors.index(first), self.sensors.index(second))
+        before, after = self.Xs[[self.sensors.index(first), self.sensors.index(second)]]
+        return se3.inverse(before) @ after
 
     def covariance(self, first: str, second: str) -> FloatArray:
         """Covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``, m and rad."""
-        return self.solution.covariance_of(self.sensors.index(first), self.sensors.index(second))
+        before, after = self.sensors.index(first), self.sensors.index(second)
+        if before == after:
+            return np.zeros((6, 6))
+        if 0 in (before, after):
+            other = before + after
+            in_first = _moved(self.calibrations[other - 1], self.Xs[other])
+        else:
+            in_first = self._own[before] + self._own[after]
+        to_second = se3.adjoint(se3.inverse(self.Xs[after]))
+        return to_second @ in_first @ to_second.T
+
+    @property
+    def noise(self) -> dict[str, SensorNoise]:
+        """Noise of every sensor: what the pairs' noises, each the sum of two sensors', ask for.
+        None where an answer is not the adaptive estimator's.
+        """
+        answers = (*self.calibrations, *self.neighbours)
+        found = [each.noise for each in answers if each.noise is not None]
+        if len(found) < len(answers):
+            return {}
+        S = len(self.sensors)
+        of_pairs = [*((0, at) for at in range(1, S)), *((at - 1, at) for at in range(2, S))]
+        design = np.zeros((len(of_pairs), S))
+        for row, pair in zip(design, of_pairs, strict=True):
+            row[[*pair]] = 1.0
+        variances = np.array([[noise[name] ** 2 for name in _LEVELS] for noise in found])
+        scale = 1.0 / np.sqrt(variances.mean(axis=0))
+        own = np.linalg.lstsq(design, variances * scale**2, rcond=None)[0]
+        rows = (np.sqrt(np.maximum(own, 0.0)) / scale).tolist()
+        return {name: SensorNoise(*row) for name, row in zip(self.sensors, rows, strict=True)}
 
     def tree(self) -> list[str]:
         """The sensors and where they are, one a line."""
@@ -124,11 +263,10 @@ class RigCalibration:
     def noise_in_words(self) -> list[str]:
         """A line for every sensor."""
         return [
-            f"{name}: each pose is off by {length(noise.translation_white)} and "
-            f"{angle(noise.rotation_white)} per axis; drift: {length(noise.translation_drift)} and "
-            f"{angle(noise.rotation_drift)} from pose to pose; "
-            f"{noise.n_jumps} jumps, {noise.n_spikes} poses left out"
-            for name, noise in zip(self.sensors, self.solution.noise, strict=True)
+            f"{name}: {length(noise.translation_white)} and {angle(noise.rotation_white)} per axis "
+            f"of each pose. Drift: {length(noise.translation_drift)} and "
+            f"{angle(noise.rotation_drift)} after 1 m."
+            for name, noise in self.noise.items()
         ]
 
     def to_dict(self) -> dict[str, Any]:
@@ -138,19 +276,20 @@ class RigCalibration:
             "version": _VERSION,
             "sensors": list(self.sensors),
             "verdict": self.verdict.value,
-            "walk_grows_with": self.solution.walk_by,
-            "misfit": self.solution.misfit,
-            "noise": {
-                name: vars(noise).copy()
-                for name, noise in zip(self.sensors, self.solution.noise, strict=True)
-            },
+            "noise": {name: asdict(noise) for name, noise in self.noise.items()},
             "closures": [
-                vars(each) | {"sensors": list(each.sensors), "closes": each.closes}
+                asdict(each) | {"sensors": list(each.sensors), "closes": each.closes}
                 for each in self.closures
             ],
             "calibrations": {each.child_frame: each.to_dict() for each in self.calibrations},
-            "pairwise": {each.child_frame: each.to_dict() for each in self.pairwise},
         }
+
+
+def _moved(calibration: Calibration, X: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of an answer in the frame that its child has the pose X (4, 4) in."""
+    adjoint = se3.adjoint(X)
+    covariance = calibration.covariance + _ROUNDING * np.eye(6)
+    return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
 def closure(
@@ -159,14 +298,8 @@ def closure(
     """How the answers for a -> b, b -> c and a -> c close."""
     ahead = to_second.T_parent_child @ on.T_parent_child
     error = ahead @ to_third.T_child_parent
-    covariance = np.zeros((6, 6))
-    for each, T in (
-        (to_second, to_second.T_parent_child),
-        (on, ahead),
-        (to_third, to_third.T_parent_child),
-    ):
-        adjoint = se3.adjoint(T)
-        covariance += adjoint @ each.covariance @ adjoint.T
+    covariance = _moved(to_second, to_second.T_parent_child) + _moved(on, ahead)
+    covariance += _moved(to_third, to_third.T_parent_child)
     variances, axes = np.linalg.eigh(covariance)
     known = axes[:, variances < _UNKNOWN]
     along = known.T @ se3.log(error)
@@ -177,23 +310,4 @@ def closure(
         rotation_rad=float(np.linalg.norm(miss[3:])),
         chi2=float((along**2 / variances[variances < _UNKNOWN]).sum()),
         dof=known.shape[1],
-    )
-
-
-def closures(
-    sensors: Sequence[str], star: Sequence[Calibration], chain: Sequence[Calibration]
-) -> tuple[Closure, ...]:
-    """Closures of the first sensor with two neighbours each.
-
-    Parameters
-    ----------
-    sensors : sequence of str
-    star : sequence of Calibration
-        Of every other sensor in the frame of the first one.
-    chain : sequence of Calibration
-        Of every sensor from the third one on in the frame of the one before it.
-    """
-    return tuple(
-        closure((sensors[0], sensors[at], sensors[at + 1]), star[at - 1], on, star[at])
-        for at, on in enumerate(chain, start=1)
     )
