@@ -1,6 +1,6 @@
 """The methods: one record each, with everything that other code has to know about a method.
 
-The solvers are in :mod:`hand_eye_calib.solvers.registry` and :mod:`hand_eye_calib.adaptive`.
+The solvers are in :mod:`hand_eye_calib.solvers.registry` and :mod:`hand_eye_calib.gls`.
 """
 
 from dataclasses import dataclass

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.assessment import metrics
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.assessment.metrics import Errors
 from hand_eye_calib.assessment.reference_selection import CANDIDATES, select_reference
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method

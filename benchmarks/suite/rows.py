@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.assessment.covariance import assess
 from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers import quadratic_form
 from hand_eye_calib.solvers.registry import Method

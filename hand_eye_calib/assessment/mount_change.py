@@ -27,9 +27,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.state_space import NormalEquations
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.state_space import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -343,7 +343,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     Parameters
     ----------
     products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see :mod:`~hand_eye_calib.adaptive.resampling`.
+        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.resampling`.
     misfit : float
         Factor of the covariances.
     """

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive import estimator
-from hand_eye_calib.adaptive.estimator import AdaptiveSolution
-from hand_eye_calib.adaptive.prediction import ReferencePredictor
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.mount_change import PossibleShift, possible_shift
 from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.gls import estimator
+from hand_eye_calib.gls.estimator import AdaptiveSolution
+from hand_eye_calib.gls.prediction import ReferencePredictor
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method

@@ -7,9 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.adaptive import estimator
-from hand_eye_calib.adaptive.part_delays import PartDelay
-from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.mount_change import find_change, information
@@ -17,6 +14,9 @@ from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.checks.response import Response, response, rotation_gains
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator
+from hand_eye_calib.gls.part_delays import PartDelay
+from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.stats import median

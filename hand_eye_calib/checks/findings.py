@@ -13,8 +13,6 @@ from hand_eye_calib.methods import METHODS
 from hand_eye_calib.text import angle, length, listing
 
 if TYPE_CHECKING:
-    from hand_eye_calib.adaptive.part_delays import PartDelay
-    from hand_eye_calib.adaptive.world_drift import WorldDrift
     from hand_eye_calib.alignment.angular_rates import Correlation
     from hand_eye_calib.alignment.scale import Scale
     from hand_eye_calib.alignment.time_offset import TimeOffset
@@ -22,6 +20,8 @@ if TYPE_CHECKING:
     from hand_eye_calib.assessment.mount_change import MountChange
     from hand_eye_calib.checks.response import Quantity
     from hand_eye_calib.config import CalibratorConfig
+    from hand_eye_calib.gls.part_delays import PartDelay
+    from hand_eye_calib.gls.world_drift import WorldDrift
     from hand_eye_calib.pairing.leaps import Leap
 
 

@@ -8,11 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.adaptive import estimator as adaptive_estimator
-from hand_eye_calib.adaptive.estimator import AdaptiveSolution
-from hand_eye_calib.adaptive.increments import SYSTEMATIC, Streams, course_of
-from hand_eye_calib.adaptive.part_delays import PartDelay, spread_by_delays
-from hand_eye_calib.adaptive.world_drift import WorldDrift
 from hand_eye_calib.alignment.scale import Scale, ScaleInUse, child_scaled, settle_scale
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
@@ -24,6 +19,11 @@ from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_refe
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.gls import estimator as adaptive_estimator
+from hand_eye_calib.gls.estimator import AdaptiveSolution
+from hand_eye_calib.gls.increments import SYSTEMATIC, Streams, course_of
+from hand_eye_calib.gls.part_delays import PartDelay, spread_by_delays
+from hand_eye_calib.gls.world_drift import WorldDrift
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs

@@ -8,8 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.adaptive import lever_arm
-from hand_eye_calib.adaptive.lever_arm import LeverArmSolution
 from hand_eye_calib.alignment.horizontal import horizontal_factors
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
@@ -27,6 +25,8 @@ from hand_eye_calib.checks.findings import (
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import positions as lever_arm
+from hand_eye_calib.gls.positions import LeverArmSolution
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 

@@ -9,20 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.adaptive import estimator as adaptive_estimator
-from hand_eye_calib.adaptive.increments import (
-    RATE,
-    SYSTEMATIC_OF_RATES,
-    SYSTEMATIC_OF_ROTATIONS,
-    without_rate_bias,
-)
-from hand_eye_calib.adaptive.solution import AdaptiveSolution
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
 from hand_eye_calib.checks.findings import Finding, rate_unit, unrelated_parts
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator as adaptive_estimator
+from hand_eye_calib.gls.increments import (
+    RATE,
+    SYSTEMATIC_OF_RATES,
+    SYSTEMATIC_OF_ROTATIONS,
+    without_rate_bias,
+)
+from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering_poses
 
-from hand_eye_calib.adaptive import estimator, lapack
-from hand_eye_calib.adaptive.increments import (
+from hand_eye_calib.assessment.covariance import assess_adaptive
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator, lapack
+from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,
     SYSTEMATIC,
     Streams,
@@ -15,18 +17,16 @@ from hand_eye_calib.adaptive.increments import (
     linearise,
     parameters_of,
 )
-from hand_eye_calib.adaptive.noise_model import (
+from hand_eye_calib.gls.noise_model import (
     _LONGEST_SHARE,
     CENTRES,
     LONGEST_IN_THE_MEAN,
     Extent,
     NoiseModel,
 )
-from hand_eye_calib.adaptive.outliers import Outliers, judged
-from hand_eye_calib.adaptive.relinearise import SensorWhite, corrected
-from hand_eye_calib.adaptive.state_space import Covariance
-from hand_eye_calib.assessment.covariance import assess_adaptive
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.outliers import Outliers, judged
+from hand_eye_calib.gls.relinearise import SensorWhite, corrected
+from hand_eye_calib.gls.state_space import Covariance
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofVerdict
 from hand_eye_calib.stats import chi_square_quantile

@@ -29,10 +29,10 @@ ENGINE = {
     "pairing": GROUND | {"geometry"},
 }
 ENGINE["solvers"] = GROUND | {"geometry", "pairing"}
-ENGINE["adaptive"] = ENGINE["solvers"] | {"results", "solvers"}
-ENGINE["assessment"] = ENGINE["adaptive"] | {"adaptive"}
+ENGINE["gls"] = ENGINE["solvers"] | {"results", "solvers"}
+ENGINE["assessment"] = ENGINE["gls"] | {"gls"}
 ENGINE["alignment"] = ENGINE["solvers"] | {"solvers"}
-ENGINE["checks"] = ENGINE["alignment"] | {"results", "adaptive", "assessment", "alignment"}
+ENGINE["checks"] = ENGINE["alignment"] | {"results", "gls", "assessment", "alignment"}
 ENGINE["engine"] = set(ENGINE)
 ENGINE["rig"] = set(ENGINE)
 ENGINE["session"] = set(ENGINE)

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering_poses
 
-from hand_eye_calib.adaptive import estimator
-from hand_eye_calib.adaptive.resampling import answers_without
 from hand_eye_calib.assessment.covariance import (
     AXES,
     Assessment,
@@ -19,6 +17,8 @@ from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.prior import widened
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator
+from hand_eye_calib.gls.resampling import answers_without
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofVerdict

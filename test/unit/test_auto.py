@@ -15,13 +15,13 @@ from motions import (
 )
 
 import hand_eye_calib as hec
-from hand_eye_calib.adaptive import estimator
 from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.reference_selection import ReferenceChoice
 from hand_eye_calib.engine import estimation
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.verdict import Verdict

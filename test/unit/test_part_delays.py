@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from motions import child_of, disturbed, smooth_poses
 
-from hand_eye_calib.adaptive import estimator
-from hand_eye_calib.adaptive.part_delays import PartDelay, spread_by_delays
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator
+from hand_eye_calib.gls.part_delays import PartDelay, spread_by_delays
 
 TIMES_S = np.arange(300) / 10
 LATE_S = 0.03

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from hand_eye_calib.adaptive import reml
-from hand_eye_calib.adaptive.block_tridiagonal import Factor, InOrder
-from hand_eye_calib.adaptive.outliers import surprises
-from hand_eye_calib.adaptive.resampling import answers_without, part_products
-from hand_eye_calib.adaptive.state_space import (
+from hand_eye_calib.gls import reml
+from hand_eye_calib.gls.block_tridiagonal import Factor, InOrder
+from hand_eye_calib.gls.outliers import surprises
+from hand_eye_calib.gls.resampling import answers_without, part_products
+from hand_eye_calib.gls.state_space import (
     Covariance,
     Group,
     NormalEquations,

@@ -7,11 +7,11 @@ import pytest
 import real_data
 
 import hand_eye_calib as hec
-from hand_eye_calib.adaptive import estimator
-from hand_eye_calib.adaptive.systematic_choice import Candidates, Model
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator
+from hand_eye_calib.gls.systematic_choice import Candidates, Model
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.noise import add_noise

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import Linearisation, Streams
-from hand_eye_calib.adaptive.relinearise import SensorWhite
-from hand_eye_calib.adaptive.reml import Fit, Prior
-from hand_eye_calib.adaptive.state_space import WHITE, Group, Posterior, StateSpace
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.increments import Linearisation, Streams
+from hand_eye_calib.gls.relinearise import SensorWhite
+from hand_eye_calib.gls.reml import Fit, Prior
+from hand_eye_calib.gls.state_space import WHITE, Group, Posterior, StateSpace
 
 # What white rotation noise turns a trajectory about: either sensor itself, or the origin of the
 # child's or of the parent's world, as of a camera that sees a target.
@@ -140,7 +140,7 @@ class NoiseModel:
         streams : Streams
         linearisation : Linearisation
         twists : (N, 6) array
-            The child's, see :class:`~hand_eye_calib.adaptive.increments.Course`.
+            The child's, see :class:`~hand_eye_calib.gls.increments.Course`.
         T_parent_child : (4, 4) array
         weights : (N,) array
         cut : (n,) bool array

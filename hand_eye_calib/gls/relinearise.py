@@ -21,10 +21,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.chunks import chunks
-from hand_eye_calib.adaptive.increments import Linearisation, Streams, turned
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.chunks import chunks
+from hand_eye_calib.gls.increments import Linearisation, Streams, turned
 
 
 @dataclass(frozen=True)

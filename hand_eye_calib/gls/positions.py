@@ -4,7 +4,7 @@ station.
 The sensor's orientation is that of the other one, as that is known from its own odometry, in the
 world of the positions: a latent rotation of each pose that may be anything, but changes from pose
 to pose as the odometry says, up to its drift. So this is the state space of the adaptive estimator
-(:mod:`~hand_eye_calib.adaptive.state_space`) with a white rotation error without bounds; the
+(:mod:`~hand_eye_calib.gls.state_space`) with a white rotation error without bounds; the
 rotations are updated from what the positions say of them, until they stay. The sensor's frame has
 the axes of the other one by convention: ``X = (I, l)``.
 """
@@ -17,9 +17,11 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.adaptive import noise_model, reml
-from hand_eye_calib.adaptive.estimator import rough_levels, sample
-from hand_eye_calib.adaptive.increments import (
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import noise_model, reml
+from hand_eye_calib.gls.estimator import rough_levels, sample
+from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,
     SCALE,
     TIME,
@@ -30,12 +32,10 @@ from hand_eye_calib.adaptive.increments import (
     summed,
     turned,
 )
-from hand_eye_calib.adaptive.noise_model import N_FAST, Extent, NoiseModel, Slow
-from hand_eye_calib.adaptive.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
-from hand_eye_calib.adaptive.resampling import part_products
-from hand_eye_calib.adaptive.state_space import Posterior, StateSpace, multiplied
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.noise_model import N_FAST, Extent, NoiseModel, Slow
+from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
+from hand_eye_calib.gls.resampling import part_products
+from hand_eye_calib.gls.state_space import Posterior, StateSpace, multiplied
 from hand_eye_calib.text import angle, length
 
 # Of the latent states.

@@ -11,10 +11,10 @@ from typing import Self
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import DRIFT, N_SYSTEMATIC, TIME, parameters_of
-from hand_eye_calib.adaptive.resampling import N_BLOCKS, answers_without, part_products
-from hand_eye_calib.adaptive.state_space import NormalEquations, Posterior, selected
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.gls.increments import DRIFT, N_SYSTEMATIC, TIME, parameters_of
+from hand_eye_calib.gls.resampling import N_BLOCKS, answers_without, part_products
+from hand_eye_calib.gls.state_space import NormalEquations, Posterior, selected
 
 # Systematic errors larger than this (of the length, m/m, s, rad/s) are none: a wrong unit, a clock
 # that was not aligned, or noise.

@@ -23,10 +23,10 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.adaptive.chunks import chunks
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import chained
+from hand_eye_calib.gls.chunks import chunks
 from hand_eye_calib.stats import median
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import RATE, SCALE, SYSTEMATIC, TIME
-from hand_eye_calib.adaptive.noise_model import (
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.gls.increments import RATE, SCALE, SYSTEMATIC, TIME
+from hand_eye_calib.gls.noise_model import (
     JITTER,
     N_FAST,
     ROTATION,
@@ -18,9 +19,8 @@ from hand_eye_calib.adaptive.noise_model import (
     WALK_TRANSLATION,
     NoiseModel,
 )
-from hand_eye_calib.adaptive.part_delays import PartDelay
-from hand_eye_calib.adaptive.world_drift import WorldDrift
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.gls.part_delays import PartDelay
+from hand_eye_calib.gls.world_drift import WorldDrift
 from hand_eye_calib.text import angle, length
 
 _TURNING = {
@@ -158,7 +158,7 @@ class AdaptiveSolution:
     metres_per_pose : float
         Path of the parent from pose to pose.
     part_products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see :mod:`~hand_eye_calib.adaptive.resampling`.
+        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.resampling`.
     delays : (PartDelay, PartDelay) or None
         Of the child's and of the parent's positions against their orientations, if they were
         estimated.

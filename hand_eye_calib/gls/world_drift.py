@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import Linearisation, Streams
-from hand_eye_calib.adaptive.state_space import NormalEquations, selected
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.increments import Linearisation, Streams
+from hand_eye_calib.gls.state_space import NormalEquations, selected
 
 N_COLUMNS = 6
 

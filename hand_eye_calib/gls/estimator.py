@@ -15,8 +15,10 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.adaptive import noise_model, reml
-from hand_eye_calib.adaptive.increments import (
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import noise_model, reml
+from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,
     SYSTEMATIC,
     TIME,
@@ -27,14 +29,14 @@ from hand_eye_calib.adaptive.increments import (
     linearise,
     parameters_of,
 )
-from hand_eye_calib.adaptive.noise_model import (
+from hand_eye_calib.gls.noise_model import (
     CENTRES,
     LONGEST_IN_THE_MEAN,
     SCALE_DRIFT,
     Extent,
     NoiseModel,
 )
-from hand_eye_calib.adaptive.outliers import (
+from hand_eye_calib.gls.outliers import (
     LONGEST_GAP,
     Outliers,
     bridged,
@@ -46,21 +48,19 @@ from hand_eye_calib.adaptive.outliers import (
     tails_are_heavy,
     with_jumps_across_spikes,
 )
-from hand_eye_calib.adaptive.part_delays import part_delay, with_delay_columns
-from hand_eye_calib.adaptive.relinearise import corrected, restored
-from hand_eye_calib.adaptive.resampling import N_BLOCKS, answers_without, part_products
-from hand_eye_calib.adaptive.solution import AdaptiveSolution
-from hand_eye_calib.adaptive.state_space import (
+from hand_eye_calib.gls.part_delays import part_delay, with_delay_columns
+from hand_eye_calib.gls.relinearise import corrected, restored
+from hand_eye_calib.gls.resampling import N_BLOCKS, answers_without, part_products
+from hand_eye_calib.gls.solution import AdaptiveSolution
+from hand_eye_calib.gls.state_space import (
     WHITE,
     NormalEquations,
     Posterior,
     StateSpace,
     selected,
 )
-from hand_eye_calib.adaptive.systematic_choice import Candidates, columns_of
-from hand_eye_calib.adaptive.world_drift import N_COLUMNS, with_world_columns, world_drift
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.systematic_choice import Candidates, columns_of
+from hand_eye_calib.gls.world_drift import N_COLUMNS, with_world_columns, world_drift
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.stats import distinct, median

@@ -13,9 +13,9 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import transposed
-from hand_eye_calib.adaptive.state_space import WHITE, Markov, Posterior, StateSpace, multiplied
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.gls.block_tridiagonal import transposed
+from hand_eye_calib.gls.state_space import WHITE, Markov, Posterior, StateSpace, multiplied
 
 # The search ends if a step promises to lower the loss by less: noise levels need no more than a few
 # per cent. Steps stay within a radius of the log levels.

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive import lapack
-from hand_eye_calib.adaptive.chunks import chunks
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.gls import lapack
+from hand_eye_calib.gls.chunks import chunks
 
 # Matrices that are fewer than so many times their size are inverted faster by LAPACK, one by one,
 # than by stacked rows. So many small ones are factored faster entry by entry, all at once.

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import inverse_products, transposed
-from hand_eye_calib.adaptive.chunks import chunks
-from hand_eye_calib.adaptive.increments import Streams
-from hand_eye_calib.adaptive.reml import walk_covariance
-from hand_eye_calib.adaptive.state_space import WHITE, Posterior
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.block_tridiagonal import inverse_products, transposed
+from hand_eye_calib.gls.chunks import chunks
+from hand_eye_calib.gls.increments import Streams
+from hand_eye_calib.gls.reml import walk_covariance
+from hand_eye_calib.gls.state_space import WHITE, Posterior
 from hand_eye_calib.stats import MEDIAN_CHI2, MEDIAN_LENGTH, STUDENT, chi_square_quantile, median
 
 # False alarms expected in a whole recording.

@@ -20,7 +20,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import (
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,
     Streams,
     course_of,
@@ -28,10 +30,8 @@ from hand_eye_calib.adaptive.increments import (
     motions,
     turned,
 )
-from hand_eye_calib.adaptive.solution import AdaptiveSolution
-from hand_eye_calib.adaptive.state_space import Covariance
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.solution import AdaptiveSolution
+from hand_eye_calib.gls.state_space import Covariance
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers import dnl, dnlo
 
@@ -42,7 +42,7 @@ class ReferencePredictor:
     Parameters
     ----------
     stamps_ns, Ts_pw_p, Ts_cw_c
-        As for :func:`hand_eye_calib.adaptive.estimator.solve`.
+        As for :func:`hand_eye_calib.gls.estimator.solve`.
     solution : AdaptiveSolution
         Its answer for them.
     threshold, min_inlier_fraction : float, optional

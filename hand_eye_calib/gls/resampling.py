@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from hand_eye_calib.adaptive.block_tridiagonal import InOrder
-from hand_eye_calib.adaptive.state_space import (
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.gls.block_tridiagonal import InOrder
+from hand_eye_calib.gls.state_space import (
     FREE,
     WHITE,
     NormalEquations,
     Posterior,
     multiplied,
 )
-from hand_eye_calib.arrays import FloatArray
 
 # Parts of a recording, and blocks of them that a jackknife leaves out.
 N_PARTS, N_BLOCKS = 20, 10

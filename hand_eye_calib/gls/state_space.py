@@ -1,6 +1,6 @@
 """Exact likelihood of increments under white errors, random walks and errors that last.
 
-The increments of the common error c obey, see :mod:`~hand_eye_calib.adaptive.increments`,
+The increments of the common error c obey, see :mod:`~hand_eye_calib.gls.increments`,
 
     e_i + J_i beta = H1_i x_{i+1} - H0_i x_i + w_i
 
@@ -24,10 +24,10 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.adaptive import lapack
-from hand_eye_calib.adaptive.block_tridiagonal import Factor, inverse_roots, squared, transposed
-from hand_eye_calib.adaptive.chunks import chunks
 from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.gls import lapack
+from hand_eye_calib.gls.block_tridiagonal import Factor, inverse_roots, squared, transposed
+from hand_eye_calib.gls.chunks import chunks
 
 WHITE = 6
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.adaptive.increments import Linearisation, turned
-from hand_eye_calib.adaptive.resampling import N_BLOCKS, answers_without
-from hand_eye_calib.adaptive.state_space import NormalEquations, selected
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.gls.increments import Linearisation, turned
+from hand_eye_calib.gls.resampling import N_BLOCKS, answers_without
+from hand_eye_calib.gls.state_space import NormalEquations, selected
 
 # Delays from so many standard deviations on are likely; a clock is more often right.
 _LIKELY, _LIKELY_OF_CLOCK = 2.0, 3.0
