@@ -1,22 +1,29 @@
-"""Plain data: what JSON and YAML know, and nothing of NumPy."""
+"""Plain data: what JSON and YAML know, and nothing of NumPy; values of any type from it."""
 
 import json
 import math
-from collections.abc import Mapping
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+# No number of a file is as large: the products of some are still finite.
+_LARGEST = 1e50
 
 
 def plain(value: Any) -> Any:
     """A value with all that it holds as mappings, lists, texts, bools and numbers.
 
-    Numbers and arrays of NumPy become those of Python, an enum its value. Infinity and NaN, which
-    JSON does not have, become None.
+    A dataclass becomes a mapping of its fields, numbers and arrays of NumPy those of Python, an
+    enum its value. Infinity and NaN, which JSON does not have, become None.
     """
     if isinstance(value, Enum):
         value = value.value
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {each.name: getattr(value, each.name) for each in fields(value)}
     if isinstance(value, Mapping):
         return {key: plain(each) for key, each in value.items()}
     if isinstance(value, np.ndarray):
@@ -26,6 +33,75 @@ def plain(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value
+
+
+def from_plain(kind: Any, value: Any) -> Any:
+    """A value of a type from what :func:`plain` made of it. Keys that a dataclass does not have are
+    ignored; a float that is None is infinite.
+
+    Parameters
+    ----------
+    kind : type
+        A dataclass, an enum, float, int, bool, str; tuple, Mapping or union of such.
+    value : plain data
+
+    Raises
+    ------
+    KeyError
+        If a dataclass lacks a field.
+    TypeError, ValueError
+        If the value is not of that type, or a number far too large.
+    """
+    args = get_args(kind)
+    if get_origin(kind) in (Union, types.UnionType):
+        if value is None:
+            return from_plain(types.NoneType, value)
+        wanted = [each for each in args if each is not types.NoneType]
+        fitting = [each for each in wanted if get_origin(each) or is_dataclass(each)]
+        fitting = fitting or [each for each in wanted if isinstance(value, each)]
+        return from_plain((fitting or wanted)[0], value)
+    if is_dataclass(kind):
+        return _record(kind, _of_type(Mapping, value))
+    if isinstance(get_origin(kind), type) and issubclass(get_origin(kind), Mapping):
+        return {key: from_plain(args[1], each) for key, each in _of_type(Mapping, value).items()}
+    if get_origin(kind) is tuple:
+        if isinstance(value, str):
+            raise TypeError("a list is a text")
+        return tuple(from_plain(args[0], each) for each in _of_type(Sequence, value))
+    if kind is float:
+        return _number(value)
+    if issubclass(kind, Enum):
+        return kind(value)
+    if isinstance(value, bool) and kind is not bool:
+        raise TypeError(f"a {kind.__name__} is true or false")
+    return _of_type(kind, value)
+
+
+def _record(kind: Any, value: Mapping[str, Any]) -> Any:
+    hints = get_type_hints(kind)
+    given = {}
+    for each in fields(kind):
+        if each.name in value:
+            given[each.name] = from_plain(hints[each.name], value[each.name])
+        elif each.default is MISSING and each.default_factory is MISSING:
+            raise KeyError(each.name)
+    return kind(**given)
+
+
+def _number(value: Any) -> float:
+    if value is None:
+        return math.inf
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"a number is {type(value).__name__}")
+    if not abs(value) < _LARGEST:
+        raise ValueError("a number is not finite, or far too large")
+    return float(value)
+
+
+def _of_type(kind: type, value: Any) -> Any:
+    if not isinstance(value, kind):
+        raise TypeError(f"a {kind.__name__.lower()} is {type(value).__name__}")
+    return value
 
 
 def json_text(document: Any) -> str:

@@ -166,14 +166,11 @@ def _of_clean(case: Case, folder: Path | None) -> Outcome:
 
 
 def _codes(parent: Trajectory, child: Trajectory) -> list[str]:
-    return _named(found.to_dict() for found in check_streams(parent, child).findings)
+    return _named(check_streams(parent, child).findings)
 
 
 def _named(findings: Iterable[Any]) -> list[str]:
-    return [
-        ("note:" if found["severity"] == Severity.NOTE.value else "") + found["code"]
-        for found in findings
-    ]
+    return [("note:" if found.severity is Severity.NOTE else "") + found.code for found in findings]
 
 
 def _judged(key: str, result: Calibration, T_parent_child: FloatArray | None) -> Outcome:
@@ -212,7 +209,7 @@ def _sound(name: str, method: str, folder: Path | None) -> _Sound:
     found = check_streams(recording.parent, recording.child)
     parent, child = recording.parent, recording.child
     offset = next(f for f in found.findings if f.code == "time_offset")
-    child = child.shifted(dict(offset.options)["time_offset"])
+    child = child.shifted(float(offset.options["time_offset"]))
     fit = found.fit
     child = child.scaled(fit.scale if fit else 1.0)
     result = calibrate(parent, child, method=method, max_pairs=_MAX_PAIRS)

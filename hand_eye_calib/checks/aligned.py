@@ -11,7 +11,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.mount_change import find_change, information
 from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.checks.response import Response, response, rotation_gains
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
@@ -20,6 +20,7 @@ from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.stats import median
+from hand_eye_calib.text import angle, length, listing
 
 # Significance that every one of these findings needs, in standard deviations, and how many times it
 # must exceed what noise may make of it.
@@ -160,9 +161,23 @@ def check_same(aligned: Aligned) -> list[Finding]:
     if angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max()):
         is_exact = distance_m < max(_SAME_M, _WITHIN * sigma_m)
         severity = Severity.ERROR if is_exact else Severity.WARNING
-        return [wording.same_frame(distance_m, angle_rad, severity)]
+        size = f"{length(distance_m)} and {angle(angle_rad)}"
+        return [
+            wording.finding(
+                "same_frame",
+                severity=severity,
+                size=size,
+                translation_m=distance_m,
+                rotation_rad=angle_rad,
+            )
+        ]
     severity = Severity.ERROR if upper_m < _SAME_POSITION_M else Severity.WARNING
-    return [wording.same_position(distance_m, sigma_m, severity)]
+    size = f"{length(distance_m)} +/- {length(sigma_m)}"
+    return [
+        wording.finding(
+            "same_position", severity=severity, size=size, translation_m=distance_m, sigma_m=sigma_m
+        )
+    ]
 
 
 def _check_gains(aligned: Aligned) -> tuple[FloatArray, list[Finding]]:
@@ -177,7 +192,16 @@ def _check_gains(aligned: Aligned) -> tuple[FloatArray, list[Finding]]:
         matrix += (gain.value - 1.0) * np.outer(axis, axis)
         if not findings:
             severity = Severity.ERROR if off > _GAIN_ERROR else Severity.WARNING
-            findings.append(wording.rotation_gain(gain, axis, severity))
+            direction = ", ".join(f"{component:.2f}" for component in axis)
+            found = wording.finding(
+                "rotation_gain",
+                "child",
+                severity,
+                axis=direction,
+                gain=gain.value,
+                sigma=gain.sigma,
+            )
+            findings.append(found)
     return matrix, findings
 
 
@@ -193,7 +217,18 @@ def _check_delays(aligned: Aligned) -> list[Finding]:
     shift_m = abs(delay.seconds) * aligned.rms_speed
     if delay.sigmas < _DELAY_SIGMAS or abs(delay.seconds) < _DELAY_S or shift_m < _SHIFT_M:
         return []
-    return [wording.position_clock(stream, delay, shift_m, _severity(shift_m))]
+    return [
+        wording.finding(
+            "position_clock",
+            stream,
+            _severity(shift_m),
+            delay_s=delay.seconds,
+            size_s=abs(delay.seconds),
+            sigma_s=delay.sigma_s,
+            late="late" if delay.seconds > 0 else "early",
+            shift_m=shift_m,
+        )
+    ]
 
 
 def _check_world(aligned: Aligned) -> list[Finding]:
@@ -204,7 +239,19 @@ def _check_world(aligned: Aligned) -> list[Finding]:
     share = drift.speed_at(aligned.pose_pairs.Ts_cw_c[:, :3, 3]) / max(aligned.rms_speed, 1e-9)
     if share < _MOVING:
         return []
-    return [wording.world_drift(drift, share)]
+    speed, rate = (float(np.linalg.norm(part)) for part in (drift.twist[:3], drift.twist[3:]))
+    return [
+        wording.finding(
+            "world_drift",
+            evidence=drift.evidence,
+            rate_rad_s=rate,
+            deg_per_minute=np.degrees(60 * rate),
+            speed_m_s=speed,
+            m_per_minute=60 * speed,
+            share_of_speed=share,
+            percent=100 * share,
+        )
+    ]
 
 
 def _check_smoothing(found: Response, rms_speed: float) -> list[Finding]:
@@ -220,7 +267,16 @@ def _check_smoothing(found: Response, rms_speed: float) -> list[Finding]:
             if shift_m < _SHIFT_M:
                 continue
             name = {"position": "positions", "rotation": "orientations"}[part]
-            return [wording.smoothed(name, stream, quantity, _severity(shift_m), shift_m)]
+            return [
+                wording.finding(
+                    f"smoothed_{name}",
+                    stream,
+                    _severity(shift_m),
+                    smoothing_s=float(np.sqrt(quantity.value)),
+                    sigmas=quantity.value / max(quantity.sigma, 1e-12),
+                    shift_m=shift_m,
+                )
+            ]
     return []
 
 
@@ -244,5 +300,25 @@ def _check_mount(aligned: Aligned) -> list[Finding]:
     is_error = change.is_step and (moved_m > _MOVED_ERROR_M or moved_rad > _MOVED_ERROR_RAD)
     at_s = (change.at_ns - pose_pairs.stamps_ns[0]) * 1e-9
     span_s = (change.latest_ns - change.earliest_ns) * 1e-9
-    severity = Severity.ERROR if is_error else Severity.WARNING
-    return [wording.mount_moved(change, at_s, max(span_s, 1.0), (moved_m, moved_rad), severity)]
+    sizes = [length(moved_m)] if moved_m else []
+    sizes += [angle(moved_rad)] if moved_rad else []
+    when = f"changes {at_s:.0f} s after the start (within {max(span_s, 1.0):.0f} s)"
+    why = "a mount that came loose or was knocked, or an estimator that started anew"
+    if not change.is_step:
+        when = "seems to change in the course of the recording"
+        why = "a mount that gives way, or a sensor whose errors wander over minutes"
+    return [
+        wording.finding(
+            "mount_moved",
+            severity=Severity.ERROR if is_error else Severity.WARNING,
+            confidence=Confidence.LIKELY if change.is_step else Confidence.POSSIBLE,
+            when=when,
+            why=why,
+            size=listing(sizes),
+            at_s=at_s,
+            at_ns=float(change.at_ns),
+            translation_m=moved_m,
+            rotation_rad=moved_rad,
+            log_likelihood_ratio=change.log_ratio,
+        )
+    ]

@@ -141,7 +141,7 @@ def check_streams(
     try:
         explanation = explain(aligned, thorough=correlation.is_clear)
     except NotEnoughDataError as error:
-        explanation, too_short = None, [wording.too_short_to_compare(str(error))]
+        explanation, too_short = None, [wording.finding("too_short", text=str(error))]
     if explanation is None or not explanation.holds:
         if not correlation.is_clear:
             # Nothing is said about the rates of a frozen stream.
@@ -256,7 +256,7 @@ def _check_agreeing(
         *findings,
         *check_offset(aligned.refined(offset) if aligned else offset, known[0]),
         *(_check_scale(scale, known[1]) if scale else []),
-        *([wording.unit_unseen()] if explanation.same_unit else []),
+        *([wording.finding("unit_unseen")] if explanation.same_unit else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
         *(_check_aligned(streams, offset.seconds, aligned) if aligned else []),
     ]
@@ -309,10 +309,16 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
     )
 
 
+def unrelated_rates(correlation: Correlation, quantity: str = "angular rates") -> Finding:
+    """The finding that angular rates, or speeds, agree at no clock offset."""
+    doubt = correlation.doubt().replace("angular rates", quantity)
+    return wording.finding("unrelated_rates", quantity=quantity, doubt=doubt)
+
+
 def _rates_disagree(correlation: Correlation) -> Finding:
     if correlation.variation < MIN_VARIATION:
-        return wording.no_rotation()
-    return wording.unrelated_rates(correlation)
+        return wording.finding("no_turning")
+    return unrelated_rates(correlation)
 
 
 def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
@@ -322,7 +328,20 @@ def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
     severity = Severity.NOTE
     if abs(found.seconds) > _OFFSET_WARNING_S:
         severity = Severity.ERROR if abs(found.seconds) > _OFFSET_ERROR_S else Severity.WARNING
-    return [wording.time_offset(found, round(known_s + found.seconds, 4), severity)]
+    total_s = round(known_s + found.seconds, 4)
+    return [
+        wording.finding(
+            "time_offset",
+            "child",
+            severity,
+            options={"time_offset": total_s},
+            total_s=total_s,
+            offset_s=found.seconds,
+            size_s=abs(found.seconds),
+            sigma_s=found.sigma_s,
+            direction="behind" if found.seconds > 0 else "ahead of",
+        )
+    ]
 
 
 def _check_scale(scale: Scale, known: float) -> list[Finding]:
@@ -330,9 +349,21 @@ def _check_scale(scale: Scale, known: float) -> list[Finding]:
         return []
     if found := unit_of(scale.value):
         factor, unit = found
-        return [wording.units(scale.value, scale.sigma, unit, round(known * factor, 9))]
+        return [in_other_units(scale.value, scale.sigma, unit, round(known * factor, 9))]
     severity = Severity.ERROR if abs(scale.value - 1.0) > _SCALE_ERROR else Severity.WARNING
-    return [wording.scale_differs(scale, round(known * scale.value, 4), severity)]
+    options = {"scale": round(known * scale.value, 4)}
+    return [
+        wording.finding(
+            "scale", "child", severity, options=options, scale=scale.value, sigma=scale.sigma
+        )
+    ]
+
+
+def in_other_units(scale: float, sigma: float, unit: str, factor: float) -> Finding:
+    """The finding that the child's lengths are in another unit, by the scale that was found."""
+    return wording.finding(
+        "units", "child", options={"scale": factor}, scale=scale, sigma=sigma, unit=unit
+    )
 
 
 def _motions(pose_pairs: PosePairs) -> MotionPairs:
@@ -350,4 +381,13 @@ def _check_axes(rotations: FloatArray, sigma_rotation: float) -> list[Finding]:
         return []
     direction = lever_arms.directions[:, 0]
     main = int(np.argmax(np.abs(direction)))
-    return [wording.one_axis(direction * np.sign(direction[main]), hidden, "xyz"[main])]
+    direction = direction * np.sign(direction[main])
+    return [
+        wording.finding(
+            "one_axis",
+            options={f"prior.{'xyz'[main]}": "VALUE+/-SIGMA"},
+            axis=", ".join(f"{component:.2f}" for component in direction),
+            hidden=" and ".join(hidden),
+            main="xyz"[main],
+        )
+    ]

@@ -22,7 +22,7 @@ import numpy as np
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.findings import Confidence, Finding
+from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.checks.streams import coarse_poses
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
@@ -268,9 +268,11 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
         attributed = _attribute(best, streams, lag_s)
-        findings = (*attributed.findings, wording.noisy(unexplained))
+        findings = (*attributed.findings, wording.finding("noisy", share=unexplained))
         return replace(attributed, findings=findings, limit=_NOISY)
-    return replace(best, findings=(wording.not_one_body(unexplained, HOLDS),))
+    return replace(
+        best, findings=(wording.finding("not_one_body", share=min(unexplained, 1.0), limit=HOLDS),)
+    )
 
 
 def _plain_or_usual(streams: StreamPair, lag_s: float, limit: float) -> Explanation:
@@ -356,21 +358,30 @@ def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
     """
     hypothesis = explanation.hypothesis
     if hypothesis.code not in ("", "inverse"):
-        return replace(explanation, findings=(_finding(hypothesis),))
+        return replace(
+            explanation,
+            findings=(
+                wording.finding(hypothesis.code, hypothesis.stream, detail=hypothesis.detail),
+            ),
+        )
     evidence, inverted_fit = _evidence_for_inverse(streams, explanation, lag_s)
     if evidence < _INVERTED:
         if not hypothesis.code:
             return explanation
-        finding = wording.inverse(hypothesis.stream, _confidence(-evidence, _INVERTED))
+        confidence = _confidence(-evidence, _INVERTED)
+        finding = wording.finding("inverse", hypothesis.stream, confidence=confidence)
         return replace(explanation, findings=(finding,))
     if hypothesis.code:
         other = "parent" if hypothesis.stream == "child" else "child"
-        finding = wording.inverse(other, _confidence(evidence, _INVERTED))
+        confidence = _confidence(evidence, _INVERTED)
+        finding = wording.finding("inverse", other, confidence=confidence)
         return Explanation(Hypothesis("inverse", other, _inverted), inverted_fit, (finding,))
     likely = np.inf if _may_be_an_arm(streams) else _LIKELY_INVERTED
-    finding = wording.inverse_both(_confidence(evidence, likely))
-    if finding.confidence is Confidence.POSSIBLE:
+    confidence = _confidence(evidence, likely)
+    if confidence is Confidence.POSSIBLE:
+        finding = wording.finding("inverse_both", "both", Severity.WARNING, confidence)
         return replace(explanation, findings=(finding,))
+    finding = wording.finding("inverse_both")
     return Explanation(_BOTH_INVERTED, inverted_fit, (finding,))
 
 
@@ -382,17 +393,6 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
         np.linalg.norm(each - np.median(each, axis=0), axis=1).max() < _REACH_M
         for each in positions
     )
-
-
-def _finding(hypothesis: Hypothesis) -> Finding:
-    if hypothesis.code == "axes":
-        return wording.axes(hypothesis.stream, hypothesis.detail)
-    make = {
-        "quaternion_order": wording.quaternion_order,
-        "inverse_orientation": wording.inverse_orientation,
-        "left_handed": wording.left_handed,
-    }
-    return make[hypothesis.code](hypothesis.stream)
 
 
 def _confidence(evidence: float, likely: float) -> Confidence:

@@ -8,7 +8,8 @@ show it: they follow from the other stream's orientations if the poses do, or if
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.findings import Finding
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import pairs_between
@@ -47,21 +48,8 @@ def check_independent(parent: Trajectory, child: Trajectory, offset_s: float) ->
             for straight in (True, False):
                 residual_rad = _disagreement(slow, fast, straight)
                 if residual_rad < limit_rad:
-                    return [_finding(residual_rad)]
+                    return [wording.finding("not_independent", residual_rad=residual_rad)]
     return []
-
-
-def _finding(residual_rad: float) -> Finding:
-    return Finding(
-        code="not_independent",
-        stream="both",
-        severity=Severity.ERROR,
-        confidence=Confidence.LIKELY,
-        what="The two streams are not independent: one seems to be computed from the other. This "
-        "result only repeats the transform that was used for it.",
-        advice="give the poses that each sensor measured by itself",
-        evidence=(("residual_rad", residual_rad),),
-    )
 
 
 def _roughness(trajectory: Trajectory) -> float:

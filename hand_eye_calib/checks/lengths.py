@@ -4,7 +4,8 @@ in millimetres agree, and nothing else tells.
 
 import numpy as np
 
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.findings import Finding
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.stats import quantile
 
@@ -30,18 +31,4 @@ def check_lengths(parent: Trajectory) -> list[Finding]:
     change = quantile(np.linalg.norm(changes, axis=1), _USUAL)
     if speed < _FASTEST and change < _HARDEST:
         return []
-    return [
-        Finding(
-            code="lengths",
-            stream="parent",
-            severity=Severity.ERROR,
-            confidence=Confidence.LIKELY,
-            what=f"the parent moves at {speed:.0f} m/s and changes its velocity by "
-            f"{change:.0f} m/s within a second, as no vehicle does: its lengths can hardly be in "
-            "metres",
-            advice="give the lengths of both streams in metres; those of a file also by the unit "
-            "in its header, such as x_mm or x [mm]",
-            cause="such as lengths in millimetres",
-            evidence=(("speed_m_s", speed), ("acceleration_m_s2", change)),
-        )
-    ]
+    return [wording.finding("lengths", "parent", speed_m_s=speed, acceleration_m_s2=change)]

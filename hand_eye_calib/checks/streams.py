@@ -142,9 +142,10 @@ def tidy(
     sorted_ns, first = np.unique(stamps_ns, return_index=True)
     findings = []
     if n_repeated := len(stamps_ns) - len(sorted_ns):
-        findings.append(wording.duplicates(stream, n_repeated, len(stamps_ns)))
+        found = wording.finding("duplicates", stream, repeated=n_repeated, poses=len(stamps_ns))
+        findings.append(found)
     if n_backwards := int((np.diff(stamps_ns) < 0).sum()):
-        findings.append(wording.disorder(stream, n_backwards))
+        findings.append(wording.finding("disorder", stream, backwards=n_backwards))
     trajectory = Trajectory.from_quat_xyzw(
         sorted_ns, np.asarray(translations)[first], np.asarray(quats_xyzw)[first], **frames
     )
@@ -179,27 +180,31 @@ def check_stream(
     if any(finding.code != "gaps" for finding in findings):
         return findings
     if levels := _mixed(trajectory):
-        return [*findings, wording.interleaved(stream, *levels)]
+        return [*findings, _takes_turns(stream, *levels)]
     share = float(_jumps(trajectory).mean())
     if share > _MIN_JUMPS:
-        findings.append(wording.jumps(stream, share))
+        findings.append(wording.finding("jumps", stream, options={"method": "dnlo"}, share=share))
     return findings
 
 
 def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
     """Findings about the stamps of one stream, and about its positions without its orientations."""
     findings = check_sampling(trajectory, stream, max_gap_s)
-    if any(finding.severity is wording.Severity.ERROR for finding in findings):
+    if any(finding.severity is Severity.ERROR for finding in findings):
         return findings
     if levels := _interleaved(trajectory):
-        return [*findings, wording.interleaved(stream, *levels)]
+        return [*findings, _takes_turns(stream, *levels)]
     if not trajectory.has_rotations and (times := _repeated(trajectory)) > 1:
-        return [*findings, wording.repeated(stream, times)]
+        return [*findings, wording.finding("repeated", stream, times=times)]
     coarse = _check_grid(trajectory.poses[:, :3, 3], stream)
     if coarse and coarse.makes_unusable and not trajectory.has_rotations:
         # Of positions alone, rounding is noise like any other.
         coarse = replace(coarse, severity=Severity.WARNING)
     return [*findings, coarse] if coarse else findings
+
+
+def _takes_turns(stream: str, ratio: float, distance_m: float) -> Finding:
+    return wording.finding("interleaved", stream, roughness_ratio=ratio, distance_m=distance_m)
 
 
 def _repeated(trajectory: Trajectory) -> int:
@@ -212,15 +217,16 @@ def _repeated(trajectory: Trajectory) -> int:
 def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
     """Findings about the stamps of one stream, whatever it measures: too few, a leap, gaps."""
     if len(trajectory) < 4:
-        return [wording.too_few_poses(stream, len(trajectory))]
+        return [wording.finding("too_few_poses", stream, poses=len(trajectory))]
     if leap := find_leap(trajectory.stamps_ns):
-        return [wording.leaping_stamps(stream, leap)]
+        return [wording.finding("leap", stream, text=leap.what(), remedy=leap.advice())]
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     gaps = are_gaps(intervals_s, max_gap_s)
     if not gaps.any():
         return []
     share = float(intervals_s[gaps].sum() / intervals_s.sum())
-    return [wording.gaps(stream, int(gaps.sum()), float(intervals_s.max()), share)]
+    longest_s, n_gaps = float(intervals_s.max()), int(gaps.sum())
+    return [wording.finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
 
 
 def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
@@ -330,7 +336,9 @@ def _check_grid(positions: FloatArray, stream: str) -> Finding | None:
     is_float32 = bool((column == column.astype(np.float32)).all()) and step_m >= 0.5 * float(
         np.spacing(np.float32(np.abs(column).max()))
     )
-    return wording.coarse_positions(stream, step_m, is_float32, severity)
+    far = "numbers of 32 bits far from the origin, such as map coordinates"
+    why = far if is_float32 else "they were rounded"
+    return wording.finding("coarse_positions", stream, severity, step_m=step_m, why=why)
 
 
 def _grid_step(values: FloatArray) -> float:
@@ -361,7 +369,11 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
             continue
         tilt_rad = _tilt(streams[other].poses[:, :3, :3])
         if tilt_rad > _TILTS_RAD:
-            return [wording.flat(name, other, tilt_rad)]
+            return [
+                wording.finding(
+                    "flat", name, other=other, tilt_rad=tilt_rad, tilt_deg=np.degrees(tilt_rad)
+                )
+            ]
     return []
 
 
@@ -402,7 +414,11 @@ def _jumps(trajectory: Trajectory) -> BoolArray:
 def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
     """Findings about streams that repeat their pose while the other moves, on one clock."""
     shares = {"parent": frozen_share(parent, child), "child": frozen_share(child, parent)}
-    return [wording.frozen(name, share) for name, share in shares.items() if share > _MAX_FROZEN]
+    return [
+        wording.finding("frozen", name, share=share)
+        for name, share in shares.items()
+        if share > _MAX_FROZEN
+    ]
 
 
 def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
@@ -449,5 +465,5 @@ def check_stamps(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> list[
             and stamps[late] > _DATE_NS
             and abs(np.log10(stamps[late] / (stamps[early] * factor))) < _SAME_TIME
         ):
-            return [wording.stamp_unit(early, late, unit, factor)]
+            return [wording.finding("stamp_unit", early, other=late, unit=unit, factor=factor)]
     return []

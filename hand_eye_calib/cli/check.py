@@ -16,6 +16,7 @@ from hand_eye_calib.cli.options import (
     options_from,
 )
 from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.plain import plain
 
 if TYPE_CHECKING:
     from hand_eye_calib.checks.check import CheckResult
@@ -129,11 +130,11 @@ _Read = tuple[dict[str, "Trajectory"], dict[str, str], "list[Finding]"]
 
 
 def _read_files(arguments: argparse.Namespace) -> _Read:
-    from hand_eye_calib.checks.findings import repaired_file
+    from hand_eye_calib.checks.findings import finding
 
     arguments.parent, arguments.child = arguments.inputs
     trajectories, repairs = read_files(arguments, options_from(arguments))
-    findings = [repaired_file(text) for text in repairs]
+    findings = [finding("repaired_file", text=text) for text in repairs]
     return trajectories, dict(zip(STREAMS, arguments.inputs, strict=True)), findings
 
 
@@ -183,7 +184,7 @@ def _document(
             "distinctness": checked.correlation.distinctness,
             "rms_rad_in_3_s": checked.rms_rotation,
         },
-        "findings": [finding.to_dict() for finding in findings],
+        "findings": plain(findings),
     }
 
 
@@ -221,7 +222,7 @@ def _verdict(findings: "Sequence[Finding]") -> str:
     errors = [finding for finding in serious if finding.makes_unusable]
     word = (Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE).value
     if all(finding.options for finding in serious):
-        options = " ".join(typed_options(finding.options) for finding in serious)
+        options = " ".join(typed_options(finding.options.items()) for finding in serious)
         return f"{word}: not as they are; calibrate with {options}."
     codes = ", ".join(finding.code for finding in errors or serious if not finding.options)
     if not errors:
@@ -239,6 +240,6 @@ def _table(findings: "Sequence[Finding]") -> Iterator[str]:
         mark = finding.severity.value
         mark = mark if mark == "note" else mark.upper()
         yield f"{mark:<8} {finding.code:<17} {finding.stream:<7} {finding.confidence.value}"
-        options = typed_options(finding.options)
+        options = typed_options(finding.options.items())
         for text in (finding.what, f"-> {finding.advice}{options and f': {options}'}"):
             yield from wrapped(text, "    ", "    ")

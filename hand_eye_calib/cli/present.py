@@ -21,6 +21,7 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Reason, Verdict
+from hand_eye_calib.results.records import CrossCheck
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import (
     amount,
@@ -226,7 +227,7 @@ def _warning_lines(calibration: Calibration) -> Iterator[str]:
 
 
 def _what_to_do(reason: Reason) -> str:
-    options = typed_options(reason.options)
+    options = typed_options(reason.options.items())
     return f"{reason.what_to_do}: {options}" if options else reason.what_to_do
 
 
@@ -254,7 +255,7 @@ def next_steps(
     extra = [
         typed_options([option])
         for reason in shown(calibration.reasons)
-        for option in reason.options
+        for option in reason.options.items()
     ]
     if calibration.verdict is not Verdict.DO_NOT_USE:
         reach = calibration.out_of_reach
@@ -357,13 +358,13 @@ def _floor_lines(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def _scatter_lines(cross_check: Mapping[str, Mapping[str, Any]] | None) -> Iterator[str]:
+def _scatter_lines(cross_check: CrossCheck | None) -> Iterator[str]:
     """How far other answers to the same question scatter about the result."""
     for kind, title in _SCATTER.items() if cross_check else ():
         told = [
-            f"{axis} {amount(axis, row[kind])}"
+            f"{axis} {amount(axis, getattr(row, kind))}"
             for axis, row in (cross_check or {}).items()
-            if row.get(kind) is not None
+            if getattr(row, kind) is not None
         ]
         if told:
             yield f"{title}: {', '.join(told)}"
@@ -372,11 +373,11 @@ def _scatter_lines(cross_check: Mapping[str, Mapping[str, Any]] | None) -> Itera
 def _comparison_lines(calibration: Calibration) -> Iterator[str]:
     """The goal of the session, and the comparison with what is installed."""
     if calibration.goal:
-        yield f"the session: {calibration.goal['sentence']}"
+        yield f"the session: {calibration.goal.sentence}"
     if calibration.comparison:
         yield (
-            f"compared with what is installed ({calibration.comparison.get('installed', '')}): "
-            f"{calibration.comparison['sentence']}"
+            f"compared with what is installed ({calibration.comparison.installed}): "
+            f"{calibration.comparison.sentence}"
         )
 
 
@@ -393,7 +394,7 @@ def _solution_lines(calibration: Calibration) -> Iterator[str]:
         yield f"method {calibration.method_reason}"
     if calibration.reference_reason:
         yield f"reference {calibration.reference_reason}"
-    yield from (calibration.noise or {}).get("in_words", ())
+    yield from calibration.noise.in_words if calibration.noise else ()
     offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
     scale = (calibration.scale, calibration.scale_sigma)
     yield (

@@ -56,7 +56,7 @@ def with_cross_check(
     pose_pairs = dataclasses.replace(snapshot, config=config).pose_pairs()
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True))
     evidence = gather(calibration, snapshot.config, pose_pairs, streams)
-    checked = dataclasses.replace(calibration, cross_check=evidence.cross_check.to_dict())
+    checked = dataclasses.replace(calibration, cross_check=evidence.cross_check)
     return checked, evidence
 
 

@@ -181,14 +181,14 @@ def with_options(snapshot: Snapshot, options: Mapping[str, Any]) -> Snapshot:
 
 
 def _with(calibration: Calibration, findings: Collection[Finding]) -> Calibration:
-    return replace(calibration, findings=tuple(finding.to_dict() for finding in findings))
+    return replace(calibration, findings=tuple(findings))
 
 
 def _told(
     findings: Collection[Finding], options: Mapping[str, Any], calibration: Calibration
 ) -> tuple[str, ...]:
     """Warnings about options that were set, and what they gave."""
-    what = {name: finding.what for finding in findings for name, _ in finding.options}
+    what = {name: finding.what for finding in findings for name in finding.options}
     offset_s = calibration.time_offset_s
     what["time_offset"] = (
         f"the child's clock is {abs(offset_s):.4f} +/- {calibration.time_offset_sigma_s:.4f} s "
@@ -211,7 +211,7 @@ def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str,
         name: value if finding.code == "units" else "estimate"
         for finding in findings
         if finding.confidence is Confidence.CERTAIN
-        for name, value in finding.options
+        for name, value in finding.options.items()
         if name in _MENDED and name not in given and _is_grave(finding, name)
     }
 
@@ -242,4 +242,4 @@ def _is_sound(found: Mended) -> bool:
 
 
 def _serious(calibration: Calibration) -> int:
-    return sum(finding["severity"] != Severity.NOTE.value for finding in calibration.findings)
+    return sum(finding.severity is not Severity.NOTE for finding in calibration.findings)

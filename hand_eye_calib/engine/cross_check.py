@@ -5,9 +5,10 @@ from dataclasses import replace
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import OtherAnswers
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-from hand_eye_calib.engine.scatter import CrossCheck, compare_answers
+from hand_eye_calib.engine.scatter import compare_answers
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import CrossCheck
 
 
 def cross_check(

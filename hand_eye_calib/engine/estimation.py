@@ -4,7 +4,6 @@ assess, add the prior, judge.
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
+from hand_eye_calib.results.records import Noise
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
 
@@ -69,7 +69,7 @@ class _Evaluation:
     method_reason: str = ""
     reference_reason: str = ""
     proved_global: str = "not tried"
-    noise: dict[str, Any] | None = None
+    noise: Noise | None = None
     scale_correction: float = 1.0
     scale_sigma: float = 0.0
     time_correction_s: float = 0.0

@@ -14,12 +14,13 @@ from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.streams import are_gaps
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import Answer, OtherAnswers
-from hand_eye_calib.engine.scatter import CrossCheck, compare_answers
+from hand_eye_calib.engine.scatter import compare_answers
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import CrossCheck
 from hand_eye_calib.stats import median
 
 # Most samples of the angular rates, and the shortest window of each (s).

@@ -3,7 +3,6 @@ offset. The rotation is out of reach; by convention the sensor that measures pos
 of the other one.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,15 +12,8 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
 from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE
 from hand_eye_calib.assessment.prior import fuse
-from hand_eye_calib.checks.check import unit_of
-from hand_eye_calib.checks.findings import (
-    Finding,
-    longitude_scale,
-    mirrored_positions,
-    swapped_coordinates,
-    units,
-    unrelated_parts,
-)
+from hand_eye_calib.checks.check import in_other_units, unit_of
+from hand_eye_calib.checks.findings import Finding, finding
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
@@ -176,26 +168,32 @@ def _findings(
     poses: FloatArray,
     positions: FloatArray,
     is_child: bool,
-) -> list[dict[str, object]]:
+) -> list[Finding]:
     """A finding if the path of the positions is not that of the odometry, or in other units."""
     share = lever_arm.unexplained_share(poses, positions, solution)
     if share < _EXPLAINED:
         return []
     if found := _coordinates(share, stamps_ns, poses, positions, "child" if is_child else "parent"):
-        return [found.to_dict()]
+        return [found]
     if is_known and share < _UNRELATED:
         return []
-    found = unrelated_parts(share, "motion of the positions", "odometry", "the units, the scale")
+    found = finding(
+        "unrelated_parts",
+        share=min(share, 1.0),
+        other="odometry",
+        part="motion of the positions",
+        units="the units, the scale",
+    )
     try:
         scaled = _solved(stamps_ns, poses, positions, with_scale=True)
     except InputError:
-        return [found.to_dict()]
+        return [found]
     scale = scaled.scale if is_child else 1.0 / scaled.scale
     explains = lever_arm.unexplained_share(poses, positions, scaled) < _UNRELATED
     if explains and (in_unit := unit_of(scale)):
         factor, unit = in_unit
-        found = units(scale, scaled.scale_sigma * (scale / scaled.scale), unit, factor)
-    return [found.to_dict()]
+        found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale), unit, factor)
+    return [found]
 
 
 def _coordinates(
@@ -205,18 +203,41 @@ def _coordinates(
     lever_arm_m, found = np.zeros(3), None
     for _ in range(2):  # the second time with the lever arm
         factors = horizontal_factors(poses[:, :3, :3] @ lever_arm_m + poses[:, :3, 3], positions)
-        wording = None if factors is None else _wrong_coordinates(factors)
-        if factors is None or wording is None:
+        key = None if factors is None else _wrong_coordinates(factors)
+        if factors is None or key is None:
             break
         mended = positions * [*factors, 1.0]
-        if wording is swapped_coordinates:
+        if key == "swapped_coordinates":
             mended = mended[:, [1, 0, 2]]
         left, lever_arm_m = _left(stamps_ns, poses, mended)
-        found = wording(stream, factors, share, left) if left < _MENDED * share else None
+        is_mended = left < _MENDED * share
+        found = _of_coordinates(key, stream, factors, (share, left)) if is_mended else None
     if found:
         return found
     left, _ = _left(stamps_ns, poses, positions[:, [1, 0, 2]])
-    return mirrored_positions(stream, share, left) if left < _MENDED * share else None
+    if left >= _MENDED * share:
+        return None
+    return _of_coordinates("mirrored_positions", stream, np.ones(2), (share, left))
+
+
+def _of_coordinates(
+    key: str, stream: str, factors: FloatArray, shares: tuple[float, float]
+) -> Finding:
+    """A finding about east and north: factors of x and y (2,), unexplained shares of the path as it
+    is and without the mistake.
+    """
+    cosines = min(1.0 / factors[0], 1.0), min(factors[1], 1.0)
+    longitude, latitude = np.degrees(np.arccos(cosines))
+    return finding(
+        key,
+        stream,
+        factor_x=float(factors[0]),
+        factor_y=float(factors[1]),
+        latitude=latitude,
+        longitude=longitude,
+        unexplained_share=shares[0],
+        unexplained_share_mended=shares[1],
+    )
 
 
 def _left(
@@ -230,10 +251,10 @@ def _left(
     return lever_arm.unexplained_share(poses, positions, solution), solution.lever_arm
 
 
-def _wrong_coordinates(factors: FloatArray) -> Callable[..., Finding] | None:
+def _wrong_coordinates(factors: FloatArray) -> str | None:
     """The finding that factors of x and y speak for; None if they speak for none."""
     east, north = factors
     off = np.abs(factors - 1.0) > _FACTOR_OFF
     if east > 1.0 - _FACTOR_OFF and north < 1.0 + _FACTOR_OFF and off.any():
-        return swapped_coordinates
-    return longitude_scale if east < 1.0 and off.tolist() == [True, False] else None
+        return "swapped_coordinates"
+    return "longitude_scale" if east < 1.0 and off.tolist() == [True, False] else None

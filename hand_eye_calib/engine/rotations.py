@@ -12,7 +12,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
-from hand_eye_calib.checks.findings import Finding, rate_unit, unrelated_parts
+from hand_eye_calib.checks.findings import Finding, finding
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator as adaptive_estimator
@@ -26,6 +26,7 @@ from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
+from hand_eye_calib.results.records import RateBias
 
 # Two streams of which more than this share of the rotation stays unexplained are not of one body.
 _UNRELATED = 0.5
@@ -90,7 +91,7 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         time_offset_sigma_s=solution.time_offset_sigma_s,
         rate_bias=_rate_bias(solution, config) if has_rates else None,
         noise=solution.describe(pose_pairs.stamps_ns),
-        findings=tuple(found.to_dict() for found in findings),
+        findings=tuple(findings),
         contradictions=fused.contradictions,
         **config.target_fields(),
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
@@ -131,22 +132,22 @@ def _without_positions(Ts: FloatArray) -> FloatArray:
     return se3.from_rotation_translation(Ts[:, :3, :3], np.zeros((len(Ts), 3)))
 
 
-def _rate_bias(solution: AdaptiveSolution, config: CalibratorConfig) -> dict[str, object]:
-    """The bias of the rates in plain values, in the axes of the sensor that has it.
+def _rate_bias(solution: AdaptiveSolution, config: CalibratorConfig) -> RateBias:
+    """The bias of the rates, in the axes of the sensor that has it.
 
     Of two gyroscopes only the difference of the biases shows, the child's less the parent's.
     """
     bias, sigmas = solution.rate_bias
     if config.child_measures == "rates":
         of = "child" if config.parent_measures != "rates" else "child less parent, child's axes"
-        return {"of": of, "rad_per_s": bias.tolist(), "sigma": sigmas.tolist()}
+        return RateBias(of=of, rad_per_s=tuple(bias.tolist()), sigma=tuple(sigmas.tolist()))
     rotation = solution.T_parent_child[:3, :3]
     variances = np.diag(rotation @ np.diag(sigmas**2) @ rotation.T)
-    return {
-        "of": "parent",
-        "rad_per_s": (-rotation @ bias).tolist(),
-        "sigma": np.sqrt(variances).tolist(),
-    }
+    return RateBias(
+        of="parent",
+        rad_per_s=tuple((-rotation @ bias).tolist()),
+        sigma=tuple(np.sqrt(variances).tolist()),
+    )
 
 
 def _residuals(pairs: MotionPairs, solution: AdaptiveSolution, pose_pairs: PosePairs) -> Residuals:
@@ -172,7 +173,15 @@ def _unrelated(
     share = float(np.median(left[most]) / max(float(np.median(turned[most])), 1e-12))
     if share < _UNRELATED:
         return []
-    return [unrelated_parts(share, "rotation of one sensor", "other", "the unit of the rates")]
+    return [
+        finding(
+            "unrelated_parts",
+            share=min(share, 1.0),
+            part="rotation of one sensor",
+            other="other",
+            units="the unit of the rates",
+        )
+    ]
 
 
 def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> Finding | None:
@@ -186,4 +195,7 @@ def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> Finding | None:
         return None
     ratio = sizes[stream] / max(sizes[other], 1e-12)
     is_unit = min(abs(ratio / _DEGREES - 1.0), abs(ratio * _DEGREES - 1.0)) < _UNIT_WITHIN
-    return rate_unit(stream, ratio) if is_unit else None
+    if not is_unit:
+        return None
+    unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
+    return finding("rate_unit", stream, ratio=ratio, unit=unit, read_as=read_as)

@@ -8,8 +8,7 @@ recording. Neither shows an error that is constant.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,6 +21,8 @@ from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import AxisScatter, CrossCheck
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import MEDIAN_NORMAL, median
 
 # Fewest other answers that have a scatter.
@@ -37,53 +38,6 @@ _FEWEST_INLIERS = 0.55
 
 # Smallest joint standard deviation (m, rad) to divide by: noise-free data has none.
 _ROUNDING = 1e-9
-
-
-@dataclass(frozen=True, kw_only=True)
-class CrossCheck:
-    """Scatter of other answers about a result, along and about the axes of the parent sensor's
-    frame (m and rad).
-
-    Attributes
-    ----------
-    axes : tuple of str
-        x, y, z, roll, pitch, yaw.
-    sigma : (6,) array
-        The result's standard deviations; infinite if an axis is unobservable.
-    of_methods : (6,) array
-        Robust standard deviation of the answers of other methods and references about the result;
-        NaN if too few of them know the axis.
-    of_halves : (6,) array
-        Standard deviation of the result that follows from the difference between the answers of
-        both halves; NaN if they do not know the axis.
-    of_model : (6,) array
-        Distance from the answer under other assumptions on the noise; NaN if there is none.
-    excess_of_methods, excess_of_halves, excess_of_model : (6,) arrays
-        Distance of the answers in their joint standard deviations (of the methods: the median over
-        that of a normal variable), which contain the common-mode floor; those of the halves also
-        the result's own standard deviations if the halves are solved with another method.
-    excess_over_own : (6,) array
-        Distance of other methods and references in the result's own standard deviations with the
-        floor, over those that are not much less certain; NaN if there are fewer than two.
-    """
-
-    axes: tuple[str, ...]
-    sigma: FloatArray
-    of_methods: FloatArray
-    of_halves: FloatArray
-    of_model: FloatArray
-    excess_of_methods: FloatArray
-    excess_of_halves: FloatArray
-    excess_of_model: FloatArray
-    excess_over_own: FloatArray
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON or YAML; None for what is not known."""
-        columns = {name: values for name, values in vars(self).items() if name != "axes"}
-        return {
-            axis: plain({name: values[k] for name, values in columns.items()})
-            for k, axis in enumerate(self.axes)
-        }
 
 
 def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
@@ -107,7 +61,7 @@ def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePair
     others, halves = ([answer.calibration for answer in kind] for kind in answers)
     if unseen := _unseen_by_all(result, others):
         result = solved.calibration(unseen)
-    return replace(result, cross_check=compare_answers(result, others, halves).to_dict())
+    return replace(result, cross_check=compare_answers(result, others, halves))
 
 
 def _unseen_by_all(calibration: Calibration, others: Sequence[Calibration]) -> list[str]:
@@ -157,18 +111,23 @@ def compare_answers(
         of_halves = apart / 2
         excess_of_halves = of_halves / np.hypot(allowed / 2, _beside_halves(calibration, halves[0]))
     of_model, excess_of_model = _from_other_model(calibration)
+    columns = {
+        "sigma": calibration.sigmas,
+        "of_methods": of_methods,
+        "of_halves": of_halves,
+        "of_model": of_model,
+        "excess_of_methods": excess_of_methods,
+        "excess_of_halves": excess_of_halves,
+        "excess_of_model": excess_of_model,
+        "excess_over_own": _over_own(calibration, robust),
+    }
     known = np.isfinite(calibration.sigmas)
-    return CrossCheck(
-        axes=tuple(dof.name for dof in calibration.observability),
-        sigma=calibration.sigmas,
-        of_methods=np.where(known, of_methods, np.nan),
-        of_halves=np.where(known, of_halves, np.nan),
-        of_model=np.where(known, of_model, np.nan),
-        excess_of_methods=np.where(known, excess_of_methods, np.nan),
-        excess_of_halves=np.where(known, excess_of_halves, np.nan),
-        excess_of_model=np.where(known, excess_of_model, np.nan),
-        excess_over_own=np.where(known, _over_own(calibration, robust), np.nan),
-    )
+    return {
+        axis: AxisScatter(
+            **{name: plain(values[k]) if known[k] else None for name, values in columns.items()}
+        )
+        for k, axis in enumerate(AXES)
+    }
 
 
 def _beside_halves(calibration: Calibration, half: Calibration) -> FloatArray:

@@ -252,14 +252,14 @@ class Snapshot:
         return replace(result, findings=gravest_first(answered(findings, self.config)))
 
     def _check_parts(self, calibration: Calibration | None) -> list[Finding]:
-        found = [Finding.from_dict(each) for each in (calibration.findings if calibration else ())]
+        found = [*calibration.findings] if calibration else []
         if not len(self.kept):  # pairs may have gaps where the streams have none
             parent, child = self.streams
             offset_s = fixed_time_offset(self.resolved().config)
             found += check_parts(parent, child.shifted(offset_s), self.config.max_gap)
         if any(each.code == "unrelated" for each in found):
             found += self._check_clocks()
-        return [*dict.fromkeys(found)]
+        return [each for index, each in enumerate(found) if each not in found[:index]]
 
     def _check_clocks(self) -> list[Finding]:
         """A finding if streams that are no poses agree at another clock offset."""
@@ -305,7 +305,7 @@ class Snapshot:
 def noise_fits(calibration: Calibration) -> bool:
     """Whether the result is the noise model's, and its residuals fit."""
     noise = calibration.noise
-    return noise is not None and noise["misfit"] <= _MAX_MISFIT
+    return noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT
 
 
 def _hides_a_translation(calibration: Calibration) -> bool:

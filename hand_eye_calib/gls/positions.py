@@ -36,6 +36,7 @@ from hand_eye_calib.gls.noise_model import N_FAST, Extent, NoiseModel, Slow
 from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
 from hand_eye_calib.gls.resampling import part_products
 from hand_eye_calib.gls.state_space import Posterior, StateSpace, multiplied
+from hand_eye_calib.results.records import Noise
 from hand_eye_calib.text import angle, length
 
 # Of the latent states.
@@ -138,7 +139,7 @@ class LeverArmSolution:
         """
         return float(np.exp(self.levels[noise_model.WALK_ROTATION]))
 
-    def describe(self, stamps_ns: IntArray) -> dict[str, object]:
+    def describe(self, stamps_ns: IntArray) -> Noise:
         """The noise in plain values and in words, as of an AdaptiveSolution."""
         sigmas = np.exp(0.5 * self.levels)
         white, walk = (
@@ -156,18 +157,17 @@ class LeverArmSolution:
         for what, found in (("jumps", self.jumps), ("positions wrong by themselves", self.spikes)):
             if found.any():
                 said.append(f"{int(found.sum())} {what}")
-        return {
-            "translation_white_m": white,
-            "translation_drift_m_per_pose": walk,
-            "rotation_drift_rad_per_pose": float(np.radians(turned)),
-            "drift_grows_with": self.model.walk_by,
-            "lasting": [],
-            "share_of_worse_positions": worse,
-            "jumps_before_stamp_ns": stamps_ns[1:][self.jumps].tolist(),
-            "spikes_at_stamp_ns": stamps_ns[self.spikes].tolist(),
-            "misfit": self.misfit,
-            "in_words": said,
-        }
+        return Noise(
+            translation_white_m=white,
+            translation_drift_m_per_pose=walk,
+            rotation_drift_rad_per_pose=float(np.radians(turned)),
+            drift_grows_with=self.model.walk_by,
+            share_of_worse_positions=worse,
+            jumps_before_stamp_ns=tuple(stamps_ns[1:][self.jumps].tolist()),
+            spikes_at_stamp_ns=tuple(stamps_ns[self.spikes].tolist()),
+            misfit=self.misfit,
+            in_words=tuple(said),
+        )
 
 
 def solve(

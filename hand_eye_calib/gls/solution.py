@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from hand_eye_calib.gls.noise_model import (
 )
 from hand_eye_calib.gls.part_delays import PartDelay
 from hand_eye_calib.gls.world_drift import WorldDrift
+from hand_eye_calib.results.records import CorrelatedError, Noise
 from hand_eye_calib.text import angle, length
 
 _TURNING = {
@@ -247,34 +247,34 @@ class AdaptiveSolution:
         """
         return float((1.0 / max(self.metres_per_pose, 1e-9)) ** 0.5)
 
-    def describe(self, stamps_ns: IntArray) -> dict[str, Any]:
+    def describe(self, stamps_ns: IntArray) -> Noise:
         """The noise in plain numbers and strings: levels per axis, systematic errors, when
         trajectories went wrong (ns), all of it in words.
         """
         noise = self.noise
-        return {
-            "rotation_white_rad": noise.rotation_white,
-            "translation_white_m": noise.translation_white,
-            "rotation_drift_rad_per_pose": noise.rotation_drift,
-            "translation_drift_m_per_pose": noise.translation_drift,
-            "rotation_drift_rad_after_a_metre": noise.rotation_drift * self._after_a_metre,
-            "translation_drift_m_after_a_metre": noise.translation_drift * self._after_a_metre,
-            "drift_grows_with": noise.walk_by,
-            "stamp_jitter_s": noise.jitter_s,
-            "lasting": [vars(slow).copy() for slow in noise.slow],
-            "rotation_turns_about": noise.centre,
-            "heavy_tails": self.heavy_tails,
-            "systematic": self.systematic,
-            "systematic_parameters": self.parameters.tolist(),
-            "scale": self.scale,
-            "scale_sigma": self.scale_sigma,
-            "time_offset_s": self.time_offset_s,
-            "time_offset_sigma_s": self.time_offset_sigma_s,
-            "jumps_before_stamp_ns": stamps_ns[1:][self.jumps].tolist(),
-            "spikes_at_stamp_ns": stamps_ns[self.spikes].tolist(),
-            "misfit": self.misfit,
-            "in_words": self._in_words(stamps_ns),
-        }
+        return Noise(
+            rotation_white_rad=noise.rotation_white,
+            translation_white_m=noise.translation_white,
+            rotation_drift_rad_per_pose=noise.rotation_drift,
+            translation_drift_m_per_pose=noise.translation_drift,
+            rotation_drift_rad_after_a_metre=noise.rotation_drift * self._after_a_metre,
+            translation_drift_m_after_a_metre=noise.translation_drift * self._after_a_metre,
+            drift_grows_with=noise.walk_by,
+            stamp_jitter_s=noise.jitter_s,
+            lasting=tuple(CorrelatedError(**vars(slow)) for slow in noise.slow),
+            rotation_turns_about=noise.centre,
+            heavy_tails=self.heavy_tails,
+            systematic=self.systematic,
+            systematic_parameters=tuple(self.parameters.tolist()),
+            scale=self.scale,
+            scale_sigma=self.scale_sigma,
+            time_offset_s=self.time_offset_s,
+            time_offset_sigma_s=self.time_offset_sigma_s,
+            jumps_before_stamp_ns=tuple(stamps_ns[1:][self.jumps].tolist()),
+            spikes_at_stamp_ns=tuple(stamps_ns[self.spikes].tolist()),
+            misfit=self.misfit,
+            in_words=tuple(self._in_words(stamps_ns)),
+        )
 
     def _in_words(self, stamps_ns: IntArray) -> list[str]:
         return [

@@ -20,6 +20,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, captions
 from hand_eye_calib.report.report_figures import draw_all
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Reason, Verdict
+from hand_eye_calib.results.records import Noise
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.text import (
@@ -167,7 +168,7 @@ def verdict_of(calibration: Calibration) -> dict[str, str]:
 
 
 def _reason(reason: Reason) -> dict[str, str]:
-    options = ", ".join(f"{name} {value}" for name, value in reason.options)
+    options = ", ".join(f"{name} {value}" for name, value in reason.options.items())
     what_to_do = f"{reason.what_to_do}: {options}" if options else reason.what_to_do
     return {"sentence": reason.sentence, "what_to_do": what_to_do}
 
@@ -245,15 +246,15 @@ def _differences(calibration: Calibration) -> list[dict[str, str]]:
     """Rows of the comparison with what is installed; none without one."""
     if not calibration.comparison:
         return []
-    (difference,) = calibration.comparison["differences"]
+    (difference,) = calibration.comparison.differences
     return [
         {
             "title": _AXIS_NAMES.get(axis, f"along {axis}"),
-            "difference": _known(axis, row["difference"]) + f" ± {_known(axis, row['sigma'])}",
-            "visible": _known(axis, row["visible"]),
-            "verdict": row["verdict"],
+            "difference": _known(axis, row.difference) + f" ± {_known(axis, row.sigma)}",
+            "visible": _known(axis, row.visible),
+            "verdict": row.verdict,
         }
-        for axis, row in difference["axes"].items()
+        for axis, row in difference.axes.items()
     ]
 
 
@@ -292,19 +293,19 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
     }
     if noise := calibration.noise:
         is_whole = calibration.measured == "poses"
-        rows["Noise"] = _noise(noise) if is_whole else "; ".join(noise["in_words"])
+        rows["Noise"] = _noise(noise) if is_whole else "; ".join(noise.in_words)
     return rows
 
 
-def _noise(noise: Plain) -> str:
+def _noise(noise: Noise) -> str:
     def levels(kind: str, suffix: str) -> str:
-        translation = length(noise[f"translation_{kind}_m{suffix}"])
-        return f"{translation} and {angle(noise[f'rotation_{kind}_rad{suffix}'])}"
+        translation = length(getattr(noise, f"translation_{kind}_m{suffix}"))
+        return f"{translation} and {angle(getattr(noise, f'rotation_{kind}_rad{suffix}'))}"
 
-    jumps = counted(len(noise["jumps_before_stamp_ns"]), "jump")
+    jumps = counted(len(noise.jumps_before_stamp_ns), "jump")
     return (
         f"{levels('white', '')} per pose and axis; growing by {levels('drift', '_per_pose')} from "
-        f"pose to pose; systematic error: {noise['systematic']}; {jumps}"
+        f"pose to pose; systematic error: {noise.systematic}; {jumps}"
     )
 
 

@@ -1,14 +1,13 @@
 """The result of a calibration: the extrinsic, its covariance, and what to know before using it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast, get_type_hints
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.printed_angles import (
@@ -19,17 +18,11 @@ from hand_eye_calib.geometry.printed_angles import (
     sigmas_translation,
 )
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.plain import plain
-from hand_eye_calib.results.document import (
-    PLAIN,
-    PLAIN_LATER,
-    base_parent,
-    check_values,
-    covariance_of,
-    floor_of,
-    numbers,
-    transform_of,
-)
+from hand_eye_calib.plain import from_plain, plain
+from hand_eye_calib.results.document import check_values, covariance_of, transform_of
+from hand_eye_calib.results.finding import Finding
+from hand_eye_calib.results.records import Residuals
+from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import (
     ROTATIONS,
     TRANSLATIONS,
@@ -48,6 +41,7 @@ __all__ = [
     "Calibration",
     "DofObservability",
     "DofVerdict",
+    "Finding",
     "Reason",
     "Residuals",
     "SolveStatus",
@@ -58,8 +52,9 @@ __all__ = [
 _FORMAT = "hand_eye_calib/extrinsic"
 _VERSION = 1
 
-# Motion pairs with more weight than this count as inliers.
-INLIER_WEIGHT = 0.5
+# Fields that a document has under other names, as matrices; and those that files do not have.
+_MATRICES = ("T_parent_child", "T_method", "covariance", "floor", "T_base_parent")
+_NOT_IN_FILES = ("motion_residuals", "other_answer")
 
 # An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
 _SHARED = 0.02
@@ -69,175 +64,12 @@ _UNKNOWN_M = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
-class Residuals:
-    """Residuals of K motion pairs at the result.
-
-    A pair of the adaptive estimator runs from one pose to the next.
-
-    Attributes
-    ----------
-    translation : (K, 3) array
-        Residuals of eq. (6) of Välimäki et al. 2023, m, in the axes of the parent sensor at the
-        start of each pair.
-    rotation : (K, 3) array
-        Rotation vectors of the residual rotations, whose angles are those of eq. (7), rad, in the
-        axes of the child sensor at the end of each pair.
-    weights : (K,) array
-        Weights of the pairs in the solution, 0 to 1.
-    start_ns, end_ns : (K,) int64 arrays
-        Stamps of both ends of each pair, parent clock.
-    """
-
-    translation: FloatArray
-    rotation: FloatArray
-    weights: FloatArray
-    start_ns: IntArray
-    end_ns: IntArray
-
-    def __len__(self) -> int:
-        return len(self.weights)
-
-    @property
-    def translation_m(self) -> FloatArray:
-        """Lengths (K,) of the translation residuals, m."""
-        return np.linalg.norm(self.translation, axis=1)
-
-    @property
-    def rotation_rad(self) -> FloatArray:
-        """Angles (K,) of the rotation residuals, rad."""
-        return np.linalg.norm(self.rotation, axis=1)
-
-    @property
-    def is_inlier(self) -> BoolArray:
-        """Whether (K,) each pair counts as an inlier."""
-        return self.weights > INLIER_WEIGHT
-
-
-@dataclass(frozen=True, kw_only=True)
-class Calibration:
-    """An extrinsic with its quality.
+class Calibration(Result):
+    """An extrinsic with its quality: the values of
+    :class:`~hand_eye_calib.results.result.Result`, and what follows from them.
 
     :attr:`verdict` says whether it may be used, and :attr:`reasons` why not.
-
-    Attributes
-    ----------
-    T_parent_child : (4, 4) array
-        Pose of the child sensor in the parent sensor's frame: maps child coordinates into the
-        parent frame, metres.
-    covariance : (6, 6) array
-        Covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho, phi), in the child
-        sensor's frame, m and rad.
-    status : SolveStatus
-    observability : tuple of DofObservability
-        x, y, z, roll, pitch, yaw in the parent sensor's frame.
-    measured : {"poses", "rotations", "positions"}
-        What the streams give together. Rotations, or angular rates, say nothing of the translation,
-        positions nothing of the rotation: :attr:`out_of_reach`.
-    T_method : (4, 4) array or None
-        The method's own answer, before directions that the motion does not reveal are set and
-        priors are added. None in a result read from a file that does not have it.
-    objective : float
-        Value of the method's cost at ``T_method``; for dnlo eq. (5), the outliers' share included.
-    proved_global : str
-        Whether no other transform has a smaller cost over the motion pairs that count: "yes", "no",
-        or "not tried" (:mod:`hand_eye_calib.solvers.certificate`).
-    method, reference, backend : str
-        How it was solved; ``method`` and ``reference`` are those that ``auto`` chose.
-    floor : (6, 6) array or None
-        Covariance, of the same xi, of errors that are the same in every part of the recording, so
-        that nothing in it shows them (:mod:`hand_eye_calib.assessment.floor`). ``covariance`` does
-        not contain it. None in a result read from a file that does not have it.
-    n_poses, n_pairs, n_inliers : int
-        Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
-    time_offset_s, time_offset_sigma_s : float
-        Seconds added to the child's stamps, and one standard deviation: 0 if the method took the
-        offset as given.
-    scale, scale_sigma : float
-        Factor applied to the child's translations, and one standard deviation: 0 if the method took
-        the scale as given.
-    rate_bias : dict or None
-        Bias of the angular rates: ``of`` which sensor, ``rad_per_s`` and ``sigma`` along its axes;
-        None if neither stream is one of rates.
-    method_reason, reference_reason : str
-        Why ``auto`` chose the method, the reference; empty if it was given.
-    noise : dict or None
-        Noise of the trajectories as the adaptive estimator found it; None with other methods.
-    cross_check : dict or None
-        Per axis, the scatter of the answers of other methods and references and of both halves of
-        the recording about this one (:class:`~hand_eye_calib.engine.scatter.CrossCheck`); None
-        without that cross-check.
-    findings : tuple of dict
-        What the stream checks found, in plain values
-        (:meth:`~hand_eye_calib.checks.findings.Finding.to_dict`).
-    contradictions : dict
-        Axis to the distance, in joint standard deviations, of a prior that contradicts the motion.
-    target_translation, target_rotation : float
-        Standard deviations (m, rad) that are good enough for the use that is made of the result.
-    target_axes : dict
-        Axis to a target of its own, m or rad.
-    comparison : dict or None
-        Comparison with what is installed, in plain values
-        (:meth:`~hand_eye_calib.session.compare.Comparison.to_dict`); None without one.
-    goal : dict or None
-        How far the session was from its goal when the result was saved, in plain values
-        (:meth:`~hand_eye_calib.session.goal.Progress.to_dict`); None without a session.
-    base_frame : str
-        Frame of the robot in which the child's pose is stated as well; empty for none.
-    T_base_parent : (4, 4) array or None
-        Pose of the parent sensor in that frame, as the robot's transforms have it.
-    stamp_ns : int
-        Stamp of the newest pose used, parent clock.
-    parent_frame, child_frame : str
-    warnings : tuple of str
-        What a person should know before using the result.
-    motion_residuals : Residuals or None
-        Not part of files; see :meth:`residuals`.
-    other_answer : ((4, 4) array, (6, 6) array) or None
-        T_parent_child and covariance under other assumptions on the noise: of the adaptive
-        estimator beside DNLO, or the reverse. Not part of files.
     """
-
-    T_parent_child: FloatArray
-    covariance: FloatArray
-    status: SolveStatus
-    observability: tuple[DofObservability, ...]
-    measured: str = "poses"
-    T_method: FloatArray | None = None
-    floor: FloatArray | None = None
-    objective: float
-    method: str
-    reference: str
-    backend: str
-    n_poses: int
-    n_pairs: int
-    n_inliers: int
-    time_offset_s: float = 0.0
-    time_offset_sigma_s: float = 0.0
-    scale: float = 1.0
-    scale_sigma: float = 0.0
-    rate_bias: dict[str, Any] | None = None
-    proved_global: str = "not tried"
-    method_reason: str = ""
-    reference_reason: str = ""
-    noise: dict[str, Any] | None = None
-    cross_check: dict[str, Any] | None = None
-    findings: tuple[Mapping[str, Any], ...] = ()
-    contradictions: dict[str, float] = field(default_factory=dict)
-    target_translation: float = CalibratorConfig.target_translation
-    target_rotation: float = CalibratorConfig.target_rotation
-    target_axes: dict[str, float] = field(default_factory=dict)
-    comparison: dict[str, Any] | None = None
-    goal: dict[str, Any] | None = None
-    base_frame: str = ""
-    T_base_parent: FloatArray | None = None
-    stamp_ns: int = 0
-    parent_frame: str = "parent"
-    child_frame: str = "child"
-    warnings: tuple[str, ...] = ()
-    motion_residuals: Residuals | None = field(default=None, repr=False, compare=False)
-    other_answer: tuple[FloatArray, FloatArray] | None = field(
-        default=None, repr=False, compare=False
-    )
 
     def __repr__(self) -> str:
         frames = f"{self.child_frame} in {self.parent_frame}"
@@ -337,90 +169,6 @@ class Calibration:
         """The verdict with its gravest reason, or with what is known, in one line."""
         return headline(self, self.reasons)
 
-    @property
-    def out_of_reach(self) -> tuple[str, ...]:
-        """Axes that streams of this kind say nothing about, and no prior either."""
-        silent = {"rotations": TRANSLATIONS, "positions": ROTATIONS}.get(self.measured, ())
-        unknown = self.unobservable()
-        return tuple(axis for axis in silent if axis in unknown)
-
-    @property
-    def T_child_parent(self) -> FloatArray:
-        """(4, 4) array: pose of the parent sensor in the child sensor's frame."""
-        return se3.inverse(self.T_parent_child)
-
-    @property
-    def T_base_child(self) -> FloatArray | None:
-        """(4, 4) array: pose of the child sensor in ``base_frame``; None without one."""
-        return None if self.T_base_parent is None else self.T_base_parent @ self.T_parent_child
-
-    @property
-    def mounting(self) -> tuple[str, FloatArray]:
-        """The frame that the child sensor is mounted on in the robot's description, and its pose
-        (4, 4) in it: the base frame if there is one, otherwise the parent sensor's.
-        """
-        if self.T_base_child is not None:
-            return self.base_frame, self.T_base_child
-        return self.parent_frame, self.T_parent_child
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's
-        frame; infinite if unobservable.
-        """
-        return np.array([dof.sigma for dof in self.observability])
-
-    @property
-    def sigmas_rpy(self) -> FloatArray:
-        """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed;
-        infinite if one is unknown. Those of ``sigmas`` are of rotations about the parent's axes.
-        """
-        return sigmas_rpy(self.T_parent_child, self.covariance)
-
-    @property
-    def covariance_with_floor(self) -> FloatArray:
-        """(6, 6) array: covariance and common-mode floor together."""
-        return self.covariance + (np.zeros((6, 6)) if self.floor is None else self.floor)
-
-    @property
-    def sigmas_of_floor(self) -> FloatArray:
-        """(6,) array: standard deviations of the common-mode floor along (m) and about (rad) the
-        axes of the parent sensor's frame.
-        """
-        if self.floor is None:
-            return np.zeros(6)
-        to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
-        variances = np.diag(to_parent @ self.floor @ to_parent.T)
-        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
-
-    @property
-    def sigmas_with_floor(self) -> FloatArray:
-        """(6,) array: :attr:`sigmas` and common-mode floor together."""
-        return np.hypot(self.sigmas, self.sigmas_of_floor)
-
-    @property
-    def weights(self) -> FloatArray:
-        """(K,) array: weight of each motion pair in the solution, 0 to 1; see :meth:`residuals`."""
-        return self.residuals().weights
-
-    def residuals(self) -> Residuals:
-        """Residuals of the motion pairs that the result comes from, at ``T_parent_child``.
-
-        Raises
-        ------
-        InputError
-            If the result was read from a file: files do not have them.
-        """
-        if self.motion_residuals is None:
-            raise InputError(
-                "a result that was read from a file has no residuals; calibrate again to have them"
-            )
-        return self.motion_residuals
-
-    def unobservable(self) -> list[str]:
-        """Names of the degrees of freedom that the motion does not reveal."""
-        return [dof.name for dof in self.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
-
     def usable_numbers(self) -> dict[str, float | str]:
         """The numbers of :attr:`mounting` for commands and files that others read.
 
@@ -473,16 +221,16 @@ class Calibration:
         not known; only a ``matrix`` has a number there, so that it can be read back.
         """
         document: dict[str, Any] = {
-            "verdict": self.verdict.value,
+            "verdict": self.verdict,
             "headline": self.headline,
-            "reasons": [reason.to_dict() for reason in self.reasons],
+            "reasons": self.reasons,
             "format": _FORMAT,
             "version": _VERSION,
             "parent_frame": self.parent_frame,
             "child_frame": self.child_frame,
             "T_parent_child": self._transform_dict(),
             "T_child_parent": self._inverse_dict(),
-            "status": self.status.value,
+            "status": self.status,
             "covariance": {
                 "of": "error xi in T_parent_child @ exp(xi)",
                 "order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"],
@@ -491,17 +239,10 @@ class Calibration:
                 "matrix": self.covariance,
             },
             "observability": [
-                {
-                    "name": dof.name,
-                    "frame": self.parent_frame,
-                    "verdict": dof.verdict.value,
-                    "sigma": dof.sigma,
-                }
-                for dof in self.observability
+                vars(dof) | {"frame": self.parent_frame} for dof in self.observability
             ],
         }
         if self.T_base_child is not None:
-            document["base_frame"] = self.base_frame
             document["T_base_child"] = self._base_dict(self.T_base_child)
         if self.T_method is not None:
             document["T_method"] = {
@@ -518,9 +259,8 @@ class Calibration:
         document |= {
             name: getattr(self, name)
             for name in self.__dataclass_fields__
-            if name in PLAIN or name in PLAIN_LATER
+            if name not in (*_MATRICES, *_NOT_IN_FILES, *document)
         }
-        document |= {"findings": self.findings, "warnings": self.warnings}
         return cast(dict[str, Any], plain(document))
 
     def _transform_dict(self) -> dict[str, Any]:
@@ -596,31 +336,38 @@ class Calibration:
                 f"found format {found[0]}, version {found[1]}"
             )
         # Version 0.1 had another name for it.
-        later: dict[str, Any] = {"cross_check": data.get("consistency")} | dict(data)
+        data = {"cross_check": data.get("consistency")} | dict(data)
         try:
-            check_values(later)
-            return cls(
-                T_parent_child=transform_of(data["T_parent_child"]),
-                T_method=transform_of(data["T_method"]) if "T_method" in data else None,
-                base_frame=str(data.get("base_frame", "")),
-                T_base_parent=base_parent(data) if "T_base_child" in data else None,
-                floor=floor_of(data["floor"]) if "floor" in data else None,
-                covariance=covariance_of(data["covariance"]),
-                status=SolveStatus(data["status"]),
-                observability=tuple(
-                    DofObservability(
-                        dof["name"], DofVerdict(dof["verdict"]), *numbers([dof["sigma"]])
-                    )
-                    for dof in data["observability"]
-                ),
-                warnings=tuple(data["warnings"]),
-                findings=tuple(data.get("findings", ())),
-                **{name: data[name] for name in PLAIN},
-                **{name: later[name] for name in PLAIN_LATER if name in later},
-            )
+            return cls(**_values(cls, data))
         except KeyError as error:
             raise InputError(f"the calibration has no {error}: restore or repeat it") from None
         except (TypeError, ValueError) as error:
             raise InputError(
                 f"the calibration was changed after it was written: {error}; restore or repeat it"
             ) from None
+
+
+def _values(of: type[Calibration], data: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a calibration from its document."""
+    values = {
+        "T_parent_child": transform_of(data["T_parent_child"]),
+        "covariance": covariance_of(data["covariance"]),
+    }
+    if "T_method" in data:
+        values["T_method"] = transform_of(data["T_method"])
+    if "floor" in data:
+        values["floor"] = covariance_of(data["floor"], is_known=True)
+    if "T_base_child" in data:
+        T_child_parent = se3.inverse(values["T_parent_child"])
+        values["T_base_parent"] = transform_of(data["T_base_child"]) @ T_child_parent
+    hints = get_type_hints(of)
+    for name, each in of.__dataclass_fields__.items():
+        if name in data and name not in (*_MATRICES, *_NOT_IN_FILES):
+            try:
+                values[name] = from_plain(hints[name], data[name])
+            except TypeError as error:
+                raise TypeError(f"{name}: {error}") from None
+        elif name not in values and each.default is each.default_factory is MISSING:
+            raise KeyError(name)
+    check_values(values)
+    return values

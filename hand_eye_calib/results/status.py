@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
+AXES = (*TRANSLATIONS, *ROTATIONS)
 
 
 class SolveStatus(str, Enum):

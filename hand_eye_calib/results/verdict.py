@@ -6,18 +6,14 @@ used as it is. The gravest reason decides. docs/verdict.md has the same table; a
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Protocol, TypeAlias
+from typing import TypeAlias
 
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.results.status import (
-    ROTATIONS,
-    TRANSLATIONS,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-)
+from hand_eye_calib.results.finding import Severity
+from hand_eye_calib.results.result import Result
+from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS, DofVerdict, SolveStatus
 from hand_eye_calib.text import amount, axes_in_words, listing
 
 
@@ -44,7 +40,7 @@ class Reason:
     what_to_do : str
     axes : tuple of str
         x, y, z, roll, pitch, yaw; empty if it is about the whole result.
-    options : tuple of (str, value)
+    options : mapping
         Options that mend it, by their public names.
     """
 
@@ -53,54 +49,12 @@ class Reason:
     sentence: str
     what_to_do: str
     axes: tuple[str, ...] = ()
-    options: tuple[tuple[str, Any], ...] = ()
+    options: Mapping[str, float | str] = field(default_factory=dict)
 
     @property
     def is_finding(self) -> bool:
         """Whether a stream check found it."""
         return self.rule in ("error_finding", "warning_finding")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values."""
-        return {
-            "rule": self.rule,
-            "verdict": self.verdict.value,
-            "axes": list(self.axes),
-            "sentence": self.sentence,
-            "what_to_do": self.what_to_do,
-            "options": dict(self.options),
-        }
-
-
-class Judged(Protocol):
-    """What the rules look at: attributes of a Calibration."""
-
-    @property
-    def status(self) -> SolveStatus: ...
-    @property
-    def observability(self) -> tuple[DofObservability, ...]: ...
-    @property
-    def out_of_reach(self) -> tuple[str, ...]: ...
-    @property
-    def sigmas_of_floor(self) -> Any: ...
-    @property
-    def contradictions(self) -> Mapping[str, float]: ...
-    @property
-    def cross_check(self) -> Mapping[str, Mapping[str, float | None]] | None: ...
-    @property
-    def findings(self) -> Sequence[Mapping[str, Any]]: ...
-    @property
-    def method(self) -> str: ...
-    @property
-    def n_pairs(self) -> int: ...
-    @property
-    def n_inliers(self) -> int: ...
-    @property
-    def target_translation(self) -> float: ...
-    @property
-    def target_rotation(self) -> float: ...
-    @property
-    def target_axes(self) -> Mapping[str, float]: ...
 
 
 @dataclass(frozen=True)
@@ -121,10 +75,10 @@ class Rule:
     name: str
     verdict: Verdict
     when: str
-    find: "Callable[[Judged], Iterator[_Found]]"
+    find: "Callable[[Result], Iterator[_Found]]"
 
 
-_Found: TypeAlias = tuple[str, str, tuple[str, ...], tuple[tuple[str, Any], ...]]
+_Found: TypeAlias = tuple[str, str, tuple[str, ...], Mapping[str, float | str]]
 
 # Other answers contradict a result if they lie farther away than so many joint standard deviations
 # and than this share of the target; other references that are about as certain also if they scatter
@@ -151,7 +105,7 @@ _WHAT_TO_DO = {
 }
 
 
-def reasons(result: Judged) -> tuple[Reason, ...]:
+def reasons(result: Result) -> tuple[Reason, ...]:
     """Why a result may not be used as it is, the gravest first; empty if nothing speaks against it.
 
     Parameters
@@ -182,7 +136,7 @@ def shown(found: Sequence[Reason]) -> tuple[Reason, ...]:
     return tuple(reason for reason in found if reason.verdict is Verdict.DO_NOT_USE)
 
 
-def headline(result: Judged, found: Sequence[Reason]) -> str:
+def headline(result: Result, found: Sequence[Reason]) -> str:
     """The verdict with its gravest reason, or with what is known, in one line."""
     decided = verdict_of(found)
     if not found:
@@ -199,7 +153,7 @@ def headline(result: Judged, found: Sequence[Reason]) -> str:
     return f"{decided.value}: {gravest[0].sentence}{rest}"
 
 
-def target_of(axis: str, result: Judged) -> float:
+def target_of(axis: str, result: Result) -> float:
     """The standard deviation (m or rad) that is good enough for an axis."""
     of_kind = result.target_rotation if axis in ROTATIONS else result.target_translation
     return float(result.target_axes.get(axis, of_kind))
@@ -208,12 +162,12 @@ def target_of(axis: str, result: Judged) -> float:
 # ---------------------------------------------------------------- the rules
 
 
-def _not_converged(result: Judged) -> Iterator[_Found]:
+def _not_converged(result: Result) -> Iterator[_Found]:
     if result.status is SolveStatus.NOT_CONVERGED:
-        yield "the solver did not converge", "record more varied motion", (), ()
+        yield "the solver did not converge", "record more varied motion", (), {}
 
 
-def _contradicted(result: Judged) -> Iterator[_Found]:
+def _contradicted(result: Result) -> Iterator[_Found]:
     if result.status is not SolveStatus.CONTRADICTED:
         return
     axes = tuple(result.contradictions)
@@ -223,29 +177,28 @@ def _contradicted(result: Judged) -> Iterator[_Found]:
     ]
     which = f"the prior {listing(apart)}" if apart else "a prior contradicts"
     names = listing([f"prior.{axis}" for axis in axes]) or "the prior"
-    yield f"{which} what the motion shows", f"check value, unit and sign of {names}", axes, ()
+    yield f"{which} what the motion shows", f"check value, unit and sign of {names}", axes, {}
 
 
-def _nothing_known(result: Judged) -> Iterator[_Found]:
+def _nothing_known(result: Result) -> Iterator[_Found]:
     if len(_unobservable(result)) == _n_within_reach(result):
         text = "the motion shows nothing of how the sensors are mounted"
-        yield text, "record motion with rotations about all axes", (), ()
+        yield text, "record motion with rotations about all axes", (), {}
 
 
-def _findings_of(severity: str) -> Callable[[Judged], Iterator[_Found]]:
-    def find(result: Judged) -> Iterator[_Found]:
+def _findings_of(severity: Severity) -> Callable[[Result], Iterator[_Found]]:
+    def find(result: Result) -> Iterator[_Found]:
         for finding in result.findings:
-            if finding["severity"] == severity:
-                options = tuple(finding.get("options", {}).items())
-                yield finding["what"], finding["advice"], (), options
+            if finding.severity is severity:
+                yield finding.what, finding.advice, (), finding.options
 
     return find
 
 
-def _contradiction(kind: str, is_hopeless: bool) -> Callable[[Judged], Iterator[_Found]]:
+def _contradiction(kind: str, is_hopeless: bool) -> Callable[[Result], Iterator[_Found]]:
     """Other answers (``kind``: halves or methods) that lie farther away than they may."""
 
-    def find(result: Judged) -> Iterator[_Found]:
+    def find(result: Result) -> Iterator[_Found]:
         far = {
             axis: scatter
             for axis, scatter in _far(result, kind).items()
@@ -262,25 +215,24 @@ def _contradiction(kind: str, is_hopeless: bool) -> Callable[[Judged], Iterator[
                 if dof.name in far
             ]
             text = f"{_OTHERS[kind]} disagree {listing(told)}; this result claims {listing(sigmas)}"
-            yield text, _WHAT_TO_DO[kind], tuple(far), ()
+            yield text, _WHAT_TO_DO[kind], tuple(far), {}
 
     return find
 
 
-def _far(result: Judged, kind: str) -> dict[str, float]:
+def _far(result: Result, kind: str) -> dict[str, float]:
     """Axis to the scatter of other answers about the result, if it is larger than allowed."""
     far = {}
     sigmas = {dof.name: dof.sigma for dof in result.observability}
     for axis, row in (result.cross_check or {}).items():
-        scatter = row.get(f"of_{kind}")
+        scatter = getattr(row, f"of_{kind}")
         if scatter is None or not math.isfinite(sigmas[axis]):
             continue
-        # Older files have no distances.
-        own = scatter / max(sigmas[axis], 1e-12)
-        excess = row.get(f"excess_of_{kind}", own) or 0.0
-        over_own = row.get("excess_over_own", own) or 0.0
+        excess = getattr(row, f"excess_of_{kind}")
+        if excess is None:  # in a file of version 0.1
+            excess = scatter / max(sigmas[axis], 1e-12)
         of_target = scatter / target_of(axis, result)
-        is_beyond_all = kind == "methods" and over_own > CONTRADICTED_SIGMAS
+        is_beyond_all = kind == "methods" and (row.excess_over_own or 0.0) > CONTRADICTED_SIGMAS
         if (excess > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE) or (
             is_beyond_all and of_target > CONTRADICTED_TARGETS
         ):
@@ -288,24 +240,24 @@ def _far(result: Judged, kind: str) -> dict[str, float]:
     return far
 
 
-def _hidden(result: Judged) -> Iterator[_Found]:
+def _hidden(result: Result) -> Iterator[_Found]:
     axes = _unobservable(result)
     if axes and len(axes) < _n_within_reach(result):
         priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
         it = "it" if len(axes) == 1 else "them"
         text = f"{axes_in_words(axes)} cannot be determined from this motion"
-        yield text, f"measure {it} by hand and give {priors}", axes, ()
+        yield text, f"measure {it} by hand and give {priors}", axes, {}
 
 
-def _few_inliers(result: Judged) -> Iterator[_Found]:
+def _few_inliers(result: Result) -> Iterator[_Found]:
     share = result.n_inliers / max(result.n_pairs, 1)
     uses_reference = METHODS[result.method].uses_reference
     if share < (FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
-        yield text, "find out why the odometry jumps, and record again", (), ()
+        yield text, "find out why the odometry jumps, and record again", (), {}
 
 
-def _worse_than_target(result: Judged) -> Iterator[_Found]:
+def _worse_than_target(result: Result) -> Iterator[_Found]:
     rough = [
         dof
         for dof in result.observability
@@ -316,10 +268,10 @@ def _worse_than_target(result: Judged) -> Iterator[_Found]:
         targets = {amount(dof.name, target_of(dof.name, result)): None for dof in rough}
         text = f"standard deviations above the target of {listing(list(targets))}: {told}"
         axes = tuple(dof.name for dof in rough)
-        yield text, f"record longer, with {_motion_for(axes)}", axes, ()
+        yield text, f"record longer, with {_motion_for(axes)}", axes, {}
 
 
-def _floor(result: Judged) -> Iterator[_Found]:
+def _floor(result: Result) -> Iterator[_Found]:
     rough = {}
     for dof, floor in zip(result.observability, result.sigmas_of_floor, strict=True):
         target = target_of(dof.name, result)
@@ -332,10 +284,10 @@ def _floor(result: Judged) -> Iterator[_Found]:
             f"a constant odometry error (1 % in scale, 0.15 deg) would change {listing(told)}. No "
             f"recording can show it, and it is above your target of {listing(list(targets))}"
         )
-        yield text, "check the scale of both odometries on a known distance", tuple(rough), ()
+        yield text, "check the scale of both odometries on a known distance", tuple(rough), {}
 
 
-def _unobservable(result: Judged) -> tuple[str, ...]:
+def _unobservable(result: Result) -> tuple[str, ...]:
     """Axes that this motion does not determine, of those that the streams can determine."""
     return tuple(
         dof.name
@@ -344,7 +296,7 @@ def _unobservable(result: Judged) -> tuple[str, ...]:
     )
 
 
-def _n_within_reach(result: Judged) -> int:
+def _n_within_reach(result: Result) -> int:
     return len(result.observability) - len(result.out_of_reach)
 
 
@@ -352,7 +304,7 @@ def _motion_for(axes: Sequence[str]) -> str:
     return "more rotation about other axes" if set(axes) & {*TRANSLATIONS} else "more rotation"
 
 
-def _known(result: Judged) -> str:
+def _known(result: Result) -> str:
     """The largest standard deviations of a translation and of a rotation."""
     texts = []
     for names in (TRANSLATIONS, ROTATIONS):
@@ -399,7 +351,7 @@ RULES = (
         "arm of more than 50 m",
         _contradicted,
     ),
-    Rule("error_finding", _NEVER, "a stream check found an error", _findings_of("error")),
+    Rule("error_finding", _NEVER, "a stream check found an error", _findings_of(Severity.ERROR)),
     Rule("nothing_known", _NEVER, "all six axes are unobservable", _nothing_known),
     *(
         Rule(
@@ -411,7 +363,7 @@ RULES = (
         for kind in _OTHERS
     ),
     Rule("unobservable", _CARE, "an axis cannot be determined from the motion", _hidden),
-    Rule("warning_finding", _CARE, "a stream check gave a warning", _findings_of("warning")),
+    Rule("warning_finding", _CARE, "a stream check gave a warning", _findings_of(Severity.WARNING)),
     *(
         Rule(
             kind,

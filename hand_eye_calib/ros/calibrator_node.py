@@ -18,7 +18,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from hand_eye_calib.config import NodeConfig, other_names
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.plain import from_plain
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import Progress
 from hand_eye_calib.ros.check_monitor import CheckMonitor
 from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
 from hand_eye_calib.ros.inputs import PoseInput, TopicInput, qos_parameter_names
@@ -244,7 +246,9 @@ class CalibratorNode(Node):
             inputs["options"] = cycle.snapshot.config.to_options()
         result = cycle.result
         if result is not None:
-            result = dataclasses.replace(result, goal=cycle.goal.progress.to_dict())
+            result = dataclasses.replace(
+                result, goal=from_plain(Progress, cycle.goal.progress.to_dict())
+            )
         saved, text = self._files.save(result, options.output_directory, inputs)
         others = {name: each.snapshot() for name, each in self._session.others.items()}
         is_wanted = options.report or others

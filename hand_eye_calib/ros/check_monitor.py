@@ -1,7 +1,5 @@
 """When the node checks the streams, and what the last check found."""
 
-from typing import Any
-
 import numpy as np
 
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
@@ -83,9 +81,9 @@ class CheckMonitor:
         """What speaks against calibrating with these streams, the gravest first, a line each."""
         return tuple(in_parameters(finding) for finding in self._faults.values())
 
-    def findings(self) -> tuple[dict[str, Any], ...]:
-        """The same findings as plain values: for a result and its verdict."""
-        return tuple(finding.to_dict() for finding in self._faults.values())
+    def findings(self) -> tuple[Finding, ...]:
+        """The same findings: for a result and its verdict."""
+        return tuple(self._faults.values())
 
     def report(self, steady_s: float) -> Report:
         """Findings of the last check."""
@@ -115,4 +113,6 @@ def _is_sure(finding: Finding) -> bool:
 
 def in_parameters(finding: Finding) -> str:
     """A finding in one line, with what helps as parameters."""
-    return f"{finding}" + "".join(f": set {name} to {value}" for name, value in finding.options)
+    return f"{finding}" + "".join(
+        f": set {name} to {value}" for name, value in finding.options.items()
+    )

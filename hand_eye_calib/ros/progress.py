@@ -1,12 +1,10 @@
 """How far the session is from its goal: on ``/diagnostics``, and in the log when that changes."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import Comparison
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.status import OK, WARN, Report
 from hand_eye_calib.session.goal import Progress
@@ -70,16 +68,18 @@ def progress_report(
     return Report(level, progress.sentence, values)
 
 
-def _comparison_values(comparison: Mapping[str, Any]) -> dict[str, object]:
+def _comparison_values(comparison: Comparison) -> dict[str, object]:
     """What is installed, and how the result differs from it, per axis."""
     values: dict[str, object] = {
-        "comparison": comparison["verdict"],
-        "comparison_sentence": comparison["sentence"],
-        "installed_from": comparison["installed"],
+        "comparison": comparison.verdict,
+        "comparison_sentence": comparison.sentence,
+        "installed_from": comparison.installed,
     }
-    for axis, row in comparison["differences"][0]["axes"].items():
-        sigma = row["sigma"]
-        values[f"installed.{axis}"] = f"{comparison['values'][axis]:.6g}"
-        values[f"difference.{axis}"] = f"{row['difference']:.6g}"
-        values[f"difference_sigma.{axis}"] = UNOBSERVABLE if sigma is None else f"{sigma:.6g}"
+    for axis, row in comparison.differences[0].axes.items():
+        sigma = row.sigma
+        values[f"installed.{axis}"] = f"{comparison.values[axis]:.6g}"
+        values[f"difference.{axis}"] = f"{row.difference:.6g}"
+        values[f"difference_sigma.{axis}"] = (
+            UNOBSERVABLE if not np.isfinite(sigma) else f"{sigma:.6g}"
+        )
     return values

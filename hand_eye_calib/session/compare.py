@@ -23,7 +23,9 @@ from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.plain import from_plain
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
+from hand_eye_calib.results.records import Comparison as Installed
 from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.stats import CHI2_THOUSANDTH, LARGEST_OF_SIX, NINE_TIMES_OUT_OF_TEN
 from hand_eye_calib.text import amount, listing
@@ -212,11 +214,11 @@ def compare(
 
 def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
     """The result with its comparison with what is installed."""
-    document = compare([result], installed, ["result"]).to_dict()
-    origin = installed.origin if isinstance(installed, Extrinsic) else "a result"
+    document: dict[str, Any] = compare([result], installed, ["result"]).to_dict()
+    document["installed"] = installed.origin if isinstance(installed, Extrinsic) else "a result"
     stated = installed if isinstance(installed, Extrinsic) else _stated(installed, "").extrinsic
-    values = dict(zip(AXES, stated.values.tolist(), strict=True))
-    return replace(result, comparison={"installed": origin, "values": values} | document)
+    document["values"] = dict(zip(AXES, stated.values.tolist(), strict=True))
+    return replace(result, comparison=from_plain(Installed, document))
 
 
 @dataclass(frozen=True)

@@ -251,8 +251,8 @@ def _errors(calibration: Calibration) -> tuple[str, ...]:
 
 def _least_motion_s(calibration: Calibration) -> float:
     """Seconds of motion below which a standard deviation is not believed."""
-    lasting = (calibration.noise or {}).get("lasting", ())
-    slowest_s = max((each["tau_s"] for each in lasting if each["kind"] != "scale"), default=0.0)
+    lasting = calibration.noise.lasting if calibration.noise else ()
+    slowest_s = max((each.tau_s for each in lasting if each.kind != "scale"), default=0.0)
     return max(_MIN_MOTION_S, _CORRELATION_TIMES * float(slowest_s))
 
 

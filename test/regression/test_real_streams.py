@@ -149,15 +149,15 @@ class TestArms:
     def test_stops_have_no_error(self, seed, interval_s):
         parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.stops(seed))
         result = calibrate(parent, child)
-        assert [f["code"] for f in result.findings if f["severity"] == "error"] == []
+        assert [f.code for f in result.findings if f.severity == "error"] == []
         assert result.verdict is not Verdict.DO_NOT_USE
 
     @pytest.mark.parametrize("interval_s", [0.2, 1.0, 5.0])
     def test_a_fixed_camera_beside_an_arm_may_have_inverse_poses(self, interval_s):
         parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.eye_to_hand())
         (finding,) = calibrate(parent, child).findings
-        assert (finding["code"], finding["severity"]) == ("inverse_both", "warning")
-        assert finding["confidence"] == "possible"
+        assert (finding.code, finding.severity) == ("inverse_both", "warning")
+        assert finding.confidence == "possible"
 
     def test_the_axis_of_one_axis_motion_is_named(self):
         recording = real_data.robot_arm("sim")
@@ -225,7 +225,7 @@ def test_streams_of_1_hz_have_no_error(rig):
     parent = Trajectory(child.stamps_ns, recording.parent.at(child.stamps_ns))
     for faster in (parent, recording.parent):
         found = calibrate(faster, child).findings
-        assert [each["code"] for each in found if each["severity"] == "error"] == []
+        assert [each.code for each in found if each.severity == "error"] == []
 
 
 def test_kitti_long_scale():

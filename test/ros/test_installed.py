@@ -62,8 +62,8 @@ def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, t
     assert values["verdict"].startswith(("USE", "DO NOT"))
     assert peer.trigger("save").success
     saved = load_result(tmp_path)
-    assert saved.comparison["verdict"] == "moved"
-    assert saved.goal["axes"]["x"]["target"] == 0.02
+    assert saved.comparison.verdict == "moved"
+    assert saved.goal.axes["x"].target == 0.02
 
 
 def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_moves(

@@ -79,7 +79,7 @@ def test_what_is_installed_comes_from_tf_but_not_from_the_node_itself(monkeypatc
     assert "not compared yet: what is installed is not known" in said.values["comparison_sentence"]
     monkeypatch.setattr(module.time, "monotonic", lambda: 1e9)  # it is tried again later
     heard.hear(edge("base_link", "camera", LIDAR @ X))
-    assert heard.robot.complete(result()).comparison["verdict"] == "same"
+    assert heard.robot.complete(result()).comparison.verdict == "same"
     assert heard.robot.problem == ""
 
 

@@ -18,6 +18,7 @@ from hand_eye_calib.engine.calibrator import Calibrator, UnusablePose
 from hand_eye_calib.engine.offline import calibrate, offline_config, whole_snapshot
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import SolveStatus
 
 IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
@@ -80,9 +81,9 @@ def test_adaptive_describes_the_noise():
     result = calibrate(parent, disturb(child), method="adaptive")
     np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.01)
     assert result.status is SolveStatus.OK
-    assert result.noise["systematic"] == "none"
-    assert result.noise["translation_white_m"] == pytest.approx(0.002, rel=0.3)
-    assert result.to_dict()["noise"] == result.noise
+    assert result.noise.systematic == "none"
+    assert result.noise.translation_white_m == pytest.approx(0.002, rel=0.3)
+    assert result.to_dict()["noise"] == plain(result.noise)
     assert all(dof.sigma < 0.02 for dof in result.observability)
 
 
@@ -90,7 +91,7 @@ def test_adaptive_reports_a_wrong_scale():
     parent, child = drive()
     small = dataclasses.replace(child, poses=child.scaled(0.95).poses)
     result = calibrate(parent, disturb(small), method="adaptive")
-    assert result.noise["systematic"] == "scale"
+    assert result.noise.systematic == "scale"
     assert result.scale == pytest.approx(1 / 0.95, abs=5e-3)
 
 

@@ -157,10 +157,10 @@ def test_files_and_python_speak_of_the_same(tmp_path):
     hec.save(changed, tmp_path)
     again = hec.load(tmp_path)
     assert again.comparison == changed.comparison
-    assert again.comparison["verdict"] == "moved"
-    assert again.comparison["installed"] == "drawing"
+    assert again.comparison.verdict == "moved"
+    assert again.comparison.installed == "drawing"
     assert hec.compare([again], Extrinsic(X, "drawing")).to_dict()["moved"] == ["result 1"]
-    json.dumps(again.comparison, allow_nan=False)
+    json.dumps(again.to_dict()["comparison"], allow_nan=False)
 
 
 @pytest.mark.parametrize(

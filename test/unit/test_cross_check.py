@@ -9,7 +9,6 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 import hand_eye_calib as hec
 from hand_eye_calib import calibrate
-from hand_eye_calib.engine.cross_check import cross_check
 from hand_eye_calib.engine.scatter import compare_answers
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import (
@@ -39,9 +38,14 @@ def answers():
     )
 
 
+def column(found, name):
+    """Values (6,) of all axes."""
+    return np.array([getattr(row, name) for row in found.values()], dtype=float)
+
+
 def contradictions(calibration, *answers):
     """Sentences of the reasons that other answers give."""
-    found = compare_answers(calibration, *answers).to_dict()
+    found = compare_answers(calibration, *answers)
     reasons = dataclasses.replace(calibration, cross_check=found).reasons
     return [reason.sentence for reason in reasons if reason.rule.partition("_")[0] in KINDS]
 
@@ -52,12 +56,23 @@ def moved(calibration, metres):
     return dataclasses.replace(calibration, T_parent_child=T)
 
 
-def test_answers_to_good_data_agree(answers):
+def test_answers_to_good_data_agree_and_few_or_odd_ones_do_not_count(answers):
+    calibration, others, halves = answers
     found = compare_answers(*answers)
     assert contradictions(*answers) == []
-    assert (found.of_methods < 4 * found.sigma).all()
-    assert (found.of_halves < 4 * found.sigma).all()
-    assert (found.of_methods > 0).all()
+    assert (column(found, "of_methods") < 4 * column(found, "sigma")).all()
+    assert (column(found, "of_halves") < 4 * column(found, "sigma")).all()
+    assert (column(found, "of_methods") > 0).all()
+    assert np.isnan(column(compare_answers(calibration, others[:2]), "of_methods")).all()
+    assert contradictions(calibration, [*others, moved(others[0], 5.0)]) == []
+    with_outliers = [dataclasses.replace(moved(other, 0.3), method="park") for other in others]
+    assert contradictions(calibration, [*others, *with_outliers]) == []
+    kept = dataclasses.replace(calibration, cross_check=found)
+    document = json.loads(json.dumps(kept.to_dict()))
+    assert Calibration.from_dict(document).cross_check == found
+    # Version 0.1 called it otherwise.
+    document["consistency"] = document.pop("cross_check")
+    assert Calibration.from_dict(document).cross_check == found
 
 
 def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(answers):
@@ -71,7 +86,7 @@ def test_halves_that_lie_apart_are_named(answers):
     calibration, others, (first, second) = answers
     halves = moved(first, -0.2), moved(second, 0.2)
     found = compare_answers(calibration, others, halves)
-    assert found.of_halves[0] == pytest.approx(0.2, abs=0.02)
+    assert column(found, "of_halves")[0] == pytest.approx(0.2, abs=0.02)
     (sentence,) = contradictions(calibration, others, halves)
     assert sentence.startswith("the two halves of the recording disagree about x by")
 
@@ -80,16 +95,11 @@ def test_an_answer_under_other_assumptions_that_lies_elsewhere_is_named(answers)
     calibration = answers[0]
     elsewhere = moved(calibration, 0.1).T_parent_child, calibration.covariance
     beside = dataclasses.replace(calibration, other_answer=elsewhere)
-    assert compare_answers(beside).of_model[0] == pytest.approx(0.1)
+    assert compare_answers(beside)["x"].of_model == pytest.approx(0.1)
     (sentence,) = contradictions(beside)
     assert "which assume different noise, disagree about x by 10 cm" in sentence
     near = moved(calibration, 0.1 * calibration.sigmas[0]).T_parent_child, calibration.covariance
     assert contradictions(dataclasses.replace(calibration, other_answer=near)) == []
-
-
-def test_one_odd_answer_among_several_is_not_a_disagreement(answers):
-    calibration, others, _ = answers
-    assert contradictions(calibration, [*others, moved(others[0], 5.0)]) == []
 
 
 def test_axes_that_an_answer_does_not_know_are_not_compared():
@@ -100,11 +110,10 @@ def test_axes_that_an_answer_does_not_know_are_not_compared():
         for reference in ("B10", "B5", "B15", "B20")
     ]
     found = compare_answers(answers[0], answers[1:], answers[1:3])
-    assert np.isnan(found.of_methods[2])
-    assert np.isnan(found.of_halves[2])
-    assert np.isinf(found.sigma[2])
-    assert np.isfinite(found.of_methods[:2]).all()
-    assert set(found.to_dict()["z"].values()) == {None}
+    assert np.isnan(column(found, "of_methods")[2])
+    assert np.isnan(column(found, "of_halves")[2])
+    assert np.isfinite(column(found, "of_methods")[:2]).all()
+    assert {*vars(found["z"]).values()} == {None}
 
 
 def gentle_ramps(degrees):
@@ -128,7 +137,7 @@ def test_an_axis_that_no_other_reference_reveals_is_unobservable():
     assert hidden.status is SolveStatus.UNOBSERVABLE
     assert hidden.T_parent_child[2, 3] == pytest.approx(0.0, abs=1e-6)
     assert hidden.T_method[2, 3] == pytest.approx(0.3, abs=0.1)
-    assert set(hidden.cross_check["z"].values()) == {None}
+    assert {*vars(hidden.cross_check["z"]).values()} == {None}
     assert shown.T_parent_child[2, 3] == pytest.approx(0.3, abs=0.03)
     np.testing.assert_allclose(hidden.T_parent_child[:2, 3], [0.6, -0.3], atol=0.02)
 
@@ -137,11 +146,6 @@ def test_a_prior_holds_for_an_axis_that_no_other_reference_reveals():
     found = calibrate(*gentle_ramps(1.5), prior={"z": (0.9, 0.02)})
     assert found.observability[2].verdict is DofVerdict.PRIOR
     assert found.T_parent_child[2, 3] == pytest.approx(0.9, abs=0.005)
-
-
-def test_two_other_answers_are_too_few(answers):
-    calibration, others, _ = answers
-    assert np.isnan(compare_answers(calibration, others[:2]).of_methods).all()
 
 
 def test_an_axis_known_by_a_prior_alone_counts_with_its_sigma(answers):
@@ -156,43 +160,6 @@ def test_an_axis_known_by_a_prior_alone_counts_with_its_sigma(answers):
     assert contradictions(known, [moved(other, 0.3) for other in others]) == []
 
 
-def test_methods_that_use_outliers_do_not_count(answers):
-    calibration, others, _ = answers
-    plain = [dataclasses.replace(moved(other, 0.3), method="park") for other in others]
-    assert contradictions(calibration, [*others, *plain]) == []
-
-
-def test_the_result_keeps_it_when_written_and_read(answers):
-    calibration, others, halves = answers
-    found = compare_answers(calibration, others, halves).to_dict()
-    kept = dataclasses.replace(calibration, cross_check=found)
-    document = json.loads(json.dumps(kept.to_dict()))
-    assert Calibration.from_dict(document).cross_check == found
-    without = dataclasses.replace(calibration, cross_check=None)
-    assert Calibration.from_dict(without.to_dict()).cross_check is None
-    # Version 0.1 called it otherwise.
-    document["consistency"] = document.pop("cross_check")
-    assert Calibration.from_dict(document).cross_check == found
-
-
-def test_from_python():
-    parent = wandering_poses(300)
-    child = disturbed(child_of(parent), 1, 0.003, 0.003)
-    streams = as_trajectory(parent), as_trajectory(child)
-    result = calibrate(*streams, reference="B5")
-    found = hec.cross_check(result, *streams)
-    assert found.axes == ("x", "y", "z", "roll", "pitch", "yaw")
-    assert (found.of_methods > 0).all()
-    assert (found.of_halves >= 0).all()
-    assert (found.excess_of_halves < 4).all()
-    assert hec.cross_check is cross_check
-    loosened = child.copy()
-    loosened[150:] = loosened[150:] @ se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1]))
-    streams = as_trajectory(parent), as_trajectory(loosened)
-    found = hec.cross_check(calibrate(*streams, reference="B5"), *streams)
-    assert found.excess_of_halves[0] > 5
-
-
 def test_every_solve_is_checked_with_other_references_and_halves():
     parent = wandering_poses(300)
     child = disturbed(child_of(parent), 1, 0.003, 0.003)
@@ -201,8 +168,21 @@ def test_every_solve_is_checked_with_other_references_and_halves():
     good = calibrate(as_trajectory(parent), as_trajectory(child))
     bad = calibrate(as_trajectory(parent), as_trajectory(loosened), method="dnlo")
     for row in good.cross_check.values():
-        assert row["of_methods"] > 0
-        assert row["of_halves"] > 0
-        assert row["of_model"] > 0
+        assert row.of_methods > 0
+        assert row.of_halves > 0
+        assert row.of_model > 0
     assert "halves" not in [reason.rule for reason in good.reasons]
     assert "halves" in [reason.rule for reason in bad.reasons]
+
+
+def test_from_python_for_a_sound_and_a_loose_mount():
+    parent = wandering_poses(300)
+    child = disturbed(child_of(parent), 1, 0.003, 0.003)
+    loosened = child.copy()
+    loosened[150:] = loosened[150:] @ se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1]))
+    for of_child, apart in ((child, False), (loosened, True)):
+        streams = as_trajectory(parent), as_trajectory(of_child)
+        found = hec.cross_check(calibrate(*streams, reference="B5"), *streams)
+        assert list(found) == ["x", "y", "z", "roll", "pitch", "yaw"]
+        assert apart or (column(found, "of_methods") > 0).all()
+        assert (found["x"].excess_of_halves > 5) == apart

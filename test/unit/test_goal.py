@@ -15,7 +15,9 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.results.records import CorrelatedError, Noise, Progress
 from hand_eye_calib.session.goal import Goal, helpful_motion
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
@@ -38,7 +40,8 @@ def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
 
 
 def lasting(tau_s):
-    return {"lasting": [{"kind": "body", "part": "rotation", "sigma": 0.01, "tau_s": tau_s}]}
+    slow = CorrelatedError(kind="body", part="rotation", sigma=0.01, tau_s=tau_s)
+    return Noise(in_words=(), lasting=(slow,))
 
 
 def test_two_good_results_in_a_row_end_the_session_and_one_does_not():
@@ -158,11 +161,11 @@ def test_once_done_a_newer_result_need_not_have_moved_long_enough_again():
 
 def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
     progress = Goal(TARGETS).add(result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0))
-    hec.save(dataclasses.replace(made(), goal=progress.to_dict()), tmp_path)
+    hec.save(dataclasses.replace(made(), goal=from_plain(Progress, progress.to_dict())), tmp_path)
     found = hec.load(tmp_path).goal
-    assert found == progress.to_dict()
-    assert found["sentence"] == progress.sentence
-    assert found["axes"]["z"] == {"sigma": None, "target": 0.02, "seconds_left": None}
+    assert plain(found) == progress.to_dict()
+    assert found.sentence == progress.sentence
+    assert (found.axes["z"].sigma, found.axes["z"].target) == (np.inf, 0.02)
     text = " ".join(as_text(hec.load(tmp_path)).split())
     assert f"the session: {progress.sentence}" in text
 

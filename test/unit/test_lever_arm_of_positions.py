@@ -130,7 +130,7 @@ class TestLeverArm:
     def test_a_drift_with_the_path_is_told_from_one_with_time(self):
         parent, child, lever_arm = simulated_positions("car", seed=3)
         found = hec.calibrate(parent, child)
-        assert found.noise["drift_grows_with"] == "distance"
+        assert found.noise.drift_grows_with == "distance"
         assert np.abs((found.T_parent_child[:3, 3] - lever_arm) / found.sigmas[:3]).max() < 4.0
 
     def test_positions_that_are_worse_for_a_time_are_as_if_they_were_missing(self, streams):
@@ -143,7 +143,7 @@ class TestLeverArm:
         apart = hec.calibrate(
             parent, Trajectory.from_positions(child.stamps_ns[good], positions[good], "antenna")
         )
-        assert 0.2 < found.noise["share_of_worse_positions"] < 0.3
+        assert 0.2 < found.noise.share_of_worse_positions < 0.3
         difference = found.T_parent_child[:3, 3] - apart.T_parent_child[:3, 3]
         assert np.abs(difference / apart.sigmas[:3]).max() < 0.5
 
@@ -194,7 +194,7 @@ class TestLeverArm:
         kept = (np.arange(len(child)) < 100) | (np.arange(len(child)) > 130)
         fixes = Trajectory.from_positions(child.stamps_ns[kept], child.poses[kept, :3, 3])
         (found,) = hec.calibrate(parent, fixes).findings
-        assert (found["code"], found["stream"]) == ("gaps", "child")
+        assert (found.code, found.stream) == ("gaps", "child")
 
     def test_swapped_latitude_and_longitude_are_named(self):
         odometry, antenna = recorded(poses=planar_poses(150, seed=3))
@@ -204,9 +204,9 @@ class TestLeverArm:
         found = hec.calibrate(swapped, odometry)
         assert found.verdict is hec.Verdict.DO_NOT_USE
         (finding,) = found.findings
-        assert finding["code"] == "swapped_coordinates"
-        assert finding["stream"] == "parent"
-        evidence = finding["evidence"]
+        assert finding.code == "swapped_coordinates"
+        assert finding.stream == "parent"
+        evidence = finding.evidence
         assert evidence["factor_x"] == pytest.approx(1.0 / np.cos(np.radians(25.0)), abs=0.03)
         assert evidence["factor_y"] == pytest.approx(0.5, abs=0.03)
         assert evidence["unexplained_share_mended"] < 0.05 < evidence["unexplained_share"]
@@ -218,8 +218,8 @@ class TestLeverArm:
         )
         snapshot = whole_snapshot(offline_config(odometry, wide, {}), odometry, wide)
         (finding,) = snapshot.estimate().findings
-        assert finding["code"] == "longitude_scale"
-        assert finding["evidence"]["factor_x"] == pytest.approx(0.5, abs=0.03)
+        assert finding.code == "longitude_scale"
+        assert finding.evidence["factor_x"] == pytest.approx(0.5, abs=0.03)
 
     def test_the_check_says_the_same_before(self):
         parent, child = recorded(n_poses=80)

@@ -63,8 +63,8 @@ def angle_to(rotation, result):
 class TestRates:
     def test_rotation_bias_and_offset_are_found(self, result):
         assert angle_to(T_PARENT_CHILD[:3, :3], result) < np.radians(0.1)
-        assert result.rate_bias["of"] == "child"
-        assert result.rate_bias["rad_per_s"] == pytest.approx(BIAS, abs=1e-3)
+        assert result.rate_bias.of == "child"
+        assert result.rate_bias.rad_per_s == pytest.approx(BIAS, abs=1e-3)
         assert result.time_offset_s == pytest.approx(OFFSET_S, abs=1e-3)
         assert 0 < result.time_offset_sigma_s < 1e-3
 
@@ -82,8 +82,8 @@ class TestRates:
         inverse = hec.calibrate(child, parent)
         product = inverse.T_parent_child[:3, :3] @ result.T_parent_child[:3, :3]
         assert float(se3.rotation_angle(product)) < np.radians(0.05)
-        assert inverse.rate_bias["of"] == "parent"
-        assert inverse.rate_bias["rad_per_s"] == pytest.approx(BIAS, abs=1e-3)
+        assert inverse.rate_bias.of == "parent"
+        assert inverse.rate_bias.rad_per_s == pytest.approx(BIAS, abs=1e-3)
         assert inverse.time_offset_s == pytest.approx(-OFFSET_S, abs=1e-3)
 
     def test_a_prior_gives_the_translation(self, streams):
@@ -123,7 +123,7 @@ class TestRates:
         _, stamps_ns, rates = smooth_streams(seed=9)
         found = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, rates))
         assert found.verdict is hec.Verdict.DO_NOT_USE
-        assert [finding["code"] for finding in found.findings] == ["unrelated"]
+        assert [finding.code for finding in found.findings] == ["unrelated"]
 
     @pytest.mark.parametrize(
         "options",

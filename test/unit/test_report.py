@@ -481,7 +481,7 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     assert "installed" in [attributes["aria-labelledby"] for attributes in page.all("section")]
     shown = page.text[page.text.index("axis of lidar difference") : page.text.index("Evidence")]
     (difference,) = hec.compare([calibration], installed).differences
-    assert compared.comparison["sentence"] in page.text
+    assert compared.comparison.sentence in page.text
     sigma, visible = (amount("x", size[0]) for size in (difference.sigmas, difference.visible))
     assert f"along x -50 cm ± {sigma} {visible} moved along y" in shown
     assert "along z 0 mm ± unknown unknown cannot tell about x" in shown

@@ -26,6 +26,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.trajectory_files import write_trajectory
+from hand_eye_calib.plain import json_text
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
 
@@ -144,10 +145,8 @@ class TestWhichStreamAndWhatToDo:
         findings = {
             f.code: f for f in check_streams(parent, child.shifted(-7.25).scaled(0.5)).findings
         }
-        assert dict(findings["time_offset"].options)["time_offset"] == pytest.approx(
-            7.25, abs=0.002
-        )
-        assert dict(findings["scale"].options)["scale"] == pytest.approx(2.0, rel=0.005)
+        assert findings["time_offset"].options["time_offset"] == pytest.approx(7.25, abs=0.002)
+        assert findings["scale"].options["scale"] == pytest.approx(2.0, rel=0.005)
         known = check_streams(
             parent, child.shifted(-7.25).scaled(0.5), time_offset_s=7.25, scale=2.0
         )
@@ -180,7 +179,7 @@ class TestWhichStreamAndWhatToDo:
         note = check_streams(as_trajectory(parent.poses @ lying), child).findings[0]
         assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
         assert "translation along it, y, will be unobservable" in note.what
-        assert dict(note.options) == {"prior.y": "VALUE+/-SIGMA"}
+        assert note.options == {"prior.y": "VALUE+/-SIGMA"}
 
     def test_motion_without_turns(self):
         poses = np.tile(np.eye(4), (300, 1, 1))
@@ -380,9 +379,9 @@ class TestCommand:
 def test_findings_are_plain_values():
     parent, child = drive()
     finding = check_streams(parent, child.shifted(-1.0)).findings[0]
-    plain = json.loads(json.dumps(finding.to_dict()))
-    assert plain["severity"] == "error"
-    assert plain["evidence"]["offset_s"] == pytest.approx(1.0, abs=0.01)
+    document = json.loads(json_text(finding))
+    assert document["severity"] == "error"
+    assert document["evidence"]["offset_s"] == pytest.approx(1.0, abs=0.01)
     assert str(finding).startswith("the child's clock is 1.0")
 
 

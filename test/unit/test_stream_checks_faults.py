@@ -53,7 +53,7 @@ def test_the_time_of_a_loose_mount_does_not_depend_on_noise(level):
     loosened = next(fault for fault in FAULTS if fault.code == "S8")
     streams = loosened.damage(sound.parent, sound.child, 5.0, np.random.default_rng(1))
     (found,) = (f for f in check_streams(*streams).findings if f.code == "mount_moved")
-    assert dict(found.evidence)["at_s"] == pytest.approx(60.0, abs=3.0)
+    assert found.evidence["at_s"] == pytest.approx(60.0, abs=3.0)
     assert "60 s after the start" in found.what or "5" in found.what
 
 
@@ -64,7 +64,7 @@ class TestGrid:
         poses[:, :3, 3] = np.round(poses[:, :3, 3] / 0.05) * 0.05
         (found,) = check_stream(Trajectory(child.stamps_ns, poses), "child")
         assert (found.code, found.severity) == ("coarse_positions", Severity.ERROR)
-        assert dict(found.evidence)["step_m"] == pytest.approx(0.05)
+        assert found.evidence["step_m"] == pytest.approx(0.05)
         assert "32 bits" not in str(found)
 
     def test_numbers_of_32_bits_are_named(self):
@@ -72,7 +72,7 @@ class TestGrid:
         poses = child.poses.copy()
         poses[:, :3, 3] = (poses[:, :3, 3] + [5e5, 4.5e6, 0]).astype(np.float32)
         (found,) = check_stream(Trajectory(child.stamps_ns, poses), "child")
-        assert dict(found.evidence)["step_m"] == pytest.approx(0.5)
+        assert found.evidence["step_m"] == pytest.approx(0.5)
         assert "32 bits" in str(found)
 
     def test_steady_motion_is_no_grid(self):

@@ -53,7 +53,7 @@ def test_on_a_road_no_bias_is_assumed_that_a_mount_askew_looks_like():
     off = deviation(result.T_parent_child, real_data.SIMPLE_KITTI_TRUTH)
     assert np.hypot(off[0], off[2]) < 0.11  # y points down: the plane is x, z
     assert np.degrees(np.linalg.norm(off[3:])) < 0.30
-    assert "bias" not in result.noise["systematic"]
+    assert "bias" not in result.noise.systematic
 
 
 @pytest.mark.parametrize(("lead", "variance"), [(0.0, 0.5), (2.0, 0.2689), (60.0, 0.0)])

@@ -19,9 +19,10 @@ from hand_eye_calib.results.calibration import (
     SolveStatus,
     Verdict,
 )
+from hand_eye_calib.results.finding import Finding, Severity
+from hand_eye_calib.results.records import AxisScatter
 from hand_eye_calib.results.verdict import RULES
 
-OTHERS = ("model", "methods", "halves")
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "verdict.md"
 TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)")
 
@@ -56,20 +57,18 @@ def good(**changes):
 
 
 def checked(axis, scatter, excess, kind):
-    nothing = dict.fromkeys(f"{what}of_{who}" for what in ("", "excess_") for who in OTHERS)
-    nothing |= {"excess_over_own": None}
-    rows = {name: {"sigma": 0.003} | nothing for name in NAMES}
-    rows[axis] |= {f"of_{kind}": scatter, f"excess_of_{kind}": excess}
-    return rows
+    nothing = AxisScatter(sigma=0.003, of_methods=None, of_halves=None)
+    there = {f"of_{kind}": scatter, f"excess_of_{kind}": excess}
+    return dict.fromkeys(NAMES, nothing) | {axis: dataclasses.replace(nothing, **there)}
 
 
-FINDING = {
-    "code": "units",
-    "severity": "error",
-    "what": "lengths are in mm",
-    "advice": "convert them",
-    "options": {"scale": 0.001},
-}
+FINDING = Finding(
+    code="units",
+    severity=Severity.ERROR,
+    what="lengths are in mm",
+    advice="convert them",
+    options={"scale": 0.001},
+)
 FLOOR = np.diag([0.03, 0, 0, 0, 0, 0]) ** 2
 
 # Rule to a result in which it alone applies.
@@ -82,7 +81,7 @@ CASES = {
     "halves_far": dict(cross_check=checked("yaw", 0.2, 9.0, "halves")),
     "methods_far": dict(cross_check=checked("x", 0.5, 9.0, "methods")),
     "unobservable": dict(observability=observed(z=np.inf)),
-    "warning_finding": dict(findings=(FINDING | {"severity": "warning"},)),
+    "warning_finding": dict(findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)),
     "model": dict(cross_check=checked("x", 0.02, 3.5, "model")),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
     "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),
@@ -136,7 +135,7 @@ def test_axes_that_cannot_be_determined_are_named_together():
 def test_a_large_scatter_of_references_is_not_excused_by_their_own_uncertainty():
     check = checked("x", 0.05, 2.9, "methods")
     assert good(cross_check=check).reasons == ()
-    check["x"]["excess_over_own"] = 3.1
+    check["x"] = dataclasses.replace(check["x"], excess_over_own=3.1)
     result = good(cross_check=check)
     assert [reason.rule for reason in result.reasons] == ["methods"]
 
@@ -158,7 +157,7 @@ def test_nothing_against_it_is_use():
 @pytest.mark.parametrize(
     "changes",
     [
-        dict(findings=(FINDING | {"severity": "note"},)),
+        dict(findings=(dataclasses.replace(FINDING, severity=Severity.NOTE),)),
         dict(cross_check=checked("x", 0.002, 9.0, "halves")),
         dict(cross_check=checked("x", 0.05, 2.9, "methods")),
         dict(cross_check=checked("x", 0.05, 2.9, "halves")),

@@ -22,6 +22,7 @@ from hand_eye_calib.engine.checked import checked
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io.limits import ReadingMemory
 from hand_eye_calib.io.remote import local_copies, public
+from hand_eye_calib.plain import plain
 
 # What came of a task, in plain values.
 Outcome = dict[str, Any]
@@ -81,7 +82,7 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
     inputs = replayed.inputs | {"options": snapshot.config.to_options()}
     found: Outcome = {
         "calibration": calibration.to_dict(),
-        "findings": [dict(finding) for finding in calibration.findings],
+        "findings": plain(calibration.findings),
         "inputs": inputs,
     }
     if calibration.status.failure:

@@ -1,0 +1,207 @@
+"""Parts of a calibration: what it says of noise, other answers, the goal, what is installed.
+
+All are plain values under names, so that :mod:`hand_eye_calib.plain` reads and writes them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+
+# Motion pairs with more weight than this count as inliers.
+INLIER_WEIGHT = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Residuals:
+    """Residuals of K motion pairs at the result.
+
+    A pair of the adaptive estimator runs from one pose to the next.
+
+    Attributes
+    ----------
+    translation : (K, 3) array
+        Residuals of eq. (6) of Välimäki et al. 2023, m, in the axes of the parent sensor at the
+        start of each pair.
+    rotation : (K, 3) array
+        Rotation vectors of the residual rotations, whose angles are those of eq. (7), rad, in the
+        axes of the child sensor at the end of each pair.
+    weights : (K,) array
+        Weights of the pairs in the solution, 0 to 1.
+    start_ns, end_ns : (K,) int64 arrays
+        Stamps of both ends of each pair, parent clock.
+    """
+
+    translation: FloatArray
+    rotation: FloatArray
+    weights: FloatArray
+    start_ns: IntArray
+    end_ns: IntArray
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @property
+    def translation_m(self) -> FloatArray:
+        """Lengths (K,) of the translation residuals, m."""
+        return np.linalg.norm(self.translation, axis=1)
+
+    @property
+    def rotation_rad(self) -> FloatArray:
+        """Angles (K,) of the rotation residuals, rad."""
+        return np.linalg.norm(self.rotation, axis=1)
+
+    @property
+    def is_inlier(self) -> BoolArray:
+        """Whether (K,) each pair counts as an inlier."""
+        return self.weights > INLIER_WEIGHT
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrelatedError:
+    """A time-correlated error: what it is fixed to (``kind``: body, world, or scale), its part of
+    the poses, its standard deviation per axis (m, rad or a share) and its correlation time.
+    """
+
+    kind: str
+    part: str
+    sigma: float
+    tau_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Noise of the trajectories as the adaptive estimator found it.
+
+    Standard deviations are per axis, of both sensors together: of a single pose (``white``), and
+    of the drift from pose to pose, or after a metre of path.
+    """
+
+    in_words: tuple[str, ...]
+    misfit: float | None = None
+    translation_white_m: float | None = None
+    rotation_white_rad: float | None = None
+    translation_drift_m_per_pose: float | None = None
+    rotation_drift_rad_per_pose: float | None = None
+    translation_drift_m_after_a_metre: float | None = None
+    rotation_drift_rad_after_a_metre: float | None = None
+    drift_grows_with: str = ""
+    stamp_jitter_s: float | None = None
+    lasting: tuple[CorrelatedError, ...] = ()
+    rotation_turns_about: str | None = None
+    heavy_tails: bool | None = None
+    share_of_worse_positions: float | None = None
+    systematic: str = ""
+    systematic_parameters: tuple[float, ...] = ()
+    scale: float | None = None
+    scale_sigma: float | None = None
+    time_offset_s: float | None = None
+    time_offset_sigma_s: float | None = None
+    jumps_before_stamp_ns: tuple[int, ...] = ()
+    spikes_at_stamp_ns: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateBias:
+    """Bias of angular rates, in the axes of the sensor that has it (``of``), rad/s."""
+
+    of: str
+    rad_per_s: tuple[float, ...]
+    sigma: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisScatter:
+    """Scatter of other answers about a result on one axis, m or rad; None where it is not known.
+
+    Attributes
+    ----------
+    sigma : float or None
+        The result's standard deviation; None if the axis is unobservable.
+    of_methods : float or None
+        Robust standard deviation of other methods and references about the result.
+    of_halves : float or None
+        Standard deviation that follows from the difference between both halves of the recording.
+    of_model : float or None
+        Distance from the answer under other assumptions on the noise.
+    excess_of_methods, excess_of_halves, excess_of_model : float or None
+        The same in joint standard deviations, which contain the common-mode uncertainty; those of
+        the halves also the result's own if the halves are solved with another method.
+    excess_over_own : float or None
+        Distance of other methods and references in the result's own standard deviations, over those
+        that are not much less certain.
+    """
+
+    sigma: float | None
+    of_methods: float | None
+    of_halves: float | None
+    of_model: float | None = None
+    excess_of_methods: float | None = None
+    excess_of_halves: float | None = None
+    excess_of_model: float | None = None
+    excess_over_own: float | None = None
+
+
+#: Axis (x, y, z, roll, pitch, yaw) to the scatter of other answers about a result.
+CrossCheck: TypeAlias = Mapping[str, AxisScatter]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisProgress:
+    """One axis against its target, m or rad: infinite if it is unobservable."""
+
+    sigma: float
+    target: float
+    seconds_left: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a session was from its goal when its result was saved."""
+
+    sentence: str
+    done: bool = False
+    limiting_axis: str = ""
+    will_not_get_there: bool = False
+    axes: Mapping[str, AxisProgress] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisDifference:
+    """Difference on one axis, m or rad, its standard deviation, and the change that would have been
+    seen nine times out of ten.
+    """
+
+    difference: float
+    sigma: float
+    visible: float
+    verdict: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """How an extrinsic differs from another, axis by axis: ``second`` minus ``first``."""
+
+    first: str
+    second: str
+    verdict: str
+    sentence: str
+    chi2: float
+    axes: Mapping[str, AxisDifference]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Comparison of a result with what is installed: where that comes from, its ``values`` by axis
+    (m, rad), and the differences.
+    """
+
+    sentence: str
+    verdict: str = ""
+    installed: str = ""
+    values: Mapping[str, float] = field(default_factory=dict)
+    moved: tuple[str, ...] = ()
+    differences: tuple[Difference, ...] = ()

@@ -1,0 +1,277 @@
+"""An extrinsic with all that is known of its quality, as values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.printed_angles import sigmas_rpy
+from hand_eye_calib.results.finding import Finding
+from hand_eye_calib.results.records import (
+    Comparison,
+    CrossCheck,
+    Noise,
+    Progress,
+    RateBias,
+    Residuals,
+)
+from hand_eye_calib.results.status import (
+    ROTATIONS,
+    TRANSLATIONS,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """An extrinsic with its quality, in six parts.
+
+    Estimate
+
+    T_parent_child : (4, 4) array
+        Pose of the child sensor in the parent sensor's frame: maps child coordinates into the
+        parent frame, metres.
+    T_method : (4, 4) array or None
+        The method's own answer, before directions that the motion does not reveal are set and
+        priors are added. None in a result read from a file that does not have it.
+    status : SolveStatus
+    objective : float
+        Value of the method's cost at ``T_method``; for dnlo eq. (5), the outliers' share included.
+    proved_global : str
+        Whether no other transform has a smaller cost over the motion pairs that count: "yes", "no",
+        or "not tried" (:mod:`hand_eye_calib.solvers.certificate`).
+    method, reference, backend : str
+        How it was solved; ``method`` and ``reference`` are those that ``auto`` chose.
+    method_reason, reference_reason : str
+        Why ``auto`` chose them; empty if they were set by the user.
+    time_offset_s, time_offset_sigma_s : float
+        Seconds added to the child's stamps, and one standard deviation: 0 if the method took the
+        offset as set by the user.
+    scale, scale_sigma : float
+        Factor applied to the child's translations, in the same way.
+    rate_bias : RateBias or None
+        None if neither stream is one of rates.
+
+    Uncertainty
+
+    covariance : (6, 6) array
+        Covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho, phi), in the child
+        sensor's frame, m and rad.
+    observability : tuple of DofObservability
+        x, y, z, roll, pitch, yaw in the parent sensor's frame.
+    floor : (6, 6) array or None
+        Common-mode uncertainty: covariance, of the same xi, of errors that are the same in every
+        part of the recording, so that nothing in it shows them
+        (:mod:`hand_eye_calib.assessment.floor`). ``covariance`` does not contain it.
+    contradictions : mapping
+        Axis to the distance, in joint standard deviations, of a prior that contradicts the motion.
+
+    Data
+
+    measured : {"poses", "rotations", "positions"}
+        What the streams give together. Rotations, or angular rates, say nothing of the translation,
+        positions nothing of the rotation: :attr:`out_of_reach`.
+    n_poses, n_pairs, n_inliers : int
+        Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
+    stamp_ns : int
+        Stamp of the newest pose used, parent clock.
+    motion_residuals : Residuals or None
+        Not part of files; see :meth:`residuals`.
+
+    Noise
+
+    noise : Noise or None
+        Of the trajectories, by the adaptive estimator; None with other methods.
+
+    Checks
+
+    findings : tuple of Finding
+        What the stream checks found.
+    cross_check : CrossCheck or None
+        Per axis, the scatter of the answers of other methods and references and of both halves of
+        the recording about this one; None without that cross-check.
+    warnings : tuple of str
+        What a person should know before using the result.
+    other_answer : ((4, 4) array, (6, 6) array) or None
+        T_parent_child and covariance under other assumptions on the noise: of the adaptive
+        estimator beside DNLO, or the reverse. Not part of files.
+
+    Context
+
+    parent_frame, child_frame : str
+    base_frame : str
+        Frame of the robot in which the child's pose is stated as well; empty for none.
+    T_base_parent : (4, 4) array or None
+        Pose of the parent sensor in that frame, as the robot's transforms have it.
+    target_translation, target_rotation : float
+        Standard deviations (m, rad) that are good enough for the use that is made of the result.
+    target_axes : mapping
+        Axis to a target of its own, m or rad.
+    comparison : Comparison or None
+        With what is installed.
+    goal : Progress or None
+        How far the session was from its goal when the result was saved.
+    """
+
+    T_parent_child: FloatArray
+    T_method: FloatArray | None = None
+    status: SolveStatus
+    objective: float
+    proved_global: str = "not tried"
+    method: str
+    reference: str
+    backend: str
+    method_reason: str = ""
+    reference_reason: str = ""
+    time_offset_s: float = 0.0
+    time_offset_sigma_s: float = 0.0
+    scale: float = 1.0
+    scale_sigma: float = 0.0
+    rate_bias: RateBias | None = None
+
+    covariance: FloatArray
+    observability: tuple[DofObservability, ...]
+    floor: FloatArray | None = None
+    contradictions: Mapping[str, float] = field(default_factory=dict)
+
+    measured: str = "poses"
+    n_poses: int
+    n_pairs: int
+    n_inliers: int
+    stamp_ns: int = 0
+    motion_residuals: Residuals | None = field(default=None, repr=False, compare=False)
+
+    noise: Noise | None = None
+
+    findings: tuple[Finding, ...] = ()
+    cross_check: CrossCheck | None = None
+    warnings: tuple[str, ...] = ()
+    other_answer: tuple[FloatArray, FloatArray] | None = field(
+        default=None, repr=False, compare=False
+    )
+
+    parent_frame: str = "parent"
+    child_frame: str = "child"
+    base_frame: str = ""
+    T_base_parent: FloatArray | None = None
+    target_translation: float = CalibratorConfig.target_translation
+    target_rotation: float = CalibratorConfig.target_rotation
+    target_axes: Mapping[str, float] = field(default_factory=dict)
+    comparison: Comparison | None = None
+    goal: Progress | None = None
+
+    @property
+    def rotation(self) -> "Rotation":
+        """Rotation of ``T_parent_child``, as SciPy has it."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_matrix(self.T_parent_child[:3, :3])
+
+    @property
+    def translation(self) -> FloatArray:
+        """(3,) array: position of the child sensor in the parent sensor's frame, m."""
+        return self.T_parent_child[:3, 3]
+
+    @property
+    def quat_xyzw(self) -> FloatArray:
+        """(4,) array: quaternion of the rotation, scalar last."""
+        return se3.to_quat_xyzw(self.T_parent_child)
+
+    @property
+    def rpy_deg(self) -> FloatArray:
+        """(3,) array: roll, pitch and yaw about fixed axes, as in URDF, degrees."""
+        return np.degrees(se3.rotation_to_rpy(self.T_parent_child[:3, :3]))
+
+    @property
+    def T_child_parent(self) -> FloatArray:
+        """(4, 4) array: pose of the parent sensor in the child sensor's frame."""
+        return se3.inverse(self.T_parent_child)
+
+    @property
+    def T_base_child(self) -> FloatArray | None:
+        """(4, 4) array: pose of the child sensor in ``base_frame``; None without one."""
+        return None if self.T_base_parent is None else self.T_base_parent @ self.T_parent_child
+
+    @property
+    def mounting(self) -> tuple[str, FloatArray]:
+        """The frame that the child sensor is mounted on in the robot's description, and its pose
+        (4, 4) in it: the base frame if there is one, otherwise the parent sensor's.
+        """
+        if self.T_base_child is not None:
+            return self.base_frame, self.T_base_child
+        return self.parent_frame, self.T_parent_child
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's
+        frame; infinite if unobservable.
+        """
+        return np.array([dof.sigma for dof in self.observability])
+
+    @property
+    def sigmas_rpy(self) -> FloatArray:
+        """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed;
+        infinite if one is unknown. Those of ``sigmas`` are of rotations about the parent's axes.
+        """
+        return sigmas_rpy(self.T_parent_child, self.covariance)
+
+    @property
+    def covariance_with_floor(self) -> FloatArray:
+        """(6, 6) array: covariance and common-mode uncertainty together."""
+        return self.covariance + (np.zeros((6, 6)) if self.floor is None else self.floor)
+
+    @property
+    def sigmas_of_floor(self) -> FloatArray:
+        """(6,) array: common-mode standard deviations along (m) and about (rad) the axes of the
+        parent sensor's frame.
+        """
+        if self.floor is None:
+            return np.zeros(6)
+        to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
+        variances = np.diag(to_parent @ self.floor @ to_parent.T)
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+    @property
+    def sigmas_with_floor(self) -> FloatArray:
+        """(6,) array: :attr:`sigmas` and the common-mode uncertainty together."""
+        return np.hypot(self.sigmas, self.sigmas_of_floor)
+
+    @property
+    def weights(self) -> FloatArray:
+        """(K,) array: weight of each motion pair in the solution, 0 to 1; see :meth:`residuals`."""
+        return self.residuals().weights
+
+    def residuals(self) -> Residuals:
+        """Residuals of the motion pairs that the result comes from, at ``T_parent_child``.
+
+        Raises
+        ------
+        InputError
+            If the result was read from a file: files do not have them.
+        """
+        if self.motion_residuals is None:
+            raise InputError(
+                "a result that was read from a file has no residuals; calibrate again to have them"
+            )
+        return self.motion_residuals
+
+    def unobservable(self) -> list[str]:
+        """Names of the degrees of freedom that the motion does not determine."""
+        return [dof.name for dof in self.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
+
+    @property
+    def out_of_reach(self) -> tuple[str, ...]:
+        """Axes that streams of this kind say nothing about, and no prior either."""
+        silent = {"rotations": TRANSLATIONS, "positions": ROTATIONS}.get(self.measured, ())
+        unknown = self.unobservable()
+        return tuple(axis for axis in silent if axis in unknown)
