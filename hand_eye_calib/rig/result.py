@@ -240,7 +240,7 @@ class RigCalibration:
         design = np.zeros((len(of_pairs), S))
         for row, pair in zip(design, of_pairs, strict=True):
             row[[*pair]] = 1.0
-        variances = np.array([[noise[name] ** 2 for name in _LEVELS] for noise in found])
+        variances = np.array([[getattr(noise, name) ** 2 for name in _LEVELS] for noise in found])
         scale = 1.0 / np.sqrt(variances.mean(axis=0))
         own = np.linalg.lstsq(design, variances * scale**2, rcond=None)[0]
         rows = (np.sqrt(np.maximum(own, 0.0)) / scale).tolist()
