@@ -18,7 +18,7 @@ _HOMES = {
     "CalibratorConfig": "config",
     "HandEyeCalibError": "errors",
     "Reason": "results.verdict",
-    "Residuals": "results.calibration",
+    "Residuals": "results.records",
     "RigCalibration": "rig.result",
     "SolveStatus": "results.status",
     "Trajectory": "geometry.trajectory",
@@ -74,7 +74,8 @@ if TYPE_CHECKING:
     from hand_eye_calib.io.trajectory_files.reading import read_trajectory
     from hand_eye_calib.io.trajectory_files.writing import write_trajectory
     from hand_eye_calib.report.plot import plot
-    from hand_eye_calib.results.calibration import Calibration, Residuals
+    from hand_eye_calib.results.calibration import Calibration
+    from hand_eye_calib.results.records import Residuals
     from hand_eye_calib.results.status import SolveStatus
     from hand_eye_calib.results.verdict import Reason, Verdict
     from hand_eye_calib.rig.calibrate import calibrate_rig
