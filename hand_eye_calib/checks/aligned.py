@@ -9,7 +9,7 @@ import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.mount_change import find_change, information
+from hand_eye_calib.assessment.mount_change import find_change
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.checks.response import Response, response, rotation_gains
@@ -287,7 +287,7 @@ def _severity(shift_m: float) -> Severity:
 def _check_mount(aligned: Aligned) -> list[Finding]:
     """Finding about a mount that has moved."""
     pose_pairs = aligned.pose_pairs
-    change = find_change(information(pose_pairs, aligned.T_parent_child))
+    change = find_change(pose_pairs, aligned.T_parent_child)
     if change is None or not change.is_significant:
         return []
     sigmas = np.sqrt(np.diag(change.covariance))

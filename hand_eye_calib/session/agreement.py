@@ -1,8 +1,8 @@
-"""Whether several results of one rig agree, and which recording does not belong to the others.
+"""Whether the results of several recordings of one rig agree, and which of them do not.
 
-Each result has a covariance, so their scatter can be tested: the sum of squared distances from the
-common extrinsic, in standard deviations, has a chi-square distribution. Directions that a recording
-did not reveal count neither as agreement nor as contradiction.
+Each result has a covariance, and recordings of one rig scatter beside it. So the sum of squared
+distances from the common extrinsic has a chi-square distribution. Directions that a recording did
+not reveal count neither as agreement nor as contradiction.
 
 Two explanations of a contradiction are tried: one recording is off, or the mount has moved at some
 time. The better one is accepted if chance rarely makes one as good; if the others still scatter
@@ -18,17 +18,17 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.assessment.metrics import deviation
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.text import amount, axes_in_words, listing
 
 # A direction with a larger standard deviation (m, rad) is unknown.
 _UNKNOWN = 0.3
 _ROUNDS = 4
-# Probability of a false alarm.
-_LEVEL = 0.01
+# Probability of a false alarm; and of a scatter that is no more than stated.
+_LEVEL, _ORDINARY = 0.01, 0.05
 
 
 class Kind(str, Enum):
@@ -44,7 +44,7 @@ class Kind(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """What came of a comparison of results.
+    """What came of a comparison of N results.
 
     Attributes
     ----------
@@ -52,24 +52,20 @@ class Agreement:
     apart : tuple of int
         Indices of the results that do not belong to the others: the one that is off, or all since
         the mount has moved.
-    T_parent_child : (4, 4) ndarray
+    T_parent_child : (4, 4) array
         Common extrinsic of the others.
-    covariance : (6, 6) ndarray
-        Of that, along and about the parent's axes; with the scatter, if that is larger than stated.
-        Unknown directions have a standard deviation of 3.
+    covariance : (6, 6) array
+        Of that, along and about the parent's axes; wider if they scatter more than stated. Unknown
+        directions have a standard deviation of 3.
     chi2, dof, p_value : float, int, float
         Of the hypothesis that all results are of one extrinsic.
     scatter : float
         How many times larger than stated the scatter is, without those apart.
-    deviations : (N, 6) ndarray
+    deviations : (N, 6) array
         Of each result from the common extrinsic: x, y, z (m) along the parent's axes and the
         rotation vector (rad) about them. NaN if it does not know the axis.
-    sigmas : (N, 6) ndarray
-        Stated standard deviations of each.
-    difference : (6,) ndarray
-        Of those apart from the others, likewise. NaN if none is apart.
-    difference_sigmas : (6,) ndarray
-        Standard deviations of that.
+    sigmas : (N, 6) array
+        Standard deviations of each, with the scatter of recordings.
     """
 
     kind: Kind
@@ -82,13 +78,47 @@ class Agreement:
     scatter: float
     deviations: FloatArray
     sigmas: FloatArray
-    difference: FloatArray
-    difference_sigmas: FloatArray
+
+    def sentence(self, names: Sequence[str]) -> str:
+        """What the comparison of results with these names found."""
+        if self.kind is Kind.SINGLE:
+            return "One recording: nothing to compare with"
+        test = (
+            f"chi-square {self.chi2:.1f} with {self.dof} degrees of freedom, p {self.p_value:.2g}"
+        )
+        match self.kind:
+            case Kind.AGREE:
+                found = f"The {len(names)} recordings agree within their standard deviations"
+            case Kind.DIFFER:
+                found = f"{names[0]} and {names[1]} differ; a third recording shows which is off"
+            case Kind.SCATTER:
+                found = f"The {len(names)} recordings scatter {self.scatter:.1f} times as much as "
+                found += "their standard deviations say; none stands out"
+            case Kind.ONE_OFF:
+                found = f"{names[self.apart[0]]} differs from the others: {self._moves()}"
+            case Kind.MOVED:
+                found = f"The mount has moved before {names[self.apart[0]]}: {self._moves()}"
+        return f"{found} ({test})"
+
+    def _moves(self) -> str:
+        """By how much those apart differ, by more than two standard deviations; at least one."""
+        apart = [*self.apart]
+        values = self.deviations[apart].mean(axis=0)
+        variances = (self.sigmas[apart] ** 2).mean(axis=0) / len(apart) + np.diag(self.covariance)
+        ratios = np.nan_to_num(np.abs(values) / np.sqrt(variances))
+        order = [axis for axis in np.argsort(-ratios) if ratios[axis] >= min(2.0, ratios.max())]
+        return listing(
+            [
+                f"{axes_in_words([AXES[axis]])} by {amount(AXES[axis], values[axis])} +/- "
+                f"{amount(AXES[axis], float(np.sqrt(variances[axis])))}"
+                for axis in order
+            ]
+        )
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """One extrinsic for a group of results."""
+    """One extrinsic for a group of results, and what is left of their scatter about it."""
 
     T: FloatArray
     information: FloatArray
@@ -101,14 +131,15 @@ def agreement_of(Ts_parent_child: FloatArray, covariances: FloatArray) -> Agreem
 
     Parameters
     ----------
-    Ts_parent_child : (N, 4, 4) ndarray
+    Ts_parent_child : (N, 4, 4) array
         In the order of time.
-    covariances : (N, 6, 6) ndarray
-        In the tangent (rho, phi) of the child; with errors that are constant during a recording, if
-        they are known (``covariance_with_floor``).
+    covariances : (N, 6, 6) array
+        Along and about the parent's axes, with the scatter of recordings.
     """
+    from scipy.special import chdtrc
+
     Ts = np.asarray(Ts_parent_child, dtype=float)
-    weights = np.array([_information(*one) for one in zip(Ts, covariances, strict=True)])
+    weights = np.array([_information(covariance) for covariance in covariances])
     nothing = np.zeros(len(Ts), dtype=bool)
     whole = _fit(Ts, weights, ~nothing)
     p_value = float(chdtrc(whole.dof, whole.chi2)) if whole.dof else 1.0
@@ -116,9 +147,8 @@ def agreement_of(Ts_parent_child: FloatArray, covariances: FloatArray) -> Agreem
     kept = _fit(Ts, weights, ~apart)
     scatter = math.sqrt(kept.chi2 / kept.dof) if kept.dof else 1.0
     widened = max(scatter, 1.0) ** 2 if kind is not Kind.AGREE else 1.0
-    difference, difference_sigmas = _difference(Ts, weights, apart, widened)
-    sigmas = np.array([_sigmas(weight) for weight in weights])
-    deviations = _errors(Ts, kept.T)
+    sigmas = np.sqrt([np.diag(_covariance(weight)) for weight in weights])
+    sigmas = np.where(sigmas < _UNKNOWN, sigmas, np.nan)
     return Agreement(
         kind=kind,
         apart=tuple(np.flatnonzero(apart).tolist()),
@@ -128,10 +158,8 @@ def agreement_of(Ts_parent_child: FloatArray, covariances: FloatArray) -> Agreem
         dof=whole.dof,
         p_value=p_value,
         scatter=scatter,
-        deviations=np.where(np.isfinite(sigmas), deviations, np.nan),
+        deviations=np.where(np.isfinite(sigmas), _errors(Ts, kept.T), np.nan),
         sigmas=sigmas,
-        difference=difference,
-        difference_sigmas=difference_sigmas,
     )
 
 
@@ -147,14 +175,11 @@ def _explanation(
         return Kind.SINGLE, nothing
     if len(Ts) == 2:
         return Kind.DIFFER if is_large else Kind.AGREE, nothing
-    best = (math.inf, Kind.AGREE, nothing)
-    candidates = list(_candidates(len(Ts)))
-    errors = _errors(Ts, whole.T)
-    for kind, apart in candidates:
-        p_value = len(candidates) * _p_of_split(errors, weights, whole, apart)
-        best = min(best, (p_value, kind, apart), key=lambda one: one[0])
-    if best[0] < _LEVEL:
-        return best[1:]
+    candidates, errors = list(_candidates(len(Ts))), _errors(Ts, whole.T)
+    p_values = [_p_of_split(errors, weights, whole, apart) for _, apart in candidates]
+    best = int(np.argmin(p_values))
+    if len(candidates) * p_values[best] < _LEVEL:
+        return candidates[best]
     return Kind.SCATTER if is_large else Kind.AGREE, nothing
 
 
@@ -169,46 +194,31 @@ def _candidates(count: int) -> Iterator[tuple[Kind, BoolArray]]:
 
 def _p_of_split(errors: FloatArray, weights: FloatArray, whole: _Fit, apart: BoolArray) -> float:
     """Probability of as good a split into two groups, if there is only one."""
+    from scipy.special import chdtrc, fdtrc
+
     left = [_left(errors[group], weights[group]) for group in (apart, ~apart)]
     chi2, dof = sum(one[0] for one in left), sum(one[1] for one in left)
     gained, spent = whole.chi2 - chi2, whole.dof - dof
     if spent <= 0:
         return 1.0
-    if chi2 <= dof or dof == 0:
+    if dof == 0 or chdtrc(dof, chi2) > _ORDINARY:
         return float(chdtrc(spent, gained))
     return float(fdtrc(spent, dof, gained / spent / (chi2 / dof)))
 
 
-def _information(T: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Inverse of a covariance (6, 6) in its known directions along the parent's axes; none in the
-    others.
-    """
+def _information(covariance: FloatArray) -> FloatArray:
+    """Inverse of a covariance (6, 6) in its known directions; none in the others."""
     if not np.isfinite(covariance).all():
         return np.zeros((6, 6))
-    to_parent = np.kron(np.eye(2), T[:3, :3])
-    values, vectors = np.linalg.eigh(to_parent @ covariance @ to_parent.T)
-    known = values < _UNKNOWN**2
-    smallest = 1e-12  # m^2, rad^2
-    return (vectors[:, known] / np.maximum(values[known], smallest)) @ vectors[:, known].T
+    values, vectors = np.linalg.eigh(covariance)
+    weights = np.where(values < _UNKNOWN**2, 1.0 / np.maximum(values, 1e-12), 0.0)
+    return (vectors * weights) @ vectors.T
 
 
-def _ranks(information: FloatArray) -> IntArray:
-    """Number of known directions of each matrix (..., 6, 6)."""
-    known = np.linalg.eigvalsh(information) > 1 / _UNKNOWN**2
-    return np.asarray(known.sum(axis=-1))
-
-
-def _known_inverse(information: FloatArray) -> FloatArray:
-    """Inverse of an information in its known directions; zero in the others."""
+def _covariance(information: FloatArray, unknown: float = 9.0) -> FloatArray:
+    """Inverse of an information; directions without any have this variance."""
     values, vectors = np.linalg.eigh(information)
-    known = values > 1 / _UNKNOWN**2
-    return (vectors[:, known] / values[known]) @ vectors[:, known].T
-
-
-def _covariance(information: FloatArray) -> FloatArray:
-    """Inverse of an information; directions without any have a standard deviation of 3."""
-    values, vectors = np.linalg.eigh(information)
-    variances = np.where(values > 1 / _UNKNOWN**2, 1 / np.maximum(values, 1e-9), 9.0)
+    variances = np.where(values > 1 / _UNKNOWN**2, 1 / np.maximum(values, 1e-9), unknown)
     return (vectors * variances) @ vectors.T
 
 
@@ -218,19 +228,18 @@ def _fit(Ts: FloatArray, weights: FloatArray, group: BoolArray) -> _Fit:
     total = weights.sum(axis=0)
     T = Ts[int(np.argmax(np.trace(weights, axis1=1, axis2=2)))]
     for _ in range(_ROUNDS):
-        errors = _errors(Ts, T)
-        step = _known_inverse(total) @ np.einsum("nij,nj->i", weights, errors)
+        weighted = np.einsum("nij,nj->i", weights, _errors(Ts, T))
+        step = _covariance(total, unknown=0.0) @ weighted
         T = se3.from_rotation_translation(
             se3.rotation_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3]
         )
-    chi2, dof = _left(_errors(Ts, T), weights)
-    return _Fit(T, total, chi2, dof)
+    return _Fit(T, total, *_left(_errors(Ts, T), weights))
 
 
 def _errors(Ts: FloatArray, T: FloatArray) -> FloatArray:
-    """Deviations (N, 6) of many transforms from one, as :func:`deviation`."""
-    turned = se3.rotation_log(Ts[:, :3, :3] @ T[:3, :3].T)
-    return np.concatenate([Ts[:, :3, 3] - T[:3, 3], turned], axis=1)
+    """Deviations (N, 6) of transforms from one, along and about the parent's axes."""
+    rotations = se3.rotation_log(Ts[:, :3, :3] @ T[:3, :3].T)
+    return np.concatenate([Ts[:, :3, 3] - T[:3, 3], rotations], axis=1)
 
 
 def _left(errors: FloatArray, weights: FloatArray) -> tuple[float, int]:
@@ -238,70 +247,6 @@ def _left(errors: FloatArray, weights: FloatArray) -> tuple[float, int]:
     total = weights.sum(axis=0)
     weighted = np.einsum("nij,nj->i", weights, errors)
     chi2 = np.einsum("ni,nij,nj->", errors, weights, errors)
-    chi2 -= weighted @ _known_inverse(total) @ weighted
-    return float(max(chi2, 0.0)), int(_ranks(weights).sum() - _ranks(total))
-
-
-def _difference(
-    Ts: FloatArray, weights: FloatArray, apart: BoolArray, widened: float
-) -> tuple[FloatArray, FloatArray]:
-    """Difference of the two groups and its sigmas."""
-    if not apart.any():
-        return np.full(6, np.nan), np.full(6, np.nan)
-    kept, other = (_fit(Ts, weights, group) for group in (~apart, apart))
-    difference = deviation(other.T, kept.T)
-    variances = sum(_sigmas(fit.information) ** 2 for fit in (kept, other))
-    sigmas = np.sqrt(variances * widened)
-    return np.where(np.isfinite(sigmas), difference, np.nan), sigmas
-
-
-def _sigmas(information: FloatArray) -> FloatArray:
-    """Standard deviations (6,); NaN of those unknown."""
-    sigmas = np.sqrt(np.diag(_covariance(information)))
-    return np.where(sigmas < _UNKNOWN, sigmas, np.nan)
-
-
-def sentence(found: Agreement, names: Sequence[str]) -> str:
-    """What a comparison found, in a sentence or two.
-
-    Parameters
-    ----------
-    found : Agreement
-    names : sequence of str
-        Of the results, in their order.
-    """
-    count = len(names)
-    test = f"chi-square {found.chi2:.1f} of {found.dof} degrees of freedom, p {found.p_value:.2g}"
-    if found.kind is Kind.SINGLE:
-        return "One recording: nothing to compare with."
-    if found.kind is Kind.AGREE:
-        return f"The {count} recordings agree within their standard deviations ({test})."
-    if found.kind is Kind.DIFFER:
-        return (
-            f"{names[0]} and {names[1]} do not agree ({test}); a third recording tells which of "
-            "them is off."
-        )
-    if found.kind is Kind.SCATTER:
-        return (
-            f"The {count} recordings scatter {found.scatter:.1f} times as much as their standard "
-            f"deviations say ({test}); none stands out."
-        )
-    moved = ", ".join(_moves(found))
-    if found.kind is Kind.ONE_OFF:
-        return f"{names[found.apart[0]]} does not agree with the others: {moved}."
-    return f"The mount has moved before {names[found.apart[0]]}: {moved}."
-
-
-def _moves(found: Agreement) -> Iterator[str]:
-    """Differences of more than two standard deviations, the largest first; at least one."""
-    ratios = np.nan_to_num(np.abs(found.difference / found.difference_sigmas))
-    order = np.argsort(-ratios)
-    axes = ("x", "y", "z", "about x", "about y", "about z")
-    for rank, index in enumerate(order.tolist()):
-        if rank and ratios[index] < 2:
-            return
-        value, sigma = found.difference[index], found.difference_sigmas[index]
-        if index < 3:
-            yield f"{axes[index]} {1000 * value:+.1f} +/- {1000 * sigma:.1f} mm"
-        else:
-            yield f"{math.degrees(value):+.2f} +/- {math.degrees(sigma):.2f} deg {axes[index]}"
+    chi2 -= weighted @ _covariance(total, unknown=0.0) @ weighted
+    ranks = (np.linalg.eigvalsh([*weights, total]) > 1 / _UNKNOWN**2).sum(axis=1)
+    return float(max(chi2, 0.0)), int(ranks[:-1].sum() - ranks[-1])

@@ -20,12 +20,8 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.floor import common_mode_floor
-from hand_eye_calib.assessment.mount_change import (
-    log_ratio,
-    noise_covariance,
-    residuals_and_jacobians,
-    shift_covariance,
-)
+from hand_eye_calib.assessment.mount_change import noise_covariance, residuals_and_jacobians
+from hand_eye_calib.assessment.moved import log_ratio, shift_covariance
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs

@@ -560,9 +560,9 @@ def test_recordings_are_compared_with_those_of_their_vehicle():
         ("d", "single"),
         ("e", "one off"),
     ]
-    assert found["b"].sentence.startswith("The mount has moved before b_4: +1.")
-    assert " deg about z" in found["b"].sentence
-    assert found["c"].sentence.startswith("c_1 does not agree with the others: +1.")
+    assert found["b"].sentence.startswith("The mount has moved before b_4: ")
+    assert "the rotation about z by " in found["b"].sentence
+    assert found["c"].sentence.startswith("c_1 differs from the others: ")
     assert found["e"].newest.sentence.startswith("moved: ")
     assert "moved" not in found["a"].newest.sentence
     assert found["d"].newest is None

@@ -10,8 +10,8 @@ from hand_eye_calib.cli.batch.results import Row, row_of
 from hand_eye_calib.cli.batch.workers import Outcome
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.results.calibration import Calibration, SolveStatus
-from hand_eye_calib.session.agreement import Agreement, agreement_of, sentence
-from hand_eye_calib.session.compare import Comparison, compare
+from hand_eye_calib.session.agreement import Agreement
+from hand_eye_calib.session.compare import Comparison, agreement_of_results, compare
 
 _FAILURES = (SolveStatus.NOT_CONVERGED, SolveStatus.CONTRADICTED)
 
@@ -85,16 +85,9 @@ def _vehicle(name: str, frames: tuple[str, str], group: list[tuple[Row, Calibrat
     ordered = sorted(group, key=lambda one: (one[0]["start_ns"] or 0, one[0]["name"]))
     rows = tuple(row for row, _ in ordered)
     calibrations = [calibration for _, calibration in ordered]
-    found = _agreement_of(calibrations)
-    said = sentence(found, [row["name"] for row in rows])
+    found = agreement_of_results(calibrations)
+    said = found.sentence([row["name"] for row in rows])
     return Vehicle(name, frames, rows, found, said, _newest(calibrations, rows[-1]["name"]))
-
-
-def _agreement_of(calibrations: Sequence[Calibration]) -> Agreement:
-    return agreement_of(
-        np.array([calibration.T_parent_child for calibration in calibrations]),
-        np.array([calibration.covariance_with_floor for calibration in calibrations]),
-    )
 
 
 def _newest(calibrations: Sequence[Calibration], name: str) -> Comparison | None:
@@ -102,7 +95,7 @@ def _newest(calibrations: Sequence[Calibration], name: str) -> Comparison | None
     *earlier, newest = calibrations
     if not earlier:
         return None
-    found = _agreement_of(earlier)
+    found = agreement_of_results(earlier)
     to_child = np.kron(np.eye(2), found.T_parent_child[:3, :3].T)
     covariance = to_child @ found.covariance @ to_child.T
     common = Extrinsic(found.T_parent_child, "earlier recordings", covariance, is_calibration=True)
