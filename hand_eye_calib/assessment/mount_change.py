@@ -22,7 +22,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.gls.state_space import NormalEquations
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.moved import (
     log_ratio,
@@ -32,6 +31,7 @@ from hand_eye_calib.assessment.moved import (
     solve,
 )
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.state_space import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.motions import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
