@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import FIX_TYPE, IMU_TYPE
 from hand_eye_calib.io.bags.writer import write_streams
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE
@@ -99,10 +98,12 @@ def _write_bag(path, lidar, camera, places, rates):
         for stamp_ns, pose in zip(lidar.stamps_ns.tolist(), lidar.poses, strict=True):
             message = tf_message([(stamp_ns, "odom", "lidar", pose)])(JAZZY)
             writer.write(connection, stamp_ns, JAZZY.serialize_cdr(message, TF))
-        connection = writer.add_connection("/gnss/fix", FIX_TYPE, typestore=JAZZY)
+        connection = writer.add_connection(
+            "/gnss/fix", "sensor_msgs/msg/NavSatFix", typestore=JAZZY
+        )
         for stamp_ns, place in zip(camera.stamps_ns.tolist(), places.tolist(), strict=True):
             writer.write(connection, stamp_ns, fix(2, *place, stamp_ns=stamp_ns))
-        connection = writer.add_connection("/imu", IMU_TYPE, typestore=JAZZY)
+        connection = writer.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=JAZZY)
         for stamp_ns, rate in zip(rates[0].tolist(), rates[1].tolist(), strict=True):
             writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
 

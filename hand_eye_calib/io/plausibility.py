@@ -17,7 +17,6 @@ from hand_eye_calib.geometry.trajectory import FARTHEST_M, far_position
 # than the usual step).
 _FACTOR = 10.0
 _SMALLEST_JUMP_M, _SMALLEST_JUMP_RAD, _SMALLEST_JUMP_S = 0.2, 0.1, 0.5
-_BLOCK = 4096
 
 
 def check_positions(positions: FloatArray) -> None:
@@ -41,18 +40,14 @@ class PoseWatch:
 
     Attributes
     ----------
-    n_poses, n_jumps, n_stamps : int
-        Poses looked at, poses that jump away and back, and poses left out because their stamps do
-        so against the bag's own time.
-    first_jump, first_stamp : str
-        The first of each, for a person.
+    n_stamps : int
+        Poses left out because their stamps jump away and back against the bag's own time.
     """
 
     def __init__(self) -> None:
-        self.n_poses = self.n_jumps = self.n_stamps = 0
-        self.first_jump = self.first_stamp = ""
+        self.n_stamps = 0
+        self._first_stamp = ""
         self._blocks: list[tuple[IntArray, IntArray, FloatArray]] = []
-        self._is_first = True
 
     def believable(self, first_number: int, stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
         """Mask of the stamps that can be right, of messages in the order of the recording.
@@ -70,12 +65,10 @@ class PoseWatch:
         -------
         (N,) array of bool
         """
-        if len(stamps_ns) < 3:
-            return np.ones(len(stamps_ns), dtype=bool)
         delays_s = np.asarray(bag_ns - stamps_ns, dtype=float)[:, None] * 1e-9
-        jumps_s = _isolated(delays_s, _distance, _SMALLEST_JUMP_S, is_first=True, is_last=True)
+        jumps_s = _isolated(delays_s, _distance, _SMALLEST_JUMP_S)
         if jumps_s.any():
-            self.first_stamp = self.first_stamp or _first(
+            self._first_stamp = self._first_stamp or _first(
                 jumps_s, "s", first_number + np.arange(len(stamps_ns)), stamps_ns
             )
             self.n_stamps += int((jumps_s > 0).sum())
@@ -104,45 +97,32 @@ class PoseWatch:
                 f"message {message_numbers[row]}, stamp {_seconds(stamps_ns[row])}: {error}; "
                 "the bag is damaged, record it again"
             ) from None
-        self.n_poses += len(stamps_ns)
         self._blocks.append((message_numbers, stamps_ns, poses))
-        if sum(len(block[0]) for block in self._blocks) > _BLOCK:
-            self._check()
 
     def warnings(self, name: str) -> list[str]:
         """List what was found, one line each; after the last pose."""
-        self._check(is_last=True)
-        found = []
-        if self.n_jumps:
-            found.append(
-                f"{name}: {self.n_jumps} of {self.n_poses} poses jump away and back (first "
-                f"{self.first_jump}), as in a damaged bag or when tracking fails; check the "
-                "stream, and use a method that rejects outliers"
-            )
-        if self.n_stamps:
-            found.append(
-                f"{name}: {self.n_stamps} of {self.n_poses + self.n_stamps} stamps jump away and "
-                f"back against the bag's own time (first {self.first_stamp}); their poses were "
-                "left out, the bag may be damaged"
-            )
-        return found
-
-    def _check(self, is_last: bool = False) -> None:
         if not self._blocks:
-            return
+            return []
         message_numbers, stamps_ns, poses = map(np.concatenate, zip(*self._blocks, strict=True))
-        self._blocks = [(message_numbers[-2:], stamps_ns[-2:], poses[-2:])]
-        if len(poses) < 3:
-            return
-        is_first, self._is_first = self._is_first, False
+        found, n_poses = [], len(poses)
         with np.errstate(over="ignore", invalid="ignore"):
-            jumps_m = _isolated(poses[:, :3], _distance, _SMALLEST_JUMP_M, is_first, is_last)
-            jumps_rad = _isolated(poses[:, 3:], _angle, _SMALLEST_JUMP_RAD, is_first, is_last)
+            jumps_m = _isolated(poses[:, :3], _distance, _SMALLEST_JUMP_M)
+            jumps_rad = _isolated(poses[:, 3:], _angle, _SMALLEST_JUMP_RAD)
         is_jump = (jumps_m > 0) | (jumps_rad > 0)
         if is_jump.any():
             jumps, unit = (jumps_m, "m") if jumps_m[np.argmax(is_jump)] else (jumps_rad, "rad")
-            self.first_jump = self.first_jump or _first(jumps, unit, message_numbers, stamps_ns)
-            self.n_jumps += int(is_jump.sum())
+            found.append(
+                f"{name}: {is_jump.sum()} of {n_poses} poses jump away and back (first "
+                f"{_first(jumps, unit, message_numbers, stamps_ns)}), as in a damaged bag or when "
+                "tracking fails; check the stream, and use a method that rejects outliers"
+            )
+        if self.n_stamps:
+            found.append(
+                f"{name}: {self.n_stamps} of {n_poses + self.n_stamps} stamps jump away and "
+                f"back against the bag's own time (first {self._first_stamp}); their poses were "
+                "left out, the bag may be damaged"
+            )
+        return found
 
 
 def _first(jumps: FloatArray, unit: str, message_numbers: IntArray, stamps_ns: IntArray) -> str:
@@ -158,25 +138,16 @@ def _seconds(stamp_ns: int) -> str:
 
 
 def _isolated(
-    values: FloatArray,
-    distance: Callable[[FloatArray, FloatArray], FloatArray],
-    smallest: float,
-    is_first: bool,
-    is_last: bool,
+    values: FloatArray, distance: Callable[[FloatArray, FloatArray], FloatArray], smallest: float
 ) -> FloatArray:
-    """(N,) distance of each value from its neighbours; 0 if that is nothing unusual.
-
-    The first and last value, neighbours of those in other blocks, are judged only if the stream
-    begins or ends with them.
-    """
-    steps = distance(values[:-1], values[1:])
+    """(N,) distance of each value from its neighbours; 0 if that is nothing unusual."""
     off, usual = np.zeros(len(values)), np.zeros(len(values))
+    if len(values) < 3:
+        return off
+    steps = distance(values[:-1], values[1:])
     off[1:-1] = np.minimum(steps[:-1], steps[1:])
     usual[1:-1] = distance(values[:-2], values[2:])
-    if is_first:
-        off[0], usual[0] = steps[0], steps[1]
-    if is_last:
-        off[-1], usual[-1] = steps[-1], steps[-2]
+    off[[0, -1]], usual[[0, -1]] = steps[[0, -1]], steps[[1, -2]]
     is_isolated = (off > smallest) & (off > _FACTOR * (usual + np.median(steps)))
     return np.where(is_isolated, off, 0.0)
 

@@ -14,9 +14,13 @@ from rclpy.subscription import Subscription
 from hand_eye_calib.config import other_names
 from hand_eye_calib.engine.pose_buffer import StreamStatistics
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
-from hand_eye_calib.io.bags.messages import MALFORMED, unpack_stamp_ns
-from hand_eye_calib.io.bags.poses import PoseFields
-from hand_eye_calib.io.bags.topics import MessageReader, measured_as
+from hand_eye_calib.io.bags.messages import (
+    MALFORMED,
+    MessageReader,
+    PoseFields,
+    measured_as,
+    unpack_stamp_ns,
+)
 from hand_eye_calib.ros.conversions import MESSAGES
 from hand_eye_calib.ros.input_monitor import InputMonitor
 from hand_eye_calib.ros.live_session import LiveSession

@@ -10,8 +10,8 @@ from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
+from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.journal import Journal, has_session, read_journal
-from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.session_journal import (
     DirectoryLock,

@@ -11,7 +11,7 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import InputError, printable
-from hand_eye_calib.io.bags.poses import PoseFields
+from hand_eye_calib.io.bags.messages import PoseFields
 from hand_eye_calib.io.transforms import TfSource
 from hand_eye_calib.ros.conversions import to_ns
 from hand_eye_calib.ros.inputs import PoseInput, waiting_messages, with_stamp

@@ -12,8 +12,7 @@ from sensor_msgs.msg import Imu, NavSatFix
 from hand_eye_calib import config
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import MESSAGE_TYPES
-from hand_eye_calib.io.bags.topics import MessageReader
+from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader
 from hand_eye_calib.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.ros import conversions
 from hand_eye_calib.ros.log import NodeLog

@@ -14,12 +14,11 @@ from hand_eye_calib.io.bags.messages import (
     MESSAGE_TYPES,
     POSE_TYPES,
     MalformedMessage,
-    unpack_one,
+    PoseFields,
     unpack_path,
     unpack_poses,
     unpack_transforms,
 )
-from hand_eye_calib.io.bags.poses import PoseFields
 
 JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 NOETIC.register(
@@ -99,8 +98,9 @@ def assert_fields(fields, pose, message_type):
 def test_a_pose(encoding, message_type, pose):
     """The length of the frames' names shifts what follows: alignment is where readers go wrong."""
     data, is_ros1 = encoded(encoding, message_type, pose)
-    *fields, values = unpack_one(data, message_type, is_ros1)
-    assert_fields(PoseFields(*fields, values[:3], values[3:]), pose, message_type)
+    stamps_ns, worlds, sensors, (values,) = unpack_poses([data], message_type, is_ros1)
+    fields = PoseFields(int(stamps_ns[0]), worlds[0], sensors[0], values[:3], values[3:])
+    assert_fields(fields, pose, message_type)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -211,4 +211,4 @@ def test_bytes_that_are_no_message_are_malformed_and_nothing_else(unpack, data, 
 
 def test_an_encoding_that_is_not_plain_cdr_is_named():
     with pytest.raises(ValueError, match="expected plain CDR, found encoding 0x0007"):
-        unpack_one(b"\x00\x07\x00\x00" + bytes(100), "geometry_msgs/msg/PoseStamped", False)
+        unpack_poses([b"\x00\x07\x00\x00" + bytes(100)], "geometry_msgs/msg/PoseStamped", False)

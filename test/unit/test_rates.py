@@ -18,8 +18,11 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.rates import RateIntegrator, integrated
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
-from hand_eye_calib.io.bags.messages import FIX_TYPE, IMU_TYPE, unpack_one
-from hand_eye_calib.io.bags.topics import MessageReader, measured_as
+from hand_eye_calib.io.bags.messages import (
+    MessageReader,
+    measured_as,
+    unpack_poses,
+)
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
 
 BIAS = np.array([0.02, -0.01, 0.03])
@@ -301,7 +304,7 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     write_bag(bag, {"/odom": (parent, "nav_msgs/msg/Odometry")}, "mcap")
     with Writer(tmp_path / "imu", version=9) as writer:
         connections = [
-            writer.add_connection(topic, IMU_TYPE, typestore=JAZZY)
+            writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=JAZZY)
             for topic in ("/imu", "/imu_again")
         ]
         for stamp_ns, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
@@ -325,21 +328,21 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
 
 
 class TestMessages:
-    def test_an_imu(self):
-        stamp_ns, frame, _, values = unpack_one(imu((0.1, 0.2, 0.3)), IMU_TYPE, is_ros1=False)
-        assert (stamp_ns, frame) == (12_000_000_005, "imu_link")
-        assert values == [0.0, 0.0, 0.6, 0.8, 0.1, 0.2, 0.3]
-        assert np.isnan(unpack_one(imu((0, 0, 0), -1.0), IMU_TYPE, is_ros1=False)[-1][4:]).all()
-
-    def test_a_fix(self):
-        assert unpack_one(fix(2), FIX_TYPE, is_ros1=False)[-1] == [60.0, 25.0, 30.0]
-        assert np.isnan(unpack_one(fix(-1), FIX_TYPE, is_ros1=False)[-1]).all()
+    def test_values_that_a_message_says_it_does_not_have_are_not_numbers(self):
+        of_imu = unpack_poses([imu((0.1, 0.2, 0.3))], "sensor_msgs/msg/Imu", False)
+        assert (of_imu.stamps_ns[0], of_imu.world_frames) == (12_000_000_005, ["imu_link"])
+        assert of_imu.poses.tolist() == [[0.0, 0.0, 0.6, 0.8, 0.1, 0.2, 0.3]]
+        without = unpack_poses([imu((0, 0, 0), -1.0)], "sensor_msgs/msg/Imu", False)
+        assert np.isnan(without.poses[0, 4:]).all()
+        fixes = unpack_poses([fix(2), fix(-1)], "sensor_msgs/msg/NavSatFix", False).poses
+        assert fixes[0].tolist() == [60.0, 25.0, 30.0]
+        assert np.isnan(fixes[1]).all()
 
     def test_without_a_fix_a_message_is_left_out(self):
         reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
         messages = [fix(0), fix(-1), fix(2, latitude=60.001)]
-        columns = reader.columns(messages, is_ros1=False)
-        assert reader.n_left_out == 1
+        columns, is_usable = reader.columns(messages, is_ros1=False)
+        assert (reader.n_left_out, is_usable.tolist()) == (1, [True, False, True])
         assert np.isnan(columns.poses[1]).all()
         assert columns.poses[0, :3] == pytest.approx([0, 0, 0])
         assert columns.poses[2, 1] == pytest.approx(111.4, abs=0.3)
@@ -356,7 +359,7 @@ class TestMessages:
 
     def test_an_imu_can_be_read_as_rotations(self):
         reader = MessageReader("sensor_msgs/msg/Imu", "rotations")
-        assert reader.columns([imu((1, 1, 1))], False).poses[0, 3:].tolist() == [0, 0, 0.6, 0.8]
+        assert reader.columns([imu((1, 1, 1))], False)[0].poses[0, 3:].tolist() == [0, 0, 0.6, 0.8]
 
     def test_what_a_type_does_not_have_is_refused(self):
         assert measured_as("sensor_msgs/msg/Imu", "auto", "/imu") == "rates"

@@ -14,6 +14,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.trajectory_files import (
     AUTO,
     layout_of_file,
@@ -21,7 +22,6 @@ from hand_eye_calib.io.trajectory_files import (
     read_trajectory_files,
     write_trajectory,
 )
-from hand_eye_calib.io.trajectory_files.geodetic import LocalOrigin
 
 NS = "1403637132888318976"
 EUROC_HEADER = (

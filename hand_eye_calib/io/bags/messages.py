@@ -1,21 +1,25 @@
 """Stamps, frames and values of ROS messages, unpacked from their bytes.
 
 All types that are read begin with the same bytes: a ``std_msgs/Header``, for some types the
-sensor's frame, then doubles. Only those are unpacked. This takes a small part of the time of a
-whole message and needs no type definitions. Poses that differ only in their values are unpacked
-together.
+sensor's frame, then what is measured. Only those are unpacked, which takes a small part of the time
+of a whole message and needs no type definitions. Poses that differ only in their values are
+unpacked together.
+
+A new type is a row in :data:`MESSAGE_TYPES`.
 """
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.errors import printable
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.errors import ConfigError, InputError, printable
+from hand_eye_calib.geometry.rates import RateIntegrator
 from hand_eye_calib.io.bags.poses import PoseColumns, PoseFields
+from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin, wrong_latitude
 from hand_eye_calib.io.limits import LONGEST_NAME
 
 # What unpacking bytes that are not a message of its type may raise.
@@ -25,6 +29,8 @@ Buffer = bytes | memoryview
 
 _NS_PER_S = 1_000_000_000
 _POSE_SIZE = 7 * 8
+# Of what is no pose, the part that is not measured: at the origin, level.
+_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class MalformedMessage(ValueError):
@@ -39,23 +45,15 @@ class MalformedMessage(ValueError):
 
 
 class _Packing(NamedTuple):
-    """How the parts of a message are packed: byte order, alignment, and formats of a stamp and of a
-    length.
-    """
+    """How the parts of a message are packed: byte order, alignment, and format of a stamp."""
 
     order: str
     is_aligned: bool
-    time: struct.Struct
-    length: struct.Struct
-    pose: struct.Struct
+    time: str
 
 
-def _packing(order: str, is_aligned: bool, time: str) -> _Packing:
-    return _Packing(order, is_aligned, *(struct.Struct(order + part) for part in (time, "I", "7d")))
-
-
-_CDR = {b"\x00\x00": _packing(">", True, "iI"), b"\x00\x01": _packing("<", True, "iI")}
-_ROS1 = _packing("<", False, "II")
+_CDR = {b"\x00\x00": _Packing(">", True, "iI"), b"\x00\x01": _Packing("<", True, "iI")}
+_ROS1 = _Packing("<", False, "II")
 
 # CDR begins with 4 bytes that say how it is encoded, and alignment counts from there. A ROS 1
 # header begins with 4 bytes of sequence number.
@@ -72,25 +70,23 @@ class _Cursor:
         self.packing, self.data = found, data
         self.position = 0 if is_ros1 else _START
 
-    def _align(self, size: int) -> None:
+    def _read(self, format_: str, size: int, alignment: int) -> tuple[float, ...]:
         if self.packing.is_aligned:
-            self.position += (_START - self.position) % size
+            self.position += (_START - self.position) % alignment
+        values = struct.unpack_from(self.packing.order + format_, self.data, self.position)
+        self.position += size
+        return values
 
     def length(self) -> int:
         """Read an unsigned integer of 4 bytes."""
-        self._align(4)
-        (value,) = self.packing.length.unpack_from(self.data, self.position)
-        self.position += 4
-        return int(value)
+        return int(self._read("I", 4, 4)[0])
 
     def stamp_ns(self) -> int:
         """Read a stamp."""
-        self._align(4)
-        seconds, nanoseconds = self.packing.time.unpack_from(self.data, self.position)
+        seconds, nanoseconds = map(int, self._read(self.packing.time, 8, 4))
         if nanoseconds >= _NS_PER_S:
             raise ValueError(f"a stamp has {nanoseconds} nanoseconds, more than a second")
-        self.position += 8
-        return int(seconds * _NS_PER_S + nanoseconds)
+        return seconds * _NS_PER_S + nanoseconds
 
     def name(self) -> str:
         """Read a string; in CDR it ends in a zero byte. Control characters are escaped."""
@@ -118,18 +114,11 @@ class _Cursor:
 
     def doubles(self, count: int) -> list[float]:
         """Read numbers."""
-        self._align(8)
-        format_ = f"{self.packing.order}{count}d"
-        values = struct.unpack_from(format_, self.data, self.position)
-        self.position += 8 * count
-        return list(values)
+        return list(self._read(f"{count}d", 8 * count, 8))
 
     def pose(self) -> list[float]:
         """Read position and quaternion."""
-        self._align(8)
-        values = self.packing.pose.unpack_from(self.data, self.position)
-        self.position += _POSE_SIZE
-        return list(values)
+        return self.doubles(7)
 
     def imu(self) -> list[float]:
         """Read orientation, scalar last, and angular rates (rad/s) of an Imu: NaN for what its
@@ -142,10 +131,8 @@ class _Cursor:
 
     def fix(self) -> list[float]:
         """Read latitude, longitude (deg) and height (m) of a NavSatFix: NaN without a fix."""
-        (status,) = struct.unpack_from("b", self.data, self.position)
-        self.position += 1
-        self._align(2)
-        self.position += 2
+        (status,) = self._read("b", 1, 1)
+        self._read("H", 2, 2)
         values = self.doubles(3)
         return values if status >= 0 else [math.nan] * 3
 
@@ -163,34 +150,39 @@ class MessageType(NamedTuple):
     Attributes
     ----------
     name : str
-    measures : tuple of str
-        What its messages can be read as, the usual first.
+    measures : mapping of str to slice
+        What its messages can be read as, the usual first, and where it is in what is unpacked.
     has_child_frame : bool
-        Whether the sensor's frame stands behind the header. Without it, the header's frame is that
-        of the world, or for Imu and NavSatFix the sensor's.
+        Whether the sensor's frame stands behind the header.
     unpack : callable
         Reads the values that follow.
+    is_sensors : bool
+        Whether the header's frame is the sensor's, not that of the world.
+    is_geodetic : bool
+        Whether positions are latitude and longitude (deg) and height (m).
     """
 
     name: str
-    measures: tuple[str, ...]
+    measures: Mapping[str, slice]
     has_child_frame: bool
     unpack: Callable[[_Cursor], list[float]]
+    is_sensors: bool = False
+    is_geodetic: bool = False
 
 
-OF_POSES = ("poses", "positions", "rotations")
-IMU_TYPE, FIX_TYPE = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
-POINT_TYPE = "geometry_msgs/msg/PointStamped"
+_OF_POSES = {"poses": slice(7), "positions": slice(3), "rotations": slice(3, 7)}
+_OF_IMU = {"rates": slice(4, 7), "rotations": slice(4)}
+_OF_POINTS = {"positions": slice(3)}
 
 # The likeliest first.
 _ROWS = (
-    MessageType("nav_msgs/msg/Odometry", OF_POSES, True, _Cursor.pose),
-    MessageType("geometry_msgs/msg/PoseStamped", OF_POSES, False, _Cursor.pose),
-    MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", OF_POSES, False, _Cursor.pose),
-    MessageType("geometry_msgs/msg/TransformStamped", OF_POSES, True, _Cursor.pose),
-    MessageType(IMU_TYPE, ("rates", "rotations"), False, _Cursor.imu),
-    MessageType(FIX_TYPE, ("positions",), False, _Cursor.fix),
-    MessageType(POINT_TYPE, ("positions",), False, _Cursor.point),
+    MessageType("nav_msgs/msg/Odometry", _OF_POSES, True, _Cursor.pose),
+    MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, False, _Cursor.pose),
+    MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, False, _Cursor.pose),
+    MessageType("geometry_msgs/msg/TransformStamped", _OF_POSES, True, _Cursor.pose),
+    MessageType("sensor_msgs/msg/Imu", _OF_IMU, False, _Cursor.imu, is_sensors=True),
+    MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, False, _Cursor.fix, True, True),
+    MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, False, _Cursor.point),
 )
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Those that carry whole poses.
@@ -200,6 +192,26 @@ PATH_TYPE = "nav_msgs/msg/Path"
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 #: Types of topics that can be one of the two sensors.
 SENSOR_TYPES = (*POSE_TYPES, PATH_TYPE, *(name for name in MESSAGE_TYPES if name not in POSE_TYPES))
+
+
+def measured_as(message_type: str, wanted: str, source: object) -> str:
+    """What messages of a type are read as: what is wanted, or the usual for "auto".
+
+    Raises
+    ------
+    ConfigError
+        If they cannot be read as that.
+    """
+    row = MESSAGE_TYPES.get(message_type)
+    possible = [*(row.measures if row else _OF_POSES)]
+    if wanted == "auto":
+        return possible[0]
+    if wanted not in possible:
+        raise ConfigError(
+            f"{source} has messages of type {message_type or 'tf2_msgs/msg/TFMessage'}, which "
+            f"measure {' or '.join(possible)}; asked for are {wanted}"
+        )
+    return wanted
 
 
 # ---- unpacking
@@ -216,20 +228,8 @@ def unpack_stamp_ns(data: Buffer) -> int:
     return _Cursor(data, is_ros1=False).stamp_ns()
 
 
-def unpack_one(
-    data: Buffer, message_type: str, is_ros1: bool
-) -> tuple[int, str, str | None, list[float]]:
-    """Unpack a message: stamp in ns, the header's frame, the sensor's behind it, and values.
-
-    Raises
-    ------
-    struct.error, ValueError
-        If the bytes are not such a message.
-    """
-    return _unpack_one(_Cursor(data, is_ros1), MESSAGE_TYPES[message_type])
-
-
-def _unpack_one(cursor: _Cursor, row: MessageType) -> tuple[int, str, str | None, list[float]]:
+def _unpack(cursor: _Cursor, row: MessageType) -> tuple[int, str, str | None, list[float]]:
+    """Stamp in ns, the header's frame, the sensor's behind it, and values."""
     stamp_ns, frame = cursor.header()
     return stamp_ns, frame, cursor.name() if row.has_child_frame else None, row.unpack(cursor)
 
@@ -255,10 +255,11 @@ def unpack_poses(messages: Sequence[Buffer], message_type: str, is_ros1: bool) -
         At the first that is not such a message.
     """
     row, size = MESSAGE_TYPES[message_type], len(messages[0])
-    if message_type in POSE_TYPES and {*map(len, messages)} == {size}:
+    is_alike = len(messages) > 1 and {*map(len, messages)} == {size}
+    if is_alike and message_type in POSE_TYPES:
         try:
             first = _Cursor(messages[0], is_ros1)
-            _, world_frame, sensor_frame, _ = _unpack_one(first, row)
+            _, world_frame, sensor_frame, _ = _unpack(first, row)
         except MALFORMED as error:
             raise MalformedMessage(0, error) from error
         bytes_of = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, size)
@@ -271,15 +272,12 @@ def unpack_poses(messages: Sequence[Buffer], message_type: str, is_ros1: bool) -
     found_rows = []
     for index, data in enumerate(messages):
         try:
-            found_rows.append(_unpack_one(_Cursor(data, is_ros1), row))
+            found_rows.append(_unpack(_Cursor(data, is_ros1), row))
         except MALFORMED as error:
             raise MalformedMessage(index, error) from error
     stamps_ns, frames, sensor_frames, values = zip(*found_rows, strict=True)
     return PoseColumns(
-        np.array(stamps_ns, dtype=np.int64),
-        list(frames),
-        list(sensor_frames),
-        np.array(values, dtype=float),
+        np.array(stamps_ns, dtype=np.int64), [*frames], [*sensor_frames], np.array(values)
     )
 
 
@@ -346,3 +344,96 @@ def unpack_transforms(data: Buffer, is_ros1: bool) -> Iterator[PoseFields]:
         frames = world_frame.lstrip("/"), cursor.name().lstrip("/")
         values = cursor.pose()
         yield PoseFields(stamp_ns, *frames, values[:3], values[3:])
+
+
+# ---- what the messages of a topic measure
+
+# What a row that is not finite lacks.
+_LACKS = {"positions": "fix", "rotations": "orientation", "rates": "angular rates"}
+
+
+class MessageReader:
+    """Unpacks the messages of one topic, in their order, as poses: of what is no pose, the other
+    part means nothing (level positions, rotations at the origin).
+
+    Parameters
+    ----------
+    message_type, measures : str
+        As of :func:`measured_as`.
+    origin : LocalOrigin, optional
+        Of latitudes and longitudes; the first one read by default.
+
+    Attributes
+    ----------
+    n_left_out : int
+        Messages without a fix or an orientation.
+    """
+
+    def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
+        self._row, self._measures = MESSAGE_TYPES[message_type], measures
+        self._integrator, self._origin = RateIntegrator(), origin or LocalOrigin()
+        self.n_left_out = 0
+
+    def columns(self, messages: Sequence[Buffer], is_ros1: bool) -> tuple[PoseColumns, BoolArray]:
+        """The next messages, and which of them have what is measured; the others are not finite.
+
+        Raises
+        ------
+        MalformedMessage
+            At the first that cannot be unpacked.
+        InputError
+            At the first latitude beyond 90 deg; its attribute ``index`` has the row.
+        """
+        columns = unpack_poses(messages, self._row.name, is_ros1)
+        if self._measures == "poses":
+            return columns, np.ones(len(messages), dtype=bool)
+        values = columns.poses[:, self._row.measures[self._measures]]
+        is_usable = np.asarray(np.isfinite(values).all(axis=1), dtype=bool)
+        self.n_left_out += int((~is_usable).sum())
+        poses = np.tile(_NOTHING, (len(values), 1))
+        if is_usable.any():
+            part = slice(3) if self._measures == "positions" else slice(3, 7)
+            poses[is_usable, part] = self._measured(columns.stamps_ns, values, is_usable)
+        poses[~is_usable] = np.nan
+        columns = columns._replace(poses=poses)
+        if self._row.is_sensors:
+            frames = columns.world_frames
+            columns = columns._replace(world_frames=[""] * len(poses), sensor_frames=frames)
+        return columns, is_usable
+
+    def _measured(self, stamps_ns: IntArray, values: FloatArray, rows: BoolArray) -> FloatArray:
+        """Positions (N, 3) or quaternions (N, 4) of what was read in some rows."""
+        if self._measures == "rates":
+            return self._integrator.quats_xyzw(stamps_ns[rows], values[rows])
+        if not self._row.is_geodetic:
+            return values[rows]
+        beyond = np.flatnonzero(rows & (np.abs(values[:, 0]) > POLE_DEG))
+        if len(beyond):
+            error = InputError(wrong_latitude(*values[beyond[0], :2]))
+            error.index = int(beyond[0])  # type: ignore[attr-defined]
+            raise error
+        lat, lon = np.radians(values[rows, :2]).T
+        return self._origin.local(lat, lon, values[rows, 2])
+
+    def __call__(self, data: Buffer) -> PoseFields:
+        """The next message, in CDR, as it arrives.
+
+        Raises
+        ------
+        InputError
+            If it cannot be unpacked, or lacks what is measured.
+        """
+        try:
+            if self._measures == "poses":
+                stamp_ns, world, sensor, of_pose = _unpack(_Cursor(data, False), self._row)
+                return PoseFields(stamp_ns, world, sensor, of_pose[:3], of_pose[3:])
+            columns, is_usable = self.columns([data], is_ros1=False)
+        except InputError:
+            raise
+        except MALFORMED as error:
+            raise InputError(f"not a message of type {self._row.name}: {error}") from error
+        if not is_usable.all():
+            raise InputError(f"the message has no {_LACKS[self._measures]}")
+        values = columns.poses[0].tolist()
+        frames = columns.world_frames[0], columns.sensor_frames[0]
+        return PoseFields(int(columns.stamps_ns[0]), *frames, values[:3], values[3:])

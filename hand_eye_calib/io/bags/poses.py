@@ -1,9 +1,7 @@
 """Poses of messages and of bags, one by one and in columns."""
 
-import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -54,25 +52,8 @@ class PoseColumns(NamedTuple):
 
 
 class StampedPose(NamedTuple):
-    """A pose of a stream.
-
-    Attributes
-    ----------
-    stream : str
-        "parent" or "child".
-    number : int
-        Number of the message within its topic, from 1; of a path or a transform, of the pose.
-    stamp_ns : int
-        From the header.
-    world_frame : str
-    sensor_frame : str or None
-        None if the message type does not carry it.
-    position : tuple of 3 floats
-        m.
-    quat_xyzw : tuple of 4 floats
-        As recorded: not checked, not normalised.
-    bag_ns : int
-        When the message was recorded.
+    """A pose of a stream: a row of PoseBlock, its position (m) and quaternion (scalar last) as
+    recorded, neither checked nor normalised.
     """
 
     stream: str
@@ -85,15 +66,20 @@ class StampedPose(NamedTuple):
     bag_ns: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PoseBlock:
     """N poses of streams in columns.
 
     Attributes
     ----------
-    streams, world_frames, sensor_frames : (N,) arrays of str or None
+    streams : (N,) array of str
+        "parent" or "child".
     message_numbers : (N,) int array
+        Of the message within its topic, from 1; of a path or a transform, of the pose.
     stamps_ns, bag_ns : (N,) int64 arrays
+        Of the header, and when the message was recorded.
+    world_frames, sensor_frames : (N,) arrays of str or None
+        None if the message type does not carry it.
     poses : (N, 7) array
         x y z qx qy qz qw.
     """
@@ -111,38 +97,28 @@ class PoseBlock:
 
     def __getitem__(self, index: Any) -> Self:
         """A part of the block: any slice, mask or index array."""
-        return type(self)(**{name: column[index] for name, column in vars(self).items()})
+        return type(self)(*(column[index] for column in vars(self).values()))
 
     @classmethod
     def concatenate(cls, blocks: Iterable["PoseBlock"]) -> "PoseBlock":
         """Join blocks in their order."""
-        columns = [vars(block) for block in blocks]
-        return cls(
-            **{name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
-        )
+        columns = zip(*(vars(block).values() for block in blocks), strict=True)
+        joined: Any = [*map(np.concatenate, columns)]
+        return cls(*joined)
 
     @classmethod
     def of_columns(
         cls, stream: str, message_numbers: IntArray, columns: PoseColumns, bag_ns: IntArray
     ) -> "PoseBlock":
         """Make a block of unpacked messages of one stream."""
-        return cls(
-            streams=np.full(len(message_numbers), stream, dtype=object),
-            message_numbers=message_numbers,
-            stamps_ns=columns.stamps_ns,
-            world_frames=np.array(columns.world_frames, dtype=object),
-            sensor_frames=np.array(columns.sensor_frames, dtype=object),
-            poses=columns.poses,
-            bag_ns=bag_ns,
-        )
+        streams = np.full(len(message_numbers), stream, dtype=object)
+        world, sensor = (np.array(each, dtype=object) for each in columns[1:3])
+        stamps_ns, *_, poses = columns
+        return cls(streams, message_numbers, stamps_ns, world, sensor, poses, bag_ns)
 
     def rows(self) -> Iterator[StampedPose]:
         """Iterate over the poses one by one."""
-        # Tuples, as quick to make as lists, do not occupy the garbage collector.
-        positions = struct.iter_unpack("3d", self.poses[:, :3].tobytes())
-        quats_xyzw = struct.iter_unpack("4d", self.poses[:, 3:].tobytes())
-        columns = (self.streams, self.message_numbers, self.stamps_ns, self.world_frames)
-        lists = (column.tolist() for column in (*columns, self.sensor_frames))
-        rows = zip(*lists, positions, quats_xyzw, self.bag_ns.tolist(), strict=True)
-        # A named tuple's own constructor takes three times as long, and there may be millions.
-        return map(partial(tuple.__new__, StampedPose), rows)
+        columns = [column.tolist() for column in vars(self).values()]
+        for *fields, pose, bag_ns in zip(*columns, strict=True):
+            row: Any = (*fields, tuple(pose[:3]), tuple(pose[3:]), bag_ns)
+            yield StampedPose(*row)

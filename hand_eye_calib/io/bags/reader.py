@@ -1,16 +1,17 @@
 """Reading the poses of two streams from bags."""
 
 import heapq
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Container, Iterator, Mapping
 from dataclasses import replace
-from itertools import chain, compress
+from itertools import chain, compress, pairwise
 from operator import itemgetter
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, IntArray
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
@@ -20,30 +21,24 @@ from hand_eye_calib.io.bags.messages import (
     MALFORMED,
     MESSAGE_TYPES,
     PATH_TYPE,
-    POSE_TYPES,
+    SENSOR_TYPES,
     TF_TYPES,
     MalformedMessage,
+    MessageReader,
+    measured_as,
     unpack_path,
     unpack_transforms,
 )
 from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns, PoseFields, StampedPose
-from hand_eye_calib.io.bags.recovery import Message, MessageKind
-from hand_eye_calib.io.bags.storage import (
-    BLOCK_SIZE,
-    BagFiles,
-    MessageBlock,
-    Storage,
-    message_blocks,
-)
+from hand_eye_calib.io.bags.recovery import Message
+from hand_eye_calib.io.bags.storage import BLOCK_SIZE, BagFiles, message_blocks
 from hand_eye_calib.io.bags.topics import (
-    MessageReader,
+    Part,
     Source,
     TopicDescription,
     TopicInfo,
-    check_source,
-    measured_as,
-    select_sources,
-    stamps_and_frames,
+    Topics,
+    joined,
     unreadable,
 )
 from hand_eye_calib.io.plausibility import PoseWatch
@@ -63,6 +58,11 @@ class PoseBag:
         file. They are read in the order of their times; those that were recorded at the same time
         are merged.
 
+    Attributes
+    ----------
+    start_ns, end_ns : int or None
+        Bag time of the first and last message; None if there is none.
+
     Raises
     ------
     InputError
@@ -81,6 +81,14 @@ class PoseBag:
         except BaseException:
             self.close()
             raise
+        found = defaultdict[str, list[tuple[str, int]]](list)
+        for name, about in chain(*(each.topics.items() for each in self._files.storages)):
+            found[name].append(about)
+        self._topics: Topics = joined(found, str(self))
+        spans = [(each.start_ns, each.end_ns) for each in self._files.storages]
+        known = [(first, last) for first, last in spans if first is not None and last is not None]
+        self.start_ns = min((first for first, _ in known), default=None)
+        self.end_ns = max((last for _, last in known), default=None)
 
     def __enter__(self) -> Self:
         return self
@@ -119,18 +127,6 @@ class PoseBag:
         return of_stamps + sum(reader.n_left_out for reader in self._readers.values())
 
     @property
-    def start_ns(self) -> int | None:
-        """Bag time of the first message, None if there is none."""
-        starts_ns = [storage.start_ns for storage in self._files.storages]
-        return min((each for each in starts_ns if each is not None), default=None)
-
-    @property
-    def end_ns(self) -> int | None:
-        """Bag time of the last message, None if there is none."""
-        ends_ns = [storage.end_ns for storage in self._files.storages]
-        return max((each for each in ends_ns if each is not None), default=None)
-
-    @property
     def duration_s(self) -> float:
         """Time from the first message to the last; 0 if there is none."""
         return ((self.end_ns or 0) - (self.start_ns or 0)) * 1e-9
@@ -143,15 +139,7 @@ class PoseBag:
 
     def topics(self) -> list[TopicInfo]:
         """All topics, in the order of their names."""
-        return list(self._topics().values())
-
-    def _topics(self) -> dict[str, TopicInfo]:
-        found: dict[str, tuple[str, int]] = {}
-        for storage in self._files.storages:
-            for name, (message_type, count) in storage.topics.items():
-                known, before = found.get(name, (message_type, 0))
-                found[name] = (message_type if message_type == known else "", before + count)
-        return {name: TopicInfo(name, *found[name]) for name in sorted(found)}
+        return list(self._topics.values())
 
     def describe(self) -> list[TopicDescription]:
         """All topics with rates and frames; reads all poses and transforms.
@@ -161,26 +149,20 @@ class PoseBag:
         InputError
             If a message cannot be read.
         """
-        infos = self.topics()
-        frames: dict[str, dict[tuple[str, str | None], None]] = {each.name: {} for each in infos}
-        stamps_ns: dict[str, tuple[int, int]] = {}
-        counts = dict.fromkeys(frames, 0)
-        known_types = (*POSE_TYPES, PATH_TYPE, *TF_TYPES)
-        blocks = self._blocks([info.name for info in infos if info.type in known_types])
-        for kind, _, messages in chain.from_iterable(map(_by_kind, blocks)):
-            name = kind.topic
-            found_ns, pairs = stamps_and_frames(kind, messages, counts[name] + 1)
-            counts[name] += len(messages)
+        frames: dict[str, dict[tuple[str, str | None], None]] = {each: {} for each in self._topics}
+        spans_ns: dict[str, tuple[int, int]] = {}
+        wanted = {*SENSOR_TYPES, *TF_TYPES}
+        names = [info.name for info in self.topics() if info.type in wanted]
+        for part in chain.from_iterable(self._unpackable(names)):
+            found_ns, pairs = part.stamps_and_frames()
+            name = part.kind.topic
             if len(frames[name]) < _MOST_FRAMES:
                 frames[name] |= pairs
             if len(found_ns):
                 first_ns, last_ns = int(found_ns.min()), int(found_ns.max())
-                before = stamps_ns.get(name, (first_ns, last_ns))
-                stamps_ns[name] = (min(first_ns, before[0]), max(last_ns, before[1]))
-        return [
-            info.described(frames[info.name], stamps_ns.get(info.name), self.duration_s)
-            for info in infos
-        ]
+                before = spans_ns.get(name, (first_ns, last_ns))
+                spans_ns[name] = (min(first_ns, before[0]), max(last_ns, before[1]))
+        return self._topics.described(frames, spans_ns, (self.start_ns or 0, self.end_ns or 0))
 
     def select_topics(
         self, parent: Source | None = None, child: Source | None = None
@@ -203,7 +185,7 @@ class PoseBag:
             If a named topic is not in the bag or holds no poses, if both are the same, or if there
             is a choice to make. The message lists the topics that are there.
         """
-        return select_sources(parent, child, self._topics(), str(self))
+        return self._topics.select(parent, child)
 
     def check(self, source: Source) -> None:
         """Refuse a topic that is not in the bag or has no poses, and frames without transforms.
@@ -213,21 +195,15 @@ class PoseBag:
         InputError
             The message lists the topics that are there.
         """
-        check_source(source, self._topics(), str(self))
+        self._topics.check(source)
 
     def expected(self, *sources: Source | None) -> int | None:
         """Number of poses that the sources will give, as far as the bag says; None for paths and
         transforms.
         """
-        topics = self._topics()
-        count = 0
-        for source in sources:
-            if not isinstance(source, str) or source not in topics:
-                return None
-            if topics[source].type not in MESSAGE_TYPES:
-                return None
-            count += topics[source].count
-        return count
+        if not all(self._topics.type_of(source) in MESSAGE_TYPES for source in sources):
+            return None
+        return sum(self._topics[str(source)].count for source in sources)
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
         """What a source measures, one of config.MEASURES: what is wanted of it, or what messages of
@@ -238,9 +214,7 @@ class PoseBag:
         ConfigError
             If its messages do not have what is wanted.
         """
-        topics = self._topics()
-        message_type = topics[source].type if isinstance(source, str) and source in topics else ""
-        return measured_as(message_type, wanted, source)
+        return measured_as(self._topics.type_of(source), wanted, source)
 
     # ---- poses
 
@@ -284,18 +258,19 @@ class PoseBag:
             If the bag is damaged, or the transforms do not lead from one frame to the other.
         """
         sources = {"parent": parent, "child": child}
-        types = {topic.name: topic.type for topic in self.topics()}
         self._watches = {str(source): PoseWatch() for source in sources.values()}
         self._readers = {}
-        direct, paths, transforms = {}, {}, {}
+        direct: dict[str, str] = {}
+        paths, transforms = {}, {}
         for stream, source in sources.items():
+            type_ = self._topics.type_of(source)
             if isinstance(source, TfSource):
                 transforms[stream] = source
-            elif source is not None and types.get(source) in MESSAGE_TYPES:
+            elif source is not None and type_ in MESSAGE_TYPES:
                 direct[source] = stream
                 measured = self.measured(source, (measures or {}).get(stream, "auto"))
-                self._readers[source] = MessageReader(types[source], measured)
-            elif source is not None and types.get(source) == PATH_TYPE:
+                self._readers[source] = MessageReader(type_, measured)
+            elif source is not None and type_ == PATH_TYPE:
                 paths[stream] = source
         blocks = self._direct_blocks(direct) if direct else iter(())
         if paths or transforms:
@@ -308,59 +283,37 @@ class PoseBag:
 
     def _direct_blocks(self, streams: dict[str, str]) -> Iterator[PoseBlock]:
         """Poses of topics that carry one in each message."""
-        counts = dict.fromkeys(streams, 0)
-        for block in self._blocks(streams):
-            parts, kept_rows = [], []
-            for kind, rows, messages in _by_kind(block):
-                numbers = counts[kind.topic] + 1 + np.arange(len(rows))
-                counts[kind.topic] += len(rows)
-                part, keep = self._unpacked_poses(
-                    kind, streams[kind.topic], numbers, messages, block.bag_ns[rows]
-                )
-                parts.append(part[keep])
-                kept_rows.append(rows[keep])
-            yield PoseBlock.concatenate(parts)[np.argsort(np.concatenate(kept_rows))]
+        for parts in self._unpackable(streams):
+            blocks, kept_rows = [], []
+            for part in parts:
+                name, reader = part.kind.topic, self._readers[part.kind.topic]
+                try:
+                    columns, keep = reader.columns(part.messages, part.kind.encoding == "ros1")
+                except MalformedMessage as error:
+                    number = int(part.numbers[error.index])
+                    raise unreadable(part.kind, number, error) from error
+                except InputError as error:
+                    number = part.numbers[getattr(error, "index", 0)]
+                    raise InputError(f"{name}, message {number}: {error}") from None
+                first = int(part.numbers[0])
+                keep &= self._watches[name].believable(first, columns.stamps_ns, part.bag_ns)
+                block = PoseBlock.of_columns(streams[name], part.numbers, columns, part.bag_ns)
+                blocks.append(self._watched(name, block[keep]))
+                kept_rows.append(part.rows[keep])
+            yield PoseBlock.concatenate(blocks)[np.argsort(np.concatenate(kept_rows))]
 
-    def _unpacked_poses(
-        self,
-        kind: MessageKind,
-        stream: str,
-        message_numbers: IntArray,
-        messages: Sequence[bytes],
-        bag_ns: IntArray,
-    ) -> tuple[PoseBlock, BoolArray]:
-        """PoseBlock of messages, and which of them to keep."""
-        reader, first_number = self._readers[kind.topic], int(message_numbers[0])
+    def _watched(self, name: str, block: PoseBlock) -> PoseBlock:
+        """Look at poses of a source."""
         try:
-            columns = reader.columns(messages, kind.encoding == "ros1")
-        except MalformedMessage as error:
-            raise unreadable(kind, first_number + error.index, error) from error
-        except InputError as error:
-            number = first_number + getattr(error, "index", 0)
-            raise InputError(f"{kind.topic}, message {number}: {error}") from None
-        keep = self._watches[kind.topic].believable(first_number, columns.stamps_ns, bag_ns)
-        keep &= reader.is_measured(columns.poses)
-        self._watch(kind.topic, message_numbers, columns, keep)
-        return PoseBlock.of_columns(stream, message_numbers, columns, bag_ns), keep
-
-    def _watch(
-        self, name: str, message_numbers: IntArray, columns: PoseColumns, keep: BoolArray
-    ) -> None:
-        """Look at the poses that are kept."""
-        try:
-            self._watches[name].add(
-                message_numbers[keep], columns.stamps_ns[keep], columns.poses[keep]
-            )
+            self._watches[name].add(block.message_numbers, block.stamps_ns, block.poses)
         except InputError as error:
             raise InputError(f"{name}, {error}") from None
+        return block
 
-    def _watched_block(
-        self, name: str, stream: str, columns: PoseColumns, bag_ns: IntArray
-    ) -> PoseBlock:
-        """PoseBlock of all poses of a stream, in the order of bag time."""
-        message_numbers = 1 + np.arange(len(bag_ns))
-        self._watch(name, message_numbers, columns, np.ones(len(bag_ns), dtype=bool))
-        block = PoseBlock.of_columns(stream, message_numbers, columns, bag_ns)
+    def _whole(self, name: str, stream: str, columns: PoseColumns, bag_ns: IntArray) -> PoseBlock:
+        """All poses of a source that is no topic of poses, in the order of bag time."""
+        numbers = 1 + np.arange(len(bag_ns))
+        block = self._watched(name, PoseBlock.of_columns(stream, numbers, columns, bag_ns))
         return block[np.argsort(bag_ns, kind="stable")]
 
     def _path_poses(self, stream: str, topic: str) -> PoseBlock:
@@ -369,8 +322,7 @@ class PoseBag:
         """
         stamps_ns, bag_ns = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
         poses, world_frame = np.empty((0, 7)), ""
-        messages = self._messages([topic])
-        for number, (kind, message_ns, data) in enumerate(messages, start=1):
+        for number, (kind, message_ns, data) in enumerate(self._messages([topic]), start=1):
             try:
                 world_frame, new_stamps_ns, new_poses = unpack_path(data, kind.encoding == "ros1")
             except MALFORMED as error:
@@ -384,49 +336,39 @@ class PoseBag:
             stamps_ns = np.concatenate([stamps_ns[older], new_stamps_ns])
             bag_ns = np.concatenate([bag_ns[older], new_bag_ns])
             poses = np.concatenate([poses[older], new_poses[order]])
-        if len(stamps_ns) > 1 and not stamps_ns.any():
+        count = len(stamps_ns)
+        if count > 1 and not stamps_ns.any():
             raise InputError(
                 f"the poses of path {topic} have no stamps: all are zero; use the odometry that "
                 "the path was made from"
             )
-        count = len(stamps_ns)
         columns = PoseColumns(stamps_ns, [world_frame] * count, [None] * count, poses)
-        return self._watched_block(topic, stream, columns, bag_ns)
+        return self._whole(topic, stream, columns, bag_ns)
 
     def _transformed_poses(self, sources: dict[str, TfSource], max_gap_s: float) -> list[PoseBlock]:
         """A PoseBlock for each stream whose poses come from the transform tree."""
-        tree = self.transforms()
+        tree, _ = self._tree_and_static()
         chains = [side for source in sources.values() for side in tree.chain(source)]
         for transform, is_static, bag_ns in self._transforms(set(chain.from_iterable(chains))):
             tree.keep(transform, is_static, bag_ns)
         found = []
         for stream, source in sources.items():
             trajectory, log_ns, n_left_out = tree.trajectory(source, max_gap_s)
+            count = len(trajectory)
             if n_left_out:
                 self._gaps.append(
-                    f"{source}: {n_left_out} of {n_left_out + len(trajectory)} poses were left "
-                    "out, because another transform of the chain was not known within "
-                    f"{max_gap_s:g} s"
+                    f"{source}: {n_left_out} of {n_left_out + count} poses were left out, because "
+                    f"another transform of the chain was not known within {max_gap_s:g} s"
                 )
             quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
             columns = PoseColumns(
                 trajectory.stamps_ns,
-                [source.world_frame] * len(trajectory),
-                [source.sensor_frame] * len(trajectory),
+                [source.world_frame] * count,
+                [source.sensor_frame] * count,
                 np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1),
             )
-            found.append(self._watched_block(str(source), stream, columns, log_ns))
+            found.append(self._whole(str(source), stream, columns, log_ns))
         return found
-
-    def transforms(self) -> TransformTree:
-        """The TransformTree of the bag, without poses.
-
-        Raises
-        ------
-        InputError
-            If the transforms form no tree or are damaged.
-        """
-        return self._tree_and_static()[0]
 
     def static_frames(self) -> FrameTree:
         """The frames of the bag and their static transforms; of repeated ones the last.
@@ -443,7 +385,7 @@ class PoseBag:
         return tree
 
     def _tree_and_static(self) -> tuple[TransformTree, dict[str, PoseFields]]:
-        """All edges, and the last static transform of each frame."""
+        """All edges without their poses, and the last static transform of each frame."""
         tree, static = TransformTree(), dict[str, PoseFields]()
         for transform, is_static, _ in self._transforms():
             tree.note(transform, is_static)
@@ -456,8 +398,7 @@ class PoseBag:
     ) -> Iterator[tuple[PoseFields, bool, int]]:
         """Transforms, whether each is static, and its bag time; of some frames, or of all."""
         names = [topic.name for topic in self.topics() if topic.type in TF_TYPES]
-        messages = self._messages(names)
-        for number, (kind, bag_ns, data) in enumerate(messages, start=1):
+        for number, (kind, bag_ns, data) in enumerate(self._messages(names), start=1):
             try:
                 for transform in unpack_transforms(data, kind.encoding == "ros1"):
                     if frames is None or transform.sensor_frame in frames:
@@ -469,17 +410,44 @@ class PoseBag:
 
     def _messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Messages of some topics in the order of bag time."""
-        return chain.from_iterable(map(_rows, self._blocks(topics)))
+        return chain.from_iterable(self._blocks(topics))
 
-    def _blocks(self, topics: Collection[str]) -> Iterator[MessageBlock]:
+    def _blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Messages of some topics in the order of bag time, many at once."""
-        for group in _overlapping(self._files.storages):
-            if len(group) == 1:
-                yield from group[0].blocks(topics)
-            else:
-                streams = (map(_rows, storage.blocks(topics)) for storage in group)
-                merged = heapq.merge(*map(chain.from_iterable, streams), key=itemgetter(1))
-                yield from message_blocks(merged, self._gaps.append)
+        storages = [each for each in self._files.storages if each.start_ns is not None]
+        if all((one.end_ns or 0) < (two.start_ns or 0) for one, two in pairwise(storages)):
+            for storage in storages:
+                yield from storage.blocks(topics)
+        else:
+            streams = (chain.from_iterable(storage.blocks(topics)) for storage in storages)
+            yield from message_blocks(heapq.merge(*streams, key=itemgetter(1)), self._gaps.append)
+
+    def _unpackable(self, topics: Collection[str]) -> Iterator[list[Part]]:
+        """Messages of some topics, many at once, those of each kind together."""
+        counts = dict.fromkeys(topics, 0)
+        for block in self._blocks(topics):
+            kinds, times_ns, contents = zip(*block, strict=True)
+            bag_ns, parts = np.array(times_ns), []
+            for kind in {id(each): each for each in kinds}.values():
+                is_of_kind = [each is kind for each in kinds]
+                rows = np.flatnonzero(is_of_kind)
+                numbers = counts[kind.topic] + 1 + np.arange(len(rows))
+                counts[kind.topic] += len(rows)
+                messages = [*compress(contents, is_of_kind)]
+                parts.append(Part(kind, rows, numbers, messages, bag_ns[rows]))
+            yield parts
+
+
+def _first_seen(
+    new_stamps_ns: IntArray, message_ns: int, stamps_ns: IntArray, bag_ns: IntArray
+) -> IntArray:
+    """Bag time at which each stamp appeared first; ``stamps_ns`` are sorted."""
+    first_ns = np.full(len(new_stamps_ns), message_ns, dtype=np.int64)
+    if len(stamps_ns):
+        index = np.minimum(np.searchsorted(stamps_ns, new_stamps_ns), len(stamps_ns) - 1)
+        is_known = stamps_ns[index] == new_stamps_ns
+        first_ns[is_known] = bag_ns[index[is_known]]
+    return first_ns
 
 
 def read_bag_trajectory(
@@ -535,51 +503,7 @@ def trajectory_of(
     if (np.diff(first) < 0).any():
         notes.append(f"{source}: stamps were not in the order of the bag and were sorted")
     poses = poses[first]
-    trajectory = Trajectory.from_quat_xyzw(
-        stamps_ns,
-        poses.poses[:, :3],
-        poses.poses[:, 3:],
-        sensor_frame=poses.sensor_frames[0] or "",
-        world_frame=poses.world_frames[0],
-    )
+    positions, quats_xyzw = poses.poses[:, :3], poses.poses[:, 3:]
+    frames = poses.sensor_frames[0] or "", poses.world_frames[0]
+    trajectory = Trajectory.from_quat_xyzw(stamps_ns, positions, quats_xyzw, *frames)
     return replace(trajectory, measures=kind) if kind != "poses" else trajectory, notes
-
-
-def _first_seen(
-    new_stamps_ns: IntArray, message_ns: int, stamps_ns: IntArray, bag_ns: IntArray
-) -> IntArray:
-    """Bag time at which each stamp appeared first; ``stamps_ns`` are sorted."""
-    first_ns = np.full(len(new_stamps_ns), message_ns, dtype=np.int64)
-    if len(stamps_ns):
-        index = np.minimum(np.searchsorted(stamps_ns, new_stamps_ns), len(stamps_ns) - 1)
-        is_known = stamps_ns[index] == new_stamps_ns
-        first_ns[is_known] = bag_ns[index[is_known]]
-    return first_ns
-
-
-def _rows(block: MessageBlock) -> Iterator[Message]:
-    """Messages of a block one by one."""
-    return zip(block.kinds, block.bag_ns.tolist(), block.contents, strict=True)
-
-
-def _by_kind(block: MessageBlock) -> Iterator[tuple[MessageKind, IntArray, list[bytes]]]:
-    """Each kind of messages in a block, their rows and their bytes."""
-    for kind in {id(each): each for each in block.kinds}.values():
-        is_of_kind = [each is kind for each in block.kinds]
-        yield kind, np.flatnonzero(is_of_kind), list(compress(block.contents, is_of_kind))
-
-
-def _overlapping(storages: list[Storage]) -> Iterator[list[Storage]]:
-    """Storages in order, those that overlap in time together."""
-    group: list[Storage] = []
-    last_ns = 0
-    for storage in storages:
-        if storage.start_ns is None or storage.end_ns is None:
-            continue
-        if group and storage.start_ns > last_ns:
-            yield group
-            group = []
-        last_ns = max(last_ns, storage.end_ns) if group else storage.end_ns
-        group.append(storage)
-    if group:
-        yield group

@@ -2,6 +2,7 @@
 mcap, which rosbags has no part of; rosbag1 and sqlite3 here.
 """
 
+import heapq
 import shutil
 import sqlite3
 import tempfile
@@ -9,12 +10,18 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
 from urllib.parse import quote
 
 from hand_eye_calib.errors import MissingDependencyError, printable
-from hand_eye_calib.io.limits import LARGEST_RATIO, LONGEST_NAME, SMALLEST_UNPACKED
+from hand_eye_calib.io.limits import (
+    LARGEST_DISORDER,
+    LARGEST_RATIO,
+    LONGEST_NAME,
+    SMALLEST_UNPACKED,
+)
 
 
 class MessageKind(NamedTuple):
@@ -60,10 +67,19 @@ def recovered_messages(file: Path, lose: Lose) -> Iterator[Message]:
     return recover(file, lose)
 
 
-def check_believable(unpacked_size: int, packed_size: int) -> None:
-    """Refuse compressed data that claims more than any recording unpacks to (ValueError)."""
-    if unpacked_size > SMALLEST_UNPACKED + LARGEST_RATIO * packed_size:
-        raise ValueError(f"{packed_size} bytes that unpack to {unpacked_size} are not believable")
+def in_order(messages: Iterable[Message]) -> Iterator[Message]:
+    """Messages that are nearly in the order of time, in that order, with little memory."""
+    waiting: list[tuple[int, int, Message]] = []
+    sequence, size = count(), 0
+    for message in messages:
+        heapq.heappush(waiting, (message[1], next(sequence), message))
+        size += len(message[2])
+        while size > LARGEST_DISORDER:
+            first = heapq.heappop(waiting)[2]
+            size -= len(first[2])
+            yield first
+    while waiting:
+        yield heapq.heappop(waiting)[2]
 
 
 def reason_of(error: BaseException) -> str:
@@ -71,11 +87,14 @@ def reason_of(error: BaseException) -> str:
     return " ".join([f"{type(error).__name__}:", *str(error).split()]).rstrip(".:")
 
 
-def _left_out(position: int, error: Exception) -> str:
-    """What is said when a chunk, or the rest of it, cannot be read."""
-    if isinstance(error, MemoryError):
-        raise error
-    return f"the chunk at byte {position} is damaged ({reason_of(error)})"
+def _from_chunk(chunk: Iterable[Any], position: int, lose: Lose) -> Iterator[Any]:
+    """What comes out of the chunk at a position, up to where it is damaged."""
+    try:
+        yield from chunk
+    except MemoryError:
+        raise
+    except Exception as error:
+        lose(f"the chunk at byte {position} is damaged ({reason_of(error)})")
 
 
 def _stop(file: BinaryIO, position: int, error: Exception) -> str:
@@ -105,11 +124,6 @@ class _WholeReads:
         return data
 
 
-def _whole_reads(file: BinaryIO) -> Any:
-    """The annotations of the library mcap ask for a class of io; it needs only the method."""
-    return _WholeReads(file)
-
-
 def _mcap(path: Path, lose: Lose) -> Iterator[Message]:
     try:
         from mcap import records as mcap
@@ -124,8 +138,12 @@ def _mcap(path: Path, lose: Lose) -> Iterator[Message]:
     schemas: dict[int, str] = {}
     kinds: dict[int, MessageKind] = {}
 
-    def messages(records: Iterable[Any]) -> Iterator[Any]:
-        for record in records:
+    def records(source: Any, skip_magic: bool = False) -> Iterator[Any]:
+        whole_reads: Any = _WholeReads(source)
+        return StreamReader(whole_reads, skip_magic=skip_magic, emit_chunks=True).records
+
+    def messages(found: Iterable[Any]) -> Iterator[Message]:
+        for record in found:
             if isinstance(record, mcap.Schema):
                 schemas[record.id] = record.name
             elif isinstance(record, mcap.Channel):
@@ -137,31 +155,24 @@ def _mcap(path: Path, lose: Lose) -> Iterator[Message]:
                 yield kinds[record.channel_id], record.log_time, record.data
 
     def inside(chunk: Any, is_whole: bool = True) -> Iterator[Any]:
-        check_believable(chunk.uncompressed_size, len(chunk.data))
+        if chunk.uncompressed_size > SMALLEST_UNPACKED + LARGEST_RATIO * len(chunk.data):
+            raise ValueError(f"{chunk.uncompressed_size} bytes unpacked are not believable")
         stream, size = get_chunk_data_stream(chunk, validate_crc=is_whole)
         if is_whole and size != chunk.uncompressed_size:
             raise ValueError(f"it unpacks to {size} bytes, not {chunk.uncompressed_size}")
-        reader = StreamReader(_whole_reads(BytesIO(stream.read(size))), skip_magic=True)
-        try:
-            yield from reader.records
-        except EOFError:
-            return  # the end of the chunk
+        with suppress(EOFError):  # the end of the chunk
+            yield from records(BytesIO(stream.read(size)), skip_magic=True)
 
     position = 0
     with path.open("rb") as file:
         # Topics are described in the first chunk, which may be damaged, and again at the end.
         with suppress(Exception):  # what is wrong is said below
-            deque(messages(StreamReader(_whole_reads(file), emit_chunks=True).records), maxlen=0)
+            deque(messages(records(file)), maxlen=0)
         file.seek(0)
         try:
-            for record in StreamReader(_whole_reads(file), emit_chunks=True).records:
-                if isinstance(record, mcap.Chunk):
-                    try:
-                        yield from messages(inside(record))
-                    except Exception as error:
-                        lose(_left_out(position, error))
-                else:
-                    yield from messages([record])
+            for record in records(file):
+                found = inside(record) if isinstance(record, mcap.Chunk) else [record]
+                yield from _from_chunk(messages(found), position, lose)
                 position = file.tell()
         except Exception as error:
             lose(_stop(file, position, error))
@@ -202,6 +213,10 @@ def _rosbag1(path: Path, lose: Lose) -> Iterator[Message]:
             elif op == rosbag1.RecordType.MSGDATA and header.get_uint32("conn") in kinds:
                 yield kinds[header.get_uint32("conn")], header.get_time("time"), data
 
+    def inside(header: Any, data: bytes) -> Iterator[Message]:
+        unpack = rosbag1.decompressors[header.get_string("compression")]
+        yield from messages(BytesIO(unpack(data)))
+
     position, has_index = 0, False
     with path.open("rb") as file:
         try:
@@ -216,11 +231,7 @@ def _rosbag1(path: Path, lose: Lose) -> Iterator[Message]:
                 op = header.get_uint8("op")
                 has_index |= op == rosbag1.RecordType.CHUNK_INFO
                 if op == rosbag1.RecordType.CHUNK:
-                    try:
-                        unpack = rosbag1.decompressors[header.get_string("compression")]
-                        yield from messages(BytesIO(unpack(data)))
-                    except Exception as error:
-                        lose(_left_out(position, error))
+                    yield from _from_chunk(inside(header, data), position, lose)
                 position = file.tell()
             if not has_index:
                 raise EOFError("it has no index at its end")
@@ -230,19 +241,17 @@ def _rosbag1(path: Path, lose: Lose) -> Iterator[Message]:
 
 def _sqlite3(path: Path, lose: Lose) -> Iterator[Message]:
     """Rows in the order in which they were written, past damaged pages."""
-    with path.open("rb") as file:
+    with path.open("rb") as file, tempfile.NamedTemporaryFile(prefix="hand_eye_calib_") as copy:
         page_size = int.from_bytes(file.read(18)[16:], "big")
         page_size = _LARGEST_PAGE if page_size < _SMALLEST_PAGE else page_size
         size = path.stat().st_size // page_size * page_size
         if size < path.stat().st_size:
             # SQLite takes what lacks of the last page for zeros, and would return them as poses.
-            with tempfile.NamedTemporaryFile(prefix="hand_eye_calib_") as whole_pages:
-                file.seek(0)
-                shutil.copyfileobj(file, whole_pages)
-                whole_pages.truncate(size)
-                yield from _rows(Path(whole_pages.name), lose)
-            return
-    yield from _rows(path, lose)
+            file.seek(0)
+            shutil.copyfileobj(file, copy)
+            copy.truncate(size)
+            path = Path(copy.name)
+        yield from _rows(path, lose)
 
 
 def _rows(path: Path, lose: Lose) -> Iterator[Message]:

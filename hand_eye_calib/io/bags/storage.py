@@ -3,32 +3,27 @@
 A file that rosbags cannot open, or not read to its end, is read record by record: see recovery.py.
 """
 
-import heapq
 import re
 import sys
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
-from itertools import compress, count, dropwhile, islice
-from operator import itemgetter, methodcaller
+from itertools import dropwhile, islice
+from operator import itemgetter
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.errors import InputError, MissingDependencyError
-from hand_eye_calib.io.bags import indexed
 from hand_eye_calib.io.bags.recovery import (
     Lose,
     Message,
     MessageKind,
+    in_order,
     reason_of,
     recovered_messages,
 )
 from hand_eye_calib.io.limits import (
     BLOCK_BYTES,
-    LARGEST_DISORDER,
     LARGEST_RATIO,
     MOST_BAG_FILES,
     MOST_TOPICS,
@@ -50,14 +45,8 @@ _ENCODINGS = ("cdr", "ros1")
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE_BYTES = 1 << 20
 _MOST_LOSSES = 10
-
-
-class MessageBlock(NamedTuple):
-    """N messages in columns: kinds, bag times (N,) in ns, and bytes."""
-
-    kinds: Sequence[MessageKind]
-    bag_ns: IntArray
-    contents: Sequence[bytes]
+# At the end of an mcap: where the index begins, two more numbers, and the magic bytes.
+_MCAP_FOOTER_SIZE = 8 + 8 + 4 + 8
 
 
 class Storage:
@@ -120,11 +109,13 @@ class Storage:
         self._reader = None
 
     def _open(self) -> None:
-        self._reader = reader = indexed.opened(self._file)
-        if not indexed.knows_all_messages(reader):
-            raise ValueError("it has no index")
+        self._reader = reader = _opened(self._file)
+        chunks = getattr(getattr(reader, "storage", None), "chunks", None)
+        n_indexed = sum(sum(each.channel_count.values()) for each in chunks or ())
+        if chunks is not None and n_indexed != reader.message_count:
+            raise ValueError("it has no index")  # of all messages: rosbags would miss the others
         for connection in reader.connections:
-            self._add(indexed.kind_of(connection), connection.msgcount)
+            self._add(_kind_of(connection), connection.msgcount)
         if reader.message_count:
             self._cover(reader.start_time)
             self._cover(reader.end_time - 1)
@@ -161,7 +152,7 @@ class Storage:
 
     # ---- messages
 
-    def blocks(self, topics: Collection[str]) -> Iterator[MessageBlock]:
+    def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Iterate over the messages of some topics in the order of bag time, many at once.
 
         Raises
@@ -177,35 +168,43 @@ class Storage:
                 return
             yield block
 
-    def _blocks(self, topics: Collection[str]) -> Iterator[MessageBlock]:
+    def _blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Messages as rosbags has them; from where it fails, as far as they can be recovered."""
-        last_ns: IntArray = np.empty(0, dtype=np.int64)
-        lose: Lose = _say_nothing
+        # The losses of a file that rosbags cannot open were noted when it was opened.
+        said: list[str] = []
+        lose: Lose = said.append if self._reader is None else self._lose
+        last: list[Message] = []
         if self._reader is not None:
-            connections = self._reader.connections
-            kinds = {each.id: indexed.kind_of(each) for each in connections}
-            wanted = {key: kind for key, kind in kinds.items() if self._is_wanted(kind, topics)}
             try:
-                n_missing = sum(each.msgcount for each in connections if each.id in wanted)
-                for block in message_blocks(indexed.messages_of(self._reader, wanted), self._lose):
-                    yield block
-                    last_ns = block.bag_ns
-                    n_missing -= len(last_ns)
-                if n_missing:
-                    self._lose(f"{n_missing} of the messages that its index has are missing")
+                for last in message_blocks(self._indexed(topics), self._lose):
+                    yield last
                 return
             except Exception as error:
                 if _is_out_of_memory(error):
                     raise
                 self._lose(f"it is damaged ({reason_of(error)}), and was read record by record")
-                lose = self._lose
         found = recovered_messages(self._file, lose)
-        ordered = _in_order(each for each in found if self._is_wanted(each[0], topics))
-        if len(last_ns):  # those before, and these at the last time, were given already
-            end_ns = int(last_ns[-1])
+        ordered = in_order(each for each in found if self._is_wanted(each[0], topics))
+        if last:  # those before, and these at the last time, were given already
+            end_ns = last[-1][1]
             later = dropwhile(lambda message: message[1] < end_ns, ordered)
-            ordered = islice(later, int((last_ns == end_ns).sum()), None)
+            ordered = islice(later, sum(each[1] == end_ns for each in last), None)
         yield from message_blocks(ordered, self._lose)
+
+    def _indexed(self, topics: Collection[str]) -> Iterator[Message]:
+        """Messages of some topics as rosbags has them."""
+        kinds = {each.id: _kind_of(each) for each in self._reader.connections}
+        wanted = [
+            each for each in self._reader.connections if self._is_wanted(kinds[each.id], topics)
+        ]
+        if not wanted:
+            return
+        n_missing = sum(each.msgcount for each in wanted)
+        for connection, bag_ns, data in self._reader.messages(wanted):
+            n_missing -= 1
+            yield kinds[connection.id], bag_ns, data
+        if n_missing:
+            self._lose(f"{n_missing} of the messages that its index has are missing")
 
     def _is_wanted(self, kind: MessageKind, topics: Collection[str]) -> bool:
         """Whether it is of one of the topics, whose messages must be encoded as CDR or of ROS 1."""
@@ -240,41 +239,52 @@ class Storage:
             ) from error
 
 
-def message_blocks(messages: Iterable[Message], lose: Lose) -> Iterator[MessageBlock]:
+def _opened(file: Path) -> Any:
+    """A reader of rosbags, open."""
+    try:
+        from rosbags import rosbag1, rosbag2
+    except ImportError as error:
+        raise MissingDependencyError(
+            "reading bags needs rosbags, which is not installed: pip install rosbags"
+        ) from error
+    if file.suffix == ".mcap":
+        with file.open("rb") as mcap:
+            mcap.seek(-min(_MCAP_FOOTER_SIZE, file.stat().st_size), 2)
+            if mcap.read(8) == bytes(8):
+                raise ValueError("it has no index")
+    reader: Any = rosbag1.Reader(file) if file.suffix == ".bag" else rosbag2.Reader(file)
+    reader.open()
+    return reader
+
+
+def _kind_of(connection: Any) -> MessageKind:
+    encoding = getattr(connection.ext, "serialization_format", "ros1")
+    return MessageKind.of(connection.topic, connection.msgtype, encoding)
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Also in SQLite as rosbags uses it, whose error is of a kind of its own."""
+    return isinstance(error, MemoryError) or type(error).__name__ == "NoMemError"
+
+
+def message_blocks(messages: Iterable[Message], lose: Lose) -> Iterator[list[Message]]:
     """Messages in blocks that are neither long nor, if they do not grow suddenly, large; those that
     are not bytes with a time are left out, and those compressed one by one unpacked.
     """
     iterator = iter(messages)
     while rows := _next_rows(iterator):
-        kinds, times_ns, contents = zip(*rows, strict=True)
-        bag_ns = np.array(times_ns)
-        if {*map(type, contents)} != {bytes} or bag_ns.dtype != np.int64 or bag_ns.min() < 0:
+        good = [row for row in rows if type(row[2]) is bytes and type(row[1]) is int]
+        good = [row for row in good if 0 <= row[1] < 1 << 63]
+        if len(good) < len(rows):
             lose("messages that are not bytes with a time were left out")
-            rows = [each for each in rows if type(each[1]) is int and type(each[2]) is bytes]
-            rows = [each for each in rows if 0 <= each[1] < 1 << 63]
-            if not rows:
-                continue
-            kinds, times_ns, contents = zip(*rows, strict=True)
-            bag_ns = np.array(times_ns)
         # Plain CDR never begins so.
-        if any(map(methodcaller("startswith", _ZSTD_MAGIC), contents)):
-            contents = tuple(map(_unpacked, contents))
-            good = [data is not None for data in contents]
-            if not all(good):
+        if any(data.startswith(_ZSTD_MAGIC) for _, _, data in good):
+            unpacked = [(kind, bag_ns, _unpacked(data)) for kind, bag_ns, data in good]
+            good = [(kind, bag_ns, data) for kind, bag_ns, data in unpacked if data is not None]
+            if len(good) < len(unpacked):
                 lose("compressed messages that are damaged were left out")
-            kinds, contents = tuple(compress(kinds, good)), tuple(compress(contents, good))
-            bag_ns = bag_ns[good]
-        yield MessageBlock(kinds, bag_ns, contents)
-
-
-def _unpacked(data: bytes) -> bytes | None:
-    """A message, unpacked if it is compressed; None if it is damaged."""
-    zstd = _zstd()
-    try:
-        is_packed = data.startswith(_ZSTD_MAGIC)
-        return bytes(zstd.decompress(data)) if is_packed else data
-    except zstd.ZstdError:
-        return None
+        if good:
+            yield good
 
 
 def _next_rows(messages: Iterator[Message]) -> list[Message]:
@@ -289,28 +299,14 @@ def _next_rows(messages: Iterator[Message]) -> list[Message]:
     return rows
 
 
-def _in_order(messages: Iterable[Message]) -> Iterator[Message]:
-    """Messages that are nearly in the order of time, in that order, with little memory."""
-    waiting: list[tuple[int, int, Message]] = []
-    sequence, size = count(), 0
-    for message in messages:
-        heapq.heappush(waiting, (message[1], next(sequence), message))
-        size += len(message[2])
-        while size > LARGEST_DISORDER:
-            first = heapq.heappop(waiting)[2]
-            size -= len(first[2])
-            yield first
-    while waiting:
-        yield heapq.heappop(waiting)[2]
-
-
-def _is_out_of_memory(error: BaseException) -> bool:
-    """Also in SQLite as rosbags uses it, whose error is of a kind of its own."""
-    return isinstance(error, MemoryError) or type(error).__name__ == "NoMemError"
-
-
-def _say_nothing(_: str) -> None:
-    """The losses were noted when the file was opened."""
+def _unpacked(data: bytes) -> bytes | None:
+    """A message, unpacked if it is compressed; None if it is damaged."""
+    zstd = _zstd()
+    try:
+        is_packed = data.startswith(_ZSTD_MAGIC)
+        return bytes(zstd.decompress(data)) if is_packed else data
+    except zstd.ZstdError:
+        return None
 
 
 def _zstd() -> Any:
@@ -366,10 +362,10 @@ class BagFiles:
 
     def _files_in(self, path: Path) -> list[Path]:
         """The files that hold a bag's messages, in order."""
-        files = self._listed_files(path) if (path / "metadata.yaml").exists() else None
-        if files is None:
+        files = self._listed_files(path) if (path / "metadata.yaml").exists() else []
+        if not files:
             found = (file for file in path.iterdir() if _suffix(file) and file.is_file())
-            files = sorted(islice(found, MOST_BAG_FILES + 1), key=_natural_order)
+            files = sorted(islice(found, MOST_BAG_FILES + 1))
         if not files:
             raise InputError(
                 f"no bag in {path}: expected metadata.yaml or files that end in "
@@ -377,8 +373,8 @@ class BagFiles:
             )
         return files
 
-    def _listed_files(self, path: Path) -> list[Path] | None:
-        """The files that metadata.yaml names; None if it cannot be used."""
+    def _listed_files(self, path: Path) -> list[Path]:
+        """The files that metadata.yaml names; none if it cannot be used."""
         metadata = path / "metadata.yaml"
         try:
             names = read_yaml(metadata)["rosbag2_bagfile_information"]["relative_file_paths"]
@@ -388,15 +384,14 @@ class BagFiles:
             self.notes.append(
                 f"{metadata} is damaged ({why}); the files beside it were read instead"
             )
-            return None
+            return []
         found = [file for file in named if file.is_file() and _suffix(file)]
+        missing = [file.name for file in named if not file.is_file()]
         if not found:
             self.notes.append(
                 f"{metadata} names none of the files beside it; they were read instead"
             )
-            return None
-        missing = [file.name for file in named if not file.is_file()]
-        if missing:
+        elif missing:
             self.notes.append(
                 f"{path}: {', '.join(missing[:10])} of {len(named)} files in metadata.yaml is "
                 "missing; its messages are left out"
@@ -442,12 +437,6 @@ def _suffix(file: Path) -> str:
     """.mcap, .db3 or .bag, also of a compressed file; empty for any other."""
     suffix = PurePath(file.name.removesuffix(".zstd")).suffix
     return suffix if suffix in _REPAIRS else ""
-
-
-def _natural_order(file: Path) -> list[tuple[int, str]]:
-    """Sort part 10 after part 9."""
-    parts = re.split(r"(\d{1,18})", file.name)
-    return [(int(text), "") if text.isdecimal() else (-1, text) for text in parts]
 
 
 def _check_path(path: Path) -> None:

@@ -9,10 +9,10 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, ROTATION_TOLERANCE
+from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first, wrong_latitude
 from hand_eye_calib.io.plausibility import check_positions
 from hand_eye_calib.io.trajectory_files.columns import QUATERNION
 from hand_eye_calib.io.trajectory_files.formats import MATRIX, UNNAMED
-from hand_eye_calib.io.trajectory_files.geodetic import local_positions, wrong_latitude
 from hand_eye_calib.io.trajectory_files.motion import fits_better
 from hand_eye_calib.io.trajectory_files.table import Table
 
@@ -145,15 +145,15 @@ def _in_local_frame(table: Table, columns: _Columns) -> Poses:
         (np.abs(lat) > np.pi / 2 + 1e-9) | (np.abs(lon) > _LARGEST_RAD),
         lambda index: _wrong_place(columns["lat"][index], columns["lon"][index], are_swapped),
     )
-    local = local_positions(lat, lon, _lengths(table, columns, "height"))
-    _checked(table, local.positions)
+    positions = LocalOrigin().local(lat, lon, _lengths(table, columns, "height"))
+    _checked(table, positions)
     unit = "" if named else f", in {'radians' if is_small else 'degrees'} by their size,"
     _guess(
         table, f"latitude and longitude{unit} became metres east and north of the first position"
     )
-    quats_xyzw = _orientations(table, columns, local.positions)
-    rotations = local.rotations @ se3.from_quat_xyzw(local.positions, quats_xyzw)[:, :3, :3]
-    return Poses(local.positions, _quats_of(rotations))
+    quats_xyzw = _orientations(table, columns, positions)
+    in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
+    return Poses(positions, se3.to_quat_xyzw(rotations_to_first(lat, lon) @ in_local))
 
 
 def _wrong_place(lat: float, lon: float, are_swapped: bool) -> str:

@@ -1,47 +1,18 @@
 """Latitude, longitude and height as metres east, north and up of the first position.
 
 The formulas are those of the coordinate operations 9602 and 9837 of the EPSG (IOGP publication
-373-7-2).
+373-7-2), on the ellipsoid of WGS 84.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 
-# The ellipsoid of WGS 84: equatorial radius (m), and the square of its eccentricity.
+#: No latitude is beyond it (deg).
+POLE_DEG = 90.0 + 1e-9
+# Equatorial radius (m), and the square of the eccentricity.
 _RADIUS_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
 _ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
-
-
-class LocalPositions(NamedTuple):
-    """Positions in the frame of the first.
-
-    Attributes
-    ----------
-    positions : (N, 3) ndarray
-        Metres east, north and up of the first position, on WGS 84.
-    rotations : (N, 3, 3) ndarray
-        From the east, north and up of each position to those of the first.
-    """
-
-    positions: FloatArray
-    rotations: FloatArray
-
-
-def local_positions(
-    lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray
-) -> LocalPositions:
-    """Local metres from geodetic coordinates.
-
-    Parameters
-    ----------
-    lat_rad, lon_rad, height_m : (N,) ndarray
-    """
-    positions = LocalOrigin().local(lat_rad, lon_rad, height_m)
-    axes = _axes(lat_rad, lon_rad)
-    return LocalPositions(positions, axes[0].T @ axes)
 
 
 class LocalOrigin:
@@ -68,6 +39,12 @@ class LocalOrigin:
         return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
 
 
+def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) from the east, north and up of each position to those of the first."""
+    axes = _axes(lat_rad, lon_rad)
+    return axes[0].T @ axes
+
+
 def wrong_latitude(lat: float, lon: float) -> str:
     """What is wrong with a latitude beyond the pole, beside a longitude that may be a latitude."""
     return (
@@ -89,8 +66,7 @@ def _axes(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
     """East, north and up (N, 3, 3), as columns, along the axes of the earth."""
     sin_lat, cos_lat = np.sin(lat_rad), np.cos(lat_rad)
     sin_lon, cos_lon = np.sin(lon_rad), np.cos(lon_rad)
-    zero = np.zeros_like(lat_rad)
-    east = np.stack([-sin_lon, cos_lon, zero], axis=1)
+    east = np.stack([-sin_lon, cos_lon, np.zeros_like(lat_rad)], axis=1)
     north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=1)
     up = np.stack([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat], axis=1)
     return np.stack([east, north, up], axis=2)
