@@ -8,7 +8,6 @@ import argparse
 import json
 import os
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,14 +16,17 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.cli.console import note
 from hand_eye_calib.cli.main import exit_code_of
 from hand_eye_calib.cli.options import add_json_argument
-from hand_eye_calib.errors import ConfigError
-from reproduction.rows import Row
+from hand_eye_calib.errors import ConfigError, InputError
 from reproduction.writing import data_folder, put_into_page
 
 if TYPE_CHECKING:
-    from reproduction.catalogue import Files
+    import pandas as pd
+
+    from reproduction.catalogue import Artefact
     from reproduction.results import Results
     from reproduction.sources import PublishedSource, Source
+
+Files = dict[str, list[Path]]
 
 EXPERIMENTS = {
     "fig3": "errors of DNLO for every reference: noise, outliers, drift, mixture",
@@ -39,7 +41,6 @@ EXPERIMENTS = {
     "faults": "study: faults on purpose, what is found and what the verdict is",
     "all": "all figures and tables of the paper, its conclusions and our findings",
 }
-
 STUDIES = ("adaptive", "certificate", "faults")
 
 _EPILOG = (
@@ -64,80 +65,73 @@ def main(argv: Sequence[str] | None = None) -> int:
         Arguments; those of the process if left out.
     """
     parser = argparse.ArgumentParser(
-        prog="python -m reproduction", description=__doc__, allow_abbrev=False
+        prog="python -m reproduction",
+        description=__doc__,
+        allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_EPILOG,
     )
-    add_arguments(parser)
-    return exit_code_of(lambda: run(parser.parse_args(argv)))
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
-    parser.add_argument("id", metavar="ID", choices=tuple(EXPERIMENTS), help=", ".join(EXPERIMENTS))
-    parser.add_argument(
+    add = parser.add_argument
+    add("id", metavar="ID", choices=tuple(EXPERIMENTS), help=", ".join(EXPERIMENTS))
+    add(
         "--data",
         choices=("published", "simulated"),
         default="published",
         help="the published trajectories, or drives of our simulator. Default: published",
     )
-    parser.add_argument(
+    add(
         "--data-folder",
         metavar="DIR",
         type=Path,
         help="folder of the published data, or the one that holds it as valimaki2023. With --data "
         "simulated, what to compare with. Default: $HAND_EYE_CALIB_DATA",
     )
-    parser.add_argument(
-        "--seed", type=int, help="with --data simulated: another seed, other drives. Default: 0"
-    )
-    parser.add_argument(
+    add("--seed", type=int, help="with --data simulated: another seed, other drives. Default: 0")
+    add(
         "--runs", type=int, metavar="N", help="with --data simulated: number of drives. Default: 38"
     )
-    parser.add_argument(
+    add(
         "--out",
         metavar="DIR",
         type=Path,
         default=Path("reproduced"),
         help="directory for the files. Default: reproduced",
     )
-    parser.add_argument(
+    add(
         "--page",
         metavar="FILE",
         type=Path,
         help="put the text of a study into this Markdown page, between its marked lines",
     )
-    parser.add_argument(
+    add(
         "--jobs",
         type=int,
         metavar="N",
+        default=os.cpu_count() or 1,
         help="number of processes; the numbers do not depend on it. Default: all cores",
     )
-    parser.add_argument(
-        "--clean", action="store_true", help="with faults: only the recordings without a fault"
-    )
+    add("--clean", action="store_true", help="with faults: only the recordings without a fault")
     add_json_argument(parser)
+    return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the experiment; returns the exit code."""
-    from reproduction.catalogue import Experiment
+    from reproduction.catalogue import artefacts_of
 
-    jobs = _cores() if arguments.jobs is None else arguments.jobs
     if arguments.clean and arguments.id != "faults":
         raise ConfigError(f"--clean is for faults; got {arguments.id}")
+    if arguments.jobs < 1:
+        raise ConfigError(f"--jobs must be at least 1; got {arguments.jobs}")
     if arguments.id == "faults":
-        return _run_faults(arguments, jobs)
+        return _run_faults(arguments)
     source, theirs = _sources(arguments)
-    if jobs < 1:
-        raise ConfigError(f"--jobs must be at least 1; got {jobs}")
     if arguments.page is not None and arguments.id not in STUDIES:
         raise ConfigError(f"--page is for {', '.join(STUDIES)}; got {arguments.id}")
-    experiment = Experiment(arguments.id, source, theirs)
-    if experiment.left_out:
-        note(f"left out, since they need the published data: {', '.join(experiment.left_out)}")
-    with _progress(len(experiment.cells) + len(experiment.artefacts)) as advance:
-        results, files = experiment.run(arguments.out, jobs, advance)
+    artefacts, left_out = artefacts_of(arguments.id, source)
+    if left_out:
+        note(f"left out, since they need the published data: {', '.join(left_out)}")
+    results, files = _made(artefacts, source, theirs, arguments)
     if arguments.page is not None:
         text = (arguments.out / f"{arguments.id}.md").read_text(encoding="utf-8")
         put_into_page(arguments.page, arguments.id, text)
@@ -147,14 +141,14 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _run_faults(arguments: argparse.Namespace, jobs: int) -> int:
+def _run_faults(arguments: argparse.Namespace) -> int:
     """Run the study of faults, which has recordings of its own; returns the exit code."""
     from reproduction import faults
 
     folder = data_folder(arguments.data_folder)
     todo = faults.clean_cases(folder) if arguments.clean else faults.cases(folder)
     with _progress(len(todo)) as advance:
-        print(faults.run(todo, folder, arguments.out, arguments.page, jobs, advance))
+        print(faults.run(todo, folder, arguments.out, arguments.page, arguments.jobs, advance))
     return 0
 
 
@@ -187,8 +181,39 @@ def _sources(arguments: argparse.Namespace) -> tuple[Source, PublishedSource | N
     return simulated, published
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _made(
+    artefacts: Sequence[Artefact],
+    source: Source,
+    theirs: PublishedSource | None,
+    arguments: argparse.Namespace,
+) -> tuple[Results, Files]:
+    """Solve what is not stored in the output directory yet and write the files; gives what was
+    solved, and the paths of the files by artefact.
+    """
+    from reproduction import runner
+    from reproduction.results import Results
+    from reproduction.rows import solve_cell, table_of
+
+    if any(artefact.name.startswith("fig") for artefact in artefacts):
+        # If Matplotlib is missing, say so before minutes of solving, not after.
+        from reproduction import paper_figures  # noqa: F401
+    cells = {cell.name: (source, cell) for artefact in artefacts for cell in artefact.cells}
+    configuration = {**source.configuration(), **runner.versions()}
+    store = runner.Store(arguments.out / "solved.jsonl", configuration)
+    with _progress(len(cells) + len(artefacts)) as advance:
+        solved = runner.solve(solve_cell, cells, arguments.jobs, store, advance)
+        rows = table_of([row for rows in solved.values() for row in rows])
+        results, files = Results(source, theirs, rows, arguments.out, arguments.jobs), Files()
+        for artefact in artefacts:
+            try:
+                files[artefact.name] = artefact.write(artefact.name, results)
+            except OSError as error:
+                raise InputError(
+                    f"cannot write {error.filename}: {error.strerror}; choose another "
+                    "directory with --out"
+                ) from None
+            advance(artefact.name)
+    return results, files
 
 
 @contextmanager
@@ -214,21 +239,20 @@ def _document(arguments: argparse.Namespace, results: Results, files: Files) -> 
         "files": {name: [str(path) for path in paths] for name, paths in files.items()},
         "rows": len(results.rows),
     }
-    if results.same_cases and results.rows:
+    if results.same_cases:
         document["agreement"] = [
-            _agreement(results.rows, method)
-            for method in sorted({row.method for row in results.rows})
+            _agreement(str(method), rows) for method, rows in results.rows.groupby("method")
         ]
     return document
 
 
-def _agreement(rows: Sequence[Row], method: str) -> dict[str, Any]:
-    chosen = [row for row in rows if row.method == method]
-    found = {"method": method, "rows": len(chosen), "agreeing": sum(row.agrees for row in chosen)}
-    found["differing"] = dict(Counter(row.why() for row in chosen if not row.agrees))
+def _agreement(method: str, rows: pd.DataFrame) -> dict[str, Any]:
+    differing = rows["why"][~rows["agrees"]].value_counts().to_dict()
+    found = {"method": method, "rows": len(rows), "agreeing": int(rows["agrees"].sum())}
+    found["differing"] = differing
     if method == "dnlo":
-        verdicts = Counter(row.objective_verdict for row in chosen)
-        found["objective"] = {each: verdicts[each] for each in ("lower", "equal", "higher")}
+        verdicts = ("lower", "equal", "higher")
+        found["objective"] = {each: int((rows["verdict"] == each).sum()) for each in verdicts}
     return found
 
 

@@ -1,13 +1,12 @@
 """Comparison with the published results: every row, every plotted point, differences and why."""
 
-from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from reproduction.rows import METRICS, TITLES, UNITS, Row, agree
-from reproduction.statistics import Summary
+from reproduction.results import Summary
+from reproduction.rows import METRICS, PUBLISHED, TITLES, UNITS, agree
 from reproduction.writing import markdown_table, percent, write_csv
 
 # Half the width of the 95 % interval of a median, in interquartile ranges over the root of the
@@ -17,84 +16,79 @@ _NOTCH = 1.57
 _MOST_LISTED = 30
 
 
-def write_rows(path: Path, rows: Sequence[Row]) -> Path:
+def write_rows(path: Path, rows: pd.DataFrame) -> Path:
     """Every row with ours, theirs and why they differ, as CSV; returns the path."""
-    named = [f"{metric}_{UNITS[metric]}" for metric in METRICS]
-    lines = (
-        {"case": row.name, "method": row.method, "reference": row.reference}
-        | dict(zip(named, row.errors, strict=True))
-        | {f"published_{name}": error for name, error in zip(named, row.theirs, strict=True)}
-        | {"objective": row.objective, "objective_at_published": row.published_objective}
-        | {"agrees": row.agrees, "why": row.why()}
-        for row in rows
-    )
-    return write_csv(path, lines)
+    named = {
+        name: f"{name}_{UNITS[name.removeprefix('published_')]}" for name in (*METRICS, *PUBLISHED)
+    } | {"published_objective": "objective_at_published"}
+    columns = ["case", "method", "reference", *METRICS, *PUBLISHED]
+    columns += ["objective", "published_objective", "agrees", "why"]
+    return write_csv(path, rows[columns].rename(columns=named))
 
 
-def describe_rows(rows: Sequence[Row]) -> str:
+def describe_rows(rows: pd.DataFrame) -> str:
     """Markdown: how many rows agree, by method, and the reasons why others do not."""
     lines = []
-    for method in sorted({row.method for row in rows}):
-        some = [row for row in rows if row.method == method]
-        absolute = sum(agree(row.errors[k], row.theirs[k]) for row in some for k in (2, 3))
-        reasons = Counter(row.why() for row in some if not row.agrees).most_common()
+    for method, some in rows.groupby("method"):
+        absolute = agree(some[["e_at", "e_aR"]].to_numpy(), some[list(PUBLISHED[2:])].to_numpy())
+        why = some["why"][~some["agrees"]].value_counts()
         lines.append(
             {
                 "method": TITLES[method],
-                "rows that agree": percent(sum(row.agrees for row in some), len(some)),
-                "values of e_at and e_aR that agree": percent(absolute, 2 * len(some)),
-                "why the others differ": "; ".join(f"{why}: {n}" for why, n in reasons) or "-",
+                "rows that agree": percent(some["agrees"].sum(), len(some)),
+                "values of e_at and e_aR that agree": percent(absolute.sum(), absolute.size),
+                "why the others differ": "; ".join(f"{k}: {n}" for k, n in why.items()) or "-",
             }
         )
-    others = [row for row in rows if not row.agrees and row.method not in ("ali", "dnlo")]
+    others = rows[~rows["agrees"] & ~rows["method"].isin(["ali", "dnlo"])]
     return (
         "A row agrees where each of its four errors is within 0.1 % or 1e-6 (m, deg) of "
         f"the published one.\n\n{markdown_table(lines)}{_list_differing(others)}"
     )
 
 
-def _list_differing(rows: Sequence[Row]) -> str:
-    if not rows:
+def _list_differing(rows: pd.DataFrame) -> str:
+    if rows.empty:
         return ""
     listed = [
         {
-            "case": row.name,
+            "case": row.case,
             "method": TITLES[row.method],
             "reference": row.reference,
-            "ours: e_at m, e_aR deg": f"{row.errors[2]:.4g}, {row.errors[3]:.4g}",
-            "published": f"{row.theirs[2]:.4g}, {row.theirs[3]:.4g}",
+            "ours: e_at m, e_aR deg": f"{row.e_at:.4g}, {row.e_aR:.4g}",
+            "published": f"{row.published_e_at:.4g}, {row.published_e_aR:.4g}",
             "objective: ours, at the published X": "-"
-            if row.published_objective is None
+            if np.isnan(row.published_objective)
             else f"{row.objective:.4g}, {row.published_objective:.4g}",
-            "why": row.why(),
+            "why": row.why,
         }
-        for row in rows[:_MOST_LISTED]
+        for row in rows[:_MOST_LISTED].itertuples()
     ]
     n_more = len(rows) - _MOST_LISTED
     more = f"\n\n{n_more} more are in the CSV file." if n_more > 0 else ""
     return "\n\n" + markdown_table(listed) + more
 
 
-def describe_dnlo(rows: Sequence[Row]) -> str:
+def describe_dnlo(rows: pd.DataFrame) -> str:
     """Markdown: the objectives of DNLO against those at the published answers, and how far the
     errors moved.
     """
-    rows = [row for row in rows if row.method == "dnlo"]
-    verdicts = Counter(row.objective_verdict for row in rows)
-    others = [row for row in rows if not row.is_e_at_the_same]
-    moved = np.array([abs(row.errors[2] - row.theirs[2]) for row in others])
-    nearer = sum(row.errors[2] < row.theirs[2] for row in others)
+    rows = rows[rows["method"] == "dnlo"]
+    lower, equal, higher = (int((rows["verdict"] == x).sum()) for x in ("lower", "equal", "higher"))
+    others = rows[~rows["same_e_at"]]
     text = (
         "DNLO has many local minima and is compared by its objective, eq. (5), taken by the same "
-        f"formula at our and at the published answer: lower in {verdicts['lower']} of {len(rows)} "
-        f"rows, equal within 1e-6 in {verdicts['equal']}, higher in {verdicts['higher']}. e_at is "
+        f"formula at our and at the published answer: lower in {lower} of {len(rows)} "
+        f"rows, equal within 1e-6 in {equal}, higher in {higher}. e_at is "
         f"the published one in {percent(len(rows) - len(others), len(rows))}."
     )
-    if others:
+    if len(others):
+        moved = (others["e_at"] - others["published_e_at"]).to_numpy()
         text += (
-            f" Where it is not, it moved by {np.median(moved):.2g} m (median; at most "
-            f"{moved.max():.2g} m) and is smaller than the published one in "
-            f"{percent(nearer, len(moved))}: a lower objective is not always a smaller error."
+            f" Where it is not, it moved by {np.median(np.abs(moved)):.2g} m (median; at most "
+            f"{np.abs(moved).max():.2g} m) and is smaller than the published one in "
+            f"{percent((moved < 0).sum(), len(moved))}: a lower objective is not always a smaller "
+            "error."
         )
     return text
 
@@ -104,12 +98,10 @@ def compare_summaries(ours: Summary, theirs: Summary, same_cases: bool) -> bool:
     must be equal. Of others: the 95 % intervals must overlap.
     """
     if same_cases:
-        names = ("centre", "low", "high")
-        return all(agree(getattr(ours, name), getattr(theirs, name)) for name in names)
-    if agree(ours.centre, theirs.centre):
-        return True
+        pairs = ((getattr(one, x) for one in (ours, theirs)) for x in ("centre", "low", "high"))
+        return all(agree(*pair) for pair in pairs)
     (low, high), (their_low, their_high) = _interval(ours), _interval(theirs)
-    return low <= their_high and their_low <= high
+    return bool(agree(ours.centre, theirs.centre)) or (low <= their_high and their_low <= high)
 
 
 def _interval(summary: Summary) -> tuple[float, float]:
@@ -119,7 +111,7 @@ def _interval(summary: Summary) -> tuple[float, float]:
     return summary.low, summary.high
 
 
-def reasons(rows: Sequence[Row]) -> str:
+def reasons(rows: pd.DataFrame) -> str:
     """Why rows differ, with counts, in one string."""
-    counts = Counter(row.why() for row in rows if row.published is not None and not row.agrees)
-    return "; ".join(f"{n} of {len(rows)} rows: {why}" for why, n in counts.most_common())
+    counts = rows["why"][~rows["agrees"] & (rows["why"] != "")].value_counts()
+    return "; ".join(f"{n} of {len(rows)} rows: {why}" for why, n in counts.items())

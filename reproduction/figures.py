@@ -5,26 +5,21 @@ comparisons.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from reproduction import comparison
 from reproduction.published import REFERENCES, SIMULATED, Case
-from reproduction.rows import ALI_AS_PUBLISHED, METRICS, TITLES, Row
-from reproduction.statistics import Summary, Table, quartile_summary
+from reproduction.results import Results, Summary, Table, quartile_summary
+from reproduction.rows import ALI_AS_PUBLISHED, METRICS, TITLES
 from reproduction.writing import bullets, markdown_table, percent, write_csv, write_text
 
-if TYPE_CHECKING:
-    from reproduction.paper_figures import Line
-    from reproduction.results import Results
-
-# Data set, method, reference; with level and metric.
+# Data set, method, reference.
 Choice = tuple[str, str, str]
-Point = tuple[str, float | None, str, str, str]
 # By component and reference.
 Components = dict[str, dict[str, Summary]]
 
@@ -43,23 +38,18 @@ _INTERVALS = (
     "interquartile ranges. Axes linear near zero, then logarithmic."
 )
 _COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
+_POINT = ["dataset", "level", "method", "reference", "metric"]
 
 
 def write_error_figure(name: str, results: Results) -> list[Path]:
     """Write a figure of :data:`FIGURE_METHODS`, its numbers and comparison; returns the paths."""
     table, methods = results.ours, FIGURE_METHODS[name]
     choices = [choice for dataset in SIMULATED for choice in _choices(dataset, methods, table)]
-    points = [
-        (dataset, level, method, reference, metric)
-        for dataset, method, reference in choices
-        for level in table.levels(dataset, method)
-        for metric in METRICS
-    ]
-    numbers = (_numbers(point, table.summary(*point)) for point in points)
+    numbers = _numbers(choices, table)
     return [
         *_draw(*_titles(name, results), choices, results, results.out / name),
         write_csv(results.out / f"{name}.csv", numbers),
-        *_compare(name, points, choices, results),
+        *_compare(name, numbers, choices, results),
     ]
 
 
@@ -70,6 +60,24 @@ def _choices(dataset: str, methods: Sequence[str], table: Table) -> list[Choice]
     if len(methods) == 1:
         return [(dataset, methods[0], reference) for reference in REFERENCES]
     return [(dataset, method, table.best_reference(dataset, method)) for method in methods]
+
+
+def _numbers(choices: Sequence[Choice], table: Table) -> pd.DataFrame:
+    """A row for every plotted point."""
+    return pd.DataFrame(
+        {
+            **dict(zip(_POINT, (dataset, level, method, reference, metric), strict=True)),
+            "statistic": "median and quartiles" if found.is_median else "mean and 95 % interval",
+            "centre": found.centre,
+            "low": found.low,
+            "high": found.high,
+            "runs": found.n,
+        }
+        for dataset, method, reference in choices
+        for level in table.levels(dataset, method)
+        for metric in METRICS
+        for found in [table.summary(dataset, level, method, reference, metric)]
+    )
 
 
 def _titles(name: str, results: Results) -> tuple[str, str]:
@@ -94,179 +102,109 @@ def _draw(
 ) -> list[Path]:
     # Imported here: tables need no Matplotlib.
     from reproduction import paper_figures
+    from reproduction.paper_figures import METHOD_LOOKS, REFERENCE_LOOKS, Line
 
-    panels = {}
+    panels: dict[tuple[str, str], list[Line]] = {}
     one_method = len({method for _, method, _ in choices}) == 1
-    for dataset in SIMULATED:
-        chosen = [choice for choice in choices if choice[0] == dataset]
-        if one_method:
-            groups = [[choice] for choice in chosen]
-        else:
-            groups = _coinciding(chosen, results.ours)
+    for group in _coinciding(choices, results.ours, alone=one_method):
+        dataset, method, reference = group[0]
+        levels = results.ours.levels(dataset, method)
+        names = ", ".join(TITLES[method] for _, method, _ in group)
+        short = "Ali publ." if method == ALI_AS_PUBLISHED else TITLES[method]
         for metric in METRICS:
-            panels[dataset, metric] = [
-                _line(group, one_method, metric, results.ours) for group in groups
-            ]
+            line = Line(
+                label=reference if one_method else short,
+                name="" if one_method else f"{names} {reference}",
+                look=REFERENCE_LOOKS[reference] if one_method else METHOD_LOOKS[method],
+                levels=tuple(level for level in levels if level is not None),
+                summaries=tuple(
+                    results.ours.summary(dataset, level, method, reference, metric)
+                    for level in levels
+                ),
+            )
+            panels.setdefault((dataset, metric), []).append(line)
     return paper_figures.draw_errors(title, note, panels, stem)
 
 
-def _coinciding(choices: Sequence[Choice], table: Table) -> list[list[Choice]]:
+def _coinciding(choices: Sequence[Choice], table: Table, alone: bool) -> list[list[Choice]]:
     """Choices whose errors are the same at every level (Park and Taylor): one line is drawn for all
-    of a group.
+    of a group. ``alone``: each is a group.
     """
-    groups: list[tuple[list[Choice], list[float]]] = []
-    for dataset, method, reference in choices:
-        centres = [
-            table.summary(dataset, level, method, reference, metric).centre
-            for level in table.levels(dataset, method)
-            for metric in METRICS
-        ]
-        for group, other in groups:
-            if np.allclose(centres, other, rtol=1e-6, atol=1e-6):
-                group.append((dataset, method, reference))
+    groups: list[tuple[list[Choice], str, Any]] = []
+    for choice in choices:
+        centres = _numbers([choice], table)["centre"]
+        for group, dataset, other in groups:
+            if not alone and dataset == choice[0] and np.allclose(centres, other, 1e-6, 1e-6):
+                group.append(choice)
                 break
         else:
-            groups.append(([(dataset, method, reference)], centres))
-    return [group for group, _ in groups]
-
-
-def _line(group: Sequence[Choice], one_method: bool, metric: str, table: Table) -> Line:
-    from reproduction.paper_figures import METHOD_LOOKS, REFERENCE_LOOKS, Line
-
-    dataset, method, reference = group[0]
-    levels = table.levels(dataset, method)
-    summaries = tuple(table.summary(dataset, level, method, reference, metric) for level in levels)
-    levels = () if levels == (None,) else levels
-    if one_method:
-        return Line(reference, "", REFERENCE_LOOKS[reference], levels, summaries)
-    names = ", ".join(TITLES[method] for _, method, _ in group)
-    label = "Ali publ." if method == ALI_AS_PUBLISHED else TITLES[method]
-    return Line(label, f"{names} {reference}", METHOD_LOOKS[method], levels, summaries)
-
-
-def _numbers(point: Point, summary: Summary) -> dict[str, Any]:
-    """A row of the figure's table."""
-    dataset, level, method, reference, metric = point
-    return {
-        "dataset": dataset,
-        "level": "" if level is None else level,
-        "method": method,
-        "reference": reference,
-        "metric": metric,
-        "statistic": "median and quartiles" if summary.is_median else "mean and 95 % interval",
-        "centre": summary.centre,
-        "low": summary.low,
-        "high": summary.high,
-        "runs": summary.n,
-    }
+            groups.append(([choice], choice[0], centres))
+    return [group for group, _, _ in groups]
 
 
 def _compare(
-    name: str, points: Sequence[Point], choices: Sequence[Choice], results: Results
+    name: str, numbers: pd.DataFrame, choices: Sequence[Choice], results: Results
 ) -> list[Path]:
     page = results.out / f"{name}_comparison.md"
     heading = f"# {name}: comparison with the published results"
     if results.theirs is None:
         text = "Nothing to compare with: name the folder of the published data with --data-folder."
         return [write_text(page, heading, text)]
-    rows: dict[tuple[Any, ...], list[Row]] = {}
-    for row in results.rows:
-        rows.setdefault((row.dataset, row.level, row.method, row.reference), []).append(row)
-    compared = []
-    for point in points:
-        ours, theirs = results.ours.summary(*point), results.theirs.summary(*point)
-        same = comparison.compare_summaries(ours, theirs, results.same_cases)
-        line = _numbers(point, ours)
-        for part in ("centre", "low", "high"):
-            line[f"published_{part}"] = getattr(theirs, part)
-        why = "" if same else _why(point, rows, results.same_cases)
-        compared.append({**line, "agrees": same, "why": why})
+    compared = _compared(numbers, choices, results, results.theirs)
     measure = (
         "to 0.1 % or 1e-6 (m, deg)"
         if results.same_cases
         else "in that their 95 % intervals overlap (other trajectories)"
     )
     paths = [write_csv(results.out / f"{name}_comparison.csv", compared)]
-    blocks = [heading, _count(compared, measure), _by_dataset(compared)]
-    if name == "fig5":
-        blocks.append(_best_variants(choices, results.ours, results.theirs))
+    blocks = [heading, _count(compared, measure)]
     if results.same_cases:
-        chosen = set(choices)
-        shown = [row for row in results.rows if (row.dataset, row.method, row.reference) in chosen]
+        keys = pd.MultiIndex.from_tuples(choices)
+        shown = results.rows[
+            pd.MultiIndex.from_frame(results.rows[["dataset", "method", "reference"]]).isin(keys)
+        ]
         blocks += ["## Row by row", comparison.describe_rows(shown)]
         if "dnlo" in FIGURE_METHODS[name]:
             blocks.append(comparison.describe_dnlo(shown))
-        paths.append(comparison.write_rows(results.out / f"{name}_rows.csv", shown))
     return [*paths, write_text(page, *blocks)]
 
 
-def _why(point: Point, rows: Mapping[tuple[Any, ...], Sequence[Row]], same_cases: bool) -> str:
-    if same_cases:
-        return comparison.reasons(rows[point[:4]])
-    if point[2] == "ali":
-        return "published quaternion was never normalised"
-    return "95 % intervals do not overlap"
+def _compared(
+    numbers: pd.DataFrame, choices: Sequence[Choice], results: Results, theirs: Table
+) -> pd.DataFrame:
+    """The plotted points with the published ones, and why they differ."""
+    compared = numbers.copy()
+    of_theirs = _numbers(choices, theirs)
+    for part in ("centre", "low", "high"):
+        compared[f"published_{part}"] = of_theirs[part]
+    agrees, whys = [], []
+    rows = dict(list(results.rows.groupby(["dataset", "method", "reference"])))
+    for point in compared.itertuples():
+        level = None if np.isnan(point.level) else point.level
+        key = point.dataset, level, point.method, point.reference, point.metric
+        ours, other = results.ours.summary(*key), theirs.summary(*key)
+        agrees.append(comparison.compare_summaries(ours, other, results.same_cases))
+        why = "95 % intervals do not overlap"
+        if results.same_cases:
+            some = rows[point.dataset, point.method, point.reference]
+            why = comparison.reasons(some[some["level"].eq(point.level) | some["level"].isna()])
+        elif point.method == "ali":
+            why = "published quaternion was never normalised"
+        whys.append("" if agrees[-1] else why)
+    return compared.assign(agrees=agrees, why=whys)
 
 
-def _count(compared: Sequence[Mapping[str, Any]], measure: str) -> str:
+def _count(compared: pd.DataFrame, measure: str) -> str:
     """How many points agree; the proper Ali, which the paper does not have, counts separately."""
     lines = []
-    for proper in (False, True):
-        chosen = [line for line in compared if (line["method"] == "ali") == proper]
-        if chosen:
-            others = [line for line in chosen if not line["agrees"]]
-            inside = sum(x["published_low"] <= x["centre"] <= x["published_high"] for x in others)
-            whose = "Points of the proper Ali" if proper else "Plotted points"
-            rest = f"; of the others {inside} lie within the published interval" if inside else ""
-            share = percent(len(chosen) - len(others), len(chosen))
-            lines.append(f"{whose} that agree {measure}: {share}{rest}.")
+    for is_proper, chosen in compared.groupby(compared["method"] == "ali"):
+        others = chosen[~chosen["agrees"]]
+        inside = others["centre"].between(others["published_low"], others["published_high"]).sum()
+        whose = "Points of the proper Ali" if is_proper else "Plotted points"
+        rest = f"; of the others {inside} lie within the published interval" if inside else ""
+        share = percent(len(chosen) - len(others), len(chosen))
+        lines.append(f"{whose} that agree {measure}: {share}{rest}.")
     return "\n".join(lines)
-
-
-def _by_dataset(compared: Sequence[Mapping[str, Any]]) -> str:
-    lines = []
-    for dataset, group in groupby(compared, key=lambda line: line["dataset"]):
-        some = list(group)
-        lines.append(
-            {
-                "data set": dataset,
-                "plotted points that agree": percent(sum(x["agrees"] for x in some), len(some)),
-                "farthest from the published value": _farthest(some),
-            }
-        )
-    return markdown_table(lines)
-
-
-def _farthest(group: Sequence[Mapping[str, Any]]) -> str:
-    differing = [line for line in group if not line["agrees"]]
-    if not differing:
-        return "-"
-    x = max(
-        differing,
-        key=lambda x: abs(np.log((x["centre"] + 1e-6) / (x["published_centre"] + 1e-6))),
-    )
-    level = f" at {x['level']:g}" if x["level"] != "" else ""
-    values = f"{x['centre']:.4g}, published {x['published_centre']:.4g}"
-    return f"{TITLES[x['method']]} {x['reference']}{level}, {x['metric']}: {values}"
-
-
-def _best_variants(choices: Sequence[Choice], ours: Table, theirs: Table) -> str:
-    lines = []
-    for dataset, method, reference in choices:
-        published = theirs.best_reference(dataset, method)
-        lines.append(
-            {
-                "data set": dataset,
-                "method": TITLES[method],
-                "best variant": reference,
-                "ours": f"{ours.score(dataset, method, reference):.4f}",
-                "published best": published,
-                "theirs": f"{theirs.score(dataset, method, published):.4f}",
-            }
-        )
-    titles = "data set | method | best variant | its e_at (m) | published best | its e_at (m)"
-    about = "Best variants, by the mean of e_at over levels and runs (mixture: median):"
-    return f"{about}\n\n{markdown_table(lines, titles)}"
 
 
 def write_components(name: str, results: Results) -> list[Path]:
@@ -306,8 +244,8 @@ def components(cases: Sequence[Case]) -> Components:
     return found
 
 
-def _component_rows(found: Components) -> list[dict[str, Any]]:
-    return [
+def _component_rows(found: Mapping[str, Mapping[str, Summary]]) -> pd.DataFrame:
+    return pd.DataFrame(
         {
             "component": component,
             "reference": reference,
@@ -319,7 +257,7 @@ def _component_rows(found: Components) -> list[dict[str, Any]]:
         }
         for component, of_component in found.items()
         for reference, summary in of_component.items()
-    ]
+    )
 
 
 def _describe_ratios(reference: str, ours: Components) -> str:
@@ -340,25 +278,19 @@ def _compare_components(name: str, ours: Components, results: Results) -> list[P
     ]
     if results.same_cases or results.theirs_source is None:
         return [write_text(page, *blocks)]
-    theirs = components(results.theirs_source.cases("noise", 0.0))
-    lines = []
-    for line in _component_rows(ours):
-        other = theirs[line["component"]][line["reference"]]
-        del line["motions"]
-        quartiles = line["lower_quartile"] <= other.centre <= line["upper_quartile"]
-        line |= {
-            "published_median": other.centre,
-            "published_lower_quartile": other.low,
-            "published_upper_quartile": other.high,
-            "medians_within_quartiles": quartiles and other.low <= line["median"] <= other.high,
-        }
-        lines.append(line)
+    table = _component_rows(ours).drop(columns="motions")
+    theirs = _component_rows(components(results.theirs_source.cases("noise", 0.0)))
+    for part in ("median", "lower_quartile", "upper_quartile"):
+        table[f"published_{part}"] = theirs[part]
+    table["medians_within_quartiles"] = theirs["median"].between(
+        table["lower_quartile"], table["upper_quartile"]
+    ) & table["median"].between(theirs["lower_quartile"], theirs["upper_quartile"])
     printed = (
         {name: f"{x:.4g}" if isinstance(x, float) else x for name, x in line.items()}
-        for line in lines
+        for line in table.to_dict("records")
     )
     blocks += ["Our simulator beside the published trajectories:", markdown_table(printed)]
     return [
-        write_csv(results.out / f"{name}_comparison.csv", lines),
+        write_csv(results.out / f"{name}_comparison.csv", table),
         write_text(page, *blocks),
     ]

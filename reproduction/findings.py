@@ -2,10 +2,10 @@
 ground truth.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from scipy.optimize import minimize_scalar
 
 from hand_eye_calib.arrays import FloatArray
@@ -16,10 +16,9 @@ from hand_eye_calib.solvers.solution import Solution
 from reproduction import comparison
 from reproduction.kitti_truth import RECTIFIED
 from reproduction.published import KITTI, LEVELS, REFERENCES, SIMULATED, Case
-from reproduction.results import Results
-from reproduction.rows import ALI_AS_PUBLISHED, TITLES, Row
+from reproduction.results import Results, Table
+from reproduction.rows import ALI_AS_PUBLISHED, TITLES
 from reproduction.sources import Source
-from reproduction.statistics import Table
 from reproduction.writing import markdown_table, percent, triple, write_text
 
 _WRONG_DEG = 90.0
@@ -27,7 +26,8 @@ _WRONG_DEG = 90.0
 
 def write(name: str, results: Results) -> list[Path]:
     """Write ``NAME.md`` and rows.csv; returns the paths."""
-    paired = [row for row in results.rows if row.method != "ali" or row.dataset in KITTI]
+    rows = results.rows
+    paired = rows[(rows["method"] != "ali") | rows["dataset"].isin(KITTI)]
     return [
         write_text(
             results.out / f"{name}.md",
@@ -51,37 +51,34 @@ def write(name: str, results: Results) -> list[Path]:
     ]
 
 
-def _agreement(rows: Sequence[Row]) -> str:
+def _agreement(rows: pd.DataFrame) -> str:
     """The share of rows that agree, of the four methods with one answer and of Ali."""
     lines = []
     for title, methods in (
         ("Park, Taylor, Zhuang, DNL", ("park", "taylor", "zhuang", "dnl")),
         ("Ali", (ALI_AS_PUBLISHED, "ali")),
     ):
-        agreeing = [row.agrees for row in rows if row.method in methods]
-        share = percent(sum(agreeing), len(agreeing))
+        agreeing = rows["agrees"][rows["method"].isin(methods)]
+        share = percent(agreeing.sum(), len(agreeing))
         lines.append(f"{title}: {share} of the published rows are reproduced.")
     return "\n".join(lines)
 
 
-def _dnlo_by_dataset(rows: Sequence[Row]) -> str:
-    lines = []
-    for dataset in (*SIMULATED, *KITTI):
-        chosen = [row for row in rows if (row.dataset, row.method) == (dataset, "dnlo")]
-        verdicts = [row.objective_verdict for row in chosen]
-        lines.append(
-            {
-                "data set": dataset,
-                "rows": len(chosen),
-                "objective lower": verdicts.count("lower"),
-                "equal": verdicts.count("equal"),
-                "higher": verdicts.count("higher"),
-                "e_at agrees": percent(sum(row.is_e_at_the_same for row in chosen), len(chosen)),
-                "median e_at (m)": f"{np.median([row.errors[2] for row in chosen]):.4f}",
-                "published (m)": f"{np.median([row.theirs[2] for row in chosen]):.4f}",
-            }
-        )
-    return markdown_table(lines)
+def _dnlo_by_dataset(rows: pd.DataFrame) -> str:
+    rows = rows[rows["method"] == "dnlo"]
+    return markdown_table(
+        {
+            "data set": dataset,
+            "rows": len(some),
+            "objective lower": (some["verdict"] == "lower").sum(),
+            "equal": (some["verdict"] == "equal").sum(),
+            "higher": (some["verdict"] == "higher").sum(),
+            "e_at agrees": percent(some["same_e_at"].sum(), len(some)),
+            "median e_at (m)": f"{some['e_at'].median():.4f}",
+            "published (m)": f"{some['published_e_at'].median():.4f}",
+        }
+        for dataset, some in rows.groupby("dataset", sort=False)
+    )
 
 
 def _ali(table: Table) -> str:
@@ -109,16 +106,16 @@ def _ali(table: Table) -> str:
     return "\n\n".join(blocks)
 
 
-def _zhuang(rows: Sequence[Row]) -> str:
-    chosen = [row for row in rows if row.method == "zhuang" and row.dataset in SIMULATED]
-    unsettled = sum(not row.converged for row in chosen)
-    free = [row for row in chosen if row.level == 0.0 and row.theirs[3] > _WRONG_DEG]
-    runs = sorted({row.run for row in free})
-    wrong = sum(row.theirs[3] > _WRONG_DEG for row in chosen)
+def _zhuang(rows: pd.DataFrame) -> str:
+    chosen = rows[(rows["method"] == "zhuang") & rows["dataset"].isin(SIMULATED)]
+    unsettled = (~chosen["converged"].astype(bool)).sum()
+    is_wrong = chosen["published_e_aR"] > _WRONG_DEG
+    wrong, free = is_wrong.sum(), chosen[is_wrong & (chosen["level"] == 0.0)]
+    runs = sorted(set(free["run"]))
+    true = rows[rows["run"].isin(runs) & (rows["method"] == "dnl") & (rows["level"] == 0.0)]
     angles = {
-        round(_angle_deg(np.eye(3), row.transform[:3, :3]), 1)
-        for row in rows
-        if row.run in runs and row.method == "dnl" and row.level == 0.0
+        round(_angle_deg(np.eye(3), np.reshape(T, (4, 4))[:3, :3]), 1)
+        for T in true["T_parent_child"]
     }
     return (
         f"The published answer is more than {_WRONG_DEG:.0f} deg wrong in "

@@ -5,17 +5,17 @@ the motions.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.report import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from reproduction.statistics import Summary
+    from reproduction.results import Summary
 
 REFERENCE_LOOKS = {
     "A": (style.BLACK, "D", "-"),
@@ -56,6 +56,14 @@ _ZERO = 1e-6
 # its letters.
 _LABEL_GAP, _LABEL_ROOM, _LETTER = 0.088, 0.12, 0.075
 
+_SMALL_BOLD: dict[str, Any] = {"fontweight": "bold", "fontsize": 6.2}
+_BARS: dict[str, Any] = {"elinewidth": 0.7, "capsize": 1.2, "capthick": 0.7, "mew": 0.8}
+_LEGEND: dict[str, Any] = {
+    "loc": "center left", "bbox_to_anchor": (1.0, 0.5), "frameon": False, "handlelength": 2.0,
+    "fontsize": 6.5, "title": "by $e_{at}$, worst first", "title_fontsize": 6.0,
+    "alignment": "left",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Line:
@@ -65,11 +73,12 @@ class Line:
     label: str
     # Full name for the legend; empty if the label is enough.
     name: str
-    look: tuple
+    # Colour, marker, dashes.
+    look: tuple[str, str, str]
     # Empty in a box plot.
-    levels: tuple
+    levels: tuple[float, ...]
     # One per level; one in a box plot.
-    summaries: tuple
+    summaries: tuple[Summary, ...]
 
 
 def draw_errors(
@@ -90,7 +99,11 @@ def draw_errors(
                 (_draw_boxes if dataset == "mixture" else _draw_lines)(ax, lines)
                 ax.set_xlabel(_DATASET_TITLES[dataset][1])
             row[0].set_ylabel(_DATASET_TITLES[dataset][0], fontweight="bold", fontsize=8)
-            _legend(row[-1], panels[dataset, "e_at"])
+            named = [line for line in panels[dataset, "e_at"] if line.name]
+            if named:
+                named.sort(key=lambda line: line.summaries[-1].centre, reverse=True)
+                handles = [style.handle(line.name, *line.look) for line in named]
+                row[-1].legend(handles=handles, **_LEGEND)
         for ax, metric in zip(axes[0], METRIC_TITLES, strict=True):
             ax.set_title(METRIC_TITLES[metric], fontsize=6.8)
         return style.save(figure, stem)
@@ -109,29 +122,9 @@ def _scale(ax: Axes, lines: Sequence[Line], metric: str) -> None:
     style.plain_decades(ax.yaxis)
 
 
-def _legend(ax: Axes, lines: Sequence[Line]) -> None:
-    """The full names, where there are any, to the right of a row of panels."""
-    if not any(line.name for line in lines):
-        return
-    handles = [
-        style.handle(line.name, *line.look)
-        for line in sorted(lines, key=lambda line: line.summaries[-1].centre, reverse=True)
-    ]
-    ax.legend(
-        handles=handles,
-        loc="center left",
-        bbox_to_anchor=(1.0, 0.5),
-        frameon=False,
-        handlelength=2.0,
-        fontsize=6.5,
-        title="by $e_{at}$, worst first",
-        title_fontsize=6.0,
-        alignment="left",
-    )
-
-
 def _draw_lines(ax: Axes, lines: Sequence[Line]) -> None:
-    span = lines[0].levels[-1] - lines[0].levels[0]
+    first, last = lines[0].levels[0], lines[0].levels[-1]
+    span = last - first
     for number, line in enumerate(lines):
         # Side by side, so that the intervals can be told apart.
         shift = 0.012 * span * (number - (len(lines) - 1) / 2)
@@ -140,26 +133,16 @@ def _draw_lines(ax: Axes, lines: Sequence[Line]) -> None:
         below = [summary.centre - max(summary.low, 0.0) for summary in line.summaries]
         above = [summary.high - summary.centre for summary in line.summaries]
         colour, marker, dashes = line.look
-        ax.errorbar(
-            [level + shift for level in line.levels],
-            centres,
-            yerr=[below, above],
-            color=colour,
-            marker=marker,
-            ls=dashes,
-            elinewidth=0.7,
-            capsize=1.2,
-            capthick=0.7,
-            mew=0.8,
-        )
+        at = [level + shift for level in line.levels]
+        look: dict[str, Any] = {"color": colour, "marker": marker, "ls": dashes}
+        ax.errorbar(at, centres, yerr=[below, above], **look, **_BARS)
     largest = max(summary.high for line in lines for summary in line.summaries)
     if largest < _ZERO:
         ax.text(0.5, 0.5, "all zero", transform=ax.transAxes, ha="center", color=style.GREY)
     ax.set_ylim(0.0, None if largest >= _ZERO else 1.0)
     room = _LABEL_ROOM + _LETTER * max(len(line.label) for line in lines)
-    ax.set_xlim(lines[0].levels[0] - 0.06 * span, lines[0].levels[-1] + room * span)
-    ends = lines[0].levels[0], lines[0].levels[-1]
-    ax.set_xticks(ends, [f"{level:g}" for level in ends])
+    ax.set_xlim(first - 0.06 * span, last + room * span)
+    ax.set_xticks([first, last], [f"{first:g}", f"{last:g}"])
     ax.set_xticks(lines[0].levels, minor=True)
     _label_ends(ax, lines, span)
 
@@ -171,51 +154,35 @@ def _label_ends(ax: Axes, lines: Sequence[Line], span: float) -> None:
     heights = [to_fraction.transform((last, line.summaries[-1].centre))[1] for line in lines]
     placed = style.spread(heights, _LABEL_GAP)
     shift = max(0.0, 0.02 - min(placed)) - max(0.0, max(placed) - 0.98)
+    right, text = (to_fraction.transform((last + x * span, 0.0))[0] for x in (0.04, 0.09))
     for line, height, place in zip(lines, heights, placed, strict=True):
-        right = to_fraction.transform((last + 0.04 * span, 0.0))[0]
-        text = to_fraction.transform((last + 0.09 * span, 0.0))[0]
-        ax.plot(
-            [right, text],
-            [height, place + shift],
-            color=line.look[0],
-            lw=0.5,
-            transform=ax.transAxes,
-        )
-        ax.text(
-            text,
-            place + shift,
-            f" {line.label}",
-            color=line.look[0],
-            fontsize=6.2,
-            fontweight="bold",
-            va="center",
-            transform=ax.transAxes,
-        )
+        look: dict[str, Any] = {"color": line.look[0], "transform": ax.transAxes}
+        ax.plot([right, text], [height, place + shift], lw=0.5, **look)
+        ax.text(text, place + shift, f" {line.label}", va="center", **_SMALL_BOLD, **look)
 
 
 def _draw_boxes(ax: Axes, lines: Sequence[Line]) -> None:
     for place, line in enumerate(lines):
         _draw_box(ax, place, line.summaries[0], line.look[0])
-    ax.set_xticks(
-        range(len(lines)),
-        [line.label for line in lines],
-        rotation=90 if max(len(ln.label) for ln in lines) > 4 else 0,
-    )
-    for tick, line in zip(ax.get_xticklabels(), lines, strict=True):
-        tick.set(color=line.look[0], fontweight="bold", fontsize=6.2)
+    labels = [line.label for line in lines]
+    _coloured_ticks(ax, labels, [line.look[0] for line in lines], **_SMALL_BOLD)
+    if max(map(len, labels)) > 4:
+        ax.tick_params(axis="x", rotation=90)
+
+
+def _coloured_ticks(ax: Axes, labels: Iterable[str], colours: Iterable[str], **look: Any) -> None:
+    labels = list(labels)
+    ax.set_xticks(range(len(labels)), labels)
+    for tick, colour in zip(ax.get_xticklabels(), colours, strict=True):
+        tick.set(color=colour, **look)
 
 
 def _draw_box(ax: Axes, place: float, summary: Summary, colour: str) -> None:
-    statistics = {
-        "med": summary.centre,
-        "q1": summary.low,
-        "q3": summary.high,
-        "whislo": summary.whiskers[0],
-        "whishi": summary.whiskers[1],
-    }
+    low, high = summary.whiskers
+    quartiles = {"med": summary.centre, "q1": summary.low, "q3": summary.high}
     thin = {"color": colour, "lw": 0.8}
     ax.bxp(
-        [statistics],
+        [{**quartiles, "whislo": low, "whishi": high}],
         positions=[place],
         widths=0.62,
         showfliers=False,
@@ -238,12 +205,13 @@ def draw_components(
         figure = style.new_page(4.0, title, note)
         axes = figure.subplots(2, 3, sharey="row")
         for ax, (name, summaries) in zip(axes.flat, components.items(), strict=True):
-            for place, (reference, summary) in enumerate(summaries.items()):
-                _draw_box(ax, place, summary, REFERENCE_LOOKS[reference][0])
+            colours = [REFERENCE_LOOKS[reference][0] for reference in summaries]
+            for place, (summary, colour) in enumerate(
+                zip(summaries.values(), colours, strict=True)
+            ):
+                _draw_box(ax, place, summary, colour)
             ax.set_title(name)
-            ax.set_xticks(range(len(summaries)), summaries)
-            for tick, reference in zip(ax.get_xticklabels(), summaries, strict=True):
-                tick.set(color=REFERENCE_LOOKS[reference][0], fontweight="bold")
+            _coloured_ticks(ax, summaries, colours, fontweight="bold")
         for row, unit, least in zip(axes, ("m", "deg"), (3e-4, 3e-2), strict=True):
             row[0].set_ylabel(unit)
             row[0].set_yscale("log")

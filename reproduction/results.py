@@ -1,26 +1,115 @@
-"""What an experiment has solved, for those who write its files."""
+"""What an experiment has solved, and summaries of many runs as in the paper's figures: mean and
+95 % confidence interval, or median and quartiles.
+"""
 
+from __future__ import annotations
+
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from reproduction import statistics
-from reproduction.published import LEVELS, METHODS, SIMULATED
-from reproduction.rows import ALI_AS_PUBLISHED, Row
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+from scipy.special import stdtrit
+
+from hand_eye_calib.arrays import FloatArray
+from reproduction.published import LEVELS, METHODS, REFERENCES, SIMULATED, Case
+from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED, in_m_and_deg, published_name
 from reproduction.sources import PublishedSource, Source
-from reproduction.statistics import Table
 
 SIMULATION_METHODS = (*METHODS, ALI_AS_PUBLISHED)
+_KEYS = ["dataset", "level", "method", "reference"]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Statistics of one error over the runs of a level."""
+
+    # Mean and its 95 % confidence interval (Student's t), or median and quartiles.
+    centre: float
+    low: float
+    high: float
+    # The farthest values within 1.5 times the interquartile range of the quartiles.
+    whiskers: tuple[float, float]
+    # Number of runs.
+    n: int
+    # Median and quartiles, not mean and interval.
+    is_median: bool
+
+
+def mean_summary(values: ArrayLike) -> Summary:
+    """Mean and 95 % confidence interval of (N,) values."""
+    values = np.asarray(values)
+    mean, n = values.mean(), len(values)
+    half = stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
+    whiskers = float(values.min()), float(values.max())
+    return Summary(float(mean), float(mean - half), float(mean + half), whiskers, n, False)
+
+
+def quartile_summary(values: ArrayLike) -> Summary:
+    """Median and quartiles of (N,) values."""
+    values = np.sort(values)
+    low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
+    inside = values[(values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))]
+    whiskers = float(inside[0]), float(inside[-1])
+    return Summary(float(median), float(low), float(high), whiskers, len(values), True)
+
+
+class Table:
+    """Errors of many rows by data set, level, method and reference; m and deg."""
+
+    def __init__(self, rows: pd.DataFrame) -> None:
+        self._errors = {
+            (dataset, None if np.isnan(level) else level, method, reference): errors
+            for (dataset, level, method, reference), group in rows.groupby(_KEYS, dropna=False)
+            if np.isfinite(errors := group[list(METRICS)].to_numpy()).all()
+        }
+
+    def values(
+        self, dataset: str, level: float | None, method: str, reference: str, metric: str
+    ) -> FloatArray:
+        """(N,) errors of the runs."""
+        return self._errors[dataset, level, method, reference][:, METRICS.index(metric)]
+
+    def levels(self, dataset: str, method: str) -> tuple[float | None, ...]:
+        """Levels of a data set, ascending; (None,) for the mixture."""
+        found = {key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)}
+        return tuple(sorted(found, key=lambda level: level or 0.0))
+
+    def summary(
+        self, dataset: str, level: float | None, method: str, reference: str, metric: str
+    ) -> Summary:
+        """As the paper does: the mixture by quartiles, the others by mean."""
+        values = self.values(dataset, level, method, reference, metric)
+        return quartile_summary(values) if dataset == "mixture" else mean_summary(values)
+
+    def score(self, dataset: str, method: str, reference: str, metric: str = "e_at") -> float:
+        """The value that variants are compared by: the mean over levels of the mean over runs; of
+        the mixture, the median.
+        """
+        levels = self.levels(dataset, method)
+        found = [self.summary(dataset, level, method, reference, metric) for level in levels]
+        return float(np.mean([summary.centre for summary in found]))
+
+    def ranking(self, dataset: str, method: str, metric: str = "e_at") -> list[str]:
+        """References from the smallest score to the largest."""
+        return sorted(REFERENCES, key=lambda name: self.score(dataset, method, name, metric))
+
+    def best_reference(self, dataset: str, method: str, metric: str = "e_at") -> str:
+        """The reference with the smallest score."""
+        return self.ranking(dataset, method, metric)[0]
 
 
 @dataclass(frozen=True)
 class Results:
-    """Solved rows and the output directory."""
+    """Solved rows (:func:`~reproduction.rows.table_of`) and the output directory."""
 
     source: Source
     # Source of the published results to compare with.
     theirs_source: PublishedSource | None
-    rows: list[Row]
+    rows: pd.DataFrame
     out: Path
     # Number of processes of the studies, which are not solved cell by cell.
     jobs: int = 1
@@ -37,14 +126,15 @@ class Results:
 
     @cached_property
     def ours(self) -> Table:
-        """:class:`~reproduction.statistics.Table` of our errors."""
-        return statistics.of_rows(self.rows)
+        """Our errors."""
+        return Table(self.rows)
 
     @cached_property
     def theirs(self) -> Table | None:
-        """Table of the published errors; None without published data."""
+        """The published errors; None without published data."""
         if self.same_cases:
-            return statistics.of_rows(self.rows, "published")
+            named = dict(zip(PUBLISHED, METRICS, strict=True))
+            return Table(self.rows.drop(columns=list(METRICS)).rename(columns=named))
         if self.theirs_source is None:
             return None
         cases = (
@@ -53,8 +143,21 @@ class Results:
             for level in LEVELS[dataset]
             for case in self.theirs_source.cases(dataset, level)
         )
-        return statistics.theirs_of_cases(cases, SIMULATION_METHODS)
+        return Table(_published_of(cases))
 
-    def of(self, dataset: str, method: str) -> list[Row]:
+    def of(self, dataset: str, method: str) -> pd.DataFrame:
         """Rows of a method on a data set."""
-        return [row for row in self.rows if (row.dataset, row.method) == (dataset, method)]
+        return self.rows[(self.rows["dataset"] == dataset) & (self.rows["method"] == method)]
+
+
+def _published_of(cases: Iterable[Case]) -> pd.DataFrame:
+    """The published errors of cases, whatever was solved."""
+    rows = [
+        (case.dataset, case.level, method, reference)
+        + in_m_and_deg(case.results[published_name(method), reference].errors)
+        for case in cases
+        for method in SIMULATION_METHODS
+        for reference in REFERENCES
+    ]
+    table = pd.DataFrame(rows, columns=[*_KEYS, *METRICS])
+    return table.astype({"level": float})

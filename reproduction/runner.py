@@ -10,8 +10,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +91,10 @@ def solve(
     for name in tasks.keys() - set(missing):
         on_done(name)
 
-    def keep(number: int, result: Any) -> None:
-        store.keep(missing[number], result)
-        on_done(missing[number])
-
-    _on_processes(function, [tasks[name] for name in missing], jobs, keep)
+    with closing(_on_processes(function, [tasks[name] for name in missing], jobs)) as results:
+        for number, result in results:
+            store.keep(missing[number], result)
+            on_done(missing[number])
     return {name: store.found[name] for name in tasks}
 
 
@@ -102,19 +102,15 @@ def in_parallel(
     function: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], jobs: int
 ) -> list[Any]:
     """``function(*task)`` of every task on ``jobs`` processes; a list in the order of tasks."""
-    tasks, found = list(tasks), dict[int, Any]()
-    _on_processes(function, tasks, jobs, found.__setitem__)
-    return [found[number] for number in range(len(tasks))]
+    found = dict(_on_processes(function, list(tasks), jobs))
+    return [found[number] for number in sorted(found)]
 
 
 def _on_processes(
-    function: Callable[..., Any],
-    tasks: Sequence[tuple[Any, ...]],
-    jobs: int,
-    on_result: Callable[[int, Any], object],
-) -> None:
-    """Call ``on_result(number, result)`` for every task as it ends. If that raises, the processes
-    are killed: one that waits to hand over a result which nobody takes would not see a signal that
+    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int
+) -> Generator[tuple[int, Any]]:
+    """The number and the result of every task as it ends. The processes are killed if the caller
+    ends before: one that waits to hand over a result which nobody takes would not see a signal that
     Python handles.
     """
     if not tasks:
@@ -130,7 +126,7 @@ def _on_processes(
         futures = {executor.submit(function, *task): number for number, task in enumerate(tasks)}
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for future in as_completed(futures):
-            on_result(futures[future], future.result())
+            yield futures[future], future.result()
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         ours = set(multiprocessing.active_children()) - others

@@ -2,18 +2,19 @@
 the rectified ground truth.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hand_eye_calib.assessment.metrics import absolute_errors
 from reproduction import comparison
 from reproduction.kitti_truth import RECTIFIED
 from reproduction.published import METHODS, REFERENCES
 from reproduction.results import Results
-from reproduction.rows import TITLES, Row, agree
+from reproduction.rows import METRICS, PUBLISHED, TITLES, agree
 from reproduction.writing import markdown_table, percent, write_csv, write_text
 
 SUMMARY_TABLES = {"table1": "kitti_short", "table2": "kitti_long"}
@@ -51,55 +52,53 @@ PRINTED: dict[str, dict[str, tuple[Any, ...]]] = {
 _ERRORS = ("e_rt (m)", "e_rR (deg)", "e_at (m)", "e_aR (deg)")
 _GAINS = ("e_at gain over B1 (m)", "e_aR gain over B1 (deg)")
 _RECTIFIED = ("rectified: e_at (m)", "rectified: e_aR (deg)")
+_RECTIFIED_GAINS = tuple(f"rectified: {gain}" for gain in _GAINS)
+_COLUMNS = (*_ERRORS, *_GAINS, *_RECTIFIED, *_RECTIFIED_GAINS)
 _NOTE = (
     "Columns 'rectified' are against the calibration of the rectified images that the SLAM saw; "
     "the others against the ground truth as published. Gain: error of the method's B1 variant "
     "less that of this one."
 )
 
-
 # Printed numbers are the same to three decimals.
 _SAME_PRINT = 0.00051
 
-# By method and reference.
-Variants = Mapping[str, Mapping[str, Row]]
-# Column to value; None without a gain.
-Values = dict[str, float | None]
+
+def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of one drive by method and reference, with errors against the rectified truth and what
+    is gained over the method's B1 variant.
+    """
+    truth = RECTIFIED[rows["dataset"].iloc[0]]
+    found = rows.set_index(["method", "reference"])
+    errors = [absolute_errors(np.reshape(T, (4, 4)), truth) for T in found["T_parent_child"]]
+    found[list(_RECTIFIED)] = np.array(errors) * [1.0, 180.0 / np.pi]
+    found = found.rename(columns=dict(zip(METRICS, _ERRORS, strict=True)))
+    absolute = [*_ERRORS[2:], *_RECTIFIED]
+    of_b1 = found.xs("B1", level="reference")[absolute].reindex(found.index, level="method")
+    gains = of_b1 - found[absolute]
+    gains[found.index.get_level_values("reference") == "B1"] = np.nan
+    found[[*_GAINS, *_RECTIFIED_GAINS]] = gains
+    return found
 
 
-def rectified_errors(row: Row) -> tuple[float, float]:
-    """e_at (m) and e_aR (deg) against the rectified ground truth."""
-    e_at, e_aR = absolute_errors(row.transform, RECTIFIED[row.dataset])
-    return e_at, float(np.degrees(e_aR))
-
-
-def best_variant(
-    rows: Iterable[Row], error: Callable[[Row], float] = lambda row: row.errors[2]
-) -> Row:
-    """The row with the smallest e_at, or another error."""
-    return min(rows, key=error)
+def best_variants(rows: pd.DataFrame, by: str = _ERRORS[2]) -> pd.DataFrame:
+    """Of each method the row with the smallest error, of :func:`with_rectified`."""
+    return rows.loc[[rows.loc[[method]][by].idxmin() for method in METHODS]]
 
 
 def write_summary_table(name: str, results: Results) -> list[Path]:
     """Tables 1 and 2; returns the paths."""
     dataset = SUMMARY_TABLES[name]
-    rows = {
-        method: {row.reference: row for row in results.of(dataset, method)} for method in METHODS
-    }
-    best = {method: best_variant(rows[method].values()) for method in METHODS}
-    values = {method: _values(best[method], rows[method]["B1"]) for method in METHODS}
-    smallest = {
-        column: min(each[column] for each in values.values()) for column in (*_ERRORS, *_RECTIFIED)
-    }
+    rows = with_rectified(results.rows[results.rows["dataset"] == dataset])
+    best = best_variants(rows)
+    smallest = best[[*_ERRORS, *_RECTIFIED]].min()
     printed = (
-        {"method": f"{TITLES[method]} {best[method].reference}"}
-        | {column: _print(value, smallest.get(column)) for column, value in each.items()}
-        for method, each in values.items()
+        {"method": f"{TITLES[method]} {reference}"}
+        | {column: _print(row[column], smallest.get(column)) for column in _COLUMNS}
+        for (method, reference), row in best.iterrows()
     )
-    table = (
-        {"method": TITLES[method], "variant": best[method].reference, **_blank(each)}
-        for method, each in values.items()
-    )
+    table = best[list(_COLUMNS)].reset_index(names=["method", "variant"])
+    table["method"] = table["method"].map(TITLES)
     return [
         write_text(
             results.out / f"{name}.md",
@@ -113,67 +112,47 @@ def write_summary_table(name: str, results: Results) -> list[Path]:
     ]
 
 
-def _values(row: Row, b1: Row) -> Any:
-    """The ten numbers of a variant by column."""
-    own, base = ((*x.errors[2:], *rectified_errors(x)) for x in (row, b1))
-    gains = [None if row.reference == "B1" else y - x for x, y in zip(own, base, strict=True)]
-    values = (*row.errors, *gains[:2], *own[2:], *gains[2:])
-    columns = (*_ERRORS, *_GAINS, *_RECTIFIED, *(f"rectified: {gain}" for gain in _GAINS))
-    return dict(zip(columns, values, strict=True))
-
-
-def _blank(values: Values) -> dict[str, float | str]:
-    return {column: "" if value is None else value for column, value in values.items()}
-
-
-def _print(value: float | None, bold: float | None = None) -> str:
+def _print(value: float, bold: float | None = None) -> str:
     """To three decimals; bold where that reads as ``bold`` does."""
-    if value is None:
+    if np.isnan(value):
         return "-"
     text = f"{value:.3f}"
     return f"**{text}**" if bold is not None and text == f"{bold:.3f}" else text
 
 
-def _best_against_rectified(rows: Variants) -> str:
+def _best_against_rectified(rows: pd.DataFrame) -> str:
     lines = []
-    for method, by_reference in rows.items():
-        row = best_variant(by_reference.values(), lambda row: rectified_errors(row)[0])
-        e_at, e_aR = rectified_errors(row)
-        b1_e_at, b1_e_aR = rectified_errors(by_reference["B1"])
+    for (method, reference), row in best_variants(rows, _RECTIFIED[0]).iterrows():
+        errors = [*row[list(_RECTIFIED)], *rows.loc[(method, "B1"), list(_RECTIFIED)]]
+        titles = ("e_at (m)", "e_aR (deg)", "B1: e_at (m)", "B1: e_aR (deg)")
         lines.append(
-            {
-                "best against the rectified truth": f"{TITLES[method]} {row.reference}",
-                "e_at (m)": f"{e_at:.3f}",
-                "e_aR (deg)": f"{e_aR:.3f}",
-                "B1: e_at (m)": f"{b1_e_at:.3f}",
-                "B1: e_aR (deg)": f"{b1_e_aR:.3f}",
-            }
+            {"best against the rectified truth": f"{TITLES[method]} {reference}"}
+            | {title: f"{error:.3f}" for title, error in zip(titles, errors, strict=True)}
         )
     return markdown_table(lines)
 
 
 def _compare_with_print(
-    name: str, rows: Variants, best: Mapping[str, Row], results: Results
+    name: str, rows: pd.DataFrame, best: pd.DataFrame, results: Results
 ) -> list[Path]:
     """Cell by cell: ours (of our best variant, and of the paper's), the published file's, and as
     printed.
     """
-    compared = [
+    dataset = SUMMARY_TABLES[name]
+    compared = pd.DataFrame(
         line
-        for method in METHODS
-        for line in _printed_cells(
-            rows[method], best[method], PRINTED[SUMMARY_TABLES[name]][method]
-        )
-    ]
+        for method, reference in best.index
+        for line in _printed_cells(rows.loc[method], method, reference, PRINTED[dataset][method])
+    )
     agreeing, there = (
-        percent(sum(line[which] for line in compared), len(compared))
+        percent(compared[which].sum(), len(compared))
         for which in ("agrees", "agrees_with_the_papers_variant")
     )
-    differing = [
+    differing = (
         {column: f"{x:.4f}" if isinstance(x, float) else x for column, x in line.items()}
-        for line in compared
-        if not line["agrees"]
-    ]
+        for line in compared[~compared["agrees"]].to_dict("records")
+    )
+    solved = results.rows[results.rows["dataset"] == dataset]
     return [
         write_csv(results.out / f"{name}_comparison.csv", compared),
         write_text(
@@ -181,90 +160,83 @@ def _compare_with_print(
             f"# {name}: comparison with the paper",
             f"Cells that agree with the printed table to its three decimals: {agreeing}; with the "
             f"paper's variant of each method: {there}.",
-            markdown_table(differing) if differing else "",
+            markdown_table(differing),
             "## Every variant, against the published results in full precision",
-            comparison.describe_rows([row for by in rows.values() for row in by.values()]),
-            comparison.describe_dnlo(list(rows["dnlo"].values())),
+            comparison.describe_rows(solved),
+            comparison.describe_dnlo(solved),
         ),
     ]
 
 
 def _printed_cells(
-    rows: Mapping[str, Row], best: Row, printed: tuple[Any, ...]
+    rows: pd.DataFrame, method: str, best: str, printed: tuple[Any, ...]
 ) -> Iterator[dict[str, Any]]:
     """A line for each printed number of a method."""
     variant, *numbers = printed
-    involved = [row for row in (rows[variant], rows["B1"]) if not row.agrees]
-    why = "; ".join(dict.fromkeys(f"{row.reference}: {row.why()}" for row in involved))
-    ours, there = _values(best, rows["B1"]), _values(rows[variant], rows["B1"])
+    involved = dict.fromkeys((variant, "B1"))
+    why = "; ".join(
+        f"{name}: {rows.loc[name, 'why']}" for name in involved if rows.loc[name, "why"]
+    )
     for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True):
-        same, same_there = (_reads_as(each[column], number) for each in (ours, there))
-        other = f"best variant is {best.reference} here" if same_there else why
+        ours, there = (float(rows.loc[name, column]) for name in (best, variant))
+        same, same_there = (_reads_as(value, number) for value in (ours, there))
         yield {
-            "method": TITLES[best.method],
-            "our_best_variant": best.reference,
+            "method": TITLES[method],
+            "our_best_variant": best,
             "papers_variant": variant,
             "column": column,
-            **_blank(
-                {
-                    "ours": ours[column],
-                    "ours_with_the_papers_variant": there[column],
-                    "printed": number,
-                }
-            ),
+            "ours": ours,
+            "ours_with_the_papers_variant": there,
+            "printed": number,
             "agrees": same,
             "agrees_with_the_papers_variant": same_there,
-            "why": "" if same else other,
+            "why": "" if same else f"best variant is {best} here" if same_there else why,
         }
 
 
-def _reads_as(value: float | None, printed: float | None) -> bool:
-    if value is None or printed is None:
-        return value is printed
+def _reads_as(value: float, printed: float | None) -> bool:
+    if printed is None:
+        return bool(np.isnan(value))
     return abs(value - printed) <= _SAME_PRINT
 
 
 def write_variant_table(name: str, results: Results) -> list[Path]:
     """Tables S1 to S12; returns the paths."""
     dataset, method = VARIANT_TABLES[name]
-    rows = results.of(dataset, method)
-    best = best_variant(rows)
-    values = {
-        row.reference: dict(
-            zip((*_ERRORS, *_RECTIFIED), (*row.errors, *rectified_errors(row)), strict=True)
-        )
-        for row in sorted(rows, key=lambda row: REFERENCES.index(row.reference))
-    }
+    solved = results.of(dataset, method)
+    rows = with_rectified(solved).loc[method].loc[list(REFERENCES)]
+    columns = [*_ERRORS, *_RECTIFIED]
+    best = rows[_ERRORS[2]].idxmin()
     printed = (
         {"reference": name}
-        | {column: _print(x, x if name == best.reference else None) for column, x in each.items()}
-        for name, each in values.items()
+        | {column: _print(row[column], row[column] if name == best else None) for column in columns}
+        for name, row in rows.iterrows()
     )
     compared = (
         {
             "reference": row.reference,
             "column": column,
-            "ours": ours,
-            "published": theirs,
-            "agrees": agree(ours, theirs),
-            "why": "" if agree(ours, theirs) else row.why(),
+            "ours": getattr(row, metric),
+            "published": getattr(row, published),
+            "agrees": (same := bool(agree(getattr(row, metric), getattr(row, published)))),
+            "why": "" if same else row.why,
         }
-        for row in rows
-        for column, ours, theirs in zip(_ERRORS, row.errors, row.theirs, strict=True)
+        for row in solved.itertuples()
+        for column, metric, published in zip(_ERRORS, METRICS, PUBLISHED, strict=True)
     )
-    blocks = [comparison.describe_rows(rows)]
+    blocks = [comparison.describe_rows(solved)]
     if method == "dnlo":
         objectives = (
             {
                 "reference": row.reference,
                 "objective": f"{row.objective:.6f}",
                 "objective at the published answer": f"{row.published_objective:.6f}",
-                "e_at (m)": f"{row.errors[2]:.4f}",
-                "published e_at (m)": f"{row.theirs[2]:.4f}",
+                "e_at (m)": f"{row.e_at:.4f}",
+                "published e_at (m)": f"{row.published_e_at:.4f}",
             }
-            for row in rows
+            for row in solved.itertuples()
         )
-        blocks += [comparison.describe_dnlo(rows), markdown_table(objectives)]
+        blocks += [comparison.describe_dnlo(solved), markdown_table(objectives)]
     return [
         write_text(
             results.out / f"{name}.md",
@@ -272,10 +244,7 @@ def write_variant_table(name: str, results: Results) -> list[Path]:
             markdown_table(printed),
             f"The best variant by e_at is bold. {_NOTE}",
         ),
-        write_csv(
-            results.out / f"{name}.csv",
-            ({"reference": reference, **each} for reference, each in values.items()),
-        ),
+        write_csv(results.out / f"{name}.csv", rows[columns].reset_index()),
         write_csv(results.out / f"{name}_comparison.csv", compared),
         write_text(
             results.out / f"{name}_comparison.md",

@@ -1,25 +1,23 @@
 """CSV and Markdown: files, tables, pages. A table is a list of rows that map column to value."""
 
 import argparse
-import csv
 import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import pandas as pd
+
 from hand_eye_calib.errors import InputError
 
 TableRow = Mapping[str, object]
 
 
-def write_csv(path: Path, rows: Iterable[TableRow]) -> Path:
+def write_csv(path: Path, rows: Iterable[TableRow] | pd.DataFrame) -> Path:
     """Write a table; returns the path. Numbers keep all digits."""
-    rows = list(rows)
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    table = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows), dtype=object)
+    table.to_csv(path, index=False, lineterminator="\n")
     return path
 
 

@@ -15,7 +15,7 @@ from hand_eye_calib.cli.main import exit_code_of
 from hand_eye_calib.errors import ConfigError
 from reproduction.recordings import Rig, real_rigs
 from reproduction.runner import Store, in_parallel, solve
-from reproduction.session import mount, pairs, prefixes, stop_rule
+from reproduction.session import mount, pairs, stop
 from reproduction.writing import markdown_table, show, study_parser
 
 
@@ -54,15 +54,13 @@ def _rigs(arguments: argparse.Namespace) -> list[Rig]:
 def _stop(arguments: argparse.Namespace) -> str:
     tables = []
     for name, recordings in (
-        ("simulated", prefixes.simulated(arguments.seeds)),
-        ("real", prefixes.real(_rigs(arguments))),
+        ("simulated", stop.simulated(arguments.seeds)),
+        ("real", stop.real(_rigs(arguments))),
     ):
         store = Store(arguments.rows / f"stop_{name}.jsonl", {"study": "stop"})
         tasks = {recorded.name: (recorded,) for recorded in recordings}
-        found = solve(prefixes.solved, tasks, arguments.jobs, store).values()
-        kept = [prefixes.Kept.from_plain(document) for document in found]
-        stops = [stop_rule.stopped(one, factor) for one in kept for factor in stop_rule.FACTORS]
-        tables.append(stop_rule.table(stops))
+        found = solve(stop.stops, tasks, arguments.jobs, store).values()
+        tables.append(stop.table([stop.Stop(**each) for plain in found for each in plain]))
     return "\n\n".join(["Simulated:", tables[0], "Real, cut off in the same way:", tables[1]])
 
 
