@@ -5,7 +5,6 @@ motion one that stays. Their sizes and the extrinsics are known.
 """
 
 import dataclasses
-import time
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -164,19 +163,6 @@ def _worst(ratios: FloatArray) -> str:
     return f"{100 * (worst - 1):+.0f} %"
 
 
-def time_table() -> str:
-    """Processor time of calibrating whole rigs."""
-    rows = []
-    for n_sensors, n_poses in ((3, 2500), (3, 10000), (8, 2500), (8, 10000)):
-        rig = simulated(1, n_poses, unequal(n_sensors))
-        trajectories = trajectories_of(rig, [f"s{index}" for index in range(n_sensors)])
-        started = time.process_time()
-        calibrate_rig(trajectories)
-        seconds = f"{time.process_time() - started:.1f}"
-        rows.append({"Sensors": n_sensors, "Poses": f"{n_poses:,}", "Calibration (s)": seconds})
-    return markdown_table(rows)
-
-
 def real_rigs(folder: Path) -> Iterator[tuple[str, RigCalibration]]:
     """The three devices of tango, and the three sensors of zxl19's vehicle in three recordings."""
     tango, zxl19 = folder / "asl_tango_easy", folder / "zxl19"
@@ -222,7 +208,6 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=1200)
     arguments = parser.parse_args()
     show(arguments.page, {"simulated": simulated_table(arguments.repeats, arguments.poses)})
-    show(arguments.page, {"time": time_table()})
     if arguments.data_folder:
         show(arguments.page, {"real": real_table(arguments.data_folder)})
 
