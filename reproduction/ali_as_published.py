@@ -19,7 +19,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers.ali import residual_rows
-from hand_eye_calib.solvers.separable import squared_translation_residual
+from hand_eye_calib.solvers.park import squared_translation_residual
 from hand_eye_calib.solvers.solution import Solution
 
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])

@@ -11,9 +11,8 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.leaps import find_leap
-from hand_eye_calib.pairing.motions import pairs_over
-from hand_eye_calib.pairing.synchronise import synchronise
+from hand_eye_calib.pairing.motion_pairs import pairs_over
+from hand_eye_calib.pairing.synchronise import find_leap, synchronise
 
 # Motions over these times (s) are compared; the lag with the smallest standard deviation wins.
 # Short motions show the offset best.

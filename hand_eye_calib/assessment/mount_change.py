@@ -32,8 +32,7 @@ from hand_eye_calib.assessment.moved import (
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.state_space import NormalEquations
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.pairing.motions import pairs_over
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.stats import median, robust_sigma, student_weights
 from hand_eye_calib.text import angle, length

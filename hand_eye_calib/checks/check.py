@@ -50,8 +50,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.pairing.motions import pairs_over
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
 # Time offsets (s) from which on an error, a warning, a note is given; each also needs this many

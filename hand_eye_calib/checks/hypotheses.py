@@ -27,10 +27,9 @@ from hand_eye_calib.checks.streams import coarse_poses
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.pairing.motions import pairs_over
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import synchronise
-from hand_eye_calib.solvers.separable import align_rotation_vectors
+from hand_eye_calib.solvers.park import align_rotation_vectors
 from hand_eye_calib.stats import median
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree.

@@ -13,7 +13,7 @@ from hand_eye_calib.checks.findings import Finding
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import pairs_between
-from hand_eye_calib.solvers.separable import align_rotation_vectors
+from hand_eye_calib.solvers.park import align_rotation_vectors
 from hand_eye_calib.stats import quantile
 
 # Orientations are copies if they agree to this angle, several times better than any two sensors of

@@ -10,7 +10,7 @@ from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.leaps import find_leap
+from hand_eye_calib.pairing.synchronise import find_leap
 from hand_eye_calib.stats import distinct, median, quantile
 
 # Shortest step (s) of a path length: over shorter steps it would be the length of the noise.

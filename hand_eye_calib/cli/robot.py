@@ -1,6 +1,7 @@
 """What a robot has installed: compared with a result, and changed in its description."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,10 +64,8 @@ def with_robot(calibration: "Calibration", arguments: argparse.Namespace) -> "Ca
         calibration = with_comparison(calibration, installed)
     if not arguments.base_frame:
         return calibration
-    from hand_eye_calib.session.installed import with_base
-
     T_base_parent = _frames(arguments).pose(arguments.base_frame, calibration.parent_frame)
-    return with_base(calibration, arguments.base_frame, T_base_parent)
+    return replace(calibration, base_frame=arguments.base_frame, T_base_parent=T_base_parent)
 
 
 def write_description(calibration: "Calibration", arguments: argparse.Namespace) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.alignment.horizontal import horizontal_factors
+from hand_eye_calib.alignment.scale import horizontal_factors
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm
 from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.geometry.interpolation import REACH
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import REACH, Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)

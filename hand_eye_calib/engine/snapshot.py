@@ -26,8 +26,7 @@ from hand_eye_calib.engine.estimators import ESTIMATORS
 from hand_eye_calib.engine.scatter import cross_checked
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.keyframes import select_keyframes
-from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+from hand_eye_calib.pairing.synchronise import PosePairs, select_keyframes, synchronise
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 
 if TYPE_CHECKING:

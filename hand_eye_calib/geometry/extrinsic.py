@@ -7,6 +7,17 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 
+ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
+ROTATION_VECTOR = ("rx", "ry", "rz")
+
+# Standard deviations above this (rad) count as unknown: the derivative does not hold that far.
+_UNKNOWN_ANGLE = 0.3
+
+# Roll and yaw cannot be separated if the cosine of the pitch is below this many standard deviations
+# of the rotation: their own would be 10 deg and more, and far from normal.
+_LOCKED_SIGMAS = 5.0
+_LOCKED_COSINE = 1e-4
+
 
 def _exact() -> FloatArray:
     return np.zeros((6, 6))
@@ -43,3 +54,140 @@ class Extrinsic:
         """(6, 6) array: covariance of the errors along and about the axes of the parent's frame."""
         to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
         return np.asarray(to_parent @ self.covariance @ to_parent.T)
+
+
+@dataclass(frozen=True)
+class PrintedRotation:
+    """A rotation as three printed values, each with its standard deviation.
+
+    Attributes
+    ----------
+    names : tuple of str
+        roll, pitch and yaw about fixed axes; near gimbal lock rx, ry and rz of the rotation vector.
+    values, sigmas : (3,) arrays
+        rad; the standard deviation is infinite for what is unknown.
+    is_near_gimbal_lock : bool
+    """
+
+    names: tuple[str, str, str]
+    values: FloatArray
+    sigmas: FloatArray
+    is_near_gimbal_lock: bool
+
+
+def printed_rotation(T_target_source: FloatArray, covariance: FloatArray) -> PrintedRotation:
+    """The rotation of a transform as it is printed, with standard deviations.
+
+    Parameters
+    ----------
+    T_target_source : (4, 4) array
+    covariance : (6, 6) array
+        Of xi = (rho, phi) in ``T_target_source @ exp(xi)``, m and rad.
+
+    Returns
+    -------
+    PrintedRotation
+        The rotation vector near gimbal lock, otherwise roll, pitch and yaw.
+    """
+    rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
+    if is_near_gimbal_lock(rotation, covariance):
+        vector = se3.rotation_log(rotation)
+        sigmas = _sigmas(_vector_jacobian(vector), covariance)
+        return PrintedRotation(ROTATION_VECTOR, vector, sigmas, True)
+    rpy = se3.rotation_to_rpy(rotation)
+    return PrintedRotation(ROLL_PITCH_YAW, rpy, sigmas_rpy(T_target_source, covariance), False)
+
+
+def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Standard deviations (3,) of roll, pitch and yaw, rad, to first order.
+
+    Parameters
+    ----------
+    T_target_source : (4, 4) array
+    covariance : (6, 6) array
+        Of xi = (rho, phi) in ``T_target_source @ exp(xi)``, m and rad.
+
+    Returns
+    -------
+    (3,) array
+        Infinite if an angle is unknown; near gimbal lock roll and yaw are.
+    """
+    rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
+    roll, pitch, _ = se3.rotation_to_rpy(rotation)
+    if is_near_gimbal_lock(rotation, covariance):
+        # The derivative of the pitch alone is finite.
+        pitch_row = np.array([[0.0, np.cos(roll), -np.sin(roll)]])
+        return np.array([np.inf, _sigmas(pitch_row, covariance)[0], np.inf])
+    return _sigmas(_rpy_jacobian(roll, pitch), covariance)
+
+
+def sigmas_translation(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Standard deviations (3,) of the translation along the axes of the target frame, m.
+
+    Parameters
+    ----------
+    T_target_source : (4, 4) array
+    covariance : (6, 6) array
+        Of xi = (rho, phi) in ``T_target_source @ exp(xi)``, m and rad.
+    """
+    rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
+    covariance = np.asarray(covariance, dtype=float)[:3, :3]
+    if not np.isfinite(covariance).all():
+        return np.full(3, np.inf)
+    return np.sqrt(np.maximum(np.diag(rotation @ covariance @ rotation.T), 0.0))
+
+
+def inverse_covariance(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of the inverse transform, in the same convention.
+
+    ``inverse(T exp(xi)) = inverse(T) exp(-Ad_T xi)``, so the covariance is ``Ad_T C Ad_T'``.
+    """
+    covariance = np.asarray(covariance, dtype=float)
+    if not np.isfinite(covariance).all():
+        return np.full((6, 6), np.inf)
+    adjoint = se3.adjoint(np.asarray(T_target_source, dtype=float))
+    return adjoint @ covariance @ adjoint.T
+
+
+def is_near_gimbal_lock(rotation: FloatArray, covariance: FloatArray) -> bool:
+    """Whether the pitch of a rotation (3, 3) is so close to +/- 90 deg, measured by the uncertainty
+    of the rotation, that roll and yaw mean nothing.
+    """
+    cosine = float(np.hypot(rotation[0, 0], rotation[1, 0]))
+    covariance = np.asarray(covariance, dtype=float)[3:, 3:]
+    if not np.isfinite(covariance).all():
+        return cosine < _LOCKED_COSINE
+    sigmas = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
+    largest = float(np.max(sigmas[sigmas <= _UNKNOWN_ANGLE], initial=0.0))
+    return cosine < max(_LOCKED_SIGMAS * largest, _LOCKED_COSINE)
+
+
+def _sigmas(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    covariance = np.asarray(covariance, dtype=float)[3:, 3:]
+    if not np.isfinite(covariance).all():
+        return np.full(len(jacobian), np.inf)
+    variances = np.diag(jacobian @ covariance @ jacobian.T)
+    sigmas = np.sqrt(np.maximum(variances, 0.0))
+    return np.where(sigmas > _UNKNOWN_ANGLE, np.inf, sigmas)
+
+
+def _rpy_jacobian(roll: float, pitch: float) -> FloatArray:
+    """Derivative (3, 3) of roll, pitch and yaw with respect to phi in ``R exp(phi)``."""
+    sine, cosine, tangent = np.sin(roll), np.cos(roll), np.tan(pitch)
+    return np.array(
+        [
+            [1.0, sine * tangent, cosine * tangent],
+            [0.0, cosine, -sine],
+            [0.0, sine / np.cos(pitch), cosine / np.cos(pitch)],
+        ]
+    )
+
+
+def _vector_jacobian(vector: FloatArray) -> FloatArray:
+    """Derivative (3, 3) of the rotation vector with respect to phi in ``exp(vector) exp(phi)``: the
+    inverse of the right Jacobian of SO(3).
+    """
+    angle = float(np.linalg.norm(vector))
+    cross = se3.skew(vector)
+    factor = 1 / 12 if angle < 1e-4 else (1 - angle / 2 / np.tan(angle / 2)) / angle**2
+    return np.eye(3) + cross / 2 + factor * cross @ cross

@@ -11,8 +11,6 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import MEASURES
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.interpolation import corners
-from hand_eye_calib.geometry.rates import integrated
 from hand_eye_calib.stats import median
 
 # A quaternion further from unit length than this is wrong and not just rounded (tf2 has the same
@@ -24,6 +22,64 @@ FARTHEST_M = 1e8
 
 # Tolerance for rotation matrices: a file with six digits passes, a scaled matrix does not.
 ROTATION_TOLERANCE = 1e-3
+
+# Intervals on either side of one that tell motion from noise, and poses before and after a stamp
+# that interpolation looks at.
+_NEARBY = 4
+REACH = _NEARBY + 2
+
+# Of white noise: covariance of neighbouring changes over their variance, and variance of the mean
+# of two of them over theirs.
+_CORRELATION, _LEFT_IN_THE_MEAN = -2.0 / 3.0, 1.0 / 6.0
+
+
+def integrated(stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
+    """Orientations (N, 3, 3) of a body in its own first axes, from its angular rates.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+        In any order; a step back in time is a rotation back.
+    rates : (N, 3) array
+        rad/s, about the axes of the body. Between two stamps the mean of both counts.
+    """
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    steps = 0.5 * (rates[1:] + rates[:-1]) * intervals_s[:, None]
+    return chained(se3.rotation_exp(steps))
+
+
+def chained(steps: FloatArray) -> FloatArray:
+    """Orientations (N + 1, 3, 3) after each of the rotations (N, 3, 3), from the identity on."""
+    rotations = np.concatenate([np.eye(3)[None], steps])
+    # Products of all up to each, in as many passes as their number has binary digits.
+    span = 1
+    while span < len(rotations):
+        rotations[span:] = rotations[:-span] @ rotations[span:]
+        span *= 2
+    return rotations
+
+
+class RateIntegrator:
+    """Integrates the angular rates of one sensor as they come in, in parts of any length."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._last_rate = np.zeros(3)
+        self._rotation = np.eye(3)
+
+    def quats_xyzw(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
+        """Orientations (M, 4), scalar last, at the stamps (M,) of the next rates (M, 3), rad/s."""
+        first_ns = stamps_ns[0] if self._last_ns is None else self._last_ns
+        before = rates[0] if self._last_ns is None else self._last_rate
+        rotations = integrated(
+            np.concatenate([[first_ns], stamps_ns]), np.concatenate([[before], rates])
+        )
+        rotations = self._rotation @ rotations[1:]
+        self._last_ns, self._last_rate = int(stamps_ns[-1]), np.array(rates[-1], dtype=float)
+        # Rounding adds up over hours.
+        left, _, right = np.linalg.svd(rotations[-1])
+        self._rotation = left @ right
+        return se3.to_quat_xyzw(rotations)
 
 
 @dataclass(frozen=True)
@@ -226,7 +282,7 @@ class Trajectory:
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
     ) -> FloatArray:
-        """Interpolate poses at other stamps, see :mod:`~hand_eye_calib.geometry.interpolation`.
+        """Interpolate poses at other stamps, see :func:`corners`.
 
         Parameters
         ----------
@@ -303,3 +359,82 @@ def _check_poses(poses: FloatArray) -> None:
             f"pose {int(np.argmax(wrong))} is not a rigid transform: its 3x3 part is not a "
             f"rotation matrix within {ROTATION_TOLERANCE} (scaled or left-handed axes?)"
         )
+
+
+def corners(
+    stamps_ns: IntArray, poses: FloatArray, start: IntArray, fraction: FloatArray
+) -> FloatArray:
+    """Twists from a constant twist to the motion.
+
+    A constant twist between two poses cuts the corners of a motion: a shake of angular frequency f,
+    seen every h seconds, shrinks by (f h)^2 / 12. So the change of the twist at the poses before
+    and after counts, too, as far as it is motion and not noise. Changes by white noise s have
+    variance 6 s^2 and a covariance of -4 s^2 with the next one; those by a motion that is sampled
+    well are alike. The share of motion follows from the poses nearby. What is left of white noise
+    halfway between two poses is between 0.71 (a constant twist) and 0.80 of it.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    poses : (N, 4, 4) array
+        ``Ts_world_sensor``.
+    start : (M,) int array
+        Index of the pose before each wanted one.
+    fraction : (M,) array
+        Of the interval to the next pose, in [0, 1].
+
+    Returns
+    -------
+    (M, 6) array
+        xi in ``T_world_sensor exp(xi)``.
+    """
+    spans_s = np.diff(stamps_ns) * 1e-9
+    changes = _changes(spans_s, poses, _near(start, len(spans_s)))
+    shares = _shares_of_motion(changes)[start]
+    at_start, at_end = changes[start], changes[start + 1]
+    bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
+    missing = 0.5 * fraction * (1.0 - fraction) * spans_s[start] ** 2
+    return -missing[:, None] * shares * bend
+
+
+def _near(start: IntArray, n_intervals: int) -> IntArray:
+    """Intervals that tell what happens in the wanted ones."""
+    is_near = np.zeros(n_intervals, dtype=bool)
+    for step in range(-_NEARBY - 1, _NEARBY + 2):
+        is_near[np.clip(start + step, 0, n_intervals - 1)] = True
+    return np.flatnonzero(is_near)
+
+
+def _changes(spans_s: FloatArray, poses: FloatArray, intervals: IntArray) -> FloatArray:
+    """Change of the twist per second (N, 6) at each pose; zero at the ends and far from these
+    intervals.
+    """
+    twists = np.zeros((len(spans_s), 6))
+    steps = se3.log(se3.inverse(poses[intervals]) @ poses[intervals + 1])
+    twists[intervals] = steps / spans_s[intervals, None]
+    changes = np.zeros((len(poses), 6))
+    changes[1:-1] = np.diff(twists, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))[:, None]
+    return changes
+
+
+def _shares_of_motion(changes: FloatArray) -> FloatArray:
+    """Share (N - 1, 6) of motion in the changes at both ends of each interval, translation and
+    rotation each on its own, as the weight that makes their mean most precise.
+    """
+    shares = np.empty((len(changes) - 1, 6))
+    for part in (slice(0, 3), slice(3, 6)):
+        of_part = changes[:, part]
+        power = (of_part**2).sum(axis=1)
+        products = _sums_nearby((of_part[1:] * of_part[:-1]).sum(axis=1))
+        powers = _sums_nearby(0.5 * (power[1:] + power[:-1]))
+        alike = products / np.maximum(powers, 1e-300)
+        motion = np.clip((alike - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
+        shares[:, part] = (motion / (motion + (1.0 - motion) * _LEFT_IN_THE_MEAN))[:, None]
+    return shares
+
+
+def _sums_nearby(values: FloatArray) -> FloatArray:
+    """Sum of each value and its neighbours on either side."""
+    padded = np.pad(values, _NEARBY)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEARBY + 1)
+    return np.asarray(windows.sum(axis=1))

@@ -25,7 +25,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.rates import chained
+from hand_eye_calib.geometry.trajectory import chained
 from hand_eye_calib.gls.chunks import chunks
 from hand_eye_calib.stats import median
 

@@ -1,5 +1,6 @@
 """Pairs of relative motions, what every AX = XB solver starts from."""
 
+import re
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -7,9 +8,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.references import reference_indices
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.stats import median
+
+_PATTERN = re.compile(r"A|([BC])([1-9][0-9]{0,8})")
+
+_MAX_PAIRS = 800
+
+
+def parse_reference(reference: str) -> tuple[str, int]:
+    """Split a reference into its kind ("A", "B" or "C") and its step (1 for "A").
+
+    Raises
+    ------
+    ConfigError
+        If it is not A, B<n> with n >= 1, or C<n> with n >= 2.
+    """
+    match = _PATTERN.fullmatch(reference) if isinstance(reference, str) else None
+    if match and reference == "A":
+        return "A", 1
+    if match and (match[1] == "B" or int(match[2]) >= 2):
+        return match[1], int(match[2])
+    raise ConfigError(
+        f"reference {str(reference)[:40]!r} is not one of A, B<n> (n >= 1) or C<n> (n >= 2), "
+        "for example B5"
+    )
+
+
+def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]:
+    """Index pairs of a reference.
+
+    Parameters
+    ----------
+    reference : str
+        ``"A"``: every pose with the first. ``"B<n>"``: with the n-th before it. ``"C<n>"``: with
+        the keyframe that starts its segment of n poses; a last segment whose keyframe is N - n or
+        later is left out, as in the published results.
+    n_poses : int
+        Number of poses N.
+
+    Returns
+    -------
+    i, j : (K,) int arrays
+        Motion k runs from pose ``i[k]`` to pose ``j[k]``; K is 0 if there are too few poses.
+
+    Raises
+    ------
+    ConfigError
+        If the reference has another form.
+    """
+    kind, step = parse_reference(reference)
+    if kind == "A":
+        j = np.arange(1, n_poses)
+        return np.zeros_like(j), j
+    if kind == "B":
+        j = np.arange(step, n_poses)
+        return j - step, j
+    keyframes = np.arange(0, max(n_poses - step, 0), step)
+    j = (keyframes[:, None] + np.arange(1, step)).ravel()
+    return np.repeat(keyframes, step - 1), j
 
 
 @dataclass(frozen=True)
@@ -88,7 +147,7 @@ def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> Mo
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of parent and child sensor in their own worlds at the same N instants.
     reference : str
-        A, B<n> or C<n>; see :func:`~hand_eye_calib.pairing.references.reference_indices`.
+        A, B<n> or C<n>; see :func:`~hand_eye_calib.pairing.motion_pairs.reference_indices`.
 
     Raises
     ------
@@ -121,3 +180,34 @@ def _relative(Ts_world_sensor: FloatArray, i: IntArray, j: IntArray) -> FloatArr
     np.matmul(np.swapaxes(start[:, :3, :3], 1, 2), end[:, :3], out=relative[:, :3])
     relative[:, 3] = 0.0, 0.0, 0.0, 1.0
     return relative
+
+
+def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = _MAX_PAIRS) -> MotionPairs:
+    """Motion pairs between poses about ``lag_s`` seconds apart, evenly over the recording.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    lag_s : float
+        The interval of the poses if that is longer.
+    max_pairs : int
+
+    Returns
+    -------
+    MotionPairs
+        Empty if no two poses lie that far apart.
+    """
+    stamps_ns = pose_pairs.stamps_ns
+    if len(stamps_ns) > 1:
+        lag_s = max(lag_s, median(np.diff(stamps_ns)) * 1e-9)
+    i, j = _indices_over(stamps_ns, lag_s, max_pairs)
+    return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i, j)
+
+
+def _indices_over(stamps_ns: IntArray, lag_s: float, max_pairs: int) -> tuple[IntArray, IntArray]:
+    i = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), max_pairs)).astype(int)
+    j = np.searchsorted(stamps_ns, stamps_ns[i] + round(lag_s * 1e9) - 1000)
+    inside = j < len(stamps_ns)
+    i, j = i[inside], j[inside]
+    near = stamps_ns[j] - stamps_ns[i] <= (1.5 * lag_s + 0.1) * 1e9
+    return i[near], j[near]

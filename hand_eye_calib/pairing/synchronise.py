@@ -7,12 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.stats import median
 
 # Streams whose intervals differ by less than this factor count as equally fast: they are paired at
 # the child's stamps.
 _EQUALLY_FAST = 1.2
+
+# Number of poses checked at once in the search for the next keyframe.
+_WINDOW = 64
+
+# No recording pauses this long (s): a stamp is wrong.
+_LEAP_S = 86_400.0
 
 
 @dataclass(frozen=True)
@@ -106,3 +113,104 @@ def _interpolable(available_ns: IntArray, wanted_ns: IntArray, max_gap_s: float)
     before = np.maximum(after - 1, 0)
     gap_ns = available_ns[after] - available_ns[before]
     return inside & (exact | ((after > 0) & (gap_ns <= max_gap_s * 1e9)))
+
+
+def select_keyframes(
+    pose_pairs: PosePairs,
+    min_translation: float,
+    min_rotation: float,
+    min_interval_s: float,
+    previous: PosePairs | None = None,
+) -> IntArray:
+    """Indices of the pose pairs to keep, in order.
+
+    A pose pair is kept if ``min_interval_s`` has passed since the last one kept and the parent
+    sensor has since moved ``min_translation`` or rotated by ``min_rotation``. A threshold of zero
+    switches that criterion off.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    min_translation, min_rotation, min_interval_s : float
+        In m, rad and s.
+    previous : PosePairs, optional
+        The last one kept before these, of length 1 (0 for none).
+
+    Returns
+    -------
+    (M,) int array
+    """
+    n_poses = len(pose_pairs)
+    if n_poses == 0 or max(min_translation, min_rotation, min_interval_s) == 0.0:
+        return np.arange(n_poses)
+    stamps_ns, poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p
+    if previous is not None and len(previous):
+        kept, last_stamp_ns, T_last = [], previous.stamps_ns[-1], previous.Ts_pw_p[-1]
+    else:
+        kept, last_stamp_ns, T_last = [0], stamps_ns[0], poses[0]
+    next_index = len(kept)
+    while next_index < n_poses:
+        window = slice(next_index, next_index + _WINDOW)
+        wanted = stamps_ns[window] - last_stamp_ns >= min_interval_s * 1e9
+        if min_translation > 0.0 or min_rotation > 0.0:
+            wanted &= _has_moved(T_last, poses[window], min_translation, min_rotation)
+        hits = np.flatnonzero(wanted)
+        if hits.size == 0:
+            next_index += _WINDOW
+            continue
+        index = next_index + int(hits[0])
+        kept.append(index)
+        last_stamp_ns, T_last, next_index = stamps_ns[index], poses[index], index + 1
+    return np.array(kept, dtype=int)
+
+
+def _has_moved(
+    T_last: FloatArray, poses: FloatArray, min_translation: float, min_rotation: float
+) -> BoolArray:
+    """Whether each pose (N, 4, 4) is at least one of both thresholds away from the last."""
+    moved = np.zeros(len(poses), dtype=bool)
+    if min_translation > 0.0:
+        moved |= np.linalg.norm(poses[:, :3, 3] - T_last[:3, 3], axis=1) >= min_translation
+    if min_rotation > 0.0:
+        moved |= se3.rotation_angle(T_last[:3, :3].T @ poses[:, :3, :3]) >= min_rotation
+    return moved
+
+
+@dataclass(frozen=True)
+class Leap:
+    """The longest leap in a stream's stamps.
+
+    Attributes
+    ----------
+    seconds : float
+        Time between the two poses.
+    before, after : int
+        Number of poses before and after it.
+    """
+
+    seconds: float
+    before: int
+    after: int
+
+    def what(self) -> str:
+        """The finding, to follow "the parent stream's"."""
+        return (
+            f"stamps leap by {self.seconds / _LEAP_S:,.0f} days after pose {self.before} "
+            f"of {self.before + self.after}"
+        )
+
+    def advice(self) -> str:
+        """The remedy."""
+        few = f"the first {self.before}" if self.before < self.after else f"the last {self.after}"
+        return f"repair the stamps, or remove {few} of its poses"
+
+
+def find_leap(stamps_ns: IntArray) -> Leap | None:
+    """The longest leap in stamps (N,), in rising order; None without one."""
+    if len(stamps_ns) < 2:
+        return None
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    before = int(np.argmax(intervals_s)) + 1
+    if intervals_s[before - 1] <= _LEAP_S:
+        return None
+    return Leap(float(intervals_s[before - 1]), before, len(stamps_ns) - before)

@@ -12,7 +12,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.printed_angles import sigmas_rpy
+from hand_eye_calib.geometry.extrinsic import sigmas_rpy
 from hand_eye_calib.report.report import environment
 from hand_eye_calib.report.report_figures import (
     BAD,

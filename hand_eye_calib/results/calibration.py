@@ -10,7 +10,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.printed_angles import (
+from hand_eye_calib.geometry.extrinsic import (
     inverse_covariance,
     is_near_gimbal_lock,
     printed_rotation,

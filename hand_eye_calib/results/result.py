@@ -10,7 +10,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.printed_angles import sigmas_rpy
+from hand_eye_calib.geometry.extrinsic import sigmas_rpy
 from hand_eye_calib.results.finding import Finding
 from hand_eye_calib.results.records import (
     Comparison,

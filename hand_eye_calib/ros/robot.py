@@ -1,6 +1,7 @@
 """What the robot has installed, and its base frame: from files, or from the transform tree."""
 
 import time
+from dataclasses import replace
 from typing import Any, Protocol
 
 from rclpy.node import Node
@@ -15,7 +16,6 @@ from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.tf import STATIC_TOPIC, message_type
 from hand_eye_calib.session.compare import with_comparison
-from hand_eye_calib.session.installed import with_base
 
 TF = "tf"
 
@@ -95,7 +95,7 @@ class Robot:
         except InputError as error:
             self._report(f"base_frame {self._base_frame} is not known from {STATIC_TOPIC}: {error}")
             return calibration
-        return with_base(calibration, self._base_frame, T_base_parent)
+        return replace(calibration, base_frame=self._base_frame, T_base_parent=T_base_parent)
 
     @property
     def why_not_compared(self) -> str:

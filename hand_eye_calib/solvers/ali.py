@@ -14,7 +14,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import quadratic_form
 from hand_eye_calib.solvers.dnl import start_rotations
-from hand_eye_calib.solvers.separable import squared_translation_residual
+from hand_eye_calib.solvers.park import squared_translation_residual
 from hand_eye_calib.solvers.solution import Solution
 
 

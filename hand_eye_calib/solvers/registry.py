@@ -10,7 +10,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
 from hand_eye_calib.methods import METHODS, MethodRecord
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import ali, certificate, dnl, dnlo, park, taylor, zhuang
+from hand_eye_calib.solvers import ali, certificate, dnl, dnlo, park, zhuang
 from hand_eye_calib.solvers.solution import Solution
 
 # ``solve(pairs, *rejection)``; for rejection see Method.rejection.
@@ -18,7 +18,7 @@ _SOLVE: dict[str, Callable[..., Solution]] = {
     "dnlo": dnlo.solve,
     "dnl": dnl.solve,
     "park": park.solve,
-    "taylor": taylor.solve,
+    "taylor": park.solve,
     "zhuang": zhuang.solve,
     "ali": ali.solve,
 }

@@ -5,7 +5,7 @@ import pytest
 from motions import as_trajectory, wandering_poses
 
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.interpolation import REACH
+from hand_eye_calib.geometry.trajectory import REACH
 
 HZ = 10
 

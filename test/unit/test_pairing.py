@@ -5,10 +5,13 @@ from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.keyframes import select_keyframes
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.pairing.references import reference_indices
-from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream, synchronise
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs, reference_indices
+from hand_eye_calib.pairing.synchronise import (
+    PosePairs,
+    select_keyframes,
+    slower_stream,
+    synchronise,
+)
 
 
 def as_lists(pairs):

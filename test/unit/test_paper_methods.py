@@ -11,7 +11,7 @@ from hand_eye_calib.assessment.metrics import absolute_errors, errors, relative_
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.solvers import ali, park, taylor, zhuang
+from hand_eye_calib.solvers import ali, park, zhuang
 from reproduction import ali_as_published, published
 
 TRUTH = se3.exp(np.array([0.4, -0.2, 0.7, 0.9, -0.5, 1.1]))
@@ -114,12 +114,6 @@ def test_park_translation_is_the_best_for_its_rotation(noisy):
     cost = lambda t: squared_translation_residual(noisy, rotation, t)  # noqa: E731
     assert solution.objective == pytest.approx(cost(translation), rel=1e-12)
     np.testing.assert_allclose(minimize(cost, np.zeros(3), tol=1e-12).x, translation, atol=1e-6)
-
-
-def test_taylor_gives_parks_answer(noisy):
-    np.testing.assert_allclose(
-        taylor.solve(noisy).T_parent_child, park.solve(noisy).T_parent_child, atol=1e-13
-    )
 
 
 def test_rotation_is_never_a_reflection():

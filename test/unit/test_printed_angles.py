@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.printed_angles import (
+from hand_eye_calib.geometry.extrinsic import (
     inverse_covariance,
     printed_rotation,
     sigmas_rpy,

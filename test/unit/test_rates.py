@@ -15,8 +15,7 @@ from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.partial_check import check_partial
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.rates import RateIntegrator, integrated
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import RateIntegrator, Trajectory, integrated
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.bags.messages import (
     MessageReader,

@@ -17,7 +17,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
-from hand_eye_calib.geometry.rates import RateIntegrator
+from hand_eye_calib.geometry.trajectory import RateIntegrator
 from hand_eye_calib.io.bags.poses import PoseColumns, PoseFields
 from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin, wrong_latitude
 from hand_eye_calib.io.limits import LONGEST_NAME
