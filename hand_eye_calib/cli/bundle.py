@@ -121,12 +121,10 @@ def _streams(inputs: Mapping[str, Any], folder: Path) -> tuple[Trajectory, ...]:
             for source in sources
         ]
         return tuple(read_bag_trajectory(inputs["bag"], *names)[0] for names in named)
-    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
+    from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
 
-    files = [
-        {"path": inputs[stream]["file"], "format": AUTO, "repair": True}
-        for stream in ("parent", "child")
-    ]
+    options = FileOptions(format=AUTO, repair=True)
+    files = [(inputs[stream]["file"], options) for stream in ("parent", "child")]
     return tuple(reading.trajectory for reading in read_trajectory_files(files))
 
 

@@ -107,18 +107,14 @@ def read_files(
     HandEyeCalibError
         If a file cannot be read.
     """
-    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
+    from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
 
-    files = [
-        {
-            "path": getattr(arguments, stream),
-            "format": _given(arguments, stream, "format") or AUTO,
-            "repair": True,
-            "measures": options.get(f"{stream}_measures", AUTO),
-            **_settings_of(arguments, stream),
-        }
-        for stream in STREAMS
-    ]
+    files = []
+    for stream in STREAMS:
+        settings = _settings_of(arguments, stream)
+        settings |= {"format": _given(arguments, stream, "format") or AUTO, "repair": True}
+        settings["measures"] = options.get(f"{stream}_measures", AUTO)
+        files.append((getattr(arguments, stream), FileOptions(**settings)))
     with waiting_for(f"reading {arguments.parent} and {arguments.child}"):
         read = dict(zip(STREAMS, read_trajectory_files(files), strict=True))
     for stream, reading in read.items():
@@ -197,7 +193,7 @@ def _read_rig(files: Sequence[str], arguments: argparse.Namespace) -> dict[str, 
     named.
     """
     from hand_eye_calib.cli.rig import add_sensor
-    from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
+    from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
 
     of_one = [
         f"--{stream}-{name.replace('_', '-')}"
@@ -210,7 +206,7 @@ def _read_rig(files: Sequence[str], arguments: argparse.Namespace) -> dict[str, 
     settings = {name: getattr(arguments, name) for name in FILE_OPTIONS}
     settings |= {"format": arguments.format or AUTO, "repair": True}
     with waiting_for(f"reading {', '.join(files)}"):
-        read = read_trajectory_files([{"path": file, **settings} for file in files])
+        read = read_trajectory_files([(file, FileOptions(**settings)) for file in files])
     found: dict[str, Trajectory] = {}
     for file, (trajectory, repairs, guesses) in zip(files, read, strict=True):
         for text in (*guesses, *repairs):

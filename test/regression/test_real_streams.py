@@ -13,7 +13,7 @@ from hand_eye_calib.checks.streams import tidy
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_files
+from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 
 SENSORS = ("lidar", "radar")
@@ -109,7 +109,8 @@ class TestBoreas:
 
     def test_the_files_themselves_are_read_by_one_convention(self):
         folder = real_data.data_folder() / "boreas" / "boreas-2021-08-05-13-34"
-        files = [{"path": folder / f"{name}_poses.csv", "format": AUTO} for name in SENSORS]
+        options = FileOptions(format=AUTO)
+        files = [(folder / f"{name}_poses.csv", options) for name in SENSORS]
         result = calibrate(*(reading.trajectory for reading in read_trajectory_files(files)))
         error = np.linalg.inv(real_data.BOREAS_TRUTH) @ result.T_parent_child
         assert np.linalg.norm(error[:3, 3]) < 0.001

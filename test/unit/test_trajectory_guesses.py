@@ -17,6 +17,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.trajectory_files import (
     AUTO,
+    FileOptions,
     layout_of_file,
     read_trajectory_file,
     read_trajectory_files,
@@ -27,6 +28,7 @@ NS = "1403637132888318976"
 EUROC_HEADER = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 )
+WXYZ = "t,x,y,z,qw,qx,qy,qz"
 POSE = ["0.1", "0.2", "0.3", "0.0", "0.0", "0.0", "1.0"]
 SCALAR_FIRST, SCALAR_LAST = [3, 0, 1, 2], [0, 1, 2, 3]
 
@@ -266,7 +268,7 @@ def test_files_with_the_same_columns_are_read_by_one_convention(tmp_path):
     alone = [read(file)[1][-1] for file in files]
     assert "read as clockwise" in alone[0]
     assert "read as counterclockwise" in alone[1]
-    settings = [{"path": file, "format": AUTO} for file in files]
+    settings = [(file, FileOptions(format=AUTO)) for file in files]
     for order in (settings, settings[::-1]):
         for reading in read_trajectory_files(order):
             assert "read as that of the world in the sensor's frame" in reading.guesses[-1]
@@ -351,7 +353,7 @@ def test_published_files_need_no_options():
     folder = data_folder() / "zxl19"
     for path in sorted(folder.glob("bag*/[ILV]*_FCPE.mat")):
         found = read_trajectory_file(path, AUTO, repair=True).trajectory
-        named = read_trajectory_file(path, "csv", "t,x,y,z,qw,qx,qy,qz", repair=True).trajectory
+        named = read_trajectory_file(path, "csv", columns=WXYZ, repair=True).trajectory
         np.testing.assert_array_equal(found.poses, named.poses)
     ins, _ = read(folder / "raw_bag1" / "bag1-novatel_data-inspvax.csv")
     theirs = read_trajectory_file(folder / "bag1" / "INS_FCPE.mat", AUTO).trajectory

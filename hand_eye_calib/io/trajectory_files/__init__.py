@@ -23,18 +23,18 @@ named. Only with ``auto`` is it judged by the motion, and what was found is said
 
 from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
 from hand_eye_calib.io.trajectory_files.reading import (
-    AUTO,
     FileReading,
-    layout_of_file,
     read_trajectory,
     read_trajectory_file,
     read_trajectory_files,
 )
+from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, layout_of_file
 from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
 __all__ = [
     "AUTO",
     "FORMATS",
+    "FileOptions",
     "FileReading",
     "layout_of_file",
     "read_trajectory",

@@ -5,19 +5,19 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.trajectory_files.table import MOST_SHOWN
 
-# Columns that a message lists.
-_MOST_LISTED = 15
+# Columns that a message lists, and characters of a name that it shows.
+_MOST_LISTED, _MOST_SHOWN = 15, 120
 
+POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
+# Coefficients of a quaternion whose order is not known.
+UNNAMED = ("q1", "q2", "q3", "q4")
+# The first three rows of a pose's matrix.
+MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
 # Sets of quantities that give a position or an orientation, the preferred first.
-POSITIONS = (("x", "y", "z"), ("lat", "lon", "height"), ("x", "y", "height"))
-ORIENTATIONS = (
-    QUATERNION,
-    ("roll", "pitch", "yaw"),
-    ("roll", "pitch", "heading"),
-)
+POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
+ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"))
 RATES = ("wx", "wy", "wz")
 # Of a machine on a plane.
 _PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
@@ -53,14 +53,7 @@ _ALIASES |= {f"w{axis}": tuple(name + axis for name in _RATE_NAMES) for axis in 
 # Names that stand for a part of an orientation, even if it is not known which.
 _ORIENTED = re.compile(r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude", re.IGNORECASE)
 _QUATERNION_NAMES = (
-    "q",
-    "q_",
-    "quat_",
-    "quaternion_",
-    "rot_",
-    "orientation_",
-    "rotation_",
-    "q_rs_",
+    *("q", "q_", "quat_", "quaternion_", "rot_", "orientation_", "rotation_", "q_rs_"),
 )
 _ALIASES |= {f"q{axis}": tuple(name + axis for name in _QUATERNION_NAMES) for axis in "xyzw"}
 
@@ -210,7 +203,7 @@ def _first_complete(
 
 def listed(names: Sequence[str]) -> str:
     """Names of columns for a message, which must not grow with the file."""
-    text = ", ".join(name[:MOST_SHOWN] for name in names[:_MOST_LISTED])
+    text = ", ".join(name[:_MOST_SHOWN] for name in names[:_MOST_LISTED])
     return text if len(names) <= _MOST_LISTED else f"{text} and {len(names) - _MOST_LISTED} more"
 
 

@@ -14,8 +14,7 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files.columns import QUATERNION, choose_columns, listed
-from hand_eye_calib.io.trajectory_files.poses import poses_of
-from hand_eye_calib.io.trajectory_files.stamps import SMALLEST_OF_UNIT
+from hand_eye_calib.io.trajectory_files.poses import poses_of, unit_by_size
 from hand_eye_calib.io.trajectory_files.table import Table
 
 _POSE = ("x", "y", "z", *QUATERNION)
@@ -215,8 +214,7 @@ def _unit_of(stamps: Any) -> str:
     """Of whole numbers by their size; others are seconds."""
     if stamps.dtype.kind == "f" and (stamps != np.floor(stamps)).any():
         return "s"
-    largest = float(np.abs(stamps).max(initial=0))
-    return next(unit for unit, least in SMALLEST_OF_UNIT.items() if largest >= float(least))
+    return unit_by_size(float(np.abs(stamps).max(initial=0)))
 
 
 def _in_order(stamps_ns: IntArray, repair: bool) -> tuple[Any, list[str]]:

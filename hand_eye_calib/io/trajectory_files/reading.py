@@ -1,41 +1,22 @@
 """Reading a trajectory from a text file in any format."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from hand_eye_calib.config import STAMP_UNITS
-from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files.columns import measured_by
-from hand_eye_calib.io.trajectory_files.formats import (
-    lines_of,
-    read_csv,
-    read_euroc,
-    read_kitti,
-    read_tum,
-)
-from hand_eye_calib.io.trajectory_files.layout import Layout, layout_of
 from hand_eye_calib.io.trajectory_files.objects import PoseObject, trajectory_from_object
-from hand_eye_calib.io.trajectory_files.poses import poses_of, rates_of
-from hand_eye_calib.io.trajectory_files.stamps import in_order, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import Lines, Table, cells_of, data_lines
+from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, rates_of, stamps_in_ns
+from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, Table, read_table
 
 _Path = str | Path
-
-# The format that the lines look like.
-AUTO = "auto"
-_USUAL = "tum"
-# Of eight numbers in files so called, the scalar is the last.
-_SUFFIXES_OF_TUM = ("", ".txt", ".tum")
-_TIMES = "times.txt"
-# What four columns without names are.
-_OF_FOUR = {"positions": "t,x,y,z", "rates": "t,wx,wy,wz"}
+_USUAL = FileOptions.format
 
 
 class FileReading(NamedTuple):
@@ -128,7 +109,13 @@ def read_trajectory(
         if not isinstance(times, _Path | None):
             raise ConfigError("stamps in memory are for poses in memory; of a kitti file name one")
         trajectory, repairs, guesses = read_trajectory_file(
-            source, format, columns, times, stamp_unit, repair, measures
+            source,
+            format,
+            columns=columns,
+            times=times,
+            stamp_unit=stamp_unit,
+            repair=repair,
+            measures=measures,
         )
         notes = [*guesses, *repairs]
     else:
@@ -140,44 +127,30 @@ def read_trajectory(
     return trajectory
 
 
-def read_trajectory_file(
-    path: _Path,
-    format: str = _USUAL,
-    columns: str | None = None,
-    times: _Path | None = None,
-    stamp_unit: str | None = None,
-    repair: bool = False,
-    measures: str = AUTO,
-) -> FileReading:
-    """Read a text file as :func:`read_trajectory`, without warnings."""
-    return _read(path, format, columns, times, stamp_unit, repair, measures)[0]
+def read_trajectory_file(path: _Path, format: str = _USUAL, **options: Any) -> FileReading:
+    """Read a text file as :func:`read_trajectory`, with the options of FileOptions, and without
+    warnings.
+    """
+    return _read(path, FileOptions(format=format, **options))[0]
 
 
-def read_trajectory_files(files: Sequence[Mapping[str, Any]]) -> list[FileReading]:
+def read_trajectory_files(files: Sequence[tuple[_Path, FileOptions]]) -> list[FileReading]:
     """Read text files that belong together: those with the same columns, which come from one
     exporter, by one convention of their angles.
-
-    Parameters
-    ----------
-    files : sequence of mapping
-        The arguments of :func:`read_trajectory_file` for each, by their names.
 
     Raises
     ------
     InputError
         If a file cannot be read, or no convention fits the motion of all with the same columns.
     """
-    read = [_read(**each) for each in files]
+    read = [_read(*each) for each in files]
     for header in {table.header for _, table in read if table.conventions}:
         rows = [row for row, (_, table) in enumerate(read) if table.header == header]
         tables = [read[row][1] for row in rows]
         if len({table.conventions[0] for table in tables}) < 2:
             continue
-        common = [
-            each
-            for each in tables[0].conventions
-            if all(each in table.conventions for table in tables)
-        ]
+        sets = [table.conventions for table in tables]
+        common = [each for each in sets[0] if all(each in others for others in sets)]
         if not common:
             raise InputError(
                 f"{' and '.join(str(table.path) for table in tables)} have the same columns, but "
@@ -186,125 +159,29 @@ def read_trajectory_files(files: Sequence[Mapping[str, Any]]) -> list[FileReadin
                 "(clockwise from north) if that is what they are"
             )
         for row in rows:
-            read[row] = _read(**files[row], convention=common[0])
+            read[row] = _read(*files[row], convention=common[0])
     return [reading for reading, _ in read]
 
 
-def _read(
-    path: _Path,
-    format: str = _USUAL,
-    columns: str | None = None,
-    times: _Path | None = None,
-    stamp_unit: str | None = None,
-    repair: bool = False,
-    measures: str = AUTO,
-    convention: str = "",
-) -> tuple[FileReading, Table]:
+def _read(path: _Path, options: FileOptions, convention: str = "") -> tuple[FileReading, Table]:
     """The trajectory of a file, and the table it was made from."""
-    _check_options(format, columns, times, stamp_unit)
-    lines = lines_of(path, "a trajectory")
-    table = _table(path, lines, format, columns, times, measures)
+    table = read_table(path, options)
     table.convention = convention
     if not table.stamps:
         raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
-    stamps_ns = stamps_in_ns(table, stamp_unit)
+    stamps_ns = stamps_in_ns(table, options.stamp_unit)
     found = measured_by(table.quantities)
     if found == "rates":
         rates = rates_of(table)
-        keep, repairs = in_order(table, stamps_ns, repair)
+        keep, repairs = in_order(table, stamps_ns, options.repair)
         trajectory = Trajectory.from_rates(stamps_ns[keep], rates[keep])
         return FileReading(trajectory, repairs, table.guesses), table
     positions, quats_xyzw = poses_of(table)
-    keep, repairs = in_order(table, stamps_ns, repair)
+    keep, repairs = in_order(table, stamps_ns, options.repair)
     trajectory = Trajectory.from_quat_xyzw(stamps_ns[keep], positions[keep], quats_xyzw[keep])
     if found != "poses":
         table.guesses.append(f"{path}: {found} alone, as its columns have it")
-    kind = found if measures == AUTO else measures
+    kind = found if options.measures == AUTO else options.measures
     if kind != "poses":
         trajectory = replace(trajectory, measures=kind)
     return FileReading(trajectory, repairs, table.guesses), table
-
-
-def layout_of_file(path: _Path) -> Layout:
-    """What the lines of a file look like.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
-    return layout_of(lines_of(path, "a trajectory"))
-
-
-def _n_columns(lines: Lines) -> int:
-    """Number of cells in the first line with data."""
-    first = next((text for _, text in data_lines(lines)), "")
-    return len(cells_of(first))
-
-
-def _check_options(
-    format: str, columns: str | None, times: _Path | None, stamp_unit: str | None
-) -> None:
-    """Refuse what is not known or does not go together."""
-    if stamp_unit is not None and stamp_unit not in STAMP_UNITS:
-        raise ConfigError(
-            f"unknown unit of stamps {stamp_unit!r}; known are {', '.join(STAMP_UNITS)}"
-        )
-    if format not in (*FORMATS, AUTO):
-        known = ", ".join((*FORMATS, AUTO))
-        raise ConfigError(f"unknown trajectory format {format!r}; known are {known}")
-    if columns is not None and format not in ("csv", AUTO):
-        raise ConfigError(f"columns are named for format csv only; the format is {format}")
-    if times is not None and format not in ("kitti", AUTO):
-        raise ConfigError(f"a file of times belongs to format kitti only; the format is {format}")
-
-
-def _table(
-    path: _Path,
-    lines: Lines,
-    format: str,
-    columns: str | None,
-    times: _Path | None,
-    measures: str,
-) -> Table:
-    if format == AUTO:
-        return _recognised(path, lines, columns, times, measures)
-    if format == "csv":
-        return read_csv(path, lines, columns, measures=measures)
-    if format == "kitti":
-        return read_kitti(path, lines, times)
-    return read_tum(path, lines) if format == _USUAL else read_euroc(path, lines)
-
-
-def _recognised(
-    path: _Path, lines: Lines, columns: str | None, times: _Path | None, measures: str
-) -> Table:
-    """The table of a file in the format that it looks like."""
-    found, is_named = layout_of(lines)
-    if columns is None and times is None and not is_named and _n_columns(lines) == 4:
-        if measures not in _OF_FOUR:
-            raise InputError(
-                f"{path}: four columns without names; name them with `columns`: t,x,y,z for "
-                "positions, t,wx,wy,wz for angular rates"
-            )
-        columns = _OF_FOUR[measures]
-    if columns is not None:
-        return read_csv(path, lines, columns, measures=measures)
-    if times is not None:
-        return read_kitti(path, lines, times)
-    if found == _USUAL:
-        table = read_tum(path, lines, is_named)
-        table.is_scalar_last_usual = Path(path).suffix.lower() in _SUFFIXES_OF_TUM
-        return table
-    guesses = [f"{path} looks like format {found}; to change that, give `format`"]
-    if found == "kitti":
-        beside = Path(path).with_name(_TIMES)
-        if beside.is_file():
-            guesses.append(f"stamps read from {beside}; to change that, give `times`")
-        table = read_kitti(path, lines, beside if beside.is_file() else None)
-    elif found == "csv":
-        table = read_csv(path, lines, None, may_guess=True, measures=measures)
-    else:
-        table = read_euroc(path, lines)
-    table.guesses[:0] = guesses
-    return table

@@ -1,25 +1,120 @@
-"""The numbers of a trajectory file, row by row, before they become poses."""
+"""The numbers of a trajectory file, row by row, before they become poses: which format its lines
+have, and what stands in which column.
+"""
 
 import re
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
+from itertools import takewhile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.limits import LONGEST_LINE
+from hand_eye_calib.config import STAMP_UNITS
+from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.io.files import read_text
+from hand_eye_calib.io.limits import LARGEST_TEXT, LONGEST_LINE, MOST_COLUMNS
+from hand_eye_calib.io.trajectory_files.columns import (
+    MATRIX,
+    POSITION,
+    QUATERNION,
+    UNNAMED,
+    are_columns,
+    choose_columns,
+    listed,
+)
 
-# Characters of a line or value that a message shows.
-MOST_SHOWN = 120
-
+_Path = str | Path
 # A line and its number, from 1.
 Line = tuple[int, str]
 
+#: The format that the lines look like.
+AUTO = "auto"
+_NS_PER_S = 1_000_000_000
+# Characters of a line that a message shows, and of a reason.
+_MOST_SHOWN, _LONGEST_REASON = 60, 120
+# A stamp in nanoseconds since 1970 has at least so many digits.
+_DIGITS_OF_NS = 17
+_MATLAB = b"MATLAB 5.0 MAT-file"
 _NOT_EMPTY = re.compile("[^\n]+")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|nan|[-+]?inf")
+
+# Of eight numbers in files so called, the scalar is the last.
+_SUFFIXES_OF_TUM = ("", ".txt", ".tum")
+_TIMES = "times.txt"
+# What four columns without names are.
+_OF_FOUR = {"positions": "t,x,y,z", "rates": "t,wx,wy,wz"}
+
+TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+
+
+class _Format(NamedTuple):
+    """A format whose columns have fixed places, a stamp first unless they are elsewhere."""
+
+    expected: str
+    quantities: tuple[str, ...]
+    separator: str | None = None
+    stamp_unit: str = ""
+
+    @property
+    def n_columns(self) -> int:
+        return len(self.quantities) + (self.quantities != MATRIX)
+
+
+_FORMATS = {
+    "tum": _Format(f"8 numbers, {TUM_COLUMNS}", (*POSITION, *QUATERNION)),
+    "kitti": _Format("12 numbers, the first three rows of a pose", MATRIX),
+    "euroc": _Format(
+        "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz",
+        (*POSITION, "qw", "qx", "qy", "qz"),
+        ",",
+        "ns",
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileOptions:
+    """How to read a text file; see :func:`hand_eye_calib.read_trajectory`.
+
+    Raises
+    ------
+    ConfigError
+        For what is not known or does not go together.
+    """
+
+    format: str = "tum"
+    columns: str | None = None
+    times: _Path | None = None
+    stamp_unit: str | None = None
+    repair: bool = False
+    measures: str = AUTO
+
+    def __post_init__(self) -> None:
+        if self.stamp_unit is not None and self.stamp_unit not in STAMP_UNITS:
+            raise ConfigError(
+                f"unknown unit of stamps {self.stamp_unit!r}; known are {', '.join(STAMP_UNITS)}"
+            )
+        known = (*FORMATS, AUTO)
+        if self.format not in known:
+            raise ConfigError(
+                f"unknown trajectory format {self.format!r}; known are {', '.join(known)}"
+            )
+        for given, of, what in (
+            (self.columns, "csv", "columns are named for"),
+            (self.times, "kitti", "a file of times belongs to"),
+        ):
+            if given is not None and self.format not in (of, AUTO):
+                raise ConfigError(f"{what} format {of} only; the format is {self.format}")
+
+
+# ---- lines
 
 
 class Lines:
@@ -37,10 +132,31 @@ class Lines:
         Lines up to this number are left out.
     """
 
-    def __init__(self, path: str | Path, text: str, after: int = 0) -> None:
+    def __init__(self, path: _Path, text: str, after: int = 0) -> None:
         if "\r" in text:
             text = text.replace("\r\n", "\n").replace("\r", "\n")
         self._path, self._text, self._after = path, text, after
+
+    @classmethod
+    def of_file(cls, path: _Path, expected: str) -> "Lines":
+        """Of a text file.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read.
+        """
+        start = b""
+        # What cannot be opened is refused by the reader.
+        if Path(path).is_file():
+            with suppress(OSError), open(path, "rb") as file:
+                start = file.read(len(_MATLAB))
+        if start == _MATLAB:
+            raise InputError(
+                f"{path}: a binary file of MATLAB; save the poses as text, "
+                "save('poses.txt', 'poses', '-ascii', '-double')"
+            )
+        return cls(path, read_text(path, f"lines of {expected}", LARGEST_TEXT))
 
     def __iter__(self) -> Iterator[Line]:
         number, end = 1, 0
@@ -57,6 +173,100 @@ class Lines:
     def after(self, number: int) -> "Lines":
         """The lines after one."""
         return Lines(self._path, self._text, number)
+
+    def data(self) -> Iterator[Line]:
+        """The lines that are neither blank nor comments."""
+        for number, text in self:
+            stripped = text.strip()
+            if stripped and not stripped.startswith("#"):
+                yield number, text
+
+    def first(self) -> Line:
+        """The first of them; 0 and nothing if there is none."""
+        return next(self.data(), (0, ""))
+
+
+def _cells_of(text: str) -> list[str]:
+    """The cells of a line: separated by commas, semicolons or white space."""
+    if "," not in text and ";" not in text:
+        return text.split()
+    import csv
+
+    reader = csv.reader([text], delimiter="," if "," in text else ";", skipinitialspace=True)
+    return [cell.strip() for cell in next(reader)]
+
+
+def _is_row(cells: Sequence[str]) -> bool:
+    """Whether all cells of a line are numbers or empty."""
+    return bool(cells) and all(_NUMBER.fullmatch(cell) for cell in cells if cell)
+
+
+# ---- what a file looks like
+
+
+class Layout(NamedTuple):
+    """What a file looks like.
+
+    Attributes
+    ----------
+    format : str
+        One of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`; tum in doubt, so that its reader
+        says what is wrong.
+    is_named : bool
+        Whether the file itself names its columns.
+    """
+
+    format: str
+    is_named: bool
+
+
+def layout_of(lines: Lines) -> Layout:
+    """The layout that the first lines of a file have."""
+    data = lines.first()[1].strip()
+    cells = _cells_of(data)
+    is_separated, n_cells = "," in data or ";" in data, len(cells)
+    if not _is_row(cells):
+        is_table = is_separated or n_cells >= 8 or are_columns(cells)
+        return Layout("csv" if is_table else "tum", is_table)
+    names, _ = _header_of(lines)
+    if names is not None and are_columns(names):
+        is_tum = not is_separated and " ".join(names).lower().endswith(TUM_COLUMNS[10:])
+        return Layout("tum" if is_tum else "csv", True)
+    if not is_separated:
+        return Layout("kitti" if n_cells == 12 else "tum", False)
+    is_ns = cells[0].isdecimal() and len(cells[0]) >= _DIGITS_OF_NS
+    return Layout("euroc" if is_ns and n_cells >= 8 else "csv", False)
+
+
+def layout_of_file(path: _Path) -> Layout:
+    """What the lines of a file look like.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    return layout_of(Lines.of_file(path, "a trajectory"))
+
+
+def _header_of(lines: Lines) -> tuple[list[str] | None, Lines]:
+    """Names of the columns, if the file has any, and the lines after a header.
+
+    The header is the first line that is no comment, unless it is a row of numbers; otherwise the
+    last comment above the data that has as many cells.
+    """
+    number, row = lines.first()
+    cells = _cells_of(row)
+    if number and not _is_row(cells):
+        return cells, lines.after(number)
+    header = None
+    for _, text in takewhile(lambda line: line[0] != number, lines):
+        names = _cells_of(text.strip().lstrip("#").strip())
+        header = names if len(names) == len(cells) and not _is_row(names) else header
+    return header or None, lines
+
+
+# ---- tables
 
 
 @dataclass
@@ -90,7 +300,7 @@ class Table:
         Those of the angles that the motion does not contradict, the usual first.
     """
 
-    path: str | Path
+    path: _Path
     expected: str
     quantities: tuple[str, ...]
     stamp_unit: str = ""
@@ -104,37 +314,50 @@ class Table:
     convention: str = ""
     conventions: list[str] = field(default_factory=list)
 
-    def add(self, number: int, stamp: str, values: Sequence[str]) -> None:
-        """Add a row from its text.
-
-        Raises
-        ------
-        InputError
-            If something in it is no number.
-        """
-        try:
-            self.stamps.append(_decimal(stamp))
-            self.numbers.extend(map(float, values))
-        except ValueError as error:
-            reason = str(error)[:MOST_SHOWN]
-            raise InputError(
-                f"{self.path}, line {number}: expected {self.expected}; {reason}"
-            ) from None
-        self.line_numbers.append(number)
-
     @property
     def values(self) -> FloatArray:
         """(N, k) array: the values of each row."""
         return np.asarray(self.numbers, dtype=float).reshape(-1, len(self.quantities))
 
-    def unexpected(self, line: Line, found: int, expected: str = "") -> InputError:
-        """The error of a line with another number of cells."""
-        number, text = line
-        shortened = text if len(text) <= 60 else text[:60] + "..."
-        return InputError(
-            f"{self.path}, line {number}: expected {expected or self.expected}; found {found}: "
-            f"{shortened!r}"
-        )
+    def fill(
+        self,
+        lines: Iterable[Line],
+        cells_of: Callable[[str], list[str]],
+        n_columns: int,
+        at: Sequence[int],
+        stamp_at: Sequence[int] = (0,),
+        may_have_more: bool = False,
+    ) -> None:
+        """Add rows from their text: the values of some columns, and the stamp from one column, or
+        from those of seconds and nanoseconds.
+
+        Raises
+        ------
+        InputError
+            At the first line with another number of cells, or with something that is no number.
+        """
+        for number, text in lines:
+            cells = cells_of(text)
+            if len(cells) != n_columns and not (may_have_more and len(cells) > n_columns):
+                shown = text if len(text) <= _MOST_SHOWN else text[:_MOST_SHOWN] + "..."
+                raise InputError(
+                    f"{self.path}, line {number}: expected {self.expected}; found {len(cells)}: "
+                    f"{shown!r}"
+                )
+            try:
+                if stamp_at:
+                    self.stamps.append(_stamp([cells[index] for index in stamp_at]))
+                self.numbers.extend(float(cells[index]) for index in at)
+            except ValueError as error:
+                reason = str(error)[:_LONGEST_REASON]
+                raise InputError(
+                    f"{self.path}, line {number}: expected {self.expected}; {reason}"
+                ) from None
+            self.line_numbers.append(number)
+
+    def guess(self, text: str) -> None:
+        """Note how something was read that the file does not say."""
+        self.guesses.append(f"{self.path}: {text}")
 
     def refuse(self, wrong: BoolArray, message: Callable[[int], str]) -> None:
         """Raise an error at the first wrong row (N,), if there is one."""
@@ -143,39 +366,149 @@ class Table:
             raise InputError(f"{self.path}, line {self.line_numbers[index]}: {message(index)}")
 
 
-def data_lines(lines: Iterable[Line]) -> Iterator[Line]:
-    """The lines that are neither empty nor comments."""
-    for number, text in lines:
-        stripped = text.strip()
-        if stripped and not stripped.startswith("#"):
-            yield number, text
-
-
-def cells_of(text: str) -> list[str]:
-    """The cells of a line: separated by commas, semicolons or white space."""
-    if "," not in text and ";" not in text:
-        return text.split()
-    import csv
-
-    reader = csv.reader([text], delimiter="," if "," in text else ";", skipinitialspace=True)
-    return [cell.strip() for cell in next(reader)]
-
-
-def is_number(text: str) -> bool:
-    """Whether a cell is a number."""
+def _stamp(cells: Sequence[str]) -> Decimal:
+    """A stamp as it is written, with no binary floating point in between; nanoseconds of one in two
+    columns.
+    """
+    if len(cells) == 2:
+        secs, nsecs = cells
+        if not (re.fullmatch(r"-?\d{1,18}", secs) and re.fullmatch(r"\d{1,9}", nsecs)):
+            raise ValueError(
+                f"expected whole seconds and nanoseconds; found {secs[:40]!r} and {nsecs[:40]!r}"
+            )
+        return Decimal(int(secs) * _NS_PER_S + int(nsecs))
     try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _decimal(text: str) -> Decimal:
-    """A stamp as it is written, with no binary floating point in between."""
-    try:
-        stamp = Decimal(text)
+        stamp = Decimal(cells[0])
     except InvalidOperation:
         stamp = Decimal("nan")
     if not stamp.is_finite() or stamp.adjusted() > 30:
-        raise ValueError(f"found {text!r} for the timestamp")
+        raise ValueError(f"found {cells[0]!r} for the timestamp")
     return stamp
+
+
+# ---- formats
+
+
+def read_table(path: _Path, options: FileOptions) -> Table:
+    """The rows of a file in its format, or in the one that it looks like.
+
+    Raises
+    ------
+    InputError
+        If a line cannot be used, or columns have no names.
+    ConfigError
+        If the stamps of format kitti are nowhere.
+    """
+    lines = Lines.of_file(path, "a trajectory")
+    layout = Layout(options.format, True)
+    columns, times, guesses = options.columns, options.times, list[str]()
+    if options.format == AUTO:
+        layout = layout_of(lines)
+        if columns is None and times is None:
+            n_columns = len(_cells_of(lines.first()[1]))
+            if n_columns == 4 and not layout.is_named:
+                columns = _named_four(path, options.measures)
+            elif layout.format != "tum":
+                guesses = [
+                    f"{path} looks like format {layout.format}; to change that, give `format`"
+                ]
+        if columns is not None or times is not None:
+            layout = Layout("csv" if columns is not None else "kitti", True)
+        beside = Path(path).with_name(_TIMES)
+        if layout.format == "kitti" and times is None and beside.is_file():
+            times = beside
+            guesses.append(f"stamps read from {beside}; to change that, give `times`")
+    if layout.format == "csv":
+        table = _read_csv(path, lines, columns, options)
+    else:
+        table = _read_fixed(path, lines, layout, times)
+    table.guesses[:0] = guesses
+    is_auto_tum = options.format == AUTO and layout.format == "tum"
+    table.is_scalar_last_usual = is_auto_tum and Path(path).suffix.lower() in _SUFFIXES_OF_TUM
+    return table
+
+
+def _named_four(path: _Path, measures: str) -> str:
+    """Names of four columns that have none."""
+    if measures not in _OF_FOUR:
+        raise InputError(
+            f"{path}: four columns without names; name them with `columns`: t,x,y,z for "
+            "positions, t,wx,wy,wz for angular rates"
+        )
+    return _OF_FOUR[measures]
+
+
+def _read_fixed(path: _Path, lines: Lines, layout: Layout, times: _Path | None) -> Table:
+    """A format whose columns have fixed places; kitti has its stamps in a file of their own."""
+    format = _FORMATS[layout.format]
+    quantities = (
+        format.quantities if layout.is_named or layout.format != "tum" else (*POSITION, *UNNAMED)
+    )
+    table = Table(path, format.expected, quantities, format.stamp_unit)
+    has_stamps = quantities != MATRIX
+    if not has_stamps and times is None:
+        raise ConfigError(
+            f"{path}: the poses of format kitti have no stamps; name their file with `times`"
+        )
+
+    def cells_of(text: str) -> list[str]:
+        return [cell.strip() for cell in text.split(format.separator)]
+
+    at, more = range(has_stamps, format.n_columns), format.separator is not None
+    table.fill(lines.data(), cells_of, format.n_columns, at, (0,) * has_stamps, more)
+    if times is not None:
+        stamps = Table(times, "a stamp", ())
+        stamps.fill(Lines.of_file(times, "stamps").data(), str.split, 1, (), may_have_more=True)
+        table.stamps = stamps.stamps
+        if len(stamps.stamps) != len(table.line_numbers):
+            raise InputError(
+                f"{path}: {len(table.line_numbers)} poses, but {times} has {len(stamps.stamps)} "
+                "stamps; they belong to different recordings"
+            )
+    return table
+
+
+def _read_csv(path: _Path, lines: Lines, columns: str | None, options: FileOptions) -> Table:
+    """Columns by the names in the header, or by those given."""
+    if columns is None:
+        header, lines = _header_of(lines)
+    else:
+        header = [name.strip() for name in columns.split(",")]
+        number, row = lines.first()
+        if number and not any(map(_is_number, _cells_of(row))):
+            lines = lines.after(number)
+    if header is None:
+        return _read_unnamed(path, lines, options.format == AUTO)
+    if len(header) > MOST_COLUMNS:
+        raise InputError(f"{path}: {len(header)} columns; at most {MOST_COLUMNS} are read")
+    chosen = choose_columns(path, header, measures=options.measures)
+    expected = f"{len(header)} columns: {listed(header)}"
+    table = Table(path, expected, tuple(chosen.quantities), chosen.stamp_unit, chosen.units)
+    table.header = tuple(header)
+    at = [*chosen.quantities.values()]
+    table.fill(lines.data(), _cells_of, len(header), at, chosen.stamp)
+    return table
+
+
+def _read_unnamed(path: _Path, lines: Lines, may_guess: bool) -> Table:
+    """Eight columns without names: a stamp, a position and a quaternion, whose order is to be
+    found.
+    """
+    n_columns = len(_cells_of(lines.first()[1]))
+    if n_columns and not (may_guess and n_columns == 8):
+        raise InputError(
+            f"{path}: the first line names no columns, so the order of the quaternion is unknown; "
+            "name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
+            f"{n_columns}"
+        )
+    table = Table(path, "8 columns: a stamp, a position and a quaternion", (*POSITION, *UNNAMED))
+    table.fill(lines.data(), _cells_of, 8, range(1, 8))
+    return table
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
