@@ -26,8 +26,7 @@ _HOMES = {
     "calibrate": "engine.offline",
     "calibrate_rig": "rig.calibrate",
     "compare": "session.compare",
-    "compare_methods": "engine.compare_methods",
-    "cross_check": "engine.cross_check",
+    "cross_check": "engine.offline",
     "load": "io.results",
     "plot": "report.plot",
     "read_trajectory": "io.trajectory_files.reading",
@@ -51,7 +50,6 @@ __all__ = [
     "calibrate",
     "calibrate_rig",
     "compare",
-    "compare_methods",
     "cross_check",
     "load",
     "plot",
@@ -64,9 +62,7 @@ if TYPE_CHECKING:
     # The same for editors and type checkers.
     from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.engine.calibrator import Calibrator
-    from hand_eye_calib.engine.compare_methods import compare_methods
-    from hand_eye_calib.engine.cross_check import cross_check
-    from hand_eye_calib.engine.offline import calibrate
+    from hand_eye_calib.engine.offline import calibrate, cross_check
     from hand_eye_calib.errors import HandEyeCalibError
     from hand_eye_calib.geometry.trajectory import Trajectory
     from hand_eye_calib.io.results import load_result as load

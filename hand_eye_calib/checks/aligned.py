@@ -79,29 +79,18 @@ class Aligned:
         X.
     covariance : (6, 6) array
         Of (rho, phi) in ``X exp(rho, phi)``.
+    solution : AdaptiveSolution or None
+        Of the adaptive estimator, if it has settled.
+    is_of_result : bool
+        The solution's time offset is in the streams already.
     """
 
     pose_pairs: PosePairs
     motions: MotionPairs
     T_parent_child: FloatArray
     covariance: FloatArray
-
-    @cached_property
-    def solution(self) -> AdaptiveSolution | None:
-        """Answer of the adaptive estimator from some of the poses, with a free clock; None if they
-        are too few, or if it does not settle.
-        """
-        poses = self.pose_pairs[:: -(-len(self.pose_pairs) // _MOST_POSES)]
-        if len(poses) < _FEWEST_POSES:
-            return None
-        found = estimator.solve(
-            poses.stamps_ns,
-            poses.Ts_pw_p,
-            poses.Ts_cw_c,
-            is_clock_free=True,
-            with_delays=True,
-        )
-        return found if found.converged else None
+    solution: AdaptiveSolution | None
+    is_of_result: bool
 
     def refined(self, offset: TimeOffset) -> TimeOffset:
         """The time offset that aligned the streams, with what the estimator adds to it: under its
@@ -110,7 +99,7 @@ class Aligned:
         found = self.solution
         if found is None or abs(found.time_offset_s) < _SETTLED_S:
             return offset
-        seconds = offset.seconds + found.time_offset_s
+        seconds = 0.0 if self.is_of_result else offset.seconds + found.time_offset_s
         return replace(offset, seconds=seconds, sigma_s=found.time_offset_sigma_s)
 
     @property
@@ -134,6 +123,18 @@ class Aligned:
         steps = np.linalg.norm(positions[n:] - positions[:-n], axis=1)
         speeds = steps / (stamps_s[n:] - stamps_s[:-n])
         return float(np.sqrt(np.mean(np.minimum(speeds, 3 * median(speeds)) ** 2)))
+
+
+def solved(pose_pairs: PosePairs) -> AdaptiveSolution | None:
+    """Answer of the adaptive estimator from some of the poses, with a free clock; None if they are
+    too few.
+    """
+    poses = pose_pairs[:: -(-len(pose_pairs) // _MOST_POSES)]
+    if len(poses) < _FEWEST_POSES:
+        return None
+    return estimator.solve(
+        poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c, is_clock_free=True, with_delays=True
+    )
 
 
 def check_aligned(aligned: Aligned) -> list[Finding]:

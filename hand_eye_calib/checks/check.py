@@ -11,6 +11,7 @@ wrong with them.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.aligned import Aligned, check_aligned, check_same
+from hand_eye_calib.checks.aligned import Aligned, check_aligned, check_same, solved
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
 from hand_eye_calib.checks.hypotheses import (
     LAGS_S,
@@ -50,6 +51,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
@@ -67,6 +69,9 @@ _UNIT_TOLERANCE = 0.1
 
 # Shortest duration and smallest rotation with which the checks of a live session mean something.
 MIN_DURATION_S, MIN_ROTATION_RAD = 20.0, float(np.radians(30.0))
+
+
+_Model: TypeAlias = AdaptiveSolution | Callable[[PosePairs], AdaptiveSolution | None] | None
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,8 @@ def check_streams(
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
     correlation: Correlation | None = None,
+    model: object = None,
+    may_solve: bool = True,
 ) -> CheckResult:
     """Check two streams.
 
@@ -118,6 +125,10 @@ def check_streams(
         Longest time between two poses that interpolation may bridge, in seconds.
     correlation : Correlation, optional
         Of the angular rates of the streams as they are, if it is known.
+    model : AdaptiveSolution, optional
+        The adaptive estimator's solution of these streams, if it is known.
+    may_solve : bool
+        Solve with that estimator if it is not known.
 
     Returns
     -------
@@ -153,7 +164,9 @@ def check_streams(
         correlation = replace(correlation, offset_s=0.0)
     findings = _with_lengths([*findings, *explanation.findings], parent)
     known = time_offset_s, scale
-    return _check_agreeing(streams, explanation, correlation, findings, known)
+    solve = solved if may_solve else None
+    of_result = model if isinstance(model, AdaptiveSolution) else None
+    return _check_agreeing(streams, explanation, correlation, findings, known, of_result or solve)
 
 
 def _offset(streams: StreamPair, correlation: Correlation, fit: SimilarityFit) -> TimeOffset:
@@ -237,9 +250,10 @@ def _check_agreeing(
     correlation: Correlation,
     findings: list[Finding],
     known: tuple[float, float],
+    model: _Model,
 ) -> CheckResult:
     """What else there is to say of streams that agree under a hypothesis, with a known time offset
-    and scale.
+    and scale, and the adaptive estimator's solution or what gives it.
     """
     is_sound = not any(finding.makes_unusable for finding in findings)
     corrected = explanation.hypothesis.undo(streams)
@@ -250,7 +264,7 @@ def _check_agreeing(
     scale = None if explanation.same_unit else _scale(pose_pairs, explanation.fit)
     rotations = _motions(pose_pairs).Ts_parenti_parentj[:, :3, :3]
     fit = scale.fit if scale else explanation.fit
-    aligned = _aligned(streams, offset.seconds, fit) if is_sound else None
+    aligned = _aligned(streams, offset.seconds, fit, model) if is_sound else None
     findings = [
         *findings,
         *check_offset(aligned.refined(offset) if aligned else offset, known[0]),
@@ -285,11 +299,15 @@ def _check_aligned(streams: StreamPair, offset_s: float, aligned: Aligned) -> li
     return check_aligned(aligned)
 
 
-def _aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit) -> Aligned:
+def _aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit, model: _Model) -> Aligned:
     """Streams that agree without any mistake undone, on one clock and in one unit of length."""
     child = streams.child.shifted(offset_s).scaled(fit.scale)
     pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
+    is_of_result = isinstance(model, AdaptiveSolution)
+    solution = model if isinstance(model, AdaptiveSolution) else model and model(pose_pairs)
     return Aligned(
+        solution=solution if solution and solution.converged else None,
+        is_of_result=is_of_result,
         pose_pairs=pose_pairs,
         motions=_motions(pose_pairs),
         T_parent_child=fit.T_parent_child,

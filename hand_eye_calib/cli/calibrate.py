@@ -164,7 +164,7 @@ def run(arguments: argparse.Namespace) -> int:
         files = [arguments.parent, arguments.child, *arguments.others]
         return calibrate_and_deliver(_read_rig(files, arguments), arguments, {"files": files})
     from hand_eye_calib.cli.present import deliver
-    from hand_eye_calib.engine.checked import at_clear_offset, checked
+    from hand_eye_calib.engine import run as engine
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
     options = options_from(arguments)
@@ -172,12 +172,9 @@ def run(arguments: argparse.Namespace) -> int:
     for text in repairs:
         note(text)
     config = offline_config(trajectories["parent"], trajectories["child"], options)
-    snapshot = whole_snapshot(config, **trajectories)
-    with waiting_for("solving"):
-        snapshot = at_clear_offset(snapshot)
-        calibration = snapshot.estimate()
-    with waiting_for("checking the streams"):
-        calibration, snapshot = checked(calibration, snapshot)
+    with waiting_for("solving, and checking the streams"):
+        found = engine.run(whole_snapshot(config, **trajectories))
+    calibration, snapshot = found.calibration, found.snapshot
     inputs: dict[str, Any] = {"options": snapshot.config.to_options()}
     for stream in STREAMS:
         inputs[stream] = {"file": str(getattr(arguments, stream)), **_extent(trajectories[stream])}

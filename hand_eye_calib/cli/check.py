@@ -16,7 +16,6 @@ from hand_eye_calib.cli.options import (
     options_from,
 )
 from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.plain import plain
 
 if TYPE_CHECKING:
     from hand_eye_calib.checks.check import CheckResult
@@ -112,8 +111,8 @@ def _checked(
         from hand_eye_calib.checks.check import check_streams
 
         return check_streams(parent, child, *known, config.max_gap)
+    from hand_eye_calib.engine.checking import check_partial
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-    from hand_eye_calib.engine.partial_check import check_partial
 
     config = offline_config(parent, child, options_from(arguments))
     return check_partial(whole_snapshot(config, parent, child))
@@ -174,6 +173,8 @@ def _document(
     findings: "Sequence[Finding]",
     checked: "CheckResult",
 ) -> dict[str, Any]:
+    from hand_eye_calib.plain import plain
+
     return {
         "streams": {
             name: {"source": sources[name], **vars(summary)} for name, summary in streams.items()

@@ -159,7 +159,7 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.cli.replaying import fingerprints
-    from hand_eye_calib.engine.checked import checked
+    from hand_eye_calib.engine.run import review
 
     replayed = _replayed(arguments)
     if arguments.out:
@@ -167,7 +167,8 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     more = {"convergence": replayed.convergence} if arguments.every else {}
     snapshot = replayed.calibrator.snapshot()
     with waiting_for("checking the streams"):
-        calibration, snapshot = checked(replayed.calibration, snapshot)
+        found = review(replayed.calibration, snapshot)
+    calibration, snapshot = found.calibration, found.snapshot
     calibration = replace(calibration, warnings=tuple(as_given(calibration.warnings)))
     inputs = as_given(replayed.inputs) | {"options": snapshot.config.to_options()}
     return deliver(calibration, arguments, inputs, snapshot, **more)

@@ -201,10 +201,10 @@ def write_session() -> None:
         if result.others:
             pickle.dump(_session_rig(directory / "rig", result), sys.stdout.buffer)
         if result.with_report:
-            from hand_eye_calib.engine.checked import checked
+            from hand_eye_calib.engine.run import review
 
-            calibration, _ = checked(result.calibration, result.snapshot, may_mend=False)
-            calibration, evidence = with_cross_check(calibration, result.snapshot)
+            found = review(result.calibration, result.snapshot, may_solve=False)
+            calibration, evidence = with_cross_check(found.calibration, result.snapshot)
             write_report(directory, calibration, evidence, result.snapshot.config, result.inputs)
     except HandEyeCalibError as error:
         sys.exit(fail(error, 1))

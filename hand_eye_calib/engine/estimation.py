@@ -81,6 +81,7 @@ class _Evaluation:
     drift: WorldDrift | None = None
     shift: PossibleShift | None = None
     is_beside: bool = False
+    model: AdaptiveSolution | None = None
 
     def spread(self, clock_offset_s: float) -> FloatArray:
         """Covariance (6, 6) of xi by what is not in the model.
@@ -232,6 +233,7 @@ def _calibration(
         ),
         motion_residuals=residuals,
         other_answer=evaluation.other_answer,
+        model=evaluation.model,
     )
 
 
@@ -285,7 +287,7 @@ def _solve_auto(
         why = why if solution.is_drowned else "the adaptive estimator did not converge"
         dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
         reason = f"auto: dnlo on reference {dnlo.reference}, because {why}"
-        return replace(dnlo, method_reason=reason, other_answer=_beside(by_model))
+        return replace(dnlo, method_reason=reason, other_answer=_beside(by_model), model=solution)
     # DNLO does not know of systematic errors: it is compared on poses without them.
     if solution.systematic != "none":
         pose_pairs = _without_biases(_corrected(pose_pairs, solution), solution)
@@ -444,6 +446,7 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         clock=solution.clock,
         drift=solution.world_drift,
         warnings=(warning,) if jumps > _MAX_JUMPS else (),
+        model=solution,
         shift=possible_shift(solution.part_products, solution.misfit),
     )
 

@@ -13,8 +13,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.streams import are_gaps
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.answers import Answer, OtherAnswers
-from hand_eye_calib.engine.scatter import compare_answers
+from hand_eye_calib.engine.answers import Answer, OtherAnswers, compare_answers
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.methods import METHODS

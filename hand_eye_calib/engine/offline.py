@@ -1,18 +1,18 @@
 """Two whole trajectories in, the extrinsic out: the Python function :func:`calibrate`."""
 
-from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, Prior
-from hand_eye_calib.engine.checked import at_clear_offset, checked
+from hand_eye_calib.engine.answers import OtherAnswers, compare_answers
+from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration
-
-#: Called with the share that is done, 0 to 1, and the step that begins.
-Progress: TypeAlias = Callable[[float, str], None]
+from hand_eye_calib.results.records import CrossCheck
 
 # Pose pairs that are used unless an option says otherwise: the noise model takes 8 kB for each, and
 # hours at ten a second hold as many.
@@ -44,6 +44,7 @@ def calibrate(
     target_axes: str | None = None,
     parent_frame: str | None = None,
     child_frame: str | None = None,
+    checks: bool | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Estimate the pose of the child sensor in the parent sensor's frame from two trajectories.
@@ -66,6 +67,10 @@ def calibrate(
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.config.Prior`.
+    checks : bool, optional
+        False: the streams are not checked, the result is not compared with other references and
+        halves of the recording, and nothing is solved a second time. True: it is compared also if
+        a reference is given, which leaves that out otherwise.
     progress : callable, optional
         Called with the share that is done, 0 to 1, and the step that begins.
 
@@ -80,27 +85,13 @@ def calibrate(
     """
     options = dict(locals())
     _require_trajectories(parent, child)
-    for name in ("parent", "child", "prior", "progress"):
+    for name in ("parent", "child", "prior", "checks", "progress"):
         del options[name]
     options = {name: value for name, value in options.items() if value is not None}
     of_streams = _most_pairs(parent, child) | _measures(parent, child)
     config = CalibratorConfig(**(of_streams | options | prior_fields(prior or {})))
     snapshot = whole_snapshot(config, parent, child)
-    if progress is None:
-        snapshot = at_clear_offset(snapshot)
-        return checked(snapshot.estimate(), snapshot)[0]
-    # The snapshot keeps what these steps give.
-    progress(0.0, "time offset")
-    snapshot = at_clear_offset(snapshot)
-    snapshot.resolved()
-    progress(0.2, "pairing")
-    snapshot.pose_pairs()
-    progress(0.3, "solving")
-    result = snapshot.estimate()
-    progress(0.8, "checking the streams")
-    result, _ = checked(result, snapshot)
-    progress(1.0, "done")
-    return result
+    return run(snapshot, checks=checks, progress=progress).calibration
 
 
 def _require_trajectories(parent: object, child: object) -> None:
@@ -173,3 +164,45 @@ def _most_pairs(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
 def _measures(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
     """Options that say what the streams measure, as they themselves do."""
     return {"parent_measures": parent.measures, "child_measures": child.measures}
+
+
+def cross_check(
+    calibration: Calibration,
+    parent: Trajectory,
+    child: Trajectory,
+    config: CalibratorConfig | None = None,
+) -> CrossCheck:
+    """Cross-check a result with other methods and references and with both halves of its recording.
+
+    This solves some fifteen times.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The result.
+    parent, child : Trajectory
+        The trajectories that gave it.
+    config : CalibratorConfig, optional
+        The options that gave it; the defaults, with the result's method, if left out.
+
+    Returns
+    -------
+    CrossCheck
+
+    Raises
+    ------
+    ConfigError
+        If a stream is not one of poses.
+    NotEnoughDataError
+        If too few poses can be paired.
+    """
+    config = config or offline_config(parent, child, {"method": calibration.method})
+    config.require_poses("a cross-check")
+    settled = replace(config, time_offset=calibration.time_offset_s)
+    pose_pairs = whole_snapshot(settled, parent, child).pose_pairs()
+    answers = OtherAnswers(calibration, config, pose_pairs)
+    return compare_answers(
+        calibration,
+        [other.calibration for other in answers.other_methods()],
+        [half.calibration for half in answers.halves()],
+    )

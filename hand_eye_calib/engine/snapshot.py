@@ -9,25 +9,20 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import (
     Correlation,
-    angular_rates,
     correlate_rates,
-    speeds,
 )
 from hand_eye_calib.alignment.time_offset import (
     TimeOffset,
     estimate_time_offset,
     time_offset_of_speeds,
 )
-from hand_eye_calib.checks.check import CheckResult, check_offset, check_parts, check_streams
-from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.answers import ESTIMATORS, cross_checked
 from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
-from hand_eye_calib.engine.estimators import ESTIMATORS
-from hand_eye_calib.engine.scatter import cross_checked
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs, select_keyframes, synchronise
-from hand_eye_calib.results.calibration import Calibration, DofVerdict
+from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.pose_buffer import RawPoses
@@ -41,13 +36,6 @@ _OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "back
 _NEGLIGIBLE_S = 0.005
 # One that is farther away is no time offset (s).
 _BELIEVABLE_S = 1.0
-
-# Weighted squared residual per degree of freedom up to which a noise model fits: it is 1 if the
-# model holds, and less if there is no noise.
-_MAX_MISFIT = 2.0
-
-# Smaller time offsets (s) of streams that are no poses are found by every solve.
-FOUND_BY_SOLVE_S = 0.25
 
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
@@ -142,8 +130,14 @@ class Snapshot:
         made = pair_poses(self.config, self.parent, self.child, self.paired_at, self.kept)
         return downsample(PosePairs.concatenate(self.kept, made), self.config.max_pairs)
 
-    def estimate(self) -> Calibration:
+    def estimate(self, cross_check: bool | None = None) -> Calibration:
         """Estimate the extrinsic.
+
+        Parameters
+        ----------
+        cross_check : bool, optional
+            Whether to compare the result with other references and with both halves; by default
+            unless the user set the reference.
 
         Returns
         -------
@@ -161,14 +155,18 @@ class Snapshot:
                 f"both streams name {self.parent_frame!r} as their sensor frame, so there is "
                 "nothing to calibrate between; give parent_frame and child_frame"
             )
-        return self.resolved()._estimate()
+        if cross_check is None:
+            cross_check = self.config.reference == "auto"
+        return self.resolved()._estimate(cross_check)
 
-    def _estimate(self) -> Calibration:
+    def _estimate(self, cross_check: bool) -> Calibration:
         if len(self._pose_pairs) < self.config.min_pairs:
             raise NotEnoughDataError(self._what_is_missing(len(self._pose_pairs)))
         if self.config.measured != "poses":
             return self._named(self._estimate_part())
         solved = solve_poses(self._pose_pairs, self.config, self.time_offset)
+        if not cross_check:
+            return self._named(solved.calibration())
         return self._named(cross_checked(solved, self.config, self._pose_pairs))
 
     def _estimate_part(self) -> Calibration:
@@ -217,67 +215,6 @@ class Snapshot:
         child = Trajectory(pairs.stamps_ns, pairs.Ts_cw_c)
         return parent, child.shifted(-offset_s)
 
-    def check(self, calibration: Calibration | None = None) -> CheckResult:
-        """Check the streams.
-
-        Parameters
-        ----------
-        calibration : Calibration, optional
-            Result from them. Its time offset and scale count as known; without one, those of the
-            options, if they are given in numbers.
-
-        Returns
-        -------
-        CheckResult
-            Of streams that are no poses, their sampling, and what the solve itself found.
-        """
-        if self.config.measured != "poses":
-            return CheckResult(gravest_first(self._check_parts(calibration)))
-        offset_s = calibration.time_offset_s if calibration else self.config.time_offset
-        scale = calibration.scale if calibration else self.config.scale
-        result = check_streams(
-            *self.streams,
-            time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
-            scale=1.0 if isinstance(scale, str) else scale,
-            max_gap_s=self.max_gap_s,
-            correlation=self.correlation,
-        )
-        obsolete = set()
-        if len(self.kept):
-            obsolete.add("gaps")  # pairs may have gaps where the streams have none
-        if calibration and not _hides_a_translation(calibration):
-            obsolete.add("one_axis")  # the result has shown otherwise
-        findings = [found for found in result.findings if found.code not in obsolete]
-        return replace(result, findings=gravest_first(answered(findings, self.config)))
-
-    def _check_parts(self, calibration: Calibration | None) -> list[Finding]:
-        found = [*calibration.findings] if calibration else []
-        if not len(self.kept):  # pairs may have gaps where the streams have none
-            parent, child = self.streams
-            offset_s = fixed_time_offset(self.resolved().config)
-            found += check_parts(parent, child.shifted(offset_s), self.config.max_gap)
-        if any(each.code == "unrelated" for each in found):
-            found += self._check_clocks()
-        return [each for index, each in enumerate(found) if each not in found[:index]]
-
-    def _check_clocks(self) -> list[Finding]:
-        """A finding if streams that are no poses agree at another clock offset."""
-        known_s = fixed_time_offset(self.resolved().config)
-        correlation = self.correlated(known_s)
-        if not correlation.is_clear or abs(correlation.offset_s) < FOUND_BY_SOLVE_S:
-            return []
-        sigma_s = max(stream.interval_s for stream in self.streams) / 5
-        offset = TimeOffset(correlation.offset_s, sigma_s, correlation, None)
-        return check_offset(offset, known_s)
-
-    def correlated(self, known_s: float) -> Correlation:
-        """Of the angular rates of both streams or, if one has only positions, of their speeds; the
-        child's stamps are off by ``known_s``.
-        """
-        parent, child = self.streams
-        of = speeds if self.config.measured == "positions" else angular_rates
-        return correlate_rates(parent, child.shifted(known_s), self.config.max_gap, of=of)
-
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
         for name, stream in (("parent", self.parent), ("child", self.child)):
@@ -299,19 +236,6 @@ class Snapshot:
             f"{needed} from {counts} that overlap for {(end_ns - start_ns) * 1e-9:.2f} s; "
             "record longer, or raise max_gap if a stream is slower than that"
         )
-
-
-def noise_fits(calibration: Calibration) -> bool:
-    """Whether the result is the noise model's, and its residuals fit."""
-    noise = calibration.noise
-    return noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT
-
-
-def _hides_a_translation(calibration: Calibration) -> bool:
-    return any(
-        dof.verdict in (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
-        for dof in calibration.observability[:3]
-    )
 
 
 def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:

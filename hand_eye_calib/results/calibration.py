@@ -54,7 +54,7 @@ _VERSION = 1
 
 # Fields that a document has under other names, as matrices; and those that files do not have.
 _MATRICES = ("T_parent_child", "T_method", "covariance", "floor", "T_base_parent")
-_NOT_IN_FILES = ("motion_residuals", "other_answer")
+_NOT_IN_FILES = ("motion_residuals", "other_answer", "model")
 
 # An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
 _SHARED = 0.02

@@ -105,6 +105,8 @@ class Result:
     other_answer : ((4, 4) array, (6, 6) array) or None
         T_parent_child and covariance under other assumptions on the noise: of the adaptive
         estimator beside DNLO, or the reverse. Not part of files.
+    model : object
+        The adaptive estimator's solution, for the stream checks. Not part of files.
 
     Context
 
@@ -159,6 +161,8 @@ class Result:
     other_answer: tuple[FloatArray, FloatArray] | None = field(
         default=None, repr=False, compare=False
     )
+
+    model: object = field(default=None, repr=False, compare=False)
 
     parent_frame: str = "parent"
     child_frame: str = "child"

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.checked import at_clear_offset, checked
 from hand_eye_calib.engine.estimation import estimate_extrinsic
-from hand_eye_calib.engine.offline import Progress, offline_config, whole_snapshot
+from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import synchronise
@@ -128,8 +128,7 @@ def _pairwise(
     first = dataclasses.replace(first, sensor_frame=name)
     other = dataclasses.replace(other, sensor_frame=of_other)
     config = offline_config(first, other, options)
-    snapshot = at_clear_offset(whole_snapshot(config, first, other))
-    return checked(snapshot.estimate(), snapshot)[0]
+    return run(whole_snapshot(config, first, other)).calibration
 
 
 def _neighbours(

@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.task import Future
 
 from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
-from hand_eye_calib.engine.checked import with_options
+from hand_eye_calib.engine.run import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.ros.check_monitor import CheckMonitor

@@ -12,14 +12,15 @@ import threading
 import time
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Any, BinaryIO
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.check import CheckResult, can_check
-from hand_eye_calib.engine.checked import mend, with_options
+from hand_eye_calib.engine.checking import check
+from hand_eye_calib.engine.run import review, with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.results.calibration import Calibration
@@ -112,9 +113,11 @@ Answer = Solved | Checked
 def answers(job: Job) -> Iterator[Answer]:
     """Solve, then check if the job asks for it."""
     solved = _solve(job)
-    yield solved
+    found = solved.calibration
+    # The node has no use for the noise model's whole solution.
+    yield replace(solved, calibration=replace(found, model=None) if found else None)
     if job.check:
-        yield _check(job, solved.calibration)
+        yield _check(job, found)
 
 
 def _solve(job: Job) -> Solved:
@@ -140,12 +143,12 @@ def _check(job: Job, calibration: Calibration | None) -> Checked:
             return Checked(job.session, time.monotonic() - start)
         snapshot = with_options(job.snapshot, job.options)
         if calibration is None:
-            return Checked(job.session, time.monotonic() - start, snapshot.check())
-        found = mend(calibration, snapshot, job.options)
+            return Checked(job.session, time.monotonic() - start, check(snapshot))
+        found = review(calibration, snapshot, job.options)
     except Exception as error:  # the node reports it
         return Checked(job.session, time.monotonic() - start, failure=_failure(error))
     seconds = time.monotonic() - start
-    return Checked(job.session, seconds, found.check, options=found.options, told=found.told)
+    return Checked(job.session, seconds, found.check, options=dict(found.options), told=found.told)
 
 
 def _failure(error: Exception) -> Failure:

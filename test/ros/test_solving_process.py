@@ -16,8 +16,8 @@ from ros_harness import RELIABLE_INPUTS, drive
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.checked import checked
 from hand_eye_calib.engine.pose_buffer import BufferLimits
+from hand_eye_calib.engine.run import review
 from hand_eye_calib.ros import solving_process
 from hand_eye_calib.ros.solving import Checked, Failure, FailureKind, Job, Solved, answers
 from hand_eye_calib.ros.solving_process import SolvingProcess
@@ -247,7 +247,6 @@ def test_it_ends_with_the_node_however_that_ends(tmp_path, command):
     program = f"""
 import time
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.checked import checked
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.ros.solving import Job
 from hand_eye_calib.ros.solving_process import SolvingProcess
@@ -293,7 +292,7 @@ def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts
     assert check.options == {"time_offset": "estimate"}
     assert "solved with time_offset estimate" in check.told[0]
     again, settled = answers(Job(1, live, check=True, options=check.options))
-    replayed, _ = checked(live.estimate(), live)
+    replayed = review(live.estimate(), live).calibration
     assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
     np.testing.assert_array_equal(again.calibration.T_parent_child, replayed.T_parent_child)
     np.testing.assert_array_equal(again.calibration.covariance, replayed.covariance)

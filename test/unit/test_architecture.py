@@ -70,7 +70,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "fsspec": "io/remote.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
-    "pandas": ("results/calibration.py", "engine/compare_methods.py", "results/tables.py"),
+    "pandas": ("results/calibration.py", "results/tables.py"),
     "jinja2": "report/",
 }
 

@@ -6,8 +6,8 @@ from motions import geodetic, planar_poses, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.engine.checking import check_partial
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-from hand_eye_calib.engine.partial_check import check_partial
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.positions import simulated_positions

@@ -19,6 +19,7 @@ from motions import (
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.engine.snapshot import downsample
 from hand_eye_calib.geometry import se3
@@ -180,8 +181,8 @@ def test_the_whole_session_is_checked_not_only_its_end(max_pairs):
         for seed, each in enumerate((parked, child_of(parked)))
     )
     sound = play(by_stamp(parent, child), max_pairs=max_pairs).snapshot()
-    assert sound.check().findings == ()
+    assert check(sound).findings == ()
     assert len(sound.parent) < 150 < 250 < len(sound.streams[0])
     late = play(by_stamp(parent, reordered(child)), max_pairs=max_pairs, time_offset=0.5).snapshot()
-    assert [finding.code for finding in late.check().findings][0] == "quaternion_order"
+    assert [finding.code for finding in check(late).findings][0] == "quaternion_order"
     assert late.streams[1].stamps_ns[0] in child.stamps_ns

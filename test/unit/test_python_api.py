@@ -41,7 +41,7 @@ class TestOptionsOfCalibrate:
         fields = {field.name: field for field in dataclasses.fields(CalibratorConfig)}
         assert set(fields) >= PRIOR_FIELDS
         keywords = self.keywords()
-        assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior", "progress"}
+        assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior", "progress", "checks"}
         for name, field in fields.items():
             if name not in PRIOR_FIELDS:
                 assert keywords[name].annotation == field.type | None, name
@@ -56,7 +56,7 @@ class TestOptionsOfCalibrate:
             "hand_eye_calib.engine.offline.whole_snapshot",
             lambda config, parent, child: seen.append(config) or _Unsolved(),
         )
-        monkeypatch.setattr("hand_eye_calib.engine.offline.checked", lambda *_: (None, None))
+        monkeypatch.setattr("hand_eye_calib.engine.offline.run", lambda *_, **__: _Unsolved())
         given = dict(
             method="dnl",
             reference="C7",
@@ -79,7 +79,7 @@ class TestOptionsOfCalibrate:
             parent_frame="lidar",
             child_frame="camera",
         )
-        assert set(given) | {"prior", "progress"} == set(self.keywords())
+        assert set(given) | {"prior", "progress", "checks"} == set(self.keywords())
         hec.calibrate(*streams(), **given, prior={"z": (1.85, 0.02)})
         (config,) = seen
         assert {name: getattr(config, name) for name in given} == given
@@ -131,10 +131,7 @@ class TestOptionsOfCalibrate:
 
 
 class _Unsolved:
-    config = CalibratorConfig(time_offset=0.0)
-
-    def estimate(self):
-        return None
+    calibration = None
 
 
 class TestPrior:

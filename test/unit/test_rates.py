@@ -11,8 +11,8 @@ from rosbags.rosbag2 import Writer
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.engine.checking import check_partial
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-from hand_eye_calib.engine.partial_check import check_partial
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import RateIntegrator, Trajectory, integrated
@@ -138,8 +138,6 @@ class TestRates:
     def test_cross_checks_are_of_poses(self, streams, result):
         with pytest.raises(ConfigError, match="a cross-check needs poses"):
             hec.cross_check(result, *streams)
-        with pytest.raises(ConfigError, match="comparison of methods needs poses"):
-            hec.compare_methods(*streams)
 
     def test_it_survives_a_file(self, result, tmp_path):
         again = hec.load(hec.save(result, tmp_path))

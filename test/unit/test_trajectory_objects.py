@@ -148,26 +148,6 @@ class TestTables:
         with pytest.raises(InputError, match="the table: no column for qw among"):
             hec.read_trajectory(self.frame().drop(columns="qw"))
 
-    def test_methods_are_compared(self):
-        parent, child = as_trajectory(POSES), as_trajectory(child_of(POSES))
-        told = []
-        table = hec.compare_methods(
-            parent,
-            child,
-            ["dnlo", "park", "adaptive"],
-            ["B1", "B2"],
-            progress=lambda share, step: told.append(step),
-        )
-        assert told == ["dnlo B1", "dnlo B2", "park B1", "park B2", "adaptive", "done"]
-        assert table["solved_by"].tolist() == ["dnlo", "dnlo", "park", "park", "adaptive"]
-        assert table["reference"].tolist() == ["B1", "B2", "B1", "B2", ""]
-        np.testing.assert_allclose(table[["x", "y", "z"]], [T_PARENT_CHILD[:3, 3]] * 5, atol=1e-6)
-        own = hec.calibrate(parent, child, method="park", reference="B2").to_frame()
-        assert table.loc[3, "yaw"] == own.loc["yaw", "value"]
-        assert own.loc["yaw", "unit"] == "rad"
-        with pytest.raises(ConfigError, match="park"):
-            hec.compare_methods(parent, child, ["prak"])
-
     def test_without_pandas_one_line_says_so(self, monkeypatch):
         result = hec.calibrate(as_trajectory(POSES), as_trajectory(child_of(POSES)))
         monkeypatch.setitem(__import__("sys").modules, "pandas", None)

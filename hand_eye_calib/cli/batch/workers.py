@@ -18,7 +18,7 @@ from hand_eye_calib.cli.batch.tasks import Task
 from hand_eye_calib.cli.replaying import fingerprints, replay
 from hand_eye_calib.cli.reporting import rendered, with_cross_check
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.engine.run import review
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io.limits import ReadingMemory
 from hand_eye_calib.io.remote import local_copies, public
@@ -76,8 +76,8 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
     replayed = replay(paths, *sources, config=config, quiet=True)
     if task.with_fingerprints:
         replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
-    snapshot = replayed.calibrator.snapshot()
-    calibration, snapshot = checked(replayed.calibration, snapshot)
+    reviewed = review(replayed.calibration, replayed.calibrator.snapshot())
+    calibration, snapshot = reviewed.calibration, reviewed.snapshot
     calibration, evidence = with_cross_check(calibration, snapshot)
     inputs = replayed.inputs | {"options": snapshot.config.to_options()}
     found: Outcome = {

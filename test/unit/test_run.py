@@ -10,12 +10,12 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
-from hand_eye_calib.checks.check import check_streams
+from hand_eye_calib.checks.check import CheckResult, check_streams
 from hand_eye_calib.checks.lengths import check_lengths
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.checked import at_clear_offset, checked, mend
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-from hand_eye_calib.engine.snapshot import noise_fits
+from hand_eye_calib.engine.run import review, run, with_options
+from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
@@ -109,9 +109,28 @@ def test_good_streams_are_left_alone(streams):
     parent, child, _ = streams
     snapshot = whole_snapshot(offline_config(parent, child, {"reference": "B5"}), parent, child)
     plain = snapshot.estimate()
-    result, same = checked(plain, snapshot)
-    assert same is snapshot
-    assert (result.warnings, result.findings) == (plain.warnings, ())
+    found = review(plain, snapshot)
+    assert found.snapshot is snapshot
+    assert (found.calibration.warnings, found.options) == (plain.warnings, {})
+    assert found.calibration.findings == ()
+
+
+@pytest.mark.parametrize("checks", [None, True, False])
+def test_a_given_reference_solves_nothing_else_unless_cross_checks_are_asked_for(
+    streams, checks, monkeypatch
+):
+    """Neither the noise model nor other references; without checks not even the stream checks."""
+    parent, child, _ = streams
+    solved = []
+    monkeypatch.setattr(
+        "hand_eye_calib.gls.estimator.solve", lambda *_, **__: solved.append("adaptive")
+    )
+    monkeypatch.setattr(
+        "hand_eye_calib.engine.run.check", lambda *_: solved.append("check") or CheckResult(())
+    )
+    result = hec.calibrate(parent, child, method="dnlo", reference="B5", checks=checks)
+    assert solved == ([] if checks is False else ["check"])
+    assert (result.cross_check is not None) == (checks is True)
 
 
 def test_a_scale_with_which_the_noise_model_does_not_fit_is_not_used():
@@ -138,11 +157,8 @@ def late():
 
 class TestClearOffset:
     def test_it_is_estimated_before_the_first_solve(self, late, monkeypatch):
-        ahead = at_clear_offset(late)
-        assert ahead.config.time_offset == "estimate"
-        in_turn = mend(late.estimate(), late)
-        result = ahead.estimate()
-        found = mend(result, ahead)
+        in_turn = review(late.estimate(), late)
+        found = run(late)
         assert found.snapshot.config == in_turn.snapshot.config
         assert found.told == in_turn.told
         expected = in_turn.calibration
@@ -151,26 +167,37 @@ class TestClearOffset:
         assert found.calibration.findings == expected.findings
         assert expected.time_offset_s == pytest.approx(0.05, abs=0.003)
         # If something speaks against it, the streams are solved as they are, too.
-        monkeypatch.setattr("hand_eye_calib.engine.checked._is_sound", lambda found: False)
-        assert mend(result, ahead).check.findings == mend(late.estimate(), late).check.findings
+        monkeypatch.setattr("hand_eye_calib.engine.run.Run._is_sound", False)
+        found = run(late)
+        assert found.check.findings == in_turn.check.findings
+        assert found.told == in_turn.told
 
     @pytest.mark.parametrize(
-        "options", [{"time_offset": 0.0}, {"method": "dnlo"}, {"reference": "B5"}]
+        "options", [{"time_offset": 0.0}, {"method": "dnlo", "time_offset": 0.05}]
     )
-    def test_it_stays_as_it_is_if_the_model_would_not_find_it(self, late, options):
+    def test_a_clock_that_the_user_set_stays(self, late, options):
         other = replace(late, config=replace(late.config, given=options, **options))
-        assert at_clear_offset(other) is other
+        assert run(other).snapshot is other
 
-    def test_none_is_left_alone(self, late):
-        level = replace(late, buffered_child=late.child.shifted(0.05))
-        assert at_clear_offset(level) is level
+    def test_two_solves_at_most(self, late, monkeypatch):
+        solved = []
+        estimate = Snapshot.estimate
 
-    def test_none_is_clear_if_motions_over_other_times_tell_another(self, late, monkeypatch):
-        spread = replace(at_clear_offset(late).time_offset, spread_s=0.04)
+        def counted(*given, **more):
+            solved.append(1)
+            return estimate(*given, **more)
+
+        monkeypatch.setattr(Snapshot, "estimate", counted)
+        run(late)
+        assert len(solved) == 1
+        spread = replace(with_options(late, {"time_offset": "estimate"}).resolved().time_offset)
+        unclear = replace(spread, spread_s=0.4)
         monkeypatch.setattr(
-            "hand_eye_calib.engine.checked.refine_time_offset", lambda *given, **more: spread
+            "hand_eye_calib.engine.run.refine_time_offset", lambda *given, **more: unclear
         )
-        assert at_clear_offset(late) is late
+        found = run(late)
+        assert len(solved) == 3
+        assert found.calibration.time_offset_s == pytest.approx(0.05, abs=0.003)
 
 
 def test_the_check_takes_the_correlation_as_it_is(late):
@@ -193,6 +220,6 @@ def test_a_model_that_fits_does_not_rule_out_smoothing_without_a_delay(kind, spa
     )
     smoothed = Trajectory(drive.child.stamps_ns, poses)
     result = hec.calibrate(drive.parent, smoothed)
-    assert noise_fits(result)
+    assert result.noise.misfit < 2.0
     assert code in [finding.code for finding in result.findings]
     assert result.verdict is Verdict.DO_NOT_USE

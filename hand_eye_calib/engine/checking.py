@@ -1,0 +1,197 @@
+"""The stream checks of a snapshot, with a result or before any.
+
+Of streams that have only positions, rotations or angular rates, what they have in common shows in a
+solve, which is quick: whether they are of one body, in one unit of length, and on one clock.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from hand_eye_calib.alignment.angular_rates import (
+    MIN_VARIATION,
+    Correlation,
+    angular_rates,
+    correlate_rates,
+    speeds,
+)
+from hand_eye_calib.alignment.time_offset import TimeOffset
+from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.check import (
+    CheckResult,
+    check_offset,
+    check_parts,
+    check_streams,
+    unrelated_rates,
+)
+from hand_eye_calib.checks.findings import Finding, Severity, answered, gravest_first
+from hand_eye_calib.engine.estimation import fixed_time_offset
+from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.text import axes_in_words
+
+# Smaller time offsets (s) of streams that are no poses are found by every solve.
+_FOUND_BY_SOLVE_S = 0.25
+
+
+def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
+    """Check the streams of a snapshot.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    calibration : Calibration, optional
+        Result from them. Its time offset and scale count as known; without one, those of the
+        options, if they are given in numbers.
+
+    Returns
+    -------
+    CheckResult
+        Of streams that are no poses, their sampling, and what the solve itself found.
+    """
+    if snapshot.config.measured != "poses":
+        return CheckResult(gravest_first(_check_parts(snapshot, calibration)))
+    offset_s = calibration.time_offset_s if calibration else snapshot.config.time_offset
+    scale = calibration.scale if calibration else snapshot.config.scale
+    model = calibration.model if calibration else None
+    # Time-correlated errors of the noise model may be a fault of a stream, which the model then
+    # does not show; solved from fewer poses and without the result's clock, it does.
+    noise = calibration.noise if calibration and calibration.method == "adaptive" else None
+    may_hide_faults = noise is not None and (model is None or bool(noise.lasting))
+    result = check_streams(
+        *snapshot.streams,
+        time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
+        scale=1.0 if isinstance(scale, str) else scale,
+        max_gap_s=snapshot.max_gap_s,
+        correlation=snapshot.correlation,
+        model=None if may_hide_faults else model,
+        may_solve=calibration is None or may_hide_faults,
+    )
+    obsolete = set()
+    if len(snapshot.kept):
+        obsolete.add("gaps")  # pairs may have gaps where the streams have none
+    if calibration and not _hides_a_translation(calibration):
+        obsolete.add("one_axis")  # the result has shown otherwise
+    findings = [found for found in result.findings if found.code not in obsolete]
+    return replace(result, findings=gravest_first(answered(findings, snapshot.config)))
+
+
+def _hides_a_translation(calibration: Calibration) -> bool:
+    return any(
+        dof.verdict in (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
+        for dof in calibration.observability[:3]
+    )
+
+
+def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Finding]:
+    """Findings about streams that are no poses; of the solve, those of its result."""
+    found = [*calibration.findings] if calibration else []
+    known_s = fixed_time_offset(snapshot.resolved().config)
+    if not len(snapshot.kept):  # pairs may have gaps where the streams have none
+        parent, child = snapshot.streams
+        found += check_parts(parent, child.shifted(known_s), snapshot.config.max_gap)
+    if any(each.code == "unrelated" for each in found):
+        correlation = _correlated(snapshot, known_s)
+        if correlation.is_clear and abs(correlation.offset_s) >= _FOUND_BY_SOLVE_S:
+            sigma_s = max(stream.interval_s for stream in snapshot.streams) / 5
+            offset = TimeOffset(correlation.offset_s, sigma_s, correlation, None)
+            found += check_offset(offset, known_s)
+    return [each for index, each in enumerate(found) if each not in found[:index]]
+
+
+def _correlated(snapshot: Snapshot, known_s: float) -> Correlation:
+    """Correlation of the angular rates of both streams or, if one has only positions, of their
+    speeds; the child's stamps are off by ``known_s``.
+    """
+    parent, child = snapshot.streams
+    of = speeds if snapshot.config.measured == "positions" else angular_rates
+    return correlate_rates(parent, child.shifted(known_s), snapshot.config.max_gap, of=of)
+
+
+def check_partial(snapshot: Snapshot) -> CheckResult:
+    """Check the streams of a snapshot of which one at least gives only a part of its poses.
+
+    A time offset in the options is known; otherwise the streams are compared at the offset at which
+    their angular rates, or the speeds beside positions, agree.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        Of whole trajectories.
+
+    Returns
+    -------
+    CheckResult
+    """
+    config = snapshot.config
+    known_s = 0.0 if isinstance(config.time_offset, str) else config.time_offset
+    before = check(replace(snapshot, config=replace(config, time_offset=known_s)))
+    if any(finding.makes_unusable for finding in before.findings):
+        return before
+    correlation = _correlated(snapshot, known_s)
+    offset_s = known_s
+    if correlation.is_clear and abs(correlation.offset_s) > _FOUND_BY_SOLVE_S / 2:
+        offset_s += correlation.offset_s
+    try:
+        found = _of_solve(snapshot, correlation, known_s, {"time_offset": offset_s})
+    except NotEnoughDataError as error:
+        found = [*before.findings, _of_no_solve(config.measured, correlation, error)]
+    except InputError as error:
+        found = [*before.findings, _unsolved(str(error))]
+    return CheckResult(gravest_first(found), correlation)
+
+
+def _of_no_solve(measured: str, correlation: Correlation, error: NotEnoughDataError) -> Finding:
+    """What is wrong with streams that have nothing in common to be solved."""
+    if correlation.is_clear or not correlation.overlap_s:
+        return wording.finding("too_short", text=str(error))
+    quantity = "speeds" if measured == "positions" else "angular rates"
+    return unrelated_rates(correlation, quantity)
+
+
+def _of_solve(
+    snapshot: Snapshot, correlation: Correlation, known_s: float, options: Mapping[str, Any]
+) -> list[Finding]:
+    """Findings of a solve with other options; with lengths in another unit, of one in metres."""
+    solved = replace(snapshot, config=replace(snapshot.config, **options))
+    result = solved.estimate()
+    found = [*check(solved, result).findings]
+    if in_units := [each for each in found if each.code == "units" and "scale" not in options]:
+        more = {**options, **in_units[0].options}
+        return [*in_units, *_of_solve(snapshot, correlation, known_s, more)]
+    if any(each.makes_unusable for each in found):
+        is_still = correlation.overlap_s > 0 and correlation.variation < MIN_VARIATION
+        is_in_unit = all(each.code != "rate_unit" for each in found)
+        if is_still and is_in_unit and result.measured == "rotations":
+            return [wording.finding("no_turning")]
+        return found
+    return [*found, *_of_result(result, correlation, known_s)]
+
+
+def _of_result(result: Calibration, correlation: Correlation, known_s: float) -> list[Finding]:
+    """Findings about motion and clock of streams that agree."""
+    within_reach = [dof.name for dof in result.observability if dof.name not in result.out_of_reach]
+    hidden = [axis for axis in within_reach if axis in result.unobservable()]
+    if result.status is SolveStatus.NOT_CONVERGED:
+        return [_unsolved("the solve of these streams does not converge")]
+    if hidden == within_reach:
+        return [wording.finding("no_turning")]
+    offset_s, sigma_s = result.time_offset_s - known_s, result.time_offset_sigma_s
+    clocks = check_offset(TimeOffset(offset_s, sigma_s, correlation, None), known_s)
+    if abs(offset_s) < _FOUND_BY_SOLVE_S:
+        clocks = [replace(finding, severity=Severity.NOTE) for finding in clocks]
+    return [
+        *clocks,
+        *([_unseen(hidden)] if hidden else []),
+    ]
+
+
+def _unsolved(text: str) -> Finding:
+    return wording.finding("unsolved", text=text, units="the units")
+
+
+def _unseen(axes: Sequence[str]) -> Finding:
+    options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in axes}
+    it = "it" if len(axes) == 1 else "them"
+    return wording.finding("unseen_axes", options=options, axes=axes_in_words(axes), it=it)

@@ -1,0 +1,287 @@
+"""From two streams to a result: clock, pairs, solve, check, at most one second solve.
+
+The only place that says so. The command line, Python, the node, batches and rigs call :func:`run`,
+or :func:`review` for a result that they have already.
+"""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
+
+from hand_eye_calib.alignment.time_offset import refine_time_offset
+from hand_eye_calib.checks.check import CheckResult
+from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.checking import check
+from hand_eye_calib.engine.estimation import fixed_time_offset
+from hand_eye_calib.engine.snapshot import GAP_INTERVALS, Snapshot
+from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.methods import METHODS
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration
+
+#: Called with the share that is done, 0 to 1, and the step that begins.
+Progress: TypeAlias = Callable[[float, str], None]
+Options: TypeAlias = Mapping[str, Any]
+
+# Options that a check can be certain of.
+_MENDED = ("time_offset", "scale")
+
+# A model's own time offset moves poses along their velocities. From this one (s) on, poses are
+# paired anew instead; positions alone later, as their model knows the offset better than speeds do.
+_MOST_MOVED_S, _MOST_MOVED_POSITIONS_S = 0.003, 0.05
+
+# Weighted squared residual per degree of freedom up to which a noise model fits: it is 1 if the
+# model holds, and less if there is no noise.
+_MAX_MISFIT = 2.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A result after the stream checks.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        With its findings, and with a warning about each option that was set.
+    snapshot : Snapshot
+        With the options that gave it.
+    check : CheckResult
+        Of its streams.
+    options : mapping
+        What was set because a check is certain of it; empty if nothing was.
+    told : tuple of str
+        Warnings about that.
+    """
+
+    calibration: Calibration
+    snapshot: Snapshot
+    check: CheckResult = CheckResult(())
+    options: Options = field(default_factory=dict)
+    told: tuple[str, ...] = ()
+
+    @property
+    def _noise_fits(self) -> bool:
+        """Whether the result is the noise model's, and its residuals fit."""
+        noise = self.calibration.noise
+        return noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT
+
+    @property
+    def _n_serious(self) -> int:
+        return sum(each.severity is not Severity.NOTE for each in self.check.findings)
+
+    @property
+    def _is_sound(self) -> bool:
+        """Whether there cannot be less to say against another result."""
+        return self._noise_fits and not self._n_serious
+
+    def _is_better_than(self, other: "Run", by: int) -> bool:
+        """Whether at least so many findings fewer speak against it, and its noise fits as well."""
+        is_worse_fit = other._noise_fits and not self._noise_fits
+        return self._n_serious <= other._n_serious - by and not is_worse_fit
+
+
+def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | None = None) -> Run:
+    """Calibrate.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The streams, and the options.
+    checks : bool, optional
+        False: neither stream checks nor cross-checks, and no second solve. True: cross-checks also
+        with a reference that the user set, which are left out otherwise.
+    progress : callable, optional
+
+    Raises
+    ------
+    NotEnoughDataError
+        If too few poses can be paired.
+    InputError
+        If both streams have the same sensor frame.
+    """
+    tell = progress or (lambda share, step: None)
+    tell(0.0, "time offset")
+    if checks is not False:
+        snapshot = _at_clear_offset(snapshot)
+    snapshot.resolved()
+    tell(0.2, "pairing")
+    snapshot.pose_pairs()
+    tell(0.3, "solving")
+    found = Run(snapshot.estimate(cross_check=checks), snapshot)
+    if checks is not False:
+        tell(0.8, "checking the streams")
+        found = review(found.calibration, snapshot)
+    tell(1.0, "done")
+    return found
+
+
+def review(
+    calibration: Calibration,
+    snapshot: Snapshot,
+    settled: Collection[str] = (),
+    *,
+    may_solve: bool = True,
+) -> Run:
+    """Check the streams of a result. If a check is certain of the time offset or of the scale, and
+    the user did not set it, solve once more with it, and keep that if there is less to say against
+    it.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    snapshot : Snapshot
+        The poses and options that gave it.
+    settled : collection of str
+        Options that an earlier check has set.
+    may_solve : bool
+        False: nothing is solved again.
+    """
+    first = _checked(calibration, snapshot)
+    if not may_solve:
+        return first
+    given = snapshot.config.given.union(settled)
+    certain = _certain(first.check.findings, given)
+    if "time_offset" not in given and snapshot.config.time_offset == "estimate":
+        return _of_clear_offset(first, certain)
+    options = _offset_of_model(calibration, snapshot, given) | certain
+    second = _solved_with(snapshot, options)
+    if second and (second._is_sound or second._is_better_than(first, by=int(bool(certain)))):
+        return _telling(second, options, first.check.findings)
+    return first
+
+
+def _of_clear_offset(first: Run, certain: Options) -> Run:
+    """The run whose time offset :func:`_at_clear_offset` had estimated, or a second one: without
+    that, or with what else is certain.
+    """
+    ahead = {"time_offset": "estimate"}
+    is_large = _is_large(first.calibration.time_offset_s, first.calibration)
+    if is_large and first._is_sound:
+        return _telling(first, ahead, ())
+    others = {name: value for name, value in certain.items() if name != "time_offset"}
+    if is_large and others:
+        second = _solved_with(first.snapshot, others)
+        if second and (second._is_sound or second._is_better_than(first, by=1)):
+            return _telling(second, ahead | others, first.check.findings)
+        return _telling(first, ahead, ())
+    without = _solved_with(first.snapshot, {"time_offset": CalibratorConfig.time_offset} | others)
+    if without is None:
+        return _telling(first, ahead, ())
+    given = first.snapshot.config.given
+    certain = _certain(without.check.findings, given)
+    asks = certain or _offset_of_model(without.calibration, without.snapshot, given)
+    if asks and first._is_better_than(without, by=int(bool(certain))):
+        return _telling(first, ahead, without.check.findings)
+    return _telling(without, others, first.check.findings)
+
+
+def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
+    """The snapshot with other options. Poses that were paired with another time offset are paired
+    anew, from the stamps of the pairs.
+    """
+    if not options:
+        return snapshot
+    config = replace(snapshot.config, **options)
+    if "time_offset" not in options:
+        return replace(snapshot, config=config)
+    if not len(snapshot.kept):
+        return replace(snapshot, config=config, time_offset=None)
+    parent, child = snapshot.streams
+    max_gap_s = max(config.max_gap, GAP_INTERVALS * parent.interval_s)
+    return replace(
+        snapshot,
+        config=replace(config, max_gap=max_gap_s),
+        kept=PosePairs.empty(),
+        buffered_parent=parent,
+        buffered_child=child,
+        paired_at=None,
+        time_offset=None,
+    )
+
+
+def _at_clear_offset(snapshot: Snapshot) -> Snapshot:
+    """The snapshot with an estimated time offset, if that is clear before any solve."""
+    config = snapshot.config
+    uses_reference = METHODS[config.method].uses_reference or config.reference != "auto"
+    if "time_offset" in config.given or config.measured != "poses" or uses_reference:
+        return snapshot
+    if not snapshot.correlation.is_clear:
+        return snapshot
+    clock = refine_time_offset(
+        snapshot.parent, snapshot.child, snapshot.correlation, config.max_gap, least_s=_MOST_MOVED_S
+    )
+    if not clock.is_agreed or abs(clock.seconds) - 0.5 * clock.spread_s < _MOST_MOVED_S:
+        return snapshot
+    moved = replace(snapshot, config=replace(config, time_offset="estimate"), time_offset=clock)
+    can_solve = all(len(each.pose_pairs()) >= config.min_pairs for each in (snapshot, moved))
+    return moved if can_solve else snapshot
+
+
+def _checked(calibration: Calibration, snapshot: Snapshot) -> Run:
+    found = check(snapshot, calibration)
+    return Run(replace(calibration, findings=found.findings), snapshot, found)
+
+
+def _solved_with(snapshot: Snapshot, options: Options) -> Run | None:
+    """What other options give; None without any, or if nothing can be solved with them."""
+    if not options:
+        return None
+    try:
+        other = with_options(snapshot, options)
+        return _checked(other.estimate(), other)
+    except HandEyeCalibError:
+        return None
+
+
+def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run:
+    """With warnings about options that were set because of findings, and what they gave."""
+    what = {name: each.what for each in findings for name in each.options}
+    offset_s = found.calibration.time_offset_s
+    what["time_offset"] = (
+        f"the child's clock is {abs(offset_s):.4f} +/- {found.calibration.time_offset_sigma_s:.4f} "
+        f"s {'behind' if offset_s > 0 else 'ahead of'} the parent's"
+    )
+    told = tuple(
+        f"{what[name]}: solved with {name} {value}; to take the stream as it is, give {name} "
+        f"{getattr(CalibratorConfig, name)}"
+        for name, value in options.items()
+    )
+    warnings = tuple(dict.fromkeys((*told, *found.calibration.warnings)))
+    calibration = replace(found.calibration, warnings=warnings)
+    return replace(found, calibration=calibration, options=dict(options), told=told)
+
+
+def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, float | str]:
+    """Options that mend a finding for certain and that the user did not set, by name.
+
+    A unit is set as it is. Anything else is estimated, so that its uncertainty counts. Lengths that
+    differ by a few per cent only give a warning: odometry whose scale drifts looks like that, too.
+    """
+    return {
+        name: value if finding.code == "units" else "estimate"
+        for finding in findings
+        if finding.confidence is Confidence.CERTAIN
+        for name, value in finding.options.items()
+        if name in _MENDED and name not in given and _is_grave(finding, name)
+    }
+
+
+def _is_grave(finding: Finding, option: str) -> bool:
+    least = (Severity.ERROR,) if option == "scale" else (Severity.ERROR, Severity.WARNING)
+    return finding.severity in least
+
+
+def _offset_of_model(
+    calibration: Calibration, snapshot: Snapshot, given: Collection[str]
+) -> dict[str, float | str]:
+    """The option that pairs the poses anew if the model found a large time offset by itself."""
+    moved_s = calibration.time_offset_s - fixed_time_offset(snapshot.resolved().config)
+    is_set = "time_offset" not in given and _is_large(moved_s, calibration)
+    return {"time_offset": "estimate"} if is_set else {}
+
+
+def _is_large(moved_s: float, calibration: Calibration) -> bool:
+    """Whether a model should not move poses by so much."""
+    most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else _MOST_MOVED_S
+    return abs(moved_s) >= most_s
