@@ -113,7 +113,8 @@ def _on_processes(
     ends before: one that waits to hand over a result which nobody takes would not see a signal that
     Python handles.
     """
-    if not tasks:
+    if jobs == 1 or not tasks:
+        yield from ((number, function(*task)) for number, task in enumerate(tasks))
         return
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")

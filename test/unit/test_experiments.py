@@ -270,7 +270,18 @@ def test_printed_gains_are_those_of_variants_other_than_b1():
 
 
 def test_command_draws_and_says_what_it_has_no_numbers_for(tmp_path, capsys):
-    arguments = ["fig3", "--data", "simulated", "--runs", "3", "--seed", "1", "--json"]
+    arguments = [
+        "fig3",
+        "--data",
+        "simulated",
+        "--runs",
+        "3",
+        "--seed",
+        "1",
+        "--jobs",
+        "1",
+        "--json",
+    ]
     assert main([*arguments, "--out", str(tmp_path)]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["experiment"], document["data"], document["runs"]) == ("fig3", "simulated", 3)

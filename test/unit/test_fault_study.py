@@ -72,6 +72,7 @@ def test_faults_that_were_built_last_change_the_streams(fault):
         assert not same or not np.array_equal(parent.poses, drive.parent.poses)
 
 
-def test_orientations_with_yaw_only_end_in_a_verdict():
+def test_orientations_with_yaw_only_end_in_a_verdict(monkeypatch):
+    monkeypatch.setattr(faults, "_MAX_PAIRS", 100)
     case = faults.Case(fault="U1", severity=2, recording="hilly_1", method="auto")
     assert faults.outcome(case, None).verdict == "DO NOT USE"
