@@ -25,8 +25,12 @@ _TAILS = 12.0
 # are normal) under heavy tails of so many degrees of freedom, which few outliers do not widen.
 _OUTLIER, _OUTLIER_TAILS = 36.0, 3.0
 
-# Rounds of weights, levels and a Gauss-Newton step; steps below this (m, rad) end them.
-_ROUNDS, _SMALL_STEP = 60, 1e-7
+# Rounds of weights, levels and a Gauss-Newton step; steps below this many standard deviations end
+# them.
+_ROUNDS, _SMALL_STEP = 60, 1e-4
+
+# Rounds of the fit that finds the outliers.
+_ROUGH_ROUNDS = 8
 
 # Starts from so many stops each: two in three are clean with a tenth of outliers.
 _STARTS, _START_STOPS = 12, 5
@@ -174,9 +178,11 @@ def _likelihood(fit: RobotWorld) -> float:
 
 def _in_one_frame(stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str) -> RobotWorld:
     """Fit without outliers."""
-    rough = _fit(stops, Xs, Zs, where, _OUTLIER_TAILS)
+    rough = _fit(stops, Xs, Zs, where, _OUTLIER_TAILS, _ROUGH_ROUNDS)
     kept = rough.weights > 0.0
-    fit = _fit(stops.take(kept), rough.Ts_parent_child, rough.Ts_world_world, where, _TAILS)
+    fit = _fit(
+        stops.take(kept), rough.Ts_parent_child, rough.Ts_world_world, where, _TAILS, _ROUNDS
+    )
     weights = np.zeros(len(stops))
     weights[kept] = fit.weights
     return replace(fit, weights=weights)
@@ -310,13 +316,15 @@ def _lasting(gradients: FloatArray, columns: IntArray, information: FloatArray) 
     return max(1.0, spread / (len(information) * (1.0 - 1.0 / n_parts)))
 
 
-def _fit(stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str, tails: float) -> RobotWorld:
+def _fit(
+    stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str, tails: float, rounds: int
+) -> RobotWorld:
     """Weights, levels and Gauss-Newton steps in turn."""
     n, n_values = len(stops), 6 * (len(Xs) + len(Zs))
     # Values that the errors are fitted with make them smaller.
     n_free = max(3.0 * n - 0.5 * n_values, 0.5)
     weights, converged = np.ones(n), False
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         linear = _linearise(stops, Xs, Zs, where)
         squared = np.sum(linear.errors.reshape(n, 2, 3) ** 2, axis=2)
         variances = np.maximum(weights @ squared / n_free, _SMALLEST_VARIANCE)
@@ -324,9 +332,10 @@ def _fit(stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str, tails: float)
         weights = (tails + 6.0) / (tails + distance)
         information, gradients = _normal(linear, n_values, variances, weights)
         gradient = _added(gradients, linear.columns, n_values)
-        step = -np.linalg.lstsq(information, gradient, rcond=1e-13)[0].reshape(-1, 6)
-        Xs, Zs = Xs @ se3.exp(step[: len(Xs)]), Zs @ se3.exp(step[len(Xs) :])
-        converged = bool(np.abs(step).max() < _SMALL_STEP)
+        step = -np.linalg.lstsq(information, gradient, rcond=1e-13)[0]
+        steps = step.reshape(-1, 6)
+        Xs, Zs = Xs @ se3.exp(steps[: len(Xs)]), Zs @ se3.exp(steps[len(Xs) :])
+        converged = bool(-step @ gradient < _SMALL_STEP**2)
         if converged:
             break
     # Of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust statistical
