@@ -7,7 +7,6 @@ each run.
 
 import argparse
 import hashlib
-import json
 import random
 import re
 import time
@@ -23,6 +22,7 @@ from scipy.spatial.transform import Rotation
 import hand_eye_calib as hec
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.stops import read_arm_samples
 from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
 
 # Pairs of the arm's poses: hand and camera within this (s).
@@ -126,11 +126,8 @@ def ethz(folder: Path) -> Iterator[Row]:
 def camodocal(folder: Path) -> Iterator[Row]:
     """The example of handeye_calib_camodocal: motions between neighbours."""
     path = folder / "independent" / "camodocal_example" / "TransformPairsInput.yml"
-    found = re.findall(r"T(\d)_\d+:.*?data: \[(.*?)\]", path.read_text(), re.DOTALL)
-    stacks: dict[str, list[FloatArray]] = {"1": [], "2": []}
-    for which, data in found:
-        stacks[which].append(np.array([float(x) for x in data.split(",")]).reshape(4, 4))
-    A, B = np.stack(stacks["1"]), np.stack(stacks["2"])
+    samples = read_arm_samples(path)
+    A, B = samples.robot, samples.tracking
     X = solve(Stops.of_one(A, B)).Ts_parent_child[0]
     motions = [se3.inverse(Ts[:-1]) @ Ts[1:] for Ts in (A, B)]
     angle_deg, apart_mm = closure(motions[0], X, X, motions[1])
@@ -142,8 +139,8 @@ def camodocal(folder: Path) -> Iterator[Row]:
 def moveit(folder: Path) -> Iterator[Row]:
     """The samples of MoveIt's tests, eye to hand: the camera in the robot's base."""
     path = folder / "independent" / "moveit_samples" / "pose_samples.json"
-    samples = np.array(json.loads(path.read_text()))
-    T_base_camera = solve(Stops.of_one(samples[:, 0], samples[:, 1])).Ts_world_world[0]
+    samples = read_arm_samples(path)
+    T_base_camera = solve(Stops.of_one(samples.robot, samples.tracking)).Ts_world_world[0]
     turned = (
         Rotation.from_euler("XYZ", [0.230, -2.540, 1.950]).as_matrix().T @ T_base_camera[:3, :3]
     )
