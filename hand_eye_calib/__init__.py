@@ -24,11 +24,14 @@ _HOMES = {
     "Trajectory": "geometry.trajectory",
     "Verdict": "results.verdict",
     "calibrate": "engine.offline",
+    "calibrate_arm": "engine.stops",
     "calibrate_rig": "rig.calibrate",
+    "calibrate_stops": "engine.stops",
     "compare": "session.compare",
     "cross_check": "engine.offline",
     "load": "io.results",
     "plot": "report.plot",
+    "read_arm_samples": "io.stops",
     "read_trajectory": "io.trajectory_files.reading",
     "save": "io.results",
     "write_trajectory": "io.trajectory_files.writing",
@@ -48,11 +51,14 @@ __all__ = [
     "Trajectory",
     "Verdict",
     "calibrate",
+    "calibrate_arm",
     "calibrate_rig",
+    "calibrate_stops",
     "compare",
     "cross_check",
     "load",
     "plot",
+    "read_arm_samples",
     "read_trajectory",
     "save",
     "write_trajectory",
@@ -63,10 +69,12 @@ if TYPE_CHECKING:
     from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.engine.calibrator import Calibrator
     from hand_eye_calib.engine.offline import calibrate, cross_check
+    from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
     from hand_eye_calib.errors import HandEyeCalibError
     from hand_eye_calib.geometry.trajectory import Trajectory
     from hand_eye_calib.io.results import load_result as load
     from hand_eye_calib.io.results import save_result as save
+    from hand_eye_calib.io.stops import read_arm_samples
     from hand_eye_calib.io.trajectory_files.reading import read_trajectory
     from hand_eye_calib.io.trajectory_files.writing import write_trajectory
     from hand_eye_calib.report.plot import plot

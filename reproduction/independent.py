@@ -105,11 +105,11 @@ def ethz(folder: Path) -> Iterator[Row]:
         held, fitted = ([pairs[k] for k in sorted(part)] for part in (order[:16], order[16:48]))
         name = hashlib.sha256("\n".join(pair[0] for pair in fitted).encode()).hexdigest()
         same += name.startswith(start)
-        A, B = (Ts[[pair[column] for pair in fitted]] for Ts, column in ((hand, 1), (eye, 2)))
+        A, B = hand[[i for _, i, _ in fitted]], eye[[row for _, _, row in fitted]]
         started = time.process_time()
         fit = solve(Stops.of_one(A, B))
         seconds.append(time.process_time() - started)
-        A, B = (Ts[[pair[column] for pair in held]] for Ts, column in ((hand, 1), (eye, 2)))
+        A, B = hand[[i for _, i, _ in held]], eye[[row for _, _, row in held]]
         X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
         motions.append(closure_of_motions(X, A, B))
         poses.append(closure(A, X, Z, B))
@@ -283,7 +283,7 @@ def main() -> None:
     parser.add_argument("--page", type=Path)
     parser.add_argument("--segments", type=int, default=20, help="of Shrimp, for each length")
     arguments = parser.parse_args()
-    rows = []
+    rows: list[Row] = []
     for study in (ethz, camodocal, moveit, wise, ntu_viral):
         rows += study(arguments.data_folder)
     rows += shrimp(arguments.data_folder, arguments.segments)

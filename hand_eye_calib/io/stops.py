@@ -39,6 +39,9 @@ _FRAMES = {
     "target": "tracking_marker_frame",
 }
 
+# With this type of easy_handeye2 ``robot`` is the pose of the base in the hand.
+_BESIDE = "eye_on_base"
+
 # A matrix whose rotation is further than this from one is none.
 _ROTATION_WITHIN = 1e-2
 
@@ -50,12 +53,12 @@ _EXPECTED = (
 
 @dataclass(frozen=True)
 class ArmSamples:
-    """Samples as a file has them, whichever way the transforms go.
+    """Samples of an arm.
 
     Attributes
     ----------
     robot, tracking : (N, 4, 4) arrays
-        Between the robot's base and its hand, and between camera and target.
+        Of the hand in the robot's base, and of the target in the camera.
     frames : mapping of str to str
         Names of base, hand, camera and target, as far as the file has them.
     """
@@ -80,22 +83,24 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     # OpenCV's header and tag are not of YAML.
     document = parse_yaml(re.sub(r"^%YAML:.*|!!opencv-matrix", "", text), str(path))
     frames: dict[str, str] = {}
+    is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
         of_file = document.get("parameters") or {}
         frames = {name: of_file[key] for name, key in _FRAMES.items() if of_file.get(key)}
-        document = document["samples"]
+        document, is_inverse = document["samples"], of_file.get("calibration_type") == _BESIDE
     elif isinstance(document, Mapping):
         document = _pairs_of_opencv(document)
     if not isinstance(document, list) or not document:
         raise InputError(f"{path}: expected {_EXPECTED}")
     pairs = [_pair(sample, f"{path}, sample {number}") for number, sample in enumerate(document, 1)]
     robot, tracking = (np.stack(column) for column in zip(*pairs, strict=True))
+    robot = se3.inverse(robot) if is_inverse else robot
     return ArmSamples(robot, tracking, frames)
 
 
 def _pairs_of_opencv(document: Mapping[str, Any]) -> list[Any]:
     """The matrices T1_k and T2_k; empty if there are none."""
-    pairs = []
+    pairs: list[list[Any]] = []
     while f"T1_{len(pairs)}" in document and f"T2_{len(pairs)}" in document:
         pairs.append([document[f"{side}_{len(pairs)}"] for side in ("T1", "T2")])
     return pairs

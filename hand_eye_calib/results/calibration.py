@@ -53,7 +53,15 @@ _FORMAT = "hand_eye_calib/extrinsic"
 _VERSION = 1
 
 # Fields that a document has under other names, as matrices; and those that files do not have.
-_MATRICES = ("T_parent_child", "T_method", "covariance", "floor", "T_base_parent")
+_MATRICES = (
+    "T_parent_child",
+    "T_method",
+    "covariance",
+    "floor",
+    "T_base_parent",
+    "T_world_world",
+    "cov_world_world",
+)
 _NOT_IN_FILES = ("motion_residuals", "other_answer", "model")
 
 # An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
@@ -249,6 +257,19 @@ class Calibration(Result):
                 "of": "T_parent_child as the method solved it: nothing set, no prior added",
                 "matrix": self.T_method,
             }
+        if self.T_world_world is not None and self.cov_world_world is not None:
+            document["T_world_world"] = {
+                "of": f"pose of {self.child_world_frame} in {self.parent_world_frame}",
+                "translation": self.T_world_world[:3, 3],
+                "quat_xyzw": se3.to_quat_xyzw(self.T_world_world),
+                "matrix": self.T_world_world,
+            }
+            document["cov_world_world"] = {
+                "of": "error xi in T_world_world @ exp(xi)",
+                "frame": self.child_world_frame,
+                "units": "m, rad",
+                "matrix": self.cov_world_world,
+            }
         if self.floor is not None:
             document["floor"] = {
                 "of": "errors of a whole recording, the same in every part; not in the covariance",
@@ -355,6 +376,9 @@ def _values(of: type[Calibration], data: Mapping[str, Any]) -> dict[str, Any]:
     }
     if "T_method" in data:
         values["T_method"] = transform_of(data["T_method"])
+    if "T_world_world" in data:
+        values["T_world_world"] = transform_of(data["T_world_world"])
+        values["cov_world_world"] = covariance_of(data["cov_world_world"])
     if "floor" in data:
         values["floor"] = covariance_of(data["floor"], is_known=True)
     if "T_base_child" in data:

@@ -61,6 +61,9 @@ class Result:
         Factor applied to the child's translations, in the same way.
     rate_bias : RateBias or None
         None if neither stream is one of rates.
+    T_world_world, cov_world_world : (4, 4), (6, 6) arrays or None
+        Of poses that are stops: pose of the child's world in the parent's (Z of A X = Z B), and
+        its covariance in the child's world.
 
     Uncertainty
 
@@ -111,6 +114,8 @@ class Result:
     Context
 
     parent_frame, child_frame : str
+    parent_world_frame, child_world_frame : str
+        Of poses that are stops.
     base_frame : str
         Frame of the robot in which the child's pose is stated as well; empty for none.
     T_base_parent : (4, 4) array or None
@@ -140,6 +145,8 @@ class Result:
     scale: float = 1.0
     scale_sigma: float = 0.0
     rate_bias: RateBias | None = None
+    T_world_world: FloatArray | None = None
+    cov_world_world: FloatArray | None = None
 
     covariance: FloatArray
     observability: tuple[DofObservability, ...]
@@ -166,6 +173,8 @@ class Result:
 
     parent_frame: str = "parent"
     child_frame: str = "child"
+    parent_world_frame: str = ""
+    child_world_frame: str = ""
     base_frame: str = ""
     T_base_parent: FloatArray | None = None
     target_translation: float = CalibratorConfig.target_translation

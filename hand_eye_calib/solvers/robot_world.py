@@ -132,7 +132,7 @@ class RobotWorld:
         levels = np.repeat([self.level_m, self.level_rad], 3)
         # In units of the errors of a stop: the squared rotations between stops (rad^2).
         information = np.linalg.inv(self.covariance[part, part]) * np.outer(levels, levels)
-        powers, directions = np.linalg.eigh(information / max(np.sum(self.weights > 0.0), 1))
+        powers, directions = np.linalg.eigh(information / max(int(np.sum(self.weights > 0.0)), 1))
         return directions[:, powers < _UNDETERMINED * self.level_rad**2]
 
 
@@ -304,7 +304,7 @@ def _normal(
 
 def _added(gradients: FloatArray, columns: IntArray, n_values: int) -> FloatArray:
     """Sum (n_values,) of the gradients of stops."""
-    return np.bincount(columns.ravel(), gradients.ravel(), n_values)
+    return np.asarray(np.bincount(columns.ravel(), gradients.ravel(), n_values), dtype=float)
 
 
 def _lasting(gradients: FloatArray, columns: IntArray, information: FloatArray) -> float:
@@ -352,7 +352,7 @@ def _fit(
         Xs,
         Zs,
         covariance * _lasting(gradients, linear.columns, information),
-        np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0),
+        np.asarray(np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0), dtype=float),
         level_m,
         level_rad,
         where,

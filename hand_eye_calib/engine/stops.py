@@ -1,0 +1,167 @@
+"""From stops of an arm to a calibration: ``A X = Z B`` solved, judged, and named by its frames."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.covariance import combined
+from hand_eye_calib.assessment.prior import fuse
+from hand_eye_calib.checks.findings import finding
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import Calibration, Finding, Residuals
+from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
+
+# Poses of one sensor are taken for inverse if so the errors are smaller by this factor.
+_CLEARLY = 3.0
+
+
+@dataclass(frozen=True)
+class StopFrames:
+    """Names of the frames: X is of ``child`` in ``parent``, Z of ``child_world`` in
+    ``parent_world``.
+    """
+
+    parent: str = "parent"
+    child: str = "child"
+    parent_world: str = "parent_world"
+    child_world: str = "child_world"
+
+
+_UNNAMED = StopFrames()
+
+
+def calibrate_stops(
+    Ts_world_parent: FloatArray,
+    Ts_world_child: FloatArray,
+    config: CalibratorConfig | None = None,
+    frames: StopFrames = _UNNAMED,
+) -> Calibration:
+    """Solve and assess stops, which are poses without an order.
+
+    Parameters
+    ----------
+    Ts_world_parent, Ts_world_child : (N, 4, 4) arrays
+        Poses of both sensors, each in its own world: of a hand in the base of a robot, and of the
+        camera in the hand in the frame of a target.
+    config : CalibratorConfig, optional
+        Its priors and targets count.
+    frames : StopFrames, optional
+
+    Returns
+    -------
+    Calibration
+        With ``T_world_world``: where the child's world is in the parent's.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If there are fewer than three stops.
+    """
+    config = config or CalibratorConfig()
+    fit = solve(Stops.of_one(Ts_world_parent, Ts_world_child))
+    mirrored = solve(Stops.of_one(Ts_world_parent, se3.inverse(Ts_world_child)))
+    findings = [finding("inverse", "child")] if _is_clearly_better(mirrored, fit) else []
+    return _assessed(fit, Ts_world_parent, Ts_world_child, config, frames, findings)
+
+
+def calibrate_arm(
+    robot: FloatArray,
+    tracking: FloatArray,
+    config: CalibratorConfig | None = None,
+    names: dict[str, str] | None = None,
+) -> Calibration:
+    """Calibrate a camera on a robot's hand, or beside the robot with the target on the hand.
+
+    Which of them it is, is seen from the samples: only one of them leaves small errors.
+
+    Parameters
+    ----------
+    robot, tracking : (N, 4, 4) arrays
+        Transforms between base and hand, and between camera and target. For a camera in the hand
+        ``robot`` is the pose of the hand in the base (or the inverse for a camera beside it), and
+        ``tracking`` the pose of the target in the camera, as MoveIt and easy_handeye2 have them.
+    config : CalibratorConfig, optional
+    names : mapping of str to str, optional
+        Names of the frames base, hand, camera, target.
+
+    Returns
+    -------
+    Calibration
+        The camera in the hand, and the target in the base; or the camera in the base, and the
+        target in the hand.
+    """
+    named = {name: name for name in ("base", "hand", "camera", "target")} | (names or {})
+    in_hand = solve(Stops.of_one(robot, se3.inverse(tracking)))
+    beside = solve(Stops.of_one(se3.inverse(robot), se3.inverse(tracking)))
+    if beside.log_likelihood > in_hand.log_likelihood:
+        frames = StopFrames(named["base"], named["camera"], named["hand"], named["target"])
+        fit, poses = beside, se3.inverse(robot)
+    else:
+        frames = StopFrames(named["hand"], named["camera"], named["base"], named["target"])
+        fit, poses = in_hand, robot
+    config = config or CalibratorConfig()
+    return _assessed(fit, poses, se3.inverse(tracking), config, frames, [])
+
+
+def _is_clearly_better(one: RobotWorld, other: RobotWorld) -> bool:
+    return (
+        _CLEARLY * one.level_m < other.level_m
+        and _CLEARLY * one.level_rad < other.level_rad
+        and one.converged
+    )
+
+
+def _assessed(
+    fit: RobotWorld,
+    Ts_world_parent: FloatArray,
+    Ts_world_child: FloatArray,
+    config: CalibratorConfig,
+    frames: StopFrames,
+    findings: list[Finding],
+) -> Calibration:
+    X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
+    fused = fuse(X, combined(X, fit.covariance[:6, :6], None, fit.undetermined()), config.prior())
+    residuals = _residuals(fit, Ts_world_parent, Ts_world_child)
+    return Calibration(
+        T_parent_child=fused.T_parent_child,
+        covariance=fused.assessment.cov_parent_child_in_child,
+        status=fused.status(fit.converged),
+        observability=fused.assessment.observability,
+        T_method=X,
+        objective=-fit.log_likelihood,
+        method="adaptive",
+        reference="stops",
+        backend="fast",
+        n_poses=len(residuals),
+        n_pairs=len(residuals),
+        n_inliers=int(residuals.is_inlier.sum()),
+        findings=tuple(findings),
+        contradictions=fused.contradictions,
+        **config.target_fields(),
+        parent_frame=frames.parent,
+        child_frame=frames.child,
+        T_world_world=Z,
+        cov_world_world=fit.covariance[6:, 6:],
+        parent_world_frame=frames.parent_world,
+        child_world_frame=frames.child_world,
+        warnings=tuple(fused.warnings),
+        motion_residuals=residuals,
+    )
+
+
+def _residuals(
+    fit: RobotWorld, Ts_world_parent: FloatArray, Ts_world_child: FloatArray
+) -> Residuals:
+    """Errors of each stop, child's axes."""
+    X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
+    errors = se3.log(se3.inverse(Z @ Ts_world_child) @ Ts_world_parent @ X)
+    rows = np.arange(len(errors))
+    return Residuals(
+        translation=errors[:, :3] @ X[:3, :3].T,
+        rotation=errors[:, 3:],
+        weights=fit.weights,
+        start_ns=rows,
+        end_ns=rows,
+    )
