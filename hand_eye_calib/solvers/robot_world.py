@@ -347,6 +347,7 @@ def _fit(
     log_likelihood = (
         -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * np.log1p(distance / tails).sum()
     )
+    lasting = _lasting(gradients, linear.columns, information)
     level_m, level_rad = (float(level) for level in np.sqrt(variances))
     return RobotWorld(
         Xs,
