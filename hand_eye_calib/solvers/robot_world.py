@@ -352,7 +352,7 @@ def _fit(
     return RobotWorld(
         Xs,
         Zs,
-        covariance * _lasting(gradients, linear.columns, information),
+        np.asarray(covariance * lasting, dtype=float),
         np.asarray(np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0), dtype=float),
         level_m,
         level_rad,
