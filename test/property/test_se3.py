@@ -165,21 +165,6 @@ def test_rotation_log_agrees_with_scipy_up_to_exact_half_turns(direction, angle)
         assert found @ expected >= 0.0
 
 
-def test_rotation_log_of_a_stack_is_that_of_each():
-    rotations = se3.rotation_exp(np.random.default_rng(0).normal(size=(4, 5, 3)) * 2)
-    one_by_one = [[se3.rotation_log(rotation) for rotation in row] for row in rotations]
-    np.testing.assert_array_equal(se3.rotation_log(rotations), one_by_one)
-    assert se3.rotation_log(np.empty((0, 3, 3))).shape == (0, 3)
-
-
-def test_cross_products_are_numpys():
-    left, right = np.random.default_rng(2).normal(size=(2, 4, 5, 3))
-    np.testing.assert_allclose(se3.cross(left, right), np.cross(left, right), rtol=0, atol=1e-15)
-    np.testing.assert_allclose(
-        se3.cross(left[0, 0], right[0, 0]), np.cross(left[0, 0], right[0, 0]), rtol=0, atol=1e-15
-    )
-
-
 @given(DIRECTIONS, st.floats(1e-6, np.pi - 1e-6), st.sampled_from([-3.0, -1.0, 0.5]))
 def test_quat_log_takes_any_length_and_sign(direction, angle, factor):
     quat = unit_quat(direction, angle)

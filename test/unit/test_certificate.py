@@ -11,7 +11,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers import quadratic_form
-from hand_eye_calib.solvers.certificate import certify, prove
+from hand_eye_calib.solvers.certificate import certify
 from hand_eye_calib.solvers.registry import Method
 
 HALF_TURNS = np.array([np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
@@ -52,16 +52,6 @@ def test_the_minimum_is_proved_and_a_false_one_is_not(method, seed, sigma):
         assert refused.gap >= above * (1 - 1e-6)
 
 
-def test_a_point_beside_the_minimum_is_not_proved():
-    pairs = noisy_pairs(1)
-    solution = Method("dnl").solve(pairs)
-    Q = form_of(pairs, solution)
-    beside = solution.T_parent_child @ se3.exp([1e-3, 0, 0, 0, 0, 1e-3])
-    assert not certify(Q, beside).is_global
-    above = float(quadratic_form.decrease(Q, beside, solution.T_parent_child))
-    assert certify(Q, beside).gap >= above * (1 - 1e-9)
-
-
 @pytest.mark.parametrize("method", ["dnl", "dnlo"])
 def test_the_search_goes_on_from_a_false_minimum(method):
     pairs = noisy_pairs(3)
@@ -74,14 +64,6 @@ def test_the_search_goes_on_from_a_false_minimum(method):
     found = method.prove(pairs, stuck)
     assert found.is_proved_global
     np.testing.assert_allclose(found.T_parent_child, solution.T_parent_child, atol=1e-6)
-
-
-def test_without_a_better_answer_it_is_said_that_there_is_no_proof():
-    pairs = noisy_pairs(3)
-    solution = Method("dnl").solve(pairs)
-    beside = solution.T_parent_child @ se3.exp([0.01, 0, 0, 0, 0, 0])
-    unproved = type(solution)(beside, solution.objective, True, 1, solution.weights)
-    assert prove(pairs, unproved, lambda T: solution).is_proved_global is False
 
 
 @pytest.mark.parametrize("name", sorted(published_data.FALSE_MINIMA_OF_DNL))

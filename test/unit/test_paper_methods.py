@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import approx_fprime, check_grad, minimize
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.assessment.metrics import absolute_errors, errors, relative_errors
+from hand_eye_calib.assessment.metrics import absolute_errors, relative_errors
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
@@ -76,10 +76,6 @@ def test_relative_errors_are_means_over_the_pairs(noisy):
     np.testing.assert_allclose(relative_errors(noisy, TRUTH), each.mean(axis=0), rtol=1e-13)
 
 
-def test_relative_errors_vanish_for_the_truth_without_noise():
-    np.testing.assert_allclose(relative_errors(random_pairs(), TRUTH), 0.0, atol=1e-14)
-
-
 @pytest.mark.parametrize("angle", [1e-12, 1e-7, 1e-3, 1.0, np.pi - 1e-7, np.pi])
 def test_absolute_errors_keep_their_digits_at_any_angle(angle):
     turned = TRUTH @ se3.exp(np.array([0.0, 0.0, 0.0, *(angle * np.array([0.6, 0.0, 0.8]))]))
@@ -87,12 +83,6 @@ def test_absolute_errors_keep_their_digits_at_any_angle(angle):
     e_at, e_aR = absolute_errors(turned, TRUTH)
     assert e_at == pytest.approx(5e-9, rel=1e-6)
     assert e_aR == pytest.approx(angle, abs=1e-15, rel=1e-9)
-
-
-def test_errors_are_all_four(noisy):
-    found = errors(noisy, np.eye(4), TRUTH)
-    assert (found.e_rt, found.e_rR) == relative_errors(noisy, np.eye(4))
-    assert (found.e_at, found.e_aR) == absolute_errors(np.eye(4), TRUTH)
 
 
 # Park and Taylor
@@ -106,14 +96,6 @@ def test_park_aligns_the_rotation_vectors(noisy):
     np.testing.assert_allclose(
         park.solve(noisy).T_parent_child[:3, :3], expected.as_matrix(), atol=1e-12
     )
-
-
-def test_park_translation_is_the_best_for_its_rotation(noisy):
-    solution = park.solve(noisy)
-    rotation, translation = split(solution.T_parent_child)
-    cost = lambda t: squared_translation_residual(noisy, rotation, t)  # noqa: E731
-    assert solution.objective == pytest.approx(cost(translation), rel=1e-12)
-    np.testing.assert_allclose(minimize(cost, np.zeros(3), tol=1e-12).x, translation, atol=1e-6)
 
 
 def test_rotation_is_never_a_reflection():
@@ -158,16 +140,6 @@ def zhuang_parameters(T):
     rotvec = se3.rotation_log(T[:3, :3])
     angle = np.linalg.norm(rotvec)
     return np.concatenate([np.tan(angle / 2) * rotvec / angle, T[:3, 3]])
-
-
-def test_zhuang_is_at_a_minimum_of_its_cost(noisy):
-    solution = zhuang.solve(noisy)
-    parameters = zhuang_parameters(solution.T_parent_child)
-    assert solution.converged
-    assert solution.iterations < 20
-    assert solution.objective == pytest.approx(zhuang_cost(parameters, noisy), rel=1e-10)
-    better = minimize(zhuang_cost, parameters, args=(noisy,), tol=1e-12)
-    assert solution.objective == pytest.approx(better.fun, rel=1e-8)
 
 
 def test_zhuang_takes_z_for_the_axis_of_no_rotation():

@@ -51,15 +51,6 @@ class TestOption:
         for axis, pair in prior.items():
             assert parsed[axis] == pytest.approx(pair)
 
-    def test_a_single_axis_goes_before_the_transform(self):
-        config = CalibratorConfig.from_options(
-            {"prior.transform": "1 2 3 0 0 90deg+/-0.1 5deg", "prior.z": "1.85+/-0.02"}
-        )
-        prior = config.prior()
-        assert prior["z"] == (1.85, 0.02)
-        assert prior["x"] == (1.0, 0.1)
-        assert prior["yaw"] == pytest.approx((np.pi / 2, np.radians(5)))
-
     @pytest.mark.parametrize(
         ("name", "text", "message"),
         [
@@ -168,18 +159,6 @@ class TestFullMotion:
         np.testing.assert_array_equal(result.T_parent_child, plain.T_parent_child)
         np.testing.assert_array_equal(result.covariance, plain.covariance)
 
-    def test_the_other_priors_are_still_used(self):
-        prior = {"x": (100.0, 1e-9), "y": (-0.3, 1e-4)}
-        result = calibrate(*self.drive(), reference="B10", prior=prior)
-        assert result.status is SolveStatus.CONTRADICTED
-        np.testing.assert_allclose(result.T_parent_child[:3, 3], MOUNT[:3, 3], atol=0.01)
-        assert result.observability[1].verdict is DofVerdict.PRIOR
-
-    def test_a_prior_that_agrees_is_no_contradiction(self):
-        result = calibrate(*self.drive(), reference="B10", prior={"x": (0.6, 0.05)})
-        assert result.status is SolveStatus.OK
-        assert result.contradictions == {}
-
     @pytest.mark.parametrize("sigma", [1e-9, 1e-15])
     def test_tiny_standard_deviations_are_no_trouble(self, sigma):
         for streams in (self.drive(), flat_drive()):
@@ -215,15 +194,6 @@ def test_the_command_refuses_a_contradiction(tmp_path, capsys):
         "extrinsic.yaml",
         "report.html",
     ]
-
-
-def test_precisions_add_up():
-    covariance = np.diag([0.04, 0.01, 0.09, 1e-4, 1e-4, 1e-4])
-    dofs = tuple(DofObservability(name, DofVerdict.OBSERVED, 0.1) for name in AXES)
-    fused = fuse(np.eye(4), Assessment(covariance, dofs), {"x": (0.1, 0.2)})
-    assert fused.T_parent_child[0, 3] == pytest.approx(0.05)
-    assert fused.assessment.cov_parent_child_in_child[0, 0] == pytest.approx(0.02)
-    assert fused.assessment.cov_parent_child_in_child[1, 1] == pytest.approx(0.01)
 
 
 def test_what_nobody_knows_keeps_its_variance():

@@ -23,12 +23,6 @@ def test_condensed_costs_are_the_matrix_costs(pairs):
         )
 
 
-def test_blocks_do_not_change_the_forms(pairs, monkeypatch):
-    whole = quadratic_form.condense(pairs)
-    monkeypatch.setattr(quadratic_form, "_BLOCK", 7)
-    assert np.array_equal(quadratic_form.condense(pairs), whole)
-
-
 def test_the_minimum_is_where_no_small_step_goes_down(pairs):
     Q = quadratic_form.expand(quadratic_form.condense(pairs).sum(axis=0))
     minimum = quadratic_form.minimise(Q, dnl.start_rotations(pairs))

@@ -96,8 +96,3 @@ def test_a_scale_that_explains_nothing_is_refused():
     with pytest.raises(NotEnoughDataError, match="scale cannot be estimated: even with a scale"):
         calibrate(parent, other, reference="B10", scale="estimate")
     assert calibrate(parent, other, reference="B10", scale="auto").scale == 1.0
-
-
-def test_too_short_for_a_scale():
-    with pytest.raises(NotEnoughDataError, match="record longer, or give scale"):
-        calibrate(*streams(n_poses=15), reference="B1", scale="estimate")
