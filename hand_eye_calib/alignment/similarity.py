@@ -33,7 +33,6 @@ _MAX_STEPS, _STEP_TOLERANCE = 30, 1e-6
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING = 3.0
-_INLIER_WEIGHT = 0.25
 
 # Blocks of the jackknife.
 _BLOCKS = 10
@@ -79,8 +78,6 @@ class SimilarityFit:
         compare the residuals with. The translations are the parent's or the child's times s,
         whichever are smaller: a scale near zero explains nothing, however small the residuals. If
         the scale is kept at 1, whichever are larger.
-    inliers : (K,) bool array
-        Pairs that agree with the fit.
     """
 
     T_parent_child: FloatArray
@@ -92,14 +89,20 @@ class SimilarityFit:
     sigma_rotation: float
     rms_translation: float
     rms_rotation: float
-    inliers: BoolArray
 
     @property
     def unexplained(self) -> float:
         """Unexplained share of the motion, of translation and rotation together."""
-        return _share(
-            self.sigma_translation, self.rms_translation, self.sigma_rotation, self.rms_rotation
-        )
+        of_rotation = self.sigma_rotation / max(self.rms_rotation, 1e-12)
+        return float(np.hypot(self.unexplained_translation, of_rotation))
+
+    @property
+    def log_volume(self) -> float:
+        """Logarithm of the volume that the residuals spread over, in the smaller unit of length:
+        small for a good fit.
+        """
+        sigma_t = self.sigma_translation / min(self.scale, 1.0)
+        return float(np.log(sigma_t) + np.log(self.sigma_rotation))
 
     @property
     def unexplained_translation(self) -> float:
@@ -152,12 +155,12 @@ def fit_similarity(
     starts = [(start.T_parent_child, start.scale)] if start else _starts(pairs)
     if same_unit:
         starts = [(T, 1.0) for T, _ in starts]
-    states = []
+    fits: list[SimilarityFit] = []
     for T, scale in starts:
-        states.append(problem.refine(T, scale))
-        if problem.unexplained(states[-1]) < EXPLAINED:
+        fits.append(problem.describe(problem.refine(T, scale)))
+        if fits[-1].unexplained < EXPLAINED:
             break
-    return problem.describe(min(states, key=problem.log_volume))
+    return min(fits, key=lambda fit: fit.log_volume)
 
 
 def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
@@ -174,10 +177,11 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     candidates = _candidates(ranked)
     coefficients = quadratic_form.coefficients(ranked)
     # In the smaller unit of length: otherwise a scale of zero would cost least.
-    costs = [
-        median(quadratic_form.costs(coefficients * _child_lengths(scale), T)) / min(scale, 1.0) ** 2
-        for T, scale in candidates
-    ]
+    costs, of_child = [], coefficients.reshape(-1, 2, 3, 4)[:, 1, :, 3]
+    child_lengths = of_child.copy()
+    for T, scale in candidates:
+        of_child[:] = child_lengths * scale
+        costs.append(median(quadratic_form.costs(coefficients, T)) / min(scale, 1.0) ** 2)
     return [
         (
             se3.from_rotation_translation(T[:3, :3], T[:3, 3] * parent_unit),
@@ -211,13 +215,6 @@ def _in_units(pairs: MotionPairs, parent_unit: float, child_unit: float) -> Moti
     parent[:, :3, 3] /= parent_unit
     child[:, :3, 3] /= child_unit
     return dataclasses.replace(pairs, Ts_parenti_parentj=parent, Ts_childi_childj=child)
-
-
-def _child_lengths(factor: float) -> FloatArray:
-    """Factors (24,) of the coefficients that multiply the child's lengths by ``factor``."""
-    factors = np.ones((2, 3, 4))
-    factors[1, :, 3] = factor
-    return factors.ravel()
 
 
 def _relaxed_rotations(forms: FloatArray) -> FloatArray:
@@ -320,27 +317,6 @@ class _Problem:
         of_translation[:, :, -1], of_rotation[:, :, -1] = self.residuals(state)
         return of_translation, of_rotation
 
-    def sigmas(self, translations: FloatArray, rotations: FloatArray) -> tuple[float, float]:
-        """Robust standard deviations per axis, m and rad, of residuals of these lengths (K,)."""
-        sigma_t = median(translations) / MEDIAN_LENGTH
-        sigma_r = median(rotations) / MEDIAN_LENGTH
-        return (
-            max(sigma_t, _MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12),
-            max(sigma_r, _MIN_SIGMA_ROTATION),
-        )
-
-    def sigmas_at(self, state: _State) -> tuple[float, float]:
-        """:meth:`sigmas` of a state."""
-        translations, rotations = self.residuals(state)
-        return self.sigmas(np.linalg.norm(translations, axis=1), np.linalg.norm(rotations, axis=1))
-
-    def log_volume(self, state: _State) -> float:
-        """Logarithm of the volume that the residuals spread over, in the smaller unit of length:
-        small for a good fit.
-        """
-        sigma_t, sigma_r = self.sigmas_at(state)
-        return float(np.log(sigma_t / min(state.scale, 1.0)) + np.log(sigma_r))
-
     def rms_translation(self, scale: float) -> float:
         """Root mean square translation, m: of the stream that moves less, or with one unit of
         length of the one that moves more.
@@ -348,16 +324,11 @@ class _Problem:
         lengths = (self.rms_a, scale * self.rms_b)
         return min(lengths) if self.free[_SCALE] else max(lengths)
 
-    def unexplained(self, state: _State) -> float:
-        """Share of the motion that a state leaves unexplained."""
-        sigma_t, sigma_r = self.sigmas_at(state)
-        return _share(sigma_t, self.rms_translation(state.scale), sigma_r, self.rms_rotation)
-
     def refine(self, T: FloatArray, scale: float) -> _State:
         """Gauss-Newton steps with robust weights from a start until they are small."""
         state = _State(T, scale, 0.0)
         for _ in range(_MAX_STEPS):
-            rows = [part.reshape(-1, _UNKNOWNS + 1) for part in self.whitened(state)[:2]]
+            rows = [part.reshape(-1, _UNKNOWNS + 1) for part in self.whitened(state)[0]]
             moments = sum((part.T @ part for part in rows), np.zeros(2 * (_UNKNOWNS + 1,)))
             step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
@@ -372,22 +343,25 @@ class _Problem:
                 break
         return state
 
-    def whitened(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def whitened(self, state: _State) -> tuple[tuple[FloatArray, FloatArray], tuple[float, float]]:
         """Both arrays of :meth:`linearised` in standard deviations and times their robust weights,
-        and the weights (K,).
+        and these per axis (m, rad).
         """
         parts = self.linearised(state)
         lengths = [np.linalg.norm(part[:, :, -1], axis=1) for part in parts]
-        sigmas = self.sigmas(*lengths)
+        sigmas = (
+            max(median(lengths[0]) / MEDIAN_LENGTH, _MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12),
+            max(median(lengths[1]) / MEDIAN_LENGTH, _MIN_SIGMA_ROTATION),
+        )
         squared = sum((length / sigma) ** 2 for length, sigma in zip(lengths, sigmas, strict=True))
         root = 1.0 / (1.0 + squared / (6 * _TUNING**2))
         for part, sigma in zip(parts, sigmas, strict=True):
             part *= (root / sigma)[:, None, None]
-        return *parts, root**2
+        return parts, sigmas
 
     def describe(self, state: _State) -> SimilarityFit:
         """The state as a result, with its uncertainty."""
-        *parts, robust = self.whitened(state)
+        parts, (sigma_translation, sigma_rotation) = self.whitened(state)
         rows = np.concatenate(parts, axis=1)
         blocks = [
             block.reshape(-1, _UNKNOWNS + 1)
@@ -395,7 +369,6 @@ class _Problem:
         ]
         moments = np.array([block.T @ block for block in blocks])
         normal, gradient = moments[:, :-1, :-1], moments[:, :-1, -1]
-        sigma_translation, sigma_rotation = self.sigmas_at(state)
         return SimilarityFit(
             T_parent_child=state.T,
             scale=state.scale,
@@ -406,19 +379,7 @@ class _Problem:
             sigma_rotation=sigma_rotation,
             rms_translation=self.rms_translation(state.scale),
             rms_rotation=self.rms_rotation,
-            inliers=robust > _INLIER_WEIGHT,
         )
-
-
-def _share(
-    sigma_translation: float, rms_translation: float, sigma_rotation: float, rms_rotation: float
-) -> float:
-    return float(
-        np.hypot(
-            sigma_translation / max(rms_translation, 1e-12),
-            sigma_rotation / max(rms_rotation, 1e-12),
-        )
-    )
 
 
 def _times(matrices: FloatArray, right: FloatArray) -> FloatArray:
@@ -443,8 +404,7 @@ def _solve(normal: FloatArray, right: FloatArray, free: BoolArray) -> FloatArray
 
 def _jackknife(normal: FloatArray, gradient: FloatArray, free: BoolArray) -> FloatArray:
     """Covariance (8, 8) of one-step answers without each block of time."""
-    total, total_gradient = normal.sum(axis=0), gradient.sum(axis=0)
-    answers = _solve(total - normal, -(total_gradient - gradient), free)
+    answers = _solve(normal.sum(axis=0) - normal, gradient - gradient.sum(axis=0), free)
     answers -= answers.mean(axis=0)
     return (len(answers) - 1) / len(answers) * answers.T @ answers
 

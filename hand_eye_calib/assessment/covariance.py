@@ -39,7 +39,6 @@ from hand_eye_calib.stats import CHI2_TENTH, MEDIAN_CHI2
 SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
 
 # Blocks of the jackknife.
-
 _BLOCKS = 10
 _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 
@@ -135,11 +134,7 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
     -------
     Assessment
     """
-    covariance = solution.cov_parent_child_in_child
-    if len(solution.jumps) >= _BLOCKS * _MIN_PAIRS_PER_BLOCK:
-        steps = answers_without(solution.part_products, _BLOCKS)[:, :6]
-        covariance = beyond_chance(covariance, _spread_of_blocks(steps))
-        covariance = widened_by_halves(covariance, solution.part_products, solution.misfit)
+    covariance = _widened(solution.cov_parent_child_in_child, solution, slice(0, 6))
     hidden = noise_driven(
         pose_pairs.Ts_pw_p,
         solution.T_parent_child,
@@ -169,9 +164,7 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     """
     part, unseen = slice(3, 6), solution.unseen[3:]
     whole = np.zeros((6, 6))
-    whole[part, part] = _widened_part(
-        solution.cov_parent_child_in_child[part, part], solution, part
-    )
+    whole[part, part] = _widened(solution.cov_parent_child_in_child[part, part], solution, part)
     lone_axes = noise_driven(
         Ts_pw_p, solution.T_parent_child, solution.jumps, solution.noise.rotation_variance
     )
@@ -196,7 +189,7 @@ def assess_lever_arm(Ts: FloatArray, solution: LeverArmSolution) -> Assessment:
         Of a transform with no rotation, which is unknown.
     """
     whole = np.zeros((6, 6))
-    whole[:3, :3] = _widened_part(solution.covariance, solution, slice(0, 3))
+    whole[:3, :3] = _widened(solution.covariance, solution, slice(0, 3))
     white, walk = _white_rotation(Ts), solution.rotation_walk
     hidden = noise_driven(
         Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)
@@ -217,10 +210,10 @@ def _white_rotation(Ts: FloatArray) -> float:
     return float(np.sort(variances)[:2].mean())
 
 
-def _widened_part(
+def _widened(
     covariance: FloatArray, solution: AdaptiveSolution | LeverArmSolution, part: slice
 ) -> FloatArray:
-    """The model's covariance (3, 3) of a part of xi, widened by blocks and halves."""
+    """The model's covariance of a part of xi, widened by blocks and halves."""
     if len(solution.jumps) < _BLOCKS * _MIN_PAIRS_PER_BLOCK:
         return covariance
     steps = answers_without(solution.part_products, _BLOCKS)[:, part]
@@ -253,28 +246,18 @@ def noise_driven(
     """
     longest = max(len(Ts_pw_p) // _BLOCKS, 1)
     baselines = sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True)
-    rotations = (Ts_pw_p[:, :3, :3], T_parent_child[:3, :3])
-    found = [
-        _hidden_translations(
-            _lever_arms_over(baseline, *rotations, jumps),
-            rotation_variance(baseline) * np.eye(3),
-            least_share,
-        )
-        for baseline in baselines
-    ]
+    rotations, jumps_before = Ts_pw_p[:, :3, :3], np.concatenate([[0], np.cumsum(jumps)])
+    found = []
+    for baseline in baselines:
+        motions = np.swapaxes(rotations[:-baseline], 1, 2) @ rotations[baseline:]
+        # No baseline may run across a jump, unless all of them do.
+        weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
+        if not weights.any():
+            weights[:] = 1.0
+        lever_arms = LeverArms.of((motions - np.eye(3)) @ T_parent_child[:3, :3], weights)
+        noise = rotation_variance(baseline) * np.eye(3)
+        found.append(_hidden_translations(lever_arms, noise, least_share))
     return min(found, key=len)
-
-
-def _lever_arms_over(
-    baseline: int, rotation: FloatArray, axes: FloatArray, jumps: BoolArray
-) -> LeverArms:
-    motions = np.swapaxes(rotation[:-baseline], 1, 2) @ rotation[baseline:]
-    # No baseline may run across a jump, unless all of them do.
-    jumps_before = np.concatenate([[0], np.cumsum(jumps)])
-    weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
-    if not weights.any():
-        weights[:] = 1.0
-    return LeverArms.of((motions - np.eye(3)) @ axes, weights)
 
 
 def combined(
@@ -286,8 +269,9 @@ def combined(
     """Covariance and verdicts from a model's covariance (6, 6) in the child's frame, that of
     resampling if there is one, and directions (6, U) that the motion does not reveal.
     """
-    known = np.eye(6) - unknown @ unknown.T
-    covariance = known @ larger_by_direction(model, resampled) @ known + _unknown_variance(unknown)
+    known, scaled = np.eye(6) - unknown @ unknown.T, UNKNOWN_SIGMAS[:, None] * unknown
+    raised = model if resampled is None else _raised(model, resampled, np.ones(len(model)))
+    covariance = known @ raised @ known + scaled @ scaled.T
     return Assessment(covariance, _verdicts(T_parent_child[:3, :3], covariance, unknown))
 
 
@@ -367,11 +351,6 @@ def basis(directions: list[FloatArray]) -> FloatArray:
     return left[:, sizes > 1e-6 * sizes[0]]
 
 
-def _unknown_variance(unknown: FloatArray) -> FloatArray:
-    scaled = UNKNOWN_SIGMAS[:, None] * unknown
-    return scaled @ scaled.T
-
-
 def jackknife_covariance(
     n_pairs: int, T_parent_child: FloatArray, solve_without: SolveWithout
 ) -> FloatArray | None:
@@ -394,11 +373,6 @@ def _spread_of_blocks(deviations: FloatArray) -> FloatArray:
     """Jackknife covariance (6, 6) of the deviations (B, 6) of the answers without a block."""
     n_blocks, centred = len(deviations), deviations - deviations.mean(axis=0)
     return (n_blocks - 1) / n_blocks * centred.T @ centred
-
-
-def larger_by_direction(first: FloatArray, second: FloatArray | None) -> FloatArray:
-    """The first covariance, raised to the second in every direction in which that is larger."""
-    return first if second is None else _raised(first, second, np.ones(len(first)))
 
 
 def beyond_chance(model: FloatArray, resampled: FloatArray) -> FloatArray:
