@@ -39,6 +39,21 @@ def skew(vectors: ArrayLike) -> FloatArray:
     return matrices
 
 
+def vee(matrices: FloatArray) -> FloatArray:
+    """Vectors (..., 3) of twice the antisymmetric part of matrices (..., 3, 3): of a rotation, its
+    axis times twice the sine of its angle.
+    """
+    M = matrices
+    return np.stack(
+        [
+            M[..., 2, 1] - M[..., 1, 2],
+            M[..., 0, 2] - M[..., 2, 0],
+            M[..., 1, 0] - M[..., 0, 1],
+        ],
+        axis=-1,
+    )
+
+
 def cross(left: FloatArray, right: FloatArray) -> FloatArray:
     """Cross products (..., 3) of two arrays of vectors of the same shape (..., 3).
 

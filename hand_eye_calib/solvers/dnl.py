@@ -3,6 +3,7 @@
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import quadratic_form
 from hand_eye_calib.solvers.solution import Solution
@@ -74,23 +75,9 @@ def start_rotations(pairs: MotionPairs) -> FloatArray:
     is rotation at all. The others do so after a rotation by pi about an axis of the child, for
     motion with hardly any rotation.
     """
-    axes_parent = _axial(pairs.Ts_parenti_parentj)
-    axes_child = _axial(pairs.Ts_childi_childj)
+    # As good as rotation vectors for aligning axes, and faster.
+    axes_parent = se3.vee(pairs.Ts_parenti_parentj)
+    axes_child = se3.vee(pairs.Ts_childi_childj)
     left, _, right = np.linalg.svd(axes_parent.T @ axes_child)
     aligned = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     return aligned @ _HALF_TURNS
-
-
-def _axial(transforms: FloatArray) -> FloatArray:
-    """Rotation axes times twice the sine of the angle (K, 3): as good as rotation vectors for
-    aligning axes, and faster.
-    """
-    rotation = transforms[:, :3, :3]
-    return np.stack(
-        [
-            rotation[:, 2, 1] - rotation[:, 1, 2],
-            rotation[:, 0, 2] - rotation[:, 2, 0],
-            rotation[:, 1, 0] - rotation[:, 0, 1],
-        ],
-        axis=1,
-    )

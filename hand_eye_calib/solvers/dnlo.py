@@ -145,7 +145,18 @@ def solve_without(
     """
     near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
     condensed, some = quadratic_form.condense(pairs), _searched(len(pairs))
-    rival = _rival_without(condensed[some], near, left_out[:, some], threshold, min_inlier_fraction)
+    # Of all that is found near the full answer and by annealing: one row's answer may suit another
+    # row better than its own.
+    rows, searched = left_out[:, some], condensed[some]
+    fewest = min_inlier_fraction * float((~rows).sum(axis=1).min())
+    everything = near
+    for _ in range(_STEPS_OVER_ALL):
+        everything = _refit(searched, (~rows).astype(float), everything)
+    annealed = _anneal(searched, everything, threshold, fewest, rows)
+    starts, twice = np.concatenate([near, annealed]), np.tile(rows, (2, 1))
+    candidates, _ = _settle(searched, starts, threshold, fewest, _SETTLED, twice)
+    costs = _costs(searched, candidates)
+    rival = candidates[[np.argmin(truncate(costs[:, ~row], threshold, fewest)[1]) for row in rows]]
     # The sample may be wrong about which of two minima is lower: all pairs decide between the best
     # and the one nearby.
     fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
@@ -153,28 +164,6 @@ def solve_without(
     answers, objectives = _settle(condensed, rivals, threshold, fewest, _CONVERGED, twice)
     nearby, other = np.split(answers, 2)
     return np.where(np.less(*np.split(objectives, 2))[:, None, None], nearby, other)
-
-
-def _rival_without(
-    condensed: FloatArray,
-    near: FloatArray,
-    left_out: BoolArray,
-    threshold: float,
-    min_inlier_fraction: float,
-) -> FloatArray:
-    """The best answer (B, 4, 4) for each row of pairs that are left out, of all that are found near
-    the full answer and by annealing: one row's answer may suit another row better than its own.
-    """
-    fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
-    everything = near
-    for _ in range(_STEPS_OVER_ALL):
-        everything = _refit(condensed, (~left_out).astype(float), everything)
-    annealed = _anneal(condensed, everything, threshold, fewest, left_out)
-    starts, twice = np.concatenate([near, annealed]), np.tile(left_out, (2, 1))
-    candidates, _ = _settle(condensed, starts, threshold, fewest, _SETTLED, twice)
-    costs = _costs(condensed, candidates)
-    best = [np.argmin(truncate(costs[:, ~row], threshold, fewest)[1]) for row in left_out]
-    return candidates[best]
 
 
 def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatArray, FloatArray]:
@@ -226,8 +215,13 @@ def _searched(n_pairs: int) -> slice | IntArray:
 def _search(pairs: MotionPairs, threshold: float, floor: float) -> FloatArray:
     """The annealed answer (4, 4), or a better rival."""
     condensed = quadratic_form.condense(pairs)
-    T_annealed = _anneal(condensed, _minimum_over_all(condensed, pairs), threshold, floor)
-    best, objective = _settle(condensed, T_annealed, threshold, floor)
+    total = condensed.sum(axis=0)
+    Ts = se3.from_rotation_translation(dnl.start_rotations(pairs), np.zeros(3))
+    for _ in range(_STEPS_OVER_ALL):
+        Ts = quadratic_form.gauss_newton_step(quadratic_form.expand(total), Ts)
+    near_all = Ts[[int(np.argmin(_costs(total[None], Ts)))]]
+    annealed = _anneal(condensed, near_all, threshold, floor)
+    best, objective = _settle(condensed, annealed, threshold, floor)
     random = np.random.default_rng(0)
     for _ in range(_MAX_GENERATIONS):
         rivals = _rivals(condensed, best, threshold, floor, random)
@@ -268,15 +262,6 @@ def _rivals(
         [started],
     ]
     return Ts[promising.ravel()]
-
-
-def _minimum_over_all(condensed: FloatArray, pairs: MotionPairs) -> FloatArray:
-    """X (1, 4, 4) near the minimum over all pairs, where annealing starts."""
-    total = condensed.sum(axis=0)
-    Ts = se3.from_rotation_translation(dnl.start_rotations(pairs), np.zeros(3))
-    for _ in range(_STEPS_OVER_ALL):
-        Ts = quadratic_form.gauss_newton_step(quadratic_form.expand(total), Ts)
-    return Ts[[int(np.argmin(_costs(total[None], Ts)))]]
 
 
 def _anneal(

@@ -212,7 +212,10 @@ def minimise(
     Minimum
     """
     rotation = np.array(rotation_start, dtype=float)
-    reduced = _eliminate_translation(np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION)))
+    reduced, to_translation = without_translation(
+        np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION))
+    )
+    constant = reduced[:, 9, 9]
     value, gradient, hessian = _derivatives(reduced, rotation)
     damping = np.zeros(len(rotation))
     converged = np.zeros(len(rotation), dtype=bool)
@@ -225,7 +228,7 @@ def minimise(
         better = (trial_value < value) & ~converged
         # At the rounding level the value falls no more. A tiny step that hardly raises it is the
         # last.
-        rounding = 1e-15 * (np.abs(value) + np.abs(reduced.constant))
+        rounding = 1e-15 * (np.abs(value) + np.abs(constant))
         stalled = ~better & (0.5 * scale * length**2 <= rounding)
         converged |= (length < _STEP_TOLERANCE) | stalled
         damping = np.where(
@@ -236,37 +239,10 @@ def minimise(
         hessian = np.where(pick, trial_hessian, hessian)
         gradient = np.where(better[:, None], trial_gradient, gradient)
         value = np.where(better, trial_value, value)
-    return Minimum(
-        se3.from_rotation_translation(rotation, reduced.translation(rotation)),
-        value + reduced.constant,
-        converged,
-        iterations,
-    )
-
-
-@dataclass(frozen=True)
-class _Reduced:
-    """Forms without the translation: ``r^T S r + 2 linear^T r + constant`` with r = vec R.
-
-    ``to_translation`` (B, 3, 10) times ``(r, 1)`` is minus the best translation.
-    """
-
-    S: FloatArray
-    linear: FloatArray
-    constant: FloatArray
-    to_translation: FloatArray
-
-    def translation(self, rotation: FloatArray) -> FloatArray:
-        """Best translations (B, 3), m, for rotations (B, 3, 3)."""
-        ones = np.ones((len(rotation), 1))
-        vectors = np.concatenate([rotation.reshape(-1, 9), ones], axis=1)
-        return -(self.to_translation @ vectors[:, :, None])[:, :, 0]
-
-
-def _eliminate_translation(Q: FloatArray) -> _Reduced:
-    """The forms (B, 13, 13) at the best translation for each rotation."""
-    reduced, to_translation = without_translation(Q)
-    return _Reduced(reduced[:, :9, :9], reduced[:, :9, 9], reduced[:, 9, 9], to_translation)
+    vectors = np.append(rotation.reshape(-1, 9), np.ones((len(rotation), 1)), axis=1)
+    translation = -(to_translation @ vectors[:, :, None])[:, :, 0]
+    T_parent_child = se3.from_rotation_translation(rotation, translation)
+    return Minimum(T_parent_child, value + constant, converged, iterations)
 
 
 def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -356,23 +332,18 @@ _TANGENTS = _TANGENTS.reshape(16, 7, 16)[:, :, _X_IN_T].reshape(16, 7 * DIMENSIO
 _TWISTS = _TWISTS.reshape(6, 16)
 
 
-def _derivatives(form: _Reduced, rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Value (B,) without the constant, gradient (B, 3) and Hessian (B, 3, 3) under
-    ``R Exp(phi)`` at phi = 0.
+def _derivatives(
+    reduced: FloatArray, rotation: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Value (B,) of forms of (vec R, 1) without the constant, gradient (B, 3) and Hessian (B, 3, 3)
+    under ``R Exp(phi)`` at phi = 0.
     """
-    S, linear = form.S, form.linear
+    S, linear = reduced[:, :9, :9], reduced[:, :9, 9]
     flat = rotation.reshape(-1, 9)
     S_flat = (S @ flat[:, :, None])[:, :, 0]
     value = ((S_flat + 2 * linear) * flat).sum(axis=1)
     product = np.swapaxes(rotation, 1, 2) @ (S_flat + linear).reshape(-1, 3, 3)
-    gradient = 2 * np.stack(
-        [
-            product[:, 2, 1] - product[:, 1, 2],
-            product[:, 0, 2] - product[:, 2, 0],
-            product[:, 1, 0] - product[:, 0, 1],
-        ],
-        axis=1,
-    )
+    gradient = 2 * se3.vee(product)
     tangents = (rotation[:, None] @ _GENERATORS).reshape(-1, 3, 9)
     trace = np.trace(product, axis1=1, axis2=2)
     hessian = 2 * (
