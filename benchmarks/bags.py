@@ -23,7 +23,7 @@ from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from hand_eye_calib.cli.replaying import feed
+from hand_eye_calib.cli.reading import feed
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from hand_eye_calib.cli.replaying import journal_in, replay_journal
+from hand_eye_calib.cli.options import STREAMS
+from hand_eye_calib.cli.reading import journal_in, read_journal_of
 from hand_eye_calib.errors import HandEyeCalibError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -35,19 +36,13 @@ Repeat it with: hand_eye_calib calibrate parent.tum child.tum --config options.y
 
 
 def write_bundle(result: str | Path, target: Path) -> list[str]:
-    """Write the bundle of a saved result.
+    """Write the bundle of a saved result into a zip file; returns what a person should know of it.
 
     Parameters
     ----------
     result : str or path-like
         ``extrinsic.yaml``, or the directory that holds it.
     target : pathlib.Path
-        The zip file.
-
-    Returns
-    -------
-    list of str
-        What a person should know of it.
 
     Raises
     ------
@@ -58,7 +53,12 @@ def write_bundle(result: str | Path, target: Path) -> list[str]:
     file = file / FILE_NAME if file.is_dir() else file
     calibration, provenance = load_result(file), read_yaml(file).get("provenance", {})
     inputs = provenance.get("inputs", {})
-    streams, reason = _streams_or_reason(inputs, file.parent)
+    streams: dict[str, Trajectory] = {}
+    reason = ""
+    try:
+        streams = dict(zip(STREAMS, _streams(inputs, file.parent), strict=True))
+    except (HandEyeCalibError, KeyError, TypeError) as error:
+        reason = f"the poses are not in the bundle, as they could not be read again: {error}"
     about = _about(calibration, provenance, reason)
     texts = {
         "README.txt": _ABOUT,
@@ -78,7 +78,8 @@ def write_bundle(result: str | Path, target: Path) -> list[str]:
 def _about(calibration: Calibration, provenance: Mapping[str, Any], reason: str) -> dict[str, Any]:
     """Versions, poses and result in plain values."""
     versions = {"hand_eye_calib": package_version(), "python": platform.python_version()}
-    versions |= {name: _version(name) for name in _LIBRARIES}
+    installed = {each.name: each.version for each in metadata.distributions()}
+    versions |= {name: installed.get(name, "not installed") for name in _LIBRARIES}
     return {
         "made_on": f"{platform.system()} {platform.machine()}",
         "versions_here": versions,
@@ -91,31 +92,14 @@ def _about(calibration: Calibration, provenance: Mapping[str, Any], reason: str)
     }
 
 
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
-def _streams_or_reason(
-    inputs: Mapping[str, Any], folder: Path
-) -> tuple[dict[str, Trajectory], str]:
-    """Both streams as they were read, or why they cannot be read again."""
-    try:
-        return dict(zip(("parent", "child"), _streams(inputs, folder), strict=True)), ""
-    except (HandEyeCalibError, KeyError, TypeError) as error:
-        return {}, f"the poses are not in the bundle, as they could not be read again: {error}"
-
-
 def _streams(inputs: Mapping[str, Any], folder: Path) -> tuple[Trajectory, ...]:
     journal = journal_in([Path(inputs.get("journal", folder))])
     if journal is not None:
-        return replay_journal(journal, {}).calibrator.snapshot().streams
+        return read_journal_of(journal, {}).snapshot.streams
     if "bag" in inputs:
         from hand_eye_calib.io.bags import read_bag_trajectory
 
-        sources = [str(inputs[stream]["topic"]) for stream in ("parent", "child")]
+        sources = [str(inputs[stream]["topic"]) for stream in STREAMS]
         named = [
             (None, source.partition(" ")[2]) if " " in source else (source, None)
             for source in sources
@@ -124,7 +108,7 @@ def _streams(inputs: Mapping[str, Any], folder: Path) -> tuple[Trajectory, ...]:
     from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
 
     options = FileOptions(format=AUTO, repair=True)
-    files = [(inputs[stream]["file"], options) for stream in ("parent", "child")]
+    files = [(inputs[stream]["file"], options) for stream in STREAMS]
     return tuple(reading.trajectory for reading in read_trajectory_files(files))
 
 
@@ -144,7 +128,7 @@ def tum_text(trajectory: Trajectory) -> str:
 def _names_of_files(inputs: Mapping[str, Any]) -> dict[str, str]:
     """Every path among the inputs, and what stands for it."""
     paths = {str(inputs[name]): name.upper() for name in ("bag", "journal") if name in inputs}
-    for stream in ("parent", "child"):
+    for stream in STREAMS:
         file = inputs.get(stream, {}).get("file")
         paths |= {str(file): f"{stream.upper()} FILE"} if file else {}
     paths |= {str(each.get("file")): "FILE" for each in inputs.get("files", [])}

@@ -1,226 +1,169 @@
-"""``calibrate PARENT CHILD``: two trajectory files, or those of all sensors of a rig."""
+"""``calibrate PATH ...``: two trajectory files, a bag or the parts of one, or the journal of a
+session; three sensors or more; many recordings. ``replay`` is its other name, for bags and journals
+alone.
+"""
 
 import argparse
-import re
-from collections.abc import Mapping, Sequence
+import dataclasses
+import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import note, waiting_for
-from hand_eye_calib.cli.options import add_config_arguments, add_output_arguments, options_from
+from hand_eye_calib.cli.console import note, print_table, waiting_for
+from hand_eye_calib.cli.options import (
+    add_config_arguments,
+    add_input_arguments,
+    add_output_arguments,
+    add_topics_argument,
+    at_least,
+)
 from hand_eye_calib.cli.robot import add_robot_arguments
-from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
-from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
-    from hand_eye_calib.geometry.trajectory import Trajectory
-
-STREAMS = ("parent", "child")
+    from hand_eye_calib.io.remote import AsGiven
 
 EXAMPLES = """\
 examples:
   hand_eye_calib calibrate lidar.txt camera.txt --out result
-  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate
-  hand_eye_calib calibrate lidar.txt mono.txt --scale estimate --prior z=1.85+/-0.02
-  hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig"""
+  hand_eye_calib calibrate my_bag --list
+  hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
+  hand_eye_calib calibrate my_bag --parent-tf odom:lidar --child-topic /vio --out result
+  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
+  hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
+  hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
+  hand_eye_calib replay live/journal --out result"""
 
-_FORMATS = (
-    "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; csv: columns "
-    "by the names in the header, or with --columns: positions as x y z or lat lon height, "
-    "orientations as quaternion, roll pitch yaw or heading. Default: what the file looks like"
-)
-# By name, what argparse needs.
-FILE_OPTIONS: dict[str, dict[str, Any]] = {
-    "format": {"choices": TRAJECTORY_FORMATS, "help": _FORMATS},
-    "columns": {
-        "metavar": "NAMES",
-        "help": "names of the columns of a csv file without a header, in their order: "
-        "t,x,y,z,qw,qx,qy,qz",
-    },
-    "times": {
-        "metavar": "FILE",
-        "type": Path,
-        "help": "stamps of the poses of a kitti file, one per line",
-    },
-    "stamp_unit": {
-        "choices": tuple(STAMP_UNITS),
-        "help": "unit of the stamps. Default: recognised from their size",
-    },
-}
-
-# Options that one of two files of different formats may have no use for.
-_OF_SOME_FILES = ("columns", "times")
-# The options of a file as the messages of its reader name them.
-_FILE_OPTION = re.compile("`(format|columns|times|stamp_unit)`")
+_HEADINGS = ("topic", "type", " count", " rate", " duration", "frames", "poses")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = EXAMPLES
-    parser.add_argument("parent", metavar="PARENT", help="trajectory of the parent sensor")
-    parser.add_argument("child", metavar="CHILD", help="trajectory of the child sensor")
-    parser.add_argument(
-        "others",
-        metavar="OTHER",
-        nargs="*",
-        help="trajectories of more sensors: all are solved together, in the frame of the parent",
+    add_input_arguments(
+        parser,
+        "trajectory files of parent and child, and of more sensors; or a rosbag2 directory, .mcap, "
+        ".db3 or .bag file, or the URL of one, as s3://..., of which several are the parts of one "
+        "recording; or the journal of a node's session, or the output directory that holds it",
     )
-    add_file_arguments(parser)
+    add_topics_argument(parser)
+    parser.add_argument(
+        "--list",
+        action="store_true",
+        help="show the bag's topics with types, counts, rates and frames, and exit",
+    )
+    batch = parser.add_argument_group("many recordings")
+    batch.add_argument(
+        "--batch",
+        metavar="FILE",
+        type=Path,
+        help="YAML file with a list of bags, each with its own options",
+    )
+    batch.add_argument(
+        "--jobs",
+        metavar="N",
+        type=at_least(1),
+        help="number of worker processes. Default: one for each core",
+    )
+    batch.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="use a Dask cluster instead: address of its scheduler, tcp://...",
+    )
     add_config_arguments(parser)
     add_output_arguments(parser)
     add_robot_arguments(parser)
 
 
-def add_file_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how trajectory files are to be read: for both, and for each."""
-    group = parser.add_argument_group(
-        "trajectory files", "each also as --parent-... and --child-... for one of the two files"
-    )
-    for name, settings in FILE_OPTIONS.items():
-        group.add_argument(f"--{name.replace('_', '-')}", dest=name, **settings)
-        for stream in STREAMS:
-            of_one = settings | {"help": f"the same for {stream.upper()} only"}
-            option = f"--{stream}-{name.replace('_', '-')}"
-            group.add_argument(option, dest=f"{stream}_{name}", **of_one)
-
-
-def read_files(
-    arguments: argparse.Namespace, options: Mapping[str, Any]
-) -> tuple[dict[str, "Trajectory"], list[str]]:
-    """Read both files as the options of :func:`add_file_arguments` say, and say what was guessed.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-    options : mapping
-        Options of the engine by their public names.
-
-    Returns
-    -------
-    trajectories : dict
-        "parent" and "child" to Trajectory.
-    repairs : list of str
-        What was wrong with the stamps.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If a file cannot be read.
-    """
-    from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
-
-    files = []
-    for stream in STREAMS:
-        settings = _settings_of(arguments, stream)
-        settings |= {"format": _given(arguments, stream, "format") or AUTO, "repair": True}
-        settings["measures"] = options.get(f"{stream}_measures", AUTO)
-        files.append((getattr(arguments, stream), FileOptions(**settings)))
-    with waiting_for(f"reading {arguments.parent} and {arguments.child}"):
-        read = dict(zip(STREAMS, read_trajectory_files(files), strict=True))
-    for stream, reading in read.items():
-        for text in reading.guesses:
-            note(_FILE_OPTION.sub(f"`{stream}_\\1`", text))
-    repairs = [text for reading in read.values() for text in reading.repairs]
-    return {stream: reading.trajectory for stream, reading in read.items()}, repairs
-
-
-def _given(arguments: argparse.Namespace, stream: str, name: str) -> Any:
-    """An option of one file, or the one for both."""
-    return getattr(arguments, f"{stream}_{name}") or getattr(arguments, name)
-
-
-def _settings_of(arguments: argparse.Namespace, stream: str) -> dict[str, Any]:
-    """How to read the file of a stream: its own options before those for both.
-
-    Of those for both, columns are meant for the files that do not name their own, and times for
-    those of format kitti.
-    """
-    given = {name: _given(arguments, stream, name) for name in FILE_OPTIONS if name != "format"}
-    for name in _OF_SOME_FILES:
-        of_both = getattr(arguments, name) and not getattr(arguments, f"{stream}_{name}")
-        if of_both and not _is_meant(arguments, stream, name):
-            others = (other for other in STREAMS if other != stream)
-            if any(_is_meant(arguments, other, name) for other in others):
-                given[name] = None
-    return given
-
-
-def _is_meant(arguments: argparse.Namespace, stream: str, name: str) -> bool:
-    """Whether ``--columns`` or ``--times`` for both files fits the file of a stream."""
-    from hand_eye_calib.io.trajectory_files import layout_of_file
-
-    found = layout_of_file(getattr(arguments, stream))
-    format = _given(arguments, stream, "format") or found.format
-    if name == "times":
-        return bool(format == "kitti")
-    return format == "csv" or not (_given(arguments, stream, "format") or found.is_named)
-
-
 def run(arguments: argparse.Namespace) -> int:
-    """Calibrate from files; returns the exit code."""
-    if arguments.others:
-        from hand_eye_calib.cli.rig import calibrate_and_deliver
+    """Calibrate; returns the exit code."""
+    _check_usage(arguments)
+    if arguments.batch:
+        from hand_eye_calib.cli.batch.run import run_batch
 
-        files = [arguments.parent, arguments.child, *arguments.others]
-        return calibrate_and_deliver(_read_rig(files, arguments), arguments, {"files": files})
-    from hand_eye_calib.cli.present import deliver
-    from hand_eye_calib.engine import run as engine
-    from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+        return run_batch(arguments)
+    from hand_eye_calib.io.remote import local_copies
 
-    options = options_from(arguments)
-    trajectories, repairs = read_files(arguments, options)
-    for text in repairs:
-        note(text)
-    config = offline_config(trajectories["parent"], trajectories["child"], options)
-    with waiting_for("solving, and checking the streams"):
-        found = engine.run(whole_snapshot(config, **trajectories))
-    calibration, snapshot = found.calibration, found.snapshot
-    inputs: dict[str, Any] = {"options": snapshot.config.to_options()}
-    for stream in STREAMS:
-        inputs[stream] = {"file": str(getattr(arguments, stream)), **_extent(trajectories[stream])}
-    if arguments.out:
-        from hand_eye_calib.cli.replaying import fingerprints
-
-        inputs["files"] = fingerprints(_files(arguments))
-    return deliver(calibration, arguments, inputs, snapshot)
+    with local_copies(arguments.paths) as (arguments.paths, as_given):
+        return _run_here(arguments, as_given)
 
 
-def _read_rig(files: Sequence[str], arguments: argparse.Namespace) -> dict[str, "Trajectory"]:
-    """The trajectories by the names of their frames: as the files name them, or as the files are
-    named.
+def _check_usage(arguments: argparse.Namespace) -> None:
+    if arguments.batch and (arguments.paths or arguments.list):
+        raise ConfigError("--batch cannot be combined with PATH or --list")
+    if not arguments.batch and (arguments.jobs or arguments.dask):
+        raise ConfigError("--jobs and --dask are for --batch")
+    if arguments.topics:
+        named = [f"{each}_{kind}" for each in ("parent", "child") for kind in ("topic", "tf")]
+        others = [name for name in (*named, "batch", "list") if getattr(arguments, name)]
+        if others:
+            raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
+    if not arguments.batch and not arguments.paths:
+        raise ConfigError("the following arguments are required: PATH, or --batch FILE")
+
+
+def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+    """Calibrate from files on this machine; ``as_given`` puts URLs back into texts.
+
+    Returns the exit code.
     """
-    from hand_eye_calib.cli.rig import add_sensor
-    from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
+    if arguments.list:
+        return _list_topics(arguments, as_given)
+    from hand_eye_calib.cli import rig
+    from hand_eye_calib.cli.present import deliver
+    from hand_eye_calib.cli.reading import are_bags, read_recording
 
-    of_one = [
-        f"--{stream}-{name.replace('_', '-')}"
-        for stream in STREAMS
-        for name in FILE_OPTIONS
-        if getattr(arguments, f"{stream}_{name}")
-    ]
-    if of_one:
-        raise ConfigError(f"{of_one[0]} is of two files; give the option for all of a rig's files")
-    settings = {name: getattr(arguments, name) for name in FILE_OPTIONS}
-    settings |= {"format": arguments.format or AUTO, "repair": True}
-    with waiting_for(f"reading {', '.join(files)}"):
-        read = read_trajectory_files([(file, FileOptions(**settings)) for file in files])
-    found: dict[str, Trajectory] = {}
-    for file, (trajectory, repairs, guesses) in zip(files, read, strict=True):
-        for text in (*guesses, *repairs):
-            note(text)
-        add_sensor(found, trajectory.sensor_frame or Path(file).stem, trajectory)
-    return found
+    if arguments.topics:
+        return rig.calibrate_bag(arguments, as_given)
+    arguments.is_of_bags = arguments.command == "replay" or are_bags(arguments.paths)
+    if len(arguments.paths) > 2 and not arguments.is_of_bags:
+        return rig.calibrate_files(arguments)
+    recording = read_recording(arguments)
+    calibration = recording.solved()
+    if arguments.out:
+        recording.with_fingerprints()
+    calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
+    return deliver(calibration, arguments, as_given(recording.inputs), recording.snapshot)
 
 
-def _files(arguments: argparse.Namespace) -> list[Path]:
-    """All files that were read."""
-    times = (arguments.times, arguments.parent_times, arguments.child_times)
-    return [Path(arguments.parent), Path(arguments.child), *filter(None, times)]
+def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+    """Print the topics of a bag; returns the exit code."""
+    from hand_eye_calib.io.bags import PoseBag
+
+    with PoseBag(*arguments.paths) as bag:
+        with waiting_for(f"reading {bag}"):
+            topics = bag.describe()
+        document: dict[str, Any] = {
+            "bag": as_given(str(bag)),
+            "start_ns": bag.start_ns,
+            "end_ns": bag.end_ns,
+            "duration_s": bag.duration_s,
+            "topics": [topic._asdict() for topic in topics],
+            "warnings": as_given(bag.warnings),
+        }
+    for text in document["warnings"]:
+        note(text)
+    if arguments.json:
+        print(json.dumps(document, indent=2))
+    elif not topics:
+        print(f"{document['bag']} has no topics")
+    else:
+        title = f"{document['bag']}, {document['duration_s']:.1f} s"
+        print_table(title, _HEADINGS, map(list, map(_cells, topics)))
+        if any(topic.is_usable for topic in topics):
+            print(
+                "--parent-topic and --child-topic take the topics with poses, --parent-tf and "
+                "--child-tf frames of /tf: odom:lidar"
+            )
+    return 0
 
 
-def _extent(trajectory: "Trajectory") -> dict[str, int]:
-    return {
-        "poses": len(trajectory),
-        "first_stamp_ns": int(trajectory.stamps_ns[0]),
-        "last_stamp_ns": int(trajectory.stamps_ns[-1]),
-    }
+def _cells(topic: Any) -> Iterator[str]:
+    yield printable(topic.name)
+    yield topic.type or "several types"
+    yield str(topic.count)
+    yield "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
+    yield "" if topic.duration_s is None else f"{topic.duration_s:.1f} s"
+    yield "\n".join(printable(frame) for frame in topic.frames)
+    yield "yes" if topic.is_usable else ""

@@ -1,21 +1,22 @@
 """``check BAG`` or ``check PARENT CHILD``: check both streams before they are calibrated."""
 
 import argparse
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.calibrate import STREAMS, add_file_arguments, read_files
 from hand_eye_calib.cli.console import note, typed_options, waiting_for, with_progress
 from hand_eye_calib.cli.options import (
+    STREAMS,
     add_config_arguments,
+    add_input_arguments,
     add_json_argument,
     config_from,
     options_from,
 )
 from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
     from hand_eye_calib.checks.check import CheckResult
@@ -32,18 +33,13 @@ examples:
 
 _HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rotation")
 
+_Read = tuple[dict[str, "Trajectory"], dict[str, str], "list[Finding]"]
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = EXAMPLES
-    parser.add_argument(
-        "inputs", metavar="BAG | PARENT CHILD", nargs="+", help="a bag, or two trajectory files"
-    )
-    for stream in STREAMS:
-        parser.add_argument(
-            f"--{stream}-topic", metavar="TOPIC", help=f"of a bag: poses of the {stream} sensor"
-        )
-    add_file_arguments(parser)
+    add_input_arguments(parser, "a bag, or the trajectory files of parent and child")
     add_config_arguments(parser)
     parser.add_argument(
         "--out",
@@ -59,13 +55,16 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.checks.findings import answered, gravest_first
     from hand_eye_calib.checks.streams import summarise
     from hand_eye_calib.cli.present import show
+    from hand_eye_calib.cli.reading import are_bags
 
-    if len(arguments.inputs) > 2:
-        raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.inputs)}")
+    if not 1 <= len(arguments.paths) <= 2:
+        raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.paths)}")
     config = config_from(arguments)
-    read = _read_bag if len(arguments.inputs) == 1 else _read_files
-    trajectories, sources, of_files = read(arguments)
-    parent, child = (trajectories[stream] for stream in STREAMS)
+    is_bag = are_bags(arguments.paths)
+    if is_bag and len(arguments.paths) > 1:
+        raise ConfigError("expected one bag or two trajectory files; got two bags")
+    trajectories, sources, of_files = _read_bag(arguments) if is_bag else _read_files(arguments)
+    parent, child = trajectories.values()
     # What is to be estimated is not known yet: the checks say what it is.
     offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
     scale = config.scale if isinstance(config.scale, float) else 1.0
@@ -75,18 +74,20 @@ def run(arguments: argparse.Namespace) -> int:
     streams = {name: summarise(one) for name, one in trajectories.items() if len(one) > 1}
     said = _verdict(findings)
 
-    def draw() -> str:
-        from hand_eye_calib.report.check_page import render_check
-
-        named = _named(sources, is_bag=len(arguments.inputs) == 1)
-        corrected = child.shifted(offset_s).scaled(scale)
-        return render_check(parent, corrected, checked, findings, named, said, config.max_gap)
-
     def finish() -> None:
         from hand_eye_calib.cli.reporting import CHECK, write_page
 
         if arguments.out:
-            write_page(arguments.out / CHECK, draw)
+            corrected = child.shifted(offset_s).scaled(scale)
+            names = [
+                f"{stream}: {source if is_bag else Path(source).name}"
+                for stream, source in sources.items()
+            ]
+            write_page(
+                arguments.out / CHECK,
+                "check_page.render_check",
+                *(parent, corrected, checked, findings, names, said, config.max_gap),
+            )
 
     errors = [str(finding) for finding in findings[:1] if finding.makes_unusable]
     return show(
@@ -106,65 +107,53 @@ def _checked(
     arguments: argparse.Namespace,
 ) -> "CheckResult":
     """What the checks say of two streams with a ``known`` time offset and scale."""
-    config = config_from(arguments)
     if {parent.measures, child.measures} == {"poses"}:
         from hand_eye_calib.checks.check import check_streams
 
-        return check_streams(parent, child, *known, config.max_gap)
+        return check_streams(parent, child, *known, config_from(arguments).max_gap)
     from hand_eye_calib.engine.checking import check_partial
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-
+    
     config = offline_config(parent, child, options_from(arguments))
     return check_partial(whole_snapshot(config, parent, child))
 
 
-def _named(sources: Mapping[str, str], is_bag: bool) -> list[str]:
-    """Streams with their topics, or with the names of their files."""
-    return [
-        f"{stream}: {source if is_bag else Path(source).name}" for stream, source in sources.items()
-    ]
-
-
-_Read = tuple[dict[str, "Trajectory"], dict[str, str], "list[Finding]"]
-
-
 def _read_files(arguments: argparse.Namespace) -> _Read:
     from hand_eye_calib.checks.findings import finding
+    from hand_eye_calib.cli.reading import read_files
 
-    arguments.parent, arguments.child = arguments.inputs
-    trajectories, repairs = read_files(arguments, options_from(arguments))
-    findings = [finding("repaired_file", text=text) for text in repairs]
-    return trajectories, dict(zip(STREAMS, arguments.inputs, strict=True)), findings
+    trajectories, repairs = read_files(arguments)
+    sources = dict(zip(STREAMS, map(str, arguments.paths), strict=True))
+    return trajectories, sources, [finding("repaired_file", text=text) for text in repairs]
 
 
 def _read_bag(arguments: argparse.Namespace) -> _Read:
+    """Every pose as it was recorded: what is wrong with the stamps is a finding."""
     import numpy as np
 
     from hand_eye_calib.checks.streams import tidy
+    from hand_eye_calib.cli.reading import measures_of, sources_from
     from hand_eye_calib.io.bags import PoseBag
 
-    config = config_from(arguments)
-    columns: dict[str, list[Any]] = {stream: [] for stream in STREAMS}
-    with PoseBag(arguments.inputs[0]) as bag:
-        sources = bag.select_topics(arguments.parent_topic, arguments.child_topic)
-        measures = {
-            stream: bag.measured(source, getattr(config, f"{stream}_measures"))
-            for stream, source in zip(STREAMS, sources, strict=True)
-        }
-        blocks = bag.blocks(*sources, measures=measures)
-        for block in with_progress(blocks, bag.expected(*sources), f"reading {bag}", len):
-            for stream in STREAMS:
-                columns[stream].append(block[block.streams == stream])
+    with PoseBag(arguments.paths[0]) as bag:
+        wanted = sources_from(arguments)
+        selected = bag.select_topics(wanted["parent"], wanted["child"])
+        sources = dict(zip(STREAMS, selected, strict=True))
+        measures = measures_of(bag, sources, config_from(arguments))
+        blocks = bag.blocks(*selected, measures=measures)
+        shown = with_progress(blocks, bag.expected(*selected), f"reading {bag}", len)
+        read = list(shown)
         for text in bag.warnings:
             note(text)
     trajectories, findings = {}, []
-    for stream, parts in columns.items():
+    for stream in STREAMS:
+        parts = [block[block.streams == stream] for block in read]
         stamps_ns = np.concatenate([np.empty(0, np.int64), *(part.stamps_ns for part in parts)])
         poses = np.concatenate([np.empty((0, 7)), *(part.poses for part in parts)])
         tidied, found = tidy(stamps_ns, poses[:, :3], poses[:, 3:], stream)
         trajectories[stream] = replace(tidied, measures=measures[stream])
         findings += found
-    return trajectories, dict(zip(STREAMS, map(str, sources), strict=True)), findings
+    return trajectories, {stream: str(source) for stream, source in sources.items()}, findings
 
 
 def _document(
@@ -191,26 +180,20 @@ def _document(
 
 def _lines(
     sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]", checked: "CheckResult"
-) -> list[str]:
-    """Both streams, and how much the parent turns."""
-    lines = [f"{stream} is {printable(source)}" for stream, source in sources.items()]
-    lines.append("{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS))
+) -> Iterator[str]:
+    """Both streams, and how much the parent rotates."""
+    yield from (f"{stream} is {printable(source)}" for stream, source in sources.items())
+    yield "{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS)
     for name, summary in streams.items():
         path, rotation = summary.path_m, summary.rotation_rad
-        lines.append(
+        yield (
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} "
-            f"{summary.longest_interval_s:10.3f} s "
-            f"{'none' if path is None else f'{path:.1f} m':>12} "
-            f"{'none' if rotation is None else f'{math.degrees(rotation):.0f} deg':>10}"
+            f"{summary.longest_interval_s:10.3f} s {'none' if path is None else length(path):>12} "
+            f"{'none' if rotation is None else angle(rotation):>10}"
         )
     if checked.rms_rotation:
-        turned = "  ".join(
-            f"{axis} {math.degrees(angle):.2f}" for axis, angle in checked.rms_rotation.items()
-        )
-        lines.append(
-            f"Rotation of the parent in 3 s about its axes, root mean square: {turned} deg"
-        )
-    return lines
+        rotated = ", ".join(f"{axis} {angle(rms)}" for axis, rms in checked.rms_rotation.items())
+        yield f"Rotation of the parent in 3 s about its axes, root mean square: {rotated}"
 
 
 def _verdict(findings: "Sequence[Finding]") -> str:

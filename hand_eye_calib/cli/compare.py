@@ -1,7 +1,6 @@
 """``compare RESULT...``: has the mount moved, or which recording shows that it has?"""
 
 import argparse
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING
 from hand_eye_calib.cli.console import waiting_for
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import InputError, printable
+from hand_eye_calib.text import amount
 
 if TYPE_CHECKING:
     from hand_eye_calib.results.calibration import Calibration
@@ -92,8 +92,6 @@ def _table(difference: "Difference") -> Iterator[str]:
     """A row per axis."""
     yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
     for axis, row in difference.to_dict()["axes"].items():
-        is_angle = axis in ("roll", "pitch", "yaw")
-        factor, unit = (math.degrees(1.0), "deg") if is_angle else (100.0, "cm")
         numbers = (row["difference"], row["sigma"], row["visible"])
-        cells = ["unknown" if value is None else f"{factor * value:.2f}" for value in numbers]
-        yield f"  {axis:<6}{cells[0]:>12}{cells[1]:>10}{cells[2]:>12} {unit:<4}{row['verdict']}"
+        cells = ["unknown" if value is None else amount(axis, value) for value in numbers]
+        yield f"  {axis:<6}{cells[0]:>12}{cells[1]:>10}{cells[2]:>12}  {row['verdict']}"

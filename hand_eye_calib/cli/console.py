@@ -5,24 +5,25 @@ command line spells options.
 import dataclasses
 import re
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, TypeVar
 
 from hand_eye_calib.config import CalibratorConfig, option_name
 from hand_eye_calib.errors import printable
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-    from rich.table import Table
+    pass
 
 _Item = TypeVar("_Item")
 
-_SILENT_S = 2.0
-_REDRAW_S = 0.2
 _CLEAR_LINE = "\r\033[K"
+# Columns of a table that does not go to a terminal: its lines stay whole.
+_WIDTH_IN_A_FILE = 240
+
+# Notes and progress are left out: work for a batch, of which only the result is of interest.
+_IS_SILENT = ContextVar("is_silent", default=False)
 
 OPTION_FIELDS = {option_name(field): field for field in dataclasses.fields(CalibratorConfig)}
 
@@ -67,9 +68,20 @@ def _typed(match: re.Match[str]) -> str:
     return f"--{flag(name)}" if is_option else match[0]
 
 
+@contextmanager
+def silence() -> Iterator[None]:
+    """Print neither notes nor progress inside the block."""
+    token = _IS_SILENT.set(True)
+    try:
+        yield
+    finally:
+        _IS_SILENT.reset(token)
+
+
 def note(text: object) -> None:
     """Print something that is good to know, in one line."""
-    print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
+    if not _IS_SILENT.get():
+        print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
 
 
 def fail(error: object, code: int) -> int:
@@ -78,33 +90,21 @@ def fail(error: object, code: int) -> int:
     return code
 
 
+def _is_watched() -> bool:
+    return sys.stderr.isatty() and not _IS_SILENT.get()
+
+
 @contextmanager
 def waiting_for(what: str) -> Iterator[None]:
-    """On a terminal, show what is being done for as long as it lasts; after two seconds, how long
-    it has taken.
-    """
-    if not sys.stderr.isatty():
+    """On a terminal, show what is being done for as long as it lasts."""
+    if not _is_watched():
         yield
         return
     print(f"{what} ...", end="", file=sys.stderr, flush=True)
-    done = threading.Event()
-    clock = threading.Thread(target=_show_seconds, args=(what, done), daemon=True)
-    clock.start()
     try:
         yield
     finally:
-        done.set()
-        clock.join()
         print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
-
-
-def _show_seconds(what: str, done: threading.Event) -> None:
-    started = time.monotonic()
-    wait_s = _SILENT_S
-    while not done.wait(wait_s):
-        seconds = time.monotonic() - started
-        print(f"\r{what} ... {seconds:.0f} s", end="", file=sys.stderr, flush=True)
-        wait_s = 1.0
 
 
 def with_progress(
@@ -113,8 +113,7 @@ def with_progress(
     doing: str,
     size: Callable[[_Item], int] = lambda item: 1,
 ) -> Iterator[_Item]:
-    """Pass on ``items``. On a terminal, from two seconds on, show how much is done, at what rate,
-    and the time left.
+    """Pass on ``items``. On a terminal, show how much is done and the time left.
 
     Parameters
     ----------
@@ -125,56 +124,35 @@ def with_progress(
     size : callable
         What an item adds to what is done.
     """
-    if not sys.stderr.isatty():
+    if not _is_watched():
         yield from items
         return
-    started = time.monotonic()
-    redraw_at = started + _SILENT_S
-    shown: Progress | None = None
-    done = 0
-    try:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(doing, total=total)
         for item in items:
-            if (now := time.monotonic()) >= redraw_at:
-                if shown is None:
-                    shown = _progress_bar()
-                    shown.start()
-                    task = shown.add_task(doing, total=total, rate="")
-                rate = f"{done / max(now - started, 1e-9):,.0f}/s"
-                shown.update(task, completed=done, rate=rate)
-                redraw_at = now + _REDRAW_S
             yield item
-            done += size(item)
-    finally:
-        if shown is not None:
-            shown.stop()
+            progress.advance(task, size(item))
 
 
-def _progress_bar() -> "Progress":
+def print_table(title: str, headings: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
+    """Print a table; through a pipe with whole lines, not those of a terminal of 80 columns.
+
+    Columns whose heading begins with a space are aligned to the right.
+    """
+    from rich import box
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.table import Table
 
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    )
-
-
-def print_table(table: "Table") -> None:
-    """Print a table; through a pipe with whole lines, not those of a terminal of 80 columns."""
-    from rich.console import Console
-
+    table: Table = Table(title=title, box=box.SIMPLE, title_justify="left", pad_edge=False)
+    for heading in headings:
+        is_number = heading.startswith(" ")
+        table.add_column(heading.strip(), justify="right" if is_number else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
-        console = Console(highlight=False, markup=False, width=240)
+        console = Console(highlight=False, markup=False, width=_WIDTH_IN_A_FILE)
     console.print(table)

@@ -10,7 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,11 +20,11 @@ from hand_eye_calib.cli.options import add_json_argument, at_least
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import HandEyeCalibError, InputError
 from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
+from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
     from hand_eye_calib.arrays import FloatArray
     from hand_eye_calib.results.calibration import Calibration
-    from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
@@ -37,6 +37,8 @@ PLAY_SPEED = 20.0
 AGREEMENT = 1e-9
 
 _STOP_S = 10.0
+
+_ROWS = {"truth": "truth", "offline": "replay of the bag", "online": "live node"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,27 +64,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo; returns the exit code."""
     from hand_eye_calib.cli.present import exit_code, show
-    from hand_eye_calib.cli.replaying import replay
+    from hand_eye_calib.cli.reading import read_bags
     from hand_eye_calib.cli.reporting import with_cross_check, write_report
-    from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import simulate_drive
 
     with waiting_for("simulating"):
         drive = simulate_drive(arguments.seed, DRIVE, REALISTIC)
         bag_path = _write_bag(arguments.out, drive)
     note(f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
-    replayed = replay([bag_path], TOPICS["parent"], TOPICS["child"], CalibratorConfig())
-    offline, snapshot = replayed.calibration, replayed.calibrator.snapshot()
+    recording = read_bags([bag_path], TOPICS, CalibratorConfig())
+    offline = recording.snapshot.estimate()
     note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
     with waiting_for("playing"):
-        live = _play(Player, bag_path, arguments.out / "node.log", offline.stamp_ns)
+        live = _play(bag_path, arguments.out / "node.log", offline.stamp_ns)
     note("3/4 calibrated live; cross-checks and report follow")
     document = _document(drive, bag_path, offline, live)
 
     def finish() -> None:
         with waiting_for("cross-checks with other methods and halves of the recording"):
-            calibration, evidence = with_cross_check(offline, snapshot)
-        write_report(arguments.out, calibration, evidence, snapshot.config, replayed.inputs)
+            calibration, evidence = with_cross_check(offline, recording.snapshot)
+        write_report(
+            arguments.out, calibration, evidence, recording.snapshot.config, recording.inputs
+        )
         note(f"4/4 done; everything is in {arguments.out}")
 
     errors = []
@@ -91,14 +94,13 @@ def run(arguments: argparse.Namespace) -> int:
             f"offline and online differ by more than {AGREEMENT}: {document['agreement']}; "
             "the same messages must give the same"
         ]
-    code = 1 if errors else exit_code(offline)
     return show(
         arguments,
         lambda: document,
-        lambda: _text(document),
+        lambda: "\n".join(_lines(document)),
         finish=finish,
         errors=errors,
-        code=code,
+        code=1 if errors else exit_code(offline),
     )
 
 
@@ -114,46 +116,30 @@ def _write_bag(out: Path, drive: "SimulatedDrive") -> Path:
             f"cannot replace {path}: {error.strerror}; remove it or choose another directory with "
             "--out"
         ) from None
-    streams = {
-        TOPICS["parent"]: (drive.parent, "nav_msgs/msg/Odometry"),
-        TOPICS["child"]: (drive.child, "nav_msgs/msg/Odometry"),
-    }
-    write_bag(path, streams)
+    streams = zip(TOPICS.values(), (drive.parent, drive.child), strict=True)
+    write_bag(path, {topic: (stream, "nav_msgs/msg/Odometry") for topic, stream in streams})
     return path
 
 
-def _play(player_type: "type[Player]", bag_path: Path, log_path: Path, stamp_ns: int) -> Any:
+def _play(bag_path: Path, log_path: Path, stamp_ns: int) -> Any:
+    """Play the bag to the node; returns its result for the stamp."""
     from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.ros.player import Player
 
-    _stay_on_this_machine()
-    with (
-        _node(log_path) as check,
-        player_type(TOPICS, check) as player,
-        PoseBag(bag_path) as bag,
-    ):
-        player.play(bag.poses(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
-        return player.wait_for_extrinsic(stamp_ns)
-
-
-def _stay_on_this_machine() -> None:
-    """Keep simulated odometry away from robots on the network."""
+    # Simulated odometry stays away from robots on the network.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     # From 102 on the ports overlap with those that Linux gives to clients.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    with _node(log_path) as check, Player(TOPICS, check) as player, PoseBag(bag_path) as bag:
+        player.play(bag.poses(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
+        return player.wait_for_extrinsic(stamp_ns)
 
 
 @contextmanager
 def _node(log_path: Path) -> Iterator[Callable[[], None]]:
     """Run the node in a process of its own; yields a function that raises if it has ended."""
-    command = [
-        sys.executable,
-        "-m",
-        "hand_eye_calib",
-        "calibrator",
-        "--ros-args",
-        "-p",
-        "solve_period:=1000.0",  # the player asks for the solve of all poses
-    ]
+    command = [sys.executable, "-m", "hand_eye_calib", "calibrator", "--ros-args"]
+    command += ["-p", "solve_period:=1000.0"]  # the player asks for the solve of all poses
     for stream, topic in TOPICS.items():
         command += ["-r", f"{stream}_odom:={topic}"]
         # At this speed best effort might lose messages, and the results of the same messages are
@@ -188,7 +174,13 @@ def _document(
             f"the node's result is of {live.child_frame} in {live.parent_frame}, the replay's of "
             f"{frames}"
         )
-    difference_m, difference_rad = _errors(live.T_parent_child, offline.T_parent_child)
+    truth = drive.T_parent_child
+    found = {"offline": offline, "online": live}
+    estimates = {
+        name: _both_directions(each.T_parent_child)
+        | {"error": _difference(each.T_parent_child, truth), "stamp_ns": each.stamp_ns}
+        for name, each in found.items()
+    }
     return {
         **frames,
         "bag": str(bag_path),
@@ -196,19 +188,10 @@ def _document(
         "verdict": offline.verdict.value,
         "headline": offline.headline,
         "status": offline.status.value,
-        "truth": _both_directions(drive.T_parent_child),
-        "offline": _estimate(offline.T_parent_child, drive.T_parent_child)
-        | {"stamp_ns": offline.stamp_ns, "reference": offline.reference},
-        "online": _estimate(live.T_parent_child, drive.T_parent_child)
-        | {"stamp_ns": live.stamp_ns},
-        "agreement": {"translation_m": difference_m, "rotation_rad": difference_rad},
-    }
-
-
-def _estimate(T_parent_child: "FloatArray", truth: "FloatArray") -> dict[str, Any]:
-    error_m, error_rad = _errors(T_parent_child, truth)
-    return _both_directions(T_parent_child) | {
-        "error": {"translation_m": error_m, "rotation_rad": error_rad}
+        "reference": offline.reference,
+        "truth": _both_directions(truth),
+        **estimates,
+        "agreement": _difference(live.T_parent_child, offline.T_parent_child),
     }
 
 
@@ -221,45 +204,36 @@ def _both_directions(T_parent_child: "FloatArray") -> dict[str, Any]:
     }
 
 
-def _errors(T_parent_child: "FloatArray", truth: "FloatArray") -> tuple[float, float]:
-    """Distance between the translations (m) and angle between the rotations (rad)."""
+def _difference(T_parent_child: "FloatArray", other: "FloatArray") -> dict[str, float]:
+    """Distance between the translations and angle between the rotations."""
     from hand_eye_calib.geometry import se3
 
-    angle = se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3])
-    return math.dist(T_parent_child[:3, 3], truth[:3, 3]), float(angle)
+    angle = se3.rotation_angle(T_parent_child[:3, :3].T @ other[:3, :3])
+    distance = math.dist(T_parent_child[:3, 3], other[:3, 3])
+    return {"translation_m": distance, "rotation_rad": float(angle)}
 
 
-_ROWS = {"truth": "truth", "offline": "replay of the bag", "online": "live node"}
+def _lines(document: Mapping[str, Any]) -> Iterator[str]:
+    from hand_eye_calib.geometry import se3
 
-
-def _text(document: Mapping[str, Any]) -> str:
     parent, child = document["parent_frame"], document["child_frame"]
-    lines = [document["headline"]]
-    directions = (("T_parent_child", child, parent), ("T_child_parent", parent, child))
-    for direction, source, target in directions:
-        lines.append(
-            f"{f'Pose of {source} in {target}':<26}         x         y         z  m"
-            "      roll     pitch       yaw  deg"
-        )
-        lines += [f"  {title:<24}{_row(document[key][direction])}" for key, title in _ROWS.items()]
-    lines.append(f"Error of the pose of {child} in {parent}")
-    for key in ("offline", "online"):
-        error = document[key]["error"]
-        degrees = math.degrees(error["rotation_rad"])
-        lines.append(
-            f"  {_ROWS[key]:<24}{1e3 * error['translation_m']:10.2f} mm {degrees:10.4f} deg"
-        )
+    yield document["headline"]
+    for key, source, target in (("parent_child", child, parent), ("child_parent", parent, child)):
+        heads = "".join(f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw"))
+        yield f"{f'Pose of {source} in {target}':<26}{heads}  deg"
+        for row, title in _ROWS.items():
+            matrix = document[row][f"T_{key}"]
+            angles = se3.rotation_to_rpy([line[:3] for line in matrix[:3]])
+            position = "".join(f"{line[3]:10.4f}" for line in matrix[:3])
+            degrees = "".join(f"{math.degrees(each):10.3f}" for each in angles)
+            yield f"  {title:<24}{position}{'':10}{degrees}"
+    yield f"Error of the pose of {child} in {parent}"
+    for row in ("offline", "online"):
+        error = document[row]["error"]
+        metres, radians = error["translation_m"], error["rotation_rad"]
+        yield f"  {_ROWS[row]:<24}{length(metres):>10} {angle(radians):>14}"
     agreement = document["agreement"]
-    lines.append(
+    yield (
         f"Offline and online differ by {agreement['translation_m']:.1e} m and "
         f"{math.degrees(agreement['rotation_rad']):.1e} deg"
     )
-    return "\n".join(lines)
-
-
-def _row(matrix: Sequence[Sequence[float]]) -> str:
-    from hand_eye_calib.geometry import se3
-
-    angles = se3.rotation_to_rpy([row[:3] for row in matrix[:3]])
-    position = "".join(f"{row[3]:10.4f}" for row in matrix[:3])
-    return position + "   " + "".join(f"{math.degrees(angle):10.3f}" for angle in angles)

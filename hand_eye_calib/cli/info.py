@@ -5,8 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import note
-from hand_eye_calib.cli.options import add_json_argument
-from hand_eye_calib.cli.robot import add_description_arguments, write_description
+from hand_eye_calib.cli.options import add_json_argument, add_verbose_argument
+from hand_eye_calib.cli.robot import (
+    add_description_arguments,
+    require_description,
+    write_description,
+)
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -33,12 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write what a report of a wrong answer needs to a zip file: versions, options, "
         "findings, the result and 200 kB of downsampled poses without their place; nothing else",
     )
-    _add_moving_arguments(parser)
-    add_json_argument(parser)
-
-
-def _add_moving_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--move`` and ``--to``."""
     parser.add_argument(
         "--move",
         metavar="CHILD",
@@ -51,16 +49,20 @@ def _add_moving_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="where to: .tum or .txt for a text file, .bag for rosbag1, otherwise a new mcap bag",
     )
+    add_json_argument(parser)
+    add_verbose_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print a saved calibration; returns the exit code, 0 whatever the calibration's status."""
-    from hand_eye_calib.cli.present import as_json, as_text
+    from hand_eye_calib.cli.present import as_text
     from hand_eye_calib.io.results import load_result
+    from hand_eye_calib.plain import json_text
 
+    require_description(arguments)
+    if arguments.urdf and not arguments.write:
+        raise ConfigError("--urdf needs --write: where to write the changed description")
     calibration = load_result(arguments.result)
-    if arguments.write and not arguments.urdf:
-        raise ConfigError("--write needs --urdf: the description to change")
     _move(calibration, arguments)
     if arguments.bundle:
         from hand_eye_calib.cli.bundle import write_bundle
@@ -68,7 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
         for text in write_bundle(arguments.result, arguments.bundle):
             note(text)
         note(f"wrote {arguments.bundle}")
-    print(as_json(calibration) if arguments.json else as_text(calibration))
+    text = as_text(calibration, with_details=arguments.verbose)
+    print(json_text(calibration.to_dict()) if arguments.json else text)
     write_description(calibration, arguments)
     return 0
 

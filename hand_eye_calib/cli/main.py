@@ -5,14 +5,13 @@ when it is asked for, so that a missing optional package breaks no other command
 """
 
 import argparse
-import atexit
 import errno
-import gc
 import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NoReturn
 
 from hand_eye_calib.cli.console import as_typed, fail
@@ -28,8 +27,8 @@ EXIT_BROKEN_PIPE = 128 + 13
 _MOST_SHOWN = 60
 
 COMMANDS = {
-    "replay": "calibrate from the poses in a bag",
-    "calibrate": "calibrate from two trajectory files",
+    "calibrate": "calibrate from two trajectory files, a bag or a journal",
+    "replay": "the same for bags and journals alone",
     "check": "check two pose streams before any solve",
     "calibrator": "run the ROS 2 node",
     "watch": "show the live node on the terminal, or in a browser",
@@ -42,9 +41,9 @@ COMMANDS = {
 
 _EPILOG = """\
 examples:
-  hand_eye_calib replay my_bag --out result   calibrate from a bag, with report.html
-  hand_eye_calib check my_bag                 check both pose streams first
-  hand_eye_calib COMMAND --help               options and examples of a command
+  hand_eye_calib calibrate my_bag --out result   calibrate from a bag, with report.html
+  hand_eye_calib check my_bag                    check both pose streams first
+  hand_eye_calib COMMAND --help                  options and examples of a command
 
 exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
 unobservable or the verdict is DO NOT USE"""
@@ -53,8 +52,8 @@ unobservable or the verdict is DO NOT USE"""
 _OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
 # Set by the shell functions of argcomplete.
 _COMPLETING = "_ARGCOMPLETE"
-# New containers after which Python looks for cycles of them: imports alone make 50,000 that stay.
-_NEW_CONTAINERS = 100_000
+# Commands that are another name of a module.
+_MODULES = {"replay": "calibrate"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -109,6 +108,11 @@ def exit_code_of(run: Callable[[], int]) -> int:
         return fail(f"cannot use {name}...: {error.strerror}; give a shorter name", EXIT_FAILED)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+
+
+def module_of(command: str) -> ModuleType:
+    """The module of a command, with ``add_arguments`` and ``run``."""
+    return importlib.import_module(f"hand_eye_calib.cli.{_MODULES.get(command, command)}")
 
 
 def _what_to_install(name: str) -> str:
@@ -174,7 +178,7 @@ def _run(argv: Sequence[str]) -> int:
     for name, summary in COMMANDS.items():
         added = commands.add_parser(name, help=summary, description=summary)
         if name == command or _COMPLETING in os.environ:
-            module, of_command = importlib.import_module(f"hand_eye_calib.cli.{name}"), added
+            module, of_command = module_of(name), added
             module.add_arguments(added)
             added.shorten_usage()
     if _COMPLETING in os.environ:
@@ -182,12 +186,8 @@ def _run(argv: Sequence[str]) -> int:
 
         argcomplete.autocomplete(parser)  # tells the shell, and ends the process
     arguments, rest = parser.parse_known_args(argv)
-    if command != "calibrator":
-        if rest:
-            of_command.refuse(rest)
-        # What is imported stays. To search it for garbage takes 3 % of the time of `calibrate`.
-        gc.set_threshold(_NEW_CONTAINERS)
-        atexit.register(gc.freeze)
+    if rest and command != "calibrator":
+        of_command.refuse(rest)
     arguments.passed_on, arguments.typed = rest, list(argv)
     return module.run(arguments)
 

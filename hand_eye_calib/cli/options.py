@@ -1,34 +1,70 @@
-"""Command-line options made from the option dataclasses, and the configuration file that sets the
-same options by name.
+"""Command-line options: those of the engine, made from the option dataclasses, with the
+configuration file that sets the same by name; what is read; what is written.
+
+Nothing here loads a library: ``--help`` is quick.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import OPTION_FIELDS, flag, note
 from hand_eye_calib.config import (
+    STAMP_UNITS,
+    TRAJECTORY_FORMATS,
     CalibratorConfig,
     NodeConfig,
     check_value,
     did_you_mean,
     option_name,
 )
-from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+
+if TYPE_CHECKING:
+    from hand_eye_calib.io.transforms import TfSource
 
 Options = dict[str, Any]
+
+STREAMS = ("parent", "child")
 
 _NODE_OPTIONS = {option_name(field) for field in dataclasses.fields(NodeConfig)}
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 _NODE_NAMES = ("calibrator", "**", "*")
 _DEST = "option "
 _PRIOR = "prior."
+_AXES = ", ".join(name.removeprefix(_PRIOR) for name in OPTION_FIELDS if _PRIOR in name)
 
 # What most people set: the help has these options first.
 _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
+
+# How a trajectory file is read. By name, what argparse needs.
+FILE_OPTIONS: dict[str, dict[str, Any]] = {
+    "format": {
+        "choices": TRAJECTORY_FORMATS,
+        "help": "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; "
+        "csv: columns by the names in the header, or with --columns: positions as x y z or lat lon "
+        "height, orientations as quaternion, roll pitch yaw or heading. Default: what the file "
+        "looks like",
+    },
+    "columns": {
+        "metavar": "NAMES",
+        "help": "names of the columns of a csv file without a header, in their order: "
+        "t,x,y,z,qw,qx,qy,qz",
+    },
+    "times": {
+        "metavar": "FILE",
+        "type": Path,
+        "help": "stamps of the poses of a kitti file, one per line",
+    },
+    "stamp_unit": {
+        "choices": tuple(STAMP_UNITS),
+        "help": "unit of the stamps. Default: recognised from their size",
+    },
+}
 
 
 def argument_type(parse: Callable[[str], Any], prefix: str = "") -> Callable[[str], Any]:
@@ -54,6 +90,14 @@ def at_least(minimum: int) -> Callable[[str], int]:
     return argument_type(parse)
 
 
+def offer(action: argparse.Action, values: Callable[[argparse.Namespace], Sequence[str]]) -> None:
+    """Let a shell offer values for an option, given what has been typed before."""
+    setattr(action, "completer", lambda parsed_args, **_: values(parsed_args))  # noqa: B010
+
+
+# ------------------------------------------------------- options of the engine
+
+
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--config`` and an option for every field of CalibratorConfig."""
     # argparse takes -1e-3, -90deg+/-2deg and the like for options otherwise.
@@ -61,37 +105,6 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("calibration options")
     for name in _COMMON:
         _add_option(group, name)
-    _add_prior_and_config(group)
-    rare = parser.add_argument_group("calibration options that are rarely needed")
-    for name in OPTION_FIELDS:
-        if name not in _COMMON:
-            _add_option(rare, name)
-
-
-def offer(action: argparse.Action, values: Callable[[argparse.Namespace], Sequence[str]]) -> None:
-    """Let a shell offer values for an option, given what has been typed before."""
-    setattr(action, "completer", lambda parsed_args, **_: values(parsed_args))  # noqa: B010
-
-
-def _add_option(group: argparse._ArgumentGroup, name: str) -> None:
-    field = OPTION_FIELDS[name]
-    meta = field.metadata
-    unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
-    default = "" if field.default == "" else f" Default: {field.default}."
-    action = group.add_argument(
-        f"--{flag(name)}",
-        dest=_DEST + name,
-        default=argparse.SUPPRESS,
-        type=argument_type(lambda text: _value(field, text), f"{name} "),
-        metavar=_metavar(name, meta),
-        help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
-    )
-    words = [*(meta["choices"] or ()), *meta["words"]]
-    if words:
-        offer(action, lambda _: words)
-
-
-def _add_prior_and_config(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--prior",
         metavar="AXIS=VALUE+/-SIGMA",
@@ -99,7 +112,7 @@ def _add_prior_and_config(group: argparse._ArgumentGroup) -> None:
         type=_prior_argument,
         default=argparse.SUPPRESS,
         help="what is known of an axis beforehand, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; "
-        f"AXIS is one of {_axes()}; may be repeated",
+        f"AXIS is one of {_AXES}; may be repeated",
     )
     group.add_argument(
         "--config",
@@ -107,26 +120,45 @@ def _add_prior_and_config(group: argparse._ArgumentGroup) -> None:
         type=Path,
         help="YAML file with these options by name, or a ROS parameter file",
     )
+    rare = parser.add_argument_group("calibration options that are rarely needed")
+    for name in OPTION_FIELDS:
+        if name not in _COMMON:
+            _add_option(rare, name)
 
 
-def add_output_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--out`` and ``--json``."""
-    group = parser.add_argument_group("output")
-    group.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        help="save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
-        "static_transform.launch.py and report.html",
+def _add_option(group: argparse._ArgumentGroup, name: str) -> None:
+    field = OPTION_FIELDS[name]
+    meta = field.metadata
+    unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
+    default = "" if field.default == "" else f" Default: {field.default}."
+    value = "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
+    action = group.add_argument(
+        f"--{flag(name)}",
+        dest=_DEST + name,
+        default=argparse.SUPPRESS,
+        type=argument_type(lambda text: _value(field, text), f"{name} "),
+        metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
+        help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
     )
-    add_json_argument(group)
+    if words := [*(meta["choices"] or ()), *meta["words"]]:
+        offer(action, lambda _: words)
 
 
-def add_json_argument(parser: argparse._ActionsContainer) -> None:
-    """Add ``--json``."""
-    parser.add_argument(
-        "--json", action="store_true", help="print one JSON document on stdout instead of text"
-    )
+@argument_type
+def _prior_argument(text: str) -> tuple[str, Any]:
+    axis, equals, value = text.partition("=")
+    if not equals or _PRIOR + axis not in OPTION_FIELDS:
+        raise ConfigError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_AXES}; got {text!r}")
+    return _PRIOR + axis, check_value(OPTION_FIELDS[_PRIOR + axis], value)
+
+
+def _value(field: dataclasses.Field[Any], value: Any) -> Any:
+    """The value of an option, from text or as YAML has it."""
+    kind = type(field.default)
+    if isinstance(value, str) and kind in (int, float):
+        with contextlib.suppress(ValueError):  # check_value says what it should be
+            value = kind(value)
+    return check_value(field, value)
 
 
 def options_from(arguments: argparse.Namespace) -> Options:
@@ -153,36 +185,7 @@ def config_from(arguments: argparse.Namespace) -> CalibratorConfig:
     return CalibratorConfig.from_options(options_from(arguments))
 
 
-def _axes() -> str:
-    return ", ".join(name.removeprefix(_PRIOR) for name in OPTION_FIELDS if _PRIOR in name)
-
-
-@argument_type
-def _prior_argument(text: str) -> tuple[str, Any]:
-    axis, equals, value = text.partition("=")
-    if not equals or _PRIOR + axis not in OPTION_FIELDS:
-        raise ConfigError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_axes()}; got {text!r}")
-    return _PRIOR + axis, check_value(OPTION_FIELDS[_PRIOR + axis], value)
-
-
-def _metavar(name: str, meta: Mapping[str, Any]) -> str:
-    if meta["choices"]:
-        return "{" + ",".join(meta["choices"]) + "}"
-    return "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
-
-
-def _value(field: dataclasses.Field[Any], value: Any) -> Any:
-    """The value of an option, from text or as YAML has it."""
-    return check_value(field, _from_text(field, value) if isinstance(value, str) else value)
-
-
-def _from_text(field: dataclasses.Field[Any], text: str) -> Any:
-    """Numbers arrive as text; what is none is left for check_value to complain about."""
-    kind = type(field.default)
-    try:
-        return kind(text) if kind in (int, float) else text
-    except ValueError:
-        return text
+# ------------------------------------------------------ the configuration file
 
 
 def _read_config(path: Path) -> Options:
@@ -198,7 +201,12 @@ def _read_config(path: Path) -> Options:
     options, ignored = {}, []
     for name, value in _flatten(_parameters(path, document)).items():
         if name in OPTION_FIELDS:
-            options[name] = _checked(path, name, value)
+            try:
+                options[name] = _value(OPTION_FIELDS[name], value)
+            except ConfigError as error:
+                # In quotes it keeps the spelling of the file.
+                text = str(error).replace(name, repr(name), 1)
+                raise ConfigError(f"{path}: {text}") from None
         elif name in _NODE_OPTIONS or name.partition(".")[0] in _ROS_OPTIONS:
             ignored.append(repr(name))
         else:
@@ -212,27 +220,12 @@ def _read_config(path: Path) -> Options:
     return options
 
 
-def _checked(path: Path, name: str, value: Any) -> Any:
-    try:
-        return _value(OPTION_FIELDS[name], value)
-    except ConfigError as error:
-        # In quotes it keeps the spelling of the file.
-        raise ConfigError(f"{path}: {str(error).replace(name, repr(name), 1)}") from None
-
-
 def _parameters(path: Path, document: Mapping[str, Any]) -> Mapping[str, Any]:
     """Of a ROS parameter file what is meant for the node ``calibrator``, of any other file all."""
-    try:
-        sections = dict(_ros_sections(document))
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+    sections = dict(_ros_sections(path, document))
     if not sections:
         return document
-    ours = [
-        parameters
-        for node, parameters in sections.items()
-        if node.rpartition("/")[2] in _NODE_NAMES
-    ]
+    ours = [each for node, each in sections.items() if node.rpartition("/")[2] in _NODE_NAMES]
     if not ours:
         raise ConfigError(
             f"{path}: no parameters for a node named calibrator; found some for "
@@ -242,25 +235,122 @@ def _parameters(path: Path, document: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _ros_sections(
-    mapping: Mapping[str, Any], node: str = ""
+    path: Path, mapping: Mapping[str, Any], node: str = ""
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
     for name, value in mapping.items():
-        if name == "ros__parameters" and isinstance(value, (dict, type(None))):
+        if name == "ros__parameters":
+            if not isinstance(value, (dict, type(None))):
+                raise ConfigError(
+                    f"{path}: {node or '/'}: ros__parameters must be a mapping of names to values"
+                )
             yield node, value or {}
-        elif name == "ros__parameters":
-            raise ConfigError(
-                f"{node or '/'}: ros__parameters must be a mapping of names to values"
-            )
         elif isinstance(value, dict):
-            yield from _ros_sections(value, f"{node}/{str(name).strip('/')}")
+            yield from _ros_sections(path, value, f"{node}/{str(name).strip('/')}")
 
 
 def _flatten(mapping: Mapping[str, Any], prefix: str = "") -> Options:
     """Nested mappings to dotted names."""
     flat: Options = {}
     for name, value in mapping.items():
-        if isinstance(value, dict):
-            flat |= _flatten(value, f"{prefix}{name}.")
-        else:
-            flat[f"{prefix}{name}"] = value
+        nested = _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else None
+        flat |= {f"{prefix}{name}": value} if nested is None else nested
     return flat
+
+
+# -------------------------------------------------- what is read, what is written
+
+
+def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> None:
+    """Add the recording: paths, how files are read, and which streams of a bag are meant."""
+    parser.add_argument("paths", metavar="PATH", nargs="*", type=_path, help=help_of_paths)
+    group = parser.add_argument_group(
+        "pose streams of a bag",
+        "Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Path; may be left "
+        "out if the bag has only two",
+    )
+    for stream in STREAMS:
+        source = group.add_mutually_exclusive_group()
+        topic = source.add_argument(
+            f"--{stream}-topic",
+            metavar="TOPIC",
+            help=f"poses of the {stream} sensor, of any type",
+        )
+        offer(topic, _topics_of)
+        source.add_argument(
+            f"--{stream}-tf",
+            metavar="WORLD:SENSOR",
+            type=_tf_source,
+            help="the same from /tf and /tf_static: fixed frame and the sensor's, as odom:lidar",
+        )
+    group = parser.add_argument_group(
+        "trajectory files", "each also as --parent-... and --child-... for one of the two files"
+    )
+    for name, settings in FILE_OPTIONS.items():
+        group.add_argument(f"--{flag(name)}", dest=name, **settings)
+        for stream in STREAMS:
+            of_one = settings | {"help": f"the same for {stream.upper()} only"}
+            group.add_argument(f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **of_one)
+
+
+def add_topics_argument(parser: argparse.ArgumentParser) -> None:
+    """Add ``--topics``, of three sensors or more."""
+    several = parser.add_argument(
+        "--topics",
+        metavar="TOPIC",
+        nargs="+",
+        help="poses of three sensors or more, or frames as odom:lidar: all are solved together, in "
+        "the frame of the first",
+    )
+    offer(several, _topics_of)
+
+
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--out``, ``--json`` and ``--verbose``."""
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
+        "static_transform.launch.py and report.html",
+    )
+    add_json_argument(group)
+    add_verbose_argument(group)
+
+
+def add_json_argument(parser: argparse._ActionsContainer) -> None:
+    """Add ``--json``."""
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON document on stdout instead of text"
+    )
+
+
+def add_verbose_argument(parser: argparse._ActionsContainer) -> None:
+    """Add ``--verbose``."""
+    parser.add_argument(
+        "-v", "--verbose", action="store_true", help="print details of the solution, too"
+    )
+
+
+def _topics_of(typed: argparse.Namespace) -> list[str]:
+    """Topics of a bag with poses; none if it cannot be read."""
+    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags.messages import SENSOR_TYPES
+
+    try:
+        with PoseBag(*typed.paths) as bag:
+            return [topic.name for topic in bag.topics() if topic.type in SENSOR_TYPES]
+    except HandEyeCalibError:
+        return []
+
+
+def _path(text: str) -> Path | str:
+    """A path; a URL stays as it is, for a path has no two slashes in a row."""
+    return text if "://" in text else Path(text)
+
+
+@argument_type
+def _tf_source(text: str) -> "TfSource":
+    from hand_eye_calib.io.transforms import TfSource
+
+    return TfSource.parse(text)

@@ -11,17 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hand_eye_calib.cli.console import as_typed, fail, note, typed_options, waiting_for
-from hand_eye_calib.cli.reporting import (
-    static_transform_command,
-    with_cross_check,
-    write_report,
-)
+from hand_eye_calib.cli.reporting import static_transform_command, with_cross_check, write_report
 from hand_eye_calib.cli.robot import with_robot, write_description
 from hand_eye_calib.errors import printable
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import json_text
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, Reason, Verdict
-from hand_eye_calib.results.records import CrossCheck
+from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import (
     amount,
@@ -41,13 +36,7 @@ _EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
 _WIDTH = 100
 
 _ROTATIONS = ("roll", "pitch", "yaw")
-_ROTATION_VECTOR = ("rx", "ry", "rz")
-_VERDICTS = {
-    DofVerdict.OBSERVED: "observed",
-    DofVerdict.WEAK: "weak",
-    DofVerdict.PRIOR: "mostly from the prior",
-    DofVerdict.UNOBSERVABLE: "unobservable",
-}
+_OBSERVED = {"prior": "mostly from the prior"}
 _PROOF = {
     "yes": ", proved to be the global minimum over them",
     "no": ", not proved to be the global minimum over them",
@@ -63,8 +52,7 @@ def deliver(
     calibration: Calibration,
     arguments: argparse.Namespace,
     inputs: dict[str, Any],
-    snapshot: "Snapshot | None" = None,
-    **more: Any,
+    snapshot: "Snapshot",
 ) -> int:
     """Print a calibration, save it if ``--out`` asks for that, and return the exit code.
 
@@ -72,19 +60,17 @@ def deliver(
     ----------
     calibration : Calibration
     arguments : argparse.Namespace
-        With ``json`` and ``out``.
+        With ``json``, ``out`` and ``verbose``.
     inputs : dict
         Where the data came from, in plain values: part of the JSON document and of the saved file's
         provenance.
-    snapshot : Snapshot, optional
+    snapshot : Snapshot
         The poses and options that gave it. With them, ``--out`` also runs the cross-checks and
         writes the report.
-    **more
-        What else the JSON document holds.
     """
     calibration = with_robot(calibration, arguments)
     evidence: Evidence | None = None
-    if arguments.out and snapshot is not None:
+    if arguments.out:
         with waiting_for("cross-checks with other methods and halves of the recording"):
             calibration, evidence = with_cross_check(calibration, snapshot)
 
@@ -96,15 +82,17 @@ def deliver(
 
     def finish() -> None:
         write_description(calibration, arguments)
-        if evidence is not None and snapshot is not None:
+        if evidence is not None:
             write_report(arguments.out, calibration, evidence, snapshot.config, inputs)
 
     code = exit_code(calibration)
     reasons = calibration.reasons[:1] if code == _EXIT_FAILED else ()
     return show(
         arguments,
-        lambda: calibration.to_dict() | {"inputs": inputs} | more,
-        lambda: as_text(calibration, next_steps(calibration, arguments, snapshot)),
+        lambda: calibration.to_dict() | {"inputs": inputs},
+        lambda: as_text(
+            calibration, next_steps(calibration, arguments, snapshot), arguments.verbose
+        ),
         save=save,
         finish=finish,
         errors=[f"{one.sentence}; do not use this result, {one.what_to_do}" for one in reasons],
@@ -159,76 +147,46 @@ def exit_code(calibration: Calibration) -> int:
     return 0 if is_all else _EXIT_NOT_ALL
 
 
-def as_json(calibration: Calibration) -> str:
-    """One JSON document: Calibration.to_dict()."""
-    return json_text(calibration.to_dict())
-
-
-def as_text(calibration: Calibration, steps: Iterable[str] = ()) -> str:
+def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False) -> str:
     """Everything a person needs to see: verdict and reasons, the extrinsic in both directions, what
-    to do next, details.
+    to do next.
 
     Parameters
     ----------
     calibration : Calibration
-    steps : iterable of str
+    steps : sequence of str
         What to do next: sentences, and commands that are indented.
+    with_details : bool
+        Also how it was solved.
     """
     parent, child = calibration.parent_frame, calibration.child_frame
-    document = calibration.to_dict()
-    lines = [
-        calibration.headline,
-        *_reason_lines(calibration),
-        *_warning_lines(calibration),
-        "",
-        f"{child} in {parent}: maps coordinates of {child} into {parent}",
-        *transform_lines(document["T_parent_child"], calibration.out_of_reach),
-        "",
-        f"{parent} in {child}: maps coordinates of {parent} into {child}",
-        *transform_lines(document["T_child_parent"], calibration.out_of_reach),
-        "",
-        *_base_lines(calibration),
-        *(["Next", *(f"  {step}" for step in steps), ""] if steps else []),
-        *_publishing_lines(calibration),
-        "Details",
-        *(line for detail in _details(calibration) for line in wrapped(detail, "  ", "    ")),
-    ]
-    return "\n".join(printable(line) for line in lines)
-
-
-def _base_lines(calibration: Calibration) -> Iterator[str]:
-    """The child's pose in the base frame, if there is one."""
-    if calibration.T_base_child is not None:
-        yield f"{calibration.child_frame} in {calibration.base_frame}"
-        document = calibration.to_dict()["T_base_child"]
-        yield from transform_lines(document, calibration.out_of_reach)
-        yield ""
-
-
-def _details(calibration: Calibration) -> Iterator[str]:
-    yield f"along and about the axes of {calibration.parent_frame}: {_observability(calibration)}"
-    yield from _floor_lines(calibration)
-    yield from _scatter_lines(calibration.cross_check)
-    yield from _comparison_lines(calibration)
-    yield from _solution_lines(calibration)
-
-
-def _reason_lines(calibration: Calibration) -> Iterator[str]:
+    document, reach = calibration.to_dict(), calibration.out_of_reach
+    lines = [calibration.headline]
     for number, reason in enumerate(shown(calibration.reasons)):
         # What to do about the first one may follow the headline, which says why, at once.
         if number or not calibration.headline.endswith(reason.sentence):
-            yield from wrapped(reason.sentence, "- ", "  ")
-        yield from wrapped(_what_to_do(reason), "  -> ", "     ")
-
-
-def _warning_lines(calibration: Calibration) -> Iterator[str]:
+            lines += wrapped(reason.sentence, "- ", "  ")
+        options = typed_options(reason.options.items())
+        lines += wrapped(reason.what_to_do + (options and f": {options}"), "  -> ", "     ")
     for warning in calibration.warnings:
-        yield from wrapped(f"Note: {warning}", "", "  ")
-
-
-def _what_to_do(reason: Reason) -> str:
-    options = typed_options(reason.options.items())
-    return f"{reason.what_to_do}: {options}" if options else reason.what_to_do
+        lines += wrapped(f"Note: {warning}", "", "  ")
+    for source, target, key in ((child, parent, "child"), (parent, child, "parent")):
+        lines += ["", f"{source} in {target}: maps coordinates of {source} into {target}"]
+        transform = document["T_parent_child" if key == "child" else "T_child_parent"]
+        lines += transform_lines(transform, reach)
+    if calibration.T_base_child is not None:
+        lines += ["", f"{child} in {calibration.base_frame}"]
+        lines += transform_lines(document["T_base_child"], reach)
+    if steps:
+        lines += ["", "Next", *(f"  {step}" for step in steps)]
+    if command := static_transform_command(calibration):
+        by_hand = [each for each in calibration.usable_numbers().values() if isinstance(each, str)]
+        condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
+        lines += ["", f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
+    details = _details(calibration) if with_details else _comparisons(calibration)
+    texts = [line for detail in details for line in wrapped(detail, "  ", "    ")]
+    lines += ["", "Details", *texts] if texts else []
+    return "\n".join(printable(line) for line in lines)
 
 
 def wrapped(text: str, first: str, others: str) -> list[str]:
@@ -244,59 +202,34 @@ def wrapped(text: str, first: str, others: str) -> list[str]:
 
 
 def next_steps(
-    calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot | None"
+    calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot"
 ) -> list[str]:
     """What to do next, in sentences and commands; empty if the result may be used."""
+    is_poor = calibration.verdict is Verdict.DO_NOT_USE
+    is_of_poses = calibration.measured == "poses"
     if calibration.verdict is Verdict.USE:
         return []
     steps = []
-    if snapshot is not None and (motion := _motion_advice(calibration, snapshot)):
-        steps.append(motion)
+    if is_of_poses and not is_poor and not calibration.status.failure:
+        from hand_eye_calib.assessment.excitation import excitation, what_is_missing
+
+        motion = what_is_missing(excitation(snapshot.pose_pairs()), calibration)
+        steps += [motion] if motion else []
     extra = [
         typed_options([option])
         for reason in shown(calibration.reasons)
         for option in reason.options.items()
     ]
-    if calibration.verdict is not Verdict.DO_NOT_USE:
+    if not is_poor:
         reach = calibration.out_of_reach
         hidden = [axis for axis in calibration.unobservable() if axis not in reach]
         extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in hidden[:3]]
-    if not extra and not arguments.out and calibration.measured == "poses":
-        extra = ["--out result"]  # figures that show where the disagreement comes from
-    typed = getattr(arguments, "typed", [])
-    if typed and extra:
-        steps.append(f"hand_eye_calib {shlex.join(typed)} {' '.join(dict.fromkeys(extra))}")
+        if not extra and not arguments.out and is_of_poses:
+            extra = ["--out result"]  # figures that show where the disagreement comes from
+    if extra:
+        typed = shlex.join(arguments.typed)
+        steps.append(f"hand_eye_calib {typed} {' '.join(dict.fromkeys(extra))}")
     return steps
-
-
-def _motion_advice(calibration: Calibration, snapshot: "Snapshot") -> str:
-    """What the recording does not show, and the motion that would."""
-    from hand_eye_calib.assessment.excitation import excitation, what_is_missing
-
-    if calibration.status.failure or calibration.verdict is Verdict.DO_NOT_USE:
-        return ""
-    if calibration.measured != "poses":
-        return ""
-    return what_is_missing(excitation(snapshot.pose_pairs()), calibration)
-
-
-def convergence_line(entry: Mapping[str, Any]) -> str:
-    """An entry of the history that ``replay --every`` makes, in one line."""
-    calibration, at = entry["calibration"], f"after {entry['bag_time_s']:g} s:"
-    if calibration is None:
-        return f"{at} no estimate yet, {entry['reason']}"
-    transform = calibration["T_parent_child"]
-    position = _values("xyz", transform["translation"], 3)
-    angles = _values(_ROTATIONS, transform["rpy_deg"], 2)
-    poses, verdict = calibration["n_poses"], calibration["verdict"]
-    return f"{at} {position} m, {angles} deg, {poses} poses, {verdict}"
-
-
-def _values(names: Sequence[str], values: Sequence[float | None], decimals: int) -> str:
-    return " ".join(
-        f"{name} unknown" if value is None else f"{name} {value:.{decimals}f}"
-        for name, value in zip(names, values, strict=True)
-    )
 
 
 def transform_lines(
@@ -312,35 +245,49 @@ def transform_lines(
     if set(out_of_reach) & set(_ROTATIONS):
         yield "  roll, pitch and yaw are not estimated"
         return
-    names, kind, note_on = _ROTATIONS, "rpy", ""
+    names, kind = _ROTATIONS, "rpy"
     if "rotation_vector_deg" in transform:
-        names, kind = _ROTATION_VECTOR, "rotation_vector"
-        note_on = "  rotation vector: pitch is near +/-90 deg, where roll and yaw mean nothing"
-        yield note_on
+        names, kind = ("rx", "ry", "rz"), "rotation_vector"
+        yield "  rotation vector: pitch is near +/-90 deg, where roll and yaw mean nothing"
     angles, sigmas = transform[f"{kind}_deg"], transform[f"sigma_{kind}_deg"]
     for name, value, sigma in zip(names, angles, sigmas, strict=True):
         yield f"  {name:<6} {with_sigma(value, sigma, 2):>24} deg"
-    quaternion = transform["quat_xyzw"]
-    yield f"  quaternion {_values('xyzw', quaternion, 6) if quaternion else 'unknown'}"
+    quaternion = transform["quat_xyzw"] or ()
+    told = " ".join(f"{name} {value:.6f}" for name, value in zip("xyzw", quaternion, strict=False))
+    yield f"  quaternion {told or 'unknown'}"
+
+
+# --------------------------------------------------------------------- details
+
+
+def _details(calibration: Calibration) -> Iterator[str]:
+    yield f"along and about the axes of {calibration.parent_frame}: {_observability(calibration)}"
+    yield from _floor(calibration)
+    for kind, title in _SCATTER.items() if calibration.cross_check else ():
+        told = [
+            f"{axis} {amount(axis, getattr(row, kind))}"
+            for axis, row in (calibration.cross_check or {}).items()
+            if getattr(row, kind) is not None
+        ]
+        if told:
+            yield f"{title}: {', '.join(told)}"
+    yield from _comparisons(calibration)
+    yield from _solution(calibration)
 
 
 def _observability(calibration: Calibration) -> str:
     """Axes by verdict: ``x, y and yaw observed; z unobservable``."""
-    texts = []
-    for verdict, words in _VERDICTS.items():
-        names = [
-            dof.name
-            for dof in calibration.observability
-            if dof.verdict is verdict and dof.name not in calibration.out_of_reach
-        ]
-        if names:
-            texts.append(f"{listing(names)} {words}")
+    groups: dict[str, list[str]] = {}
+    for dof in calibration.observability:
+        if dof.name not in calibration.out_of_reach:
+            word = _OBSERVED.get(dof.verdict.value, dof.verdict.value)
+            groups.setdefault(word, []).append(dof.name)
     if calibration.out_of_reach:
-        texts.append(f"{listing(calibration.out_of_reach)} out of reach")
-    return "; ".join(texts)
+        groups["out of reach"] = [*calibration.out_of_reach]
+    return "; ".join(f"{listing(names)} {words}" for words, names in groups.items())
 
 
-def _floor_lines(calibration: Calibration) -> Iterator[str]:
+def _floor(calibration: Calibration) -> Iterator[str]:
     """Errors that nothing in the recording shows."""
     if calibration.floor is not None and np.isfinite(calibration.sigmas).any():
         from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE, FLOOR_TILT
@@ -358,19 +305,7 @@ def _floor_lines(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def _scatter_lines(cross_check: CrossCheck | None) -> Iterator[str]:
-    """How far other answers to the same question scatter about the result."""
-    for kind, title in _SCATTER.items() if cross_check else ():
-        told = [
-            f"{axis} {amount(axis, getattr(row, kind))}"
-            for axis, row in (cross_check or {}).items()
-            if getattr(row, kind) is not None
-        ]
-        if told:
-            yield f"{title}: {', '.join(told)}"
-
-
-def _comparison_lines(calibration: Calibration) -> Iterator[str]:
+def _comparisons(calibration: Calibration) -> Iterator[str]:
     """The goal of the session, and the comparison with what is installed."""
     if calibration.goal:
         yield f"the session: {calibration.goal.sentence}"
@@ -381,7 +316,7 @@ def _comparison_lines(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def _solution_lines(calibration: Calibration) -> Iterator[str]:
+def _solution(calibration: Calibration) -> Iterator[str]:
     on = f"on reference {calibration.reference}"
     if not METHODS[calibration.method].uses_reference:
         on = "on all poses"
@@ -397,21 +332,4 @@ def _solution_lines(calibration: Calibration) -> Iterator[str]:
     yield from calibration.noise.in_words if calibration.noise else ()
     offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
     scale = (calibration.scale, calibration.scale_sigma)
-    yield (
-        f"time offset {given_or_estimated(*offset, 's')}; scale {given_or_estimated(*scale, '')}"
-    )
-
-
-def _publishing_lines(calibration: Calibration) -> Iterator[str]:
-    """The command that publishes the result, under its verdict, if it is one to use."""
-    if command := static_transform_command(calibration):
-        yield f"To publish it ({_condition(calibration)})"
-        yield f"  {command}"
-        yield ""
-
-
-def _condition(calibration: Calibration) -> str:
-    numbers = calibration.usable_numbers().values()
-    by_hand = [value for value in numbers if isinstance(value, str)]
-    first = f", once you have put in {listing(by_hand)}" if by_hand else ""
-    return f"{calibration.verdict.value}{first}"
+    yield f"time offset {given_or_estimated(*offset, 's')}; scale {given_or_estimated(*scale, '')}"

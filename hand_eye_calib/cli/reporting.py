@@ -7,7 +7,8 @@ import os
 import pickle
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,16 +91,8 @@ def rendered(
     config: CalibratorConfig,
     inputs: Mapping[str, Any],
 ) -> str:
-    """The report as HTML.
-
-    Parameters
-    ----------
-    calibration, evidence
-        As :func:`with_cross_check` returns them.
-    config : CalibratorConfig
-        The options that gave the result.
-    inputs : dict
-        Where the data came from, in plain values.
+    """The report as HTML, from what :func:`with_cross_check` returns, the options that gave the
+    result, and where the data came from in plain values.
     """
     from hand_eye_calib.report.report import render
 
@@ -107,37 +100,23 @@ def rendered(
     return render(calibration, config, evidence, inputs=inputs, command=command)
 
 
-def write_report(directory: Path, *arguments: Any) -> None:
-    """Write the report of a calibration; ``arguments`` are those of :func:`rendered`.
+def write_report(directory: Path, calibration: Calibration, *more: Any) -> None:
+    """Write the report of a calibration; the arguments are those of :func:`rendered`.
 
     Raises
     ------
     InputError
         If it cannot be written.
     """
-    write_page(Path(directory) / REPORT, lambda: rendered(*arguments))
+    if can_draw(REPORT):
+        with waiting_for(f"writing {REPORT}"):
+            save_text(Path(directory) / REPORT, rendered(calibration, *more))
+        note(f"wrote {Path(directory) / REPORT}")
 
 
-def write_rig_report(directory: Path, *arguments: Any) -> None:
-    """Write the report of a rig; ``arguments`` are those of
-    :func:`~hand_eye_calib.report.rig_page.render_rig`.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-
-    def render() -> str:
-        from hand_eye_calib.report.rig_page import render_rig
-
-        return render_rig(*arguments)
-
-    write_page(directory / REPORT, render)
-
-
-def write_page(path: Path, render: Callable[[], str]) -> None:
-    """Write the page that ``render`` returns; if a library for it is missing, say so and go on.
+def write_page(path: Path, function: str, *arguments: Any) -> None:
+    """Write the page that a function of the package ``report`` returns, such as
+    ``rig_page.render_rig``; if a library for it is missing, say so and go on.
 
     Raises
     ------
@@ -146,7 +125,9 @@ def write_page(path: Path, render: Callable[[], str]) -> None:
     """
     if can_draw(path.name):
         with waiting_for(f"writing {path.name}"):
-            save_page(path, render())
+            module, _, name = function.partition(".")
+            render = getattr(import_module(f"hand_eye_calib.report.{module}"), name)
+            save_text(path, render(*arguments))
         note(f"wrote {path}")
 
 
@@ -163,8 +144,8 @@ def can_draw(file_name: str) -> bool:
     return True
 
 
-def save_page(path: Path, text: str) -> Path:
-    """Write a page in one step, into a directory that is made if it is missing; returns its path.
+def save_text(path: Path, text: str | bytes) -> None:
+    """Write a file in one step, into a directory that is made if it is missing.
 
     A link at that path is replaced, not followed.
 
@@ -182,7 +163,6 @@ def save_page(path: Path, text: str) -> Path:
         raise InputError(
             f"cannot write {error.filename or path}: {error.strerror}; choose another directory"
         ) from None
-    return path
 
 
 # ----------------------------------------------------------- a session's pages
@@ -225,7 +205,7 @@ def _session_rig(directory: Path, result: "SessionResult") -> list[Calibration]:
     rig = solve_rig(*_rig_of(result))
     inputs = {**result.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
-    write_rig_report(directory, rig, rig.sensors)
+    write_page(directory / REPORT, "rig_page.render_rig", rig, rig.sensors)
     return [*rig.calibrations[1:]]
 
 

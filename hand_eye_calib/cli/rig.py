@@ -1,13 +1,15 @@
 """A rig of three sensors or more: calibrated, printed and saved."""
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.options import options_from
+from hand_eye_calib.cli.parts import refuse_recordings
 from hand_eye_calib.cli.present import exit_code, show, transform_lines, wrapped
-from hand_eye_calib.cli.reporting import write_rig_report
+from hand_eye_calib.cli.reading import add_sensor, read_rig_files
+from hand_eye_calib.cli.reporting import REPORT, write_page
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, printable
 
@@ -17,20 +19,26 @@ if TYPE_CHECKING:
     from hand_eye_calib.rig.result import RigCalibration
 
 
+def calibrate_files(arguments: argparse.Namespace) -> int:
+    """Calibrate a rig from a trajectory file of each sensor; returns the exit code."""
+    inputs = {"files": [str(path) for path in arguments.paths]}
+    return _calibrate(read_rig_files(arguments), arguments, inputs)
+
+
 def calibrate_bag(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     """Calibrate a rig from the topics of a bag; returns the exit code.
 
     ``as_given`` puts the name of a remote bag back into plain values.
     """
-    from hand_eye_calib.cli.replaying import fingerprints, refuse_recordings
     from hand_eye_calib.io.bags import PoseBag, trajectory_of
+    from hand_eye_calib.io.results import fingerprint
     from hand_eye_calib.io.transforms import TfSource
 
     found: dict[str, Trajectory] = {}
-    with PoseBag(*arguments.bags) as bag:
+    with PoseBag(*arguments.paths) as bag:
         for topic in arguments.topics:
             source = TfSource.parse(topic) if ":" in topic else topic
-            refuse_recordings(arguments.bags, {"parent": source}, CalibratorConfig.max_gap)
+            refuse_recordings(arguments.paths, source, CalibratorConfig.max_gap)
             with waiting_for(f"reading {topic}"):
                 trajectory, notes = trajectory_of(bag, source)
             for text in notes:
@@ -39,30 +47,21 @@ def calibrate_bag(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         for text in bag.warnings:
             note(text)
         inputs: dict[str, Any] = {"bag": str(bag), "topics": arguments.topics}
-        files = bag.files()
-    if arguments.out:
-        inputs["files"] = fingerprints(files)
-    return calibrate_and_deliver(found, arguments, as_given(inputs))
+        if arguments.out:
+            inputs["files"] = [fingerprint(file) for file in bag.files()]
+    return _calibrate(found, arguments, as_given(inputs))
 
 
-def calibrate_and_deliver(
+def _calibrate(
     trajectories: Mapping[str, "Trajectory"], arguments: argparse.Namespace, inputs: dict[str, Any]
 ) -> int:
-    """Calibrate a rig, print it and save it if ``--out`` asks for that; returns the exit code.
-
-    Parameters
-    ----------
-    trajectories : mapping of str to Trajectory
-        By the sensors' frames.
-    arguments : argparse.Namespace
-        With the calibration options, ``json`` and ``out``.
-    inputs : dict
-        Where the data came from, in plain values.
-    """
+    """Calibrate a rig, print it and save it if ``--out`` asks for that; returns the exit code."""
     from hand_eye_calib.io.rig_files import save_rig
     from hand_eye_calib.rig.calibrate import solve_rig
 
-    _refuse_robot(arguments)
+    for name in ("installed", "urdf", "write", "base_frame"):
+        if getattr(arguments, name):
+            raise ConfigError(f"--{name.replace('_', '-')} is of two sensors, not of a rig")
     options = options_from(arguments)
     with waiting_for(f"solving for {len(trajectories)} sensors"):
         rig = solve_rig(trajectories, options)
@@ -70,7 +69,8 @@ def calibrate_and_deliver(
 
     def finish() -> None:
         if arguments.out:
-            write_rig_report(arguments.out, rig, inputs.get("topics") or inputs["files"])
+            names = inputs.get("topics") or inputs["files"]
+            write_page(arguments.out / REPORT, "rig_page.render_rig", rig, names)
 
     codes = [exit_code(each) for each in rig.calibrations]
     failed = [each for each in rig.calibrations if each.status.failure]
@@ -85,47 +85,23 @@ def calibrate_and_deliver(
     )
 
 
-def add_sensor(found: dict[str, "Trajectory"], name: str, trajectory: "Trajectory") -> None:
-    """Add the trajectory of a sensor by its name, which no other one has.
-
-    Raises
-    ------
-    ConfigError
-        If another one has it.
-    """
-    if name in found:
-        raise ConfigError(
-            f"two trajectories of the rig are of one sensor, {name!r}: sensors have the names of "
-            "their frames or files, which must differ"
-        )
-    found[name] = trajectory
-
-
 def as_lines(rig: "RigCalibration") -> list[str]:
     """What a person needs to see of a rig: tree, extrinsics, closure, noise."""
     lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", "", *rig.tree(), ""]
     for each in rig.calibrations:
         lines += [f"{each.child_frame} in {each.parent_frame}: {each.headline}"]
-        lines += [
-            line
-            for reason in each.reasons
-            for line in wrapped(f"{reason.sentence}: {reason.what_to_do}", "- ", "  ")
-        ]
-        lines += [line for text in each.warnings for line in wrapped(f"Note: {text}", "", "  ")]
+        for reason in each.reasons:
+            lines += wrapped(f"{reason.sentence}: {reason.what_to_do}", "- ", "  ")
+        for text in each.warnings:
+            lines += wrapped(f"Note: {text}", "", "  ")
         lines += [*transform_lines(each.to_dict()["T_parent_child"]), ""]
-    lines.append("Answers for two sensors at a time")
-    lines += _indented(closure.sentence for closure in rig.closures)
-    if noise := rig.noise_in_words():
-        lines += ["", "Noise of every sensor", *_indented(noise)]
-    return lines
-
-
-def _indented(texts: Iterable[str]) -> list[str]:
-    return [line for text in texts for line in wrapped(text, "  ", "    ")]
-
-
-def _refuse_robot(arguments: argparse.Namespace) -> None:
-    """Options that compare or write one extrinsic."""
-    for name in ("installed", "urdf", "write", "base_frame"):
-        if getattr(arguments, name, None):
-            raise ConfigError(f"--{name.replace('_', '-')} is of two sensors, not of a rig")
+    closures = [each.sentence for each in rig.closures]
+    sections = {
+        "Results for two sensors at a time": closures,
+        "Noise of every sensor": rig.noise_in_words(),
+    }
+    for title, texts in sections.items():
+        if not texts:
+            continue
+        lines += [title, *(line for text in texts for line in wrapped(text, "  ", "    ")), ""]
+    return lines[:-1]

@@ -54,18 +54,25 @@ def with_robot(calibration: "Calibration", arguments: argparse.Namespace) -> "Ca
     HandEyeCalibError
         If what is installed cannot be read.
     """
-    if arguments.write and not arguments.urdf:
-        raise ConfigError("--write needs --urdf: the description to change")
+    require_description(arguments)
     if calibration.status.failure:
         return calibration
     if (installed := _installed(calibration, arguments)) is not None:
         from hand_eye_calib.session.compare import with_comparison
 
         calibration = with_comparison(calibration, installed)
-    if not arguments.base_frame:
-        return calibration
-    T_base_parent = _frames(arguments).pose(arguments.base_frame, calibration.parent_frame)
-    return replace(calibration, base_frame=arguments.base_frame, T_base_parent=T_base_parent)
+    if arguments.base_frame:
+        T_base_parent = _frames(arguments).pose(arguments.base_frame, calibration.parent_frame)
+        calibration = replace(
+            calibration, base_frame=arguments.base_frame, T_base_parent=T_base_parent
+        )
+    return calibration
+
+
+def require_description(arguments: argparse.Namespace) -> None:
+    """Refuse ``--write`` without ``--urdf``."""
+    if arguments.write and not arguments.urdf:
+        raise ConfigError("--write needs --urdf: the description to change")
 
 
 def write_description(calibration: "Calibration", arguments: argparse.Namespace) -> None:
@@ -78,7 +85,7 @@ def write_description(calibration: "Calibration", arguments: argparse.Namespace)
     """
     if not arguments.write:
         return
-    from hand_eye_calib.io.files import write_atomically
+    from hand_eye_calib.cli.reporting import save_text
     from hand_eye_calib.io.urdf import RobotDescription
     from hand_eye_calib.results.calibration import SolveStatus, Verdict
 
@@ -92,11 +99,7 @@ def write_description(calibration: "Calibration", arguments: argparse.Namespace)
         raise InputError(f"{arguments.write} is not written: {calibration.headline}")
     description = RobotDescription(arguments.urdf)
     frames = calibration.parent_frame, calibration.child_frame
-    patched = description.patched(*frames, calibration.T_parent_child)
-    try:
-        write_atomically({arguments.write: patched})
-    except OSError as error:
-        raise InputError(f"cannot write {arguments.write}: {error.strerror}") from None
+    save_text(arguments.write, description.patched(*frames, calibration.T_parent_child))
     note(f"wrote {arguments.write}: joint {description.joint_name(*frames)} changed")
 
 
@@ -118,6 +121,6 @@ def _frames(arguments: argparse.Namespace) -> "FrameTree":
 
     if arguments.urdf:
         return RobotDescription(arguments.urdf).frames
-    if bags := getattr(arguments, "bags", None):
-        return frames_of_bag(bags[0])
+    if getattr(arguments, "is_of_bags", False):
+        return frames_of_bag(arguments.paths[0])
     raise ConfigError("--base-frame needs --urdf: the description that has the frame")

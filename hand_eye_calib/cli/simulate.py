@@ -17,6 +17,7 @@ from hand_eye_calib.simulation.options import (
     DriveConfig,
     NoiseConfig,
 )
+from hand_eye_calib.text import counted
 
 if TYPE_CHECKING:
     from hand_eye_calib.simulation.drive import SimulatedDrive
@@ -59,17 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0,
         help="the same seed gives the same recordings. Default: 0",
     )
-    _add_motion_arguments(parser)
-    _add_noise_arguments(parser)
     parser.add_argument(
         "--bag",
         choices=("mcap", "sqlite3", "rosbag1"),
         help="also write a bag of every recording, in this storage format",
     )
     add_json_argument(parser)
-
-
-def _add_motion_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("motion")
     group.add_argument(
         "--drive",
@@ -84,6 +80,7 @@ def _add_motion_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="poses of the parent sensor. Default: 100 (published), 1200 (hilly)",
     )
+    _add_noise_arguments(parser)
 
 
 def _add_noise_arguments(parser: argparse.ArgumentParser) -> None:
@@ -132,20 +129,13 @@ def run(arguments: argparse.Namespace) -> int:
         }
         print(json.dumps({"runs": [str(folder) for folder in folders], **settings}, indent=2))
     else:
-        recordings = "recording" if len(folders) == 1 else "recordings"
-        print(f"{len(folders)} {recordings} written to {arguments.out}")
+        print(f"{counted(len(folders), 'recording')} written to {arguments.out}")
     return 0
 
 
 def write_drive(folder: Path, drive: "SimulatedDrive", bag: str | None = None) -> None:
-    """Write a SimulatedDrive into a new folder.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-    drive : SimulatedDrive
-    bag : str, optional
-        Storage of a bag to write as well: mcap, sqlite3 or rosbag1.
+    """Write a SimulatedDrive into a new folder; ``bag`` is the storage of a bag to write as well:
+    mcap, sqlite3 or rosbag1.
 
     Raises
     ------
@@ -174,13 +164,9 @@ def _configs(arguments: argparse.Namespace) -> tuple[DriveConfig, NoiseConfig]:
     config = _DRIVES[arguments.drive]
     if arguments.poses is not None:
         config = dataclasses.replace(config, poses=arguments.poses)
-    given = {
-        name: getattr(arguments, option)
-        for option, name in _NOISE_OPTIONS.items()
-        if getattr(arguments, option) is not None
-    }
-    noise = MIXTURE if arguments.mixture else REALISTIC
-    noise = NoiseConfig() if arguments.noise_free else noise
+    noise = MIXTURE if arguments.mixture else NoiseConfig() if arguments.noise_free else REALISTIC
+    given = {name: getattr(arguments, option) for option, name in _NOISE_OPTIONS.items()}
+    given = {name: value for name, value in given.items() if value is not None}
     return config, dataclasses.replace(noise, **given)
 
 

@@ -1,6 +1,6 @@
 """What there is to see in each figure of the report, in words and numbers."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -9,42 +9,32 @@ from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.answers import Answer
 from hand_eye_calib.engine.evidence import Evidence, StreamView
-from hand_eye_calib.methods import METHODS
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import amount, angle, counted, length, listing, share
-
-Caption = Callable[[Calibration, Evidence], str]
 
 TITLES = {
     "trajectories": "Both trajectories, aligned",
     "residuals": "Residuals over time",
     "convergence": "Convergence",
     "excitation": "Excitation",
-    "methods": "Other methods and references",
-    "halves": "The two halves of the recording",
+    "answers": "Other methods, other references, and each half alone",
     "streams": "Both streams before any solve",
 }
 
-# Figures that streams of other kinds do not have.
-_OF_POSES_ALONE = {"methods": ("poses",), "trajectories": ("poses", "positions")}
-
-# Two results disagree when they are this many standard deviations apart.
+# Two results disagree, and a result has not settled, from so many standard deviations on.
 _DISAGREE = 3.0
 
-# A recording is long enough when from its first part on the result stays within this many standard
-# deviations of the final one.
-_SETTLED = 3.0
+_WHAT_COINCIDES = {
+    "angular rate": "Two sensors on one rigid body have the same angular rate at every moment, "
+    "however they are mounted: the two curves must coincide, up to the bias of a gyroscope.",
+    "speed": "Two points of one rigid body have the same speed while it does not rotate: the two "
+    "curves must have the same course.",
+}
 
 
 def time_axis(duration_s: float) -> tuple[float, str]:
     """Factor and name of the unit in which the time of a recording is shown."""
     return (1.0, "s") if duration_s < 300 else (1 / 60, "min")
-
-
-def figures_of(calibration: Calibration) -> list[str]:
-    """Names of the figures in :data:`TITLES` that a result of its kind has."""
-    kind = calibration.measured
-    return [name for name in TITLES if kind in _OF_POSES_ALONE.get(name, (kind,))]
 
 
 def measured_axes(calibration: Calibration) -> BoolArray:
@@ -53,50 +43,67 @@ def measured_axes(calibration: Calibration) -> BoolArray:
     return np.array([name not in silent for name in AXES])
 
 
+def known_axes(calibration: Calibration) -> BoolArray:
+    """Mask (6,) of the axes that the result knows."""
+    known: BoolArray = np.isfinite(calibration.sigmas) & measured_axes(calibration)
+    return known
+
+
 def captions(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
-    """A caption for each figure of a result."""
-    return {name: _CAPTIONS[name](calibration, evidence) for name in figures_of(calibration)}
+    """A caption for each figure that a result of its kind has, by the names in :data:`TITLES`."""
+    makers: dict[str, Callable[[Calibration, Evidence], str]] = {
+        "trajectories": _of_trajectories,
+        "residuals": _of_residuals,
+        "convergence": _of_convergence,
+        "excitation": _of_excitation,
+        "answers": _of_answers,
+    }
+    if calibration.measured == "rotations":
+        del makers["trajectories"]
+    texts = {name: make(calibration, evidence) for name, make in makers.items()}
+    return texts | {"streams": of_streams(evidence.streams)}
 
 
 def _of_trajectories(calibration: Calibration, evidence: Evidence) -> str:
     tracks = evidence.tracks
     apart = np.linalg.norm(tracks.parent - tracks.child, axis=1)
-    farthest = int(np.argmax(apart))
     path_m = float(np.linalg.norm(np.diff(tracks.parent, axis=0), axis=1).sum())
-    factor, unit = time_axis(tracks.times_s[-1])
-    names, drifting = (calibration.parent_frame, calibration.child_frame), "both odometries"
-    if calibration.measured == "positions":
-        names = names if evidence.has_positions_of_parent else names[::-1]
-        drifting = "the odometry"
+    names = (calibration.parent_frame, calibration.child_frame)
+    if calibration.measured == "positions" and not evidence.has_positions_of_parent:
+        names = names[::-1]
+    at = _at(tracks.times_s[int(np.argmax(apart))], evidence)
     return (
         f"The path of {names[0]}, {length(path_m)} long, and the same path "
         f"computed from the poses of {names[1]} and the result. Half of the time "
         f"they are within {length(float(np.median(apart)))} of each other, and at most "
-        f"{length(apart[farthest])} apart, at {tracks.times_s[farthest] * factor:.1f} {unit}. "
-        f"That includes drift and jumps of {drifting}."
+        f"{length(apart.max())} apart, {at}. That includes drift and jumps of the odometry."
     )
 
 
+def _at(seconds: float, evidence: Evidence) -> str:
+    factor, unit = time_axis(evidence.tracks.times_s[-1])
+    return f"at {seconds * factor:.1f} {unit}"
+
+
 def _of_residuals(calibration: Calibration, evidence: Evidence) -> str:
-    residuals = evidence.residuals
+    residuals, sizes = evidence.residuals, residual_sizes(calibration, evidence)
     n_out = int(residuals.is_outlier.sum())
     what = f"motion pairs ({residuals.reference})"
     if calibration.measured == "positions":
         what = "distances from one position to the next"
-    sizes = residual_sizes(calibration, evidence)
-    text = (
-        f"Half of the {len(residuals.times_s):,} {what} agree with the result to "
-        f"{_each(sizes, np.median)}"
-    )
+
+    def each(of: Callable[[FloatArray], FloatArray]) -> str:
+        return listing([amount(axis, float(of(values))) for axis, values in sizes.items()])
+
+    text = f"Half of the {len(residuals.times_s):,} {what} agree with the result to "
     if not n_out:
-        return f"{text}, all of them to {_each(sizes, np.max)}. There are no outliers."
+        return f"{text}{each(np.median)}, all of them to {each(np.max)}. There are no outliers."
     axis, values = next(iter(sizes.items()))
     largest = int(np.argmax(np.where(residuals.is_outlier, values, -1)))
-    factor, unit = time_axis(evidence.tracks.times_s[-1])
     return (
-        f"{text}; {n_out:,} ({share(n_out / len(residuals.times_s))}) were rejected as outliers, "
-        f"the largest {amount(axis, values[largest])} at "
-        f"{residuals.times_s[largest] * factor:.1f} {unit}."
+        f"{text}{each(np.median)}; {n_out:,} ({share(n_out / len(residuals.times_s))}) were "
+        f"rejected as outliers, the largest {amount(axis, values[largest])} "
+        f"{_at(residuals.times_s[largest], evidence)}."
     )
 
 
@@ -104,143 +111,103 @@ def residual_sizes(calibration: Calibration, evidence: Evidence) -> dict[str, Fl
     """Lengths of the residuals that streams of this kind have: of translations under "x", of
     rotations under "yaw".
     """
-    residuals = evidence.residuals
+    residuals, seen = evidence.residuals, measured_axes(calibration)
     both = {"x": residuals.translation_m, "yaw": residuals.rotation_rad}
-    seen = measured_axes(calibration)
     return {axis: values for axis, values in both.items() if seen[AXES.index(axis)]}
 
 
-def _each(sizes: Mapping[str, FloatArray], of: Callable[[FloatArray], FloatArray]) -> str:
-    return listing([amount(axis, float(of(values))) for axis, values in sizes.items()])
-
-
 def _of_convergence(calibration: Calibration, evidence: Evidence) -> str:
-    estimates = evidence.convergence
+    estimates, known = evidence.convergence, known_axes(calibration)
     if len(estimates) < 3:
         return "The recording is too short to be divided into parts."
-    known = np.isfinite(calibration.sigmas) & measured_axes(calibration)
     if not known.any():
         return "No axis is observable, however much of the recording is used."
-    last = _last_change(calibration, estimates, known)
-    first = _settled_from(calibration, estimates, known)
-    factor, unit = time_axis(estimates[-1].until_s)
+    moved = relative_to(calibration, [one.calibration for one in estimates])
+    sigmas = np.array([one.calibration.sigmas for one in estimates])
+    limits = _DISAGREE * np.where(np.isfinite(sigmas), sigmas, 0)
+    near = np.all((np.abs(moved) <= limits)[:, known], axis=1)
+    first = 0 if near.all() else len(near) - int(np.argmin(near[::-1]))
+    late = max(len(estimates) * 7 // 10 - 1, 0)
+    rest = 1 - estimates[late].until_s / estimates[-1].until_s
+    last = (
+        f"The last {rest:.0%} of the recording changed the result by "
+        f"{_largest(moved[late], known)}. Shaded: one standard deviation.{_downsampled(estimates)}"
+    )
     if first == len(estimates) - 1:
         names = [name for name, is_known in zip(AXES, known, strict=True) if is_known]
         return (
-            f"The result had not settled within its own uncertainty before the end "
-            f"({listing(names)}): record longer. {last} Shaded: one standard "
-            f"deviation.{_downsampled(estimates)}"
+            "The result had not settled within its own uncertainty before the end "
+            f"({listing(names)}): record longer. {last}"
         )
+    since = _at(estimates[first].until_s, evidence).replace("at", "From")
     return (
-        f"From {estimates[first].until_s * factor:.1f} {unit} on, the result stays within "
-        f"{_SETTLED:g} of its standard deviations (shaded: one) of the final result. "
-        f"{last}{_downsampled(estimates)}"
+        f"{since} on, the result stays within {_DISAGREE:g} of its standard deviations of the "
+        f"final result. {last}"
     )
-
-
-def _settled_from(calibration: Calibration, estimates: Sequence[Answer], known: BoolArray) -> int:
-    """Index of the estimate from which on all lie near the result."""
-    moved = np.array(
-        [deviation(one.calibration.T_parent_child, calibration.T_parent_child) for one in estimates]
-    )[:, known]
-    sigmas = np.array([one.calibration.sigmas for one in estimates])[:, known]
-    near = (np.abs(moved) <= _SETTLED * np.where(np.isfinite(sigmas), sigmas, 0)).all(axis=1)
-    return 0 if near.all() else len(near) - int(np.argmin(near[::-1]))
-
-
-def _last_change(calibration: Calibration, estimates: Sequence[Answer], known: BoolArray) -> str:
-    late = estimates[max(len(estimates) * 7 // 10 - 1, 0)]
-    moved = deviation(late.calibration.T_parent_child, calibration.T_parent_child)
-    rest = 1 - late.until_s / estimates[-1].until_s
-    return f"The last {rest:.0%} of the recording changed the result by {_largest(moved, known)}."
 
 
 def _of_excitation(calibration: Calibration, evidence: Evidence) -> str:
     seen, rotations = evidence.excitation, evidence.rotations
     if not len(rotations.times_s):
         return "The poses are too far apart to show the rotations."
-    over = np.degrees(np.percentile(np.abs(rotations.vectors), 95, axis=0))
-    angles = [f"{angle:.1f}° in {name}" for angle, name in zip(over, AXES[3:], strict=True)]
-    least = "xyz"[int(np.argmax(np.abs(seen.worst)))]
-    text = (
-        f"Rotation within {rotations.span_s:.1f} s: up to {listing(angles)} (95 % of the time "
-        "less)."
-    )
+    over = np.percentile(np.abs(rotations.vectors), 95, axis=0)
+    angles = [f"{angle(value)} about {axis}" for value, axis in zip(over, "xyz", strict=True)]
+    text = f"Rotation within {rotations.span_s:.1f} s: up to {listing(angles)} (95 % of the time)."
     if calibration.measured == "rotations":
         return f"{text} Only rotations about two axes and more show the whole orientation."
+    least = "xyz"[int(np.argmax(np.abs(seen.worst)))]
     return (
         f"{text} The lever arm along {least} is observed least: an error of 1 cm in it moves a "
-        f"motion by "
-        f"{seen.worst_gain:.2g} cm, an error of 1 cm along the best observed axis by "
-        f"{seen.gain.max():.2g} cm. Rotations inside the grey band say little about a lever arm."
+        f"motion by {length(0.01 * seen.worst_gain)}, one along the best observed axis by "
+        f"{length(0.01 * seen.gain.max())}. Rotations inside the grey band say little about it."
     )
 
 
-def _of_methods(calibration: Calibration, evidence: Evidence) -> str:
-    if not evidence.comparison:
-        return "The recording is too short to compare methods."
-    known = np.isfinite(calibration.sigmas)
+def _of_answers(calibration: Calibration, evidence: Evidence) -> str:
+    if not (evidence.comparison or evidence.halves):
+        return "The recording is too short to compare methods, or to be divided into halves."
+    known = known_axes(calibration)
     if not known.any():
         return "No axis is observable, so there is nothing to compare."
-    robust: dict[str, FloatArray] = {}
-    others: dict[str, FloatArray] = {}
-    for one in evidence.comparison:
-        # What a method itself calls unobservable is not held against it.
-        moved = np.where(
-            np.isfinite(one.calibration.sigmas),
-            deviation(one.calibration.T_parent_child, calibration.T_parent_child),
-            0.0,
-        )
-        group = robust if METHODS[one.calibration.method].rejects_outliers else others
-        group[one.label] = moved
     texts = []
-    if robust:
-        worst = np.max(np.abs(list(robust.values())), axis=0)
+    if evidence.comparison:
+        others = [one.calibration for one in evidence.comparison]
+        moved = np.abs(relative_to(calibration, others))
+        # What a method itself calls unobservable is not held against it.
+        moved[~np.isfinite([one.sigmas for one in others])] = 0.0
+        farthest = int(np.argmax(np.linalg.norm(moved[:, known], axis=1)))
         texts.append(
-            "The methods that reject outliers differ from the result by at most "
-            f"{_largest(worst, known)}"
+            f"Half of the other methods and references are within "
+            f"{_largest(np.median(moved, axis=0), known)} of the result; the farthest, "
+            f"{evidence.comparison[farthest].label}, is {_largest(moved[farthest], known)} away."
         )
-    if others:
-        label = max(others, key=lambda name: _distance(others[name], known))
-        texts.append(f"those that use every pair by {_largest(others[label], known)} ({label})")
+    texts += [_halves(calibration, evidence)] if len(evidence.halves) == 2 else []
     return (
-        "; ".join(texts) + ". B<n> pairs each pose with the n-th before it. Bars: one standard "
+        f"{' '.join(texts)} B<n> pairs each pose with the n-th before it. Bars: one standard "
         "deviation; triangles lie beyond the axis; shaded: one standard deviation of the result."
     )
 
 
-def _of_halves(calibration: Calibration, evidence: Evidence) -> str:
-    if len(evidence.halves) < 2:
-        return "The recording is too short to be divided into halves."
+def _halves(calibration: Calibration, evidence: Evidence) -> str:
+    """Whether the halves of the recording, without priors, differ by more than chance."""
     first, second = (half.calibration for half in evidence.halves)
     known = np.isfinite(first.sigmas) & np.isfinite(second.sigmas) & measured_axes(calibration)
     if not known.any():
         return "No axis is observable in both halves."
     apart = deviation(first.T_parent_child, second.T_parent_child)
-    joint = np.hypot(first.sigmas, second.sigmas)
-    hidden = ~known & np.isfinite(calibration.sigmas) & measured_axes(calibration)
+    ratio = np.where(known, np.abs(apart) / np.hypot(first.sigmas, second.sigmas), 0.0)
+    worst = int(np.argmax(ratio))
+    judged = f"the largest, {AXES[worst]}, is {ratio[worst]:.1f} standard deviations"
+    text = f"The two halves alone differ by {_largest(apart, known)}, which may be chance: {judged}"
+    if ratio[worst] > _DISAGREE:
+        text = (
+            f"The two halves alone differ by {_largest(apart, known)}, which is more than chance: "
+            f"{judged}. Do not trust the result beyond that difference"
+        )
+    hidden = known_axes(calibration) & ~known
     less = [name for name, is_hidden in zip(AXES, hidden, strict=True) if is_hidden]
     missing = f" Half of the recording does not determine {listing(less)}." if less else ""
-    return (
-        f"From each half alone, without priors: they differ by {_largest(apart, known)}, "
-        f"{_judged(apart[known], joint[known], np.array(AXES)[known].tolist())}.{missing}"
-        f"{_downsampled(evidence.halves)}"
-    )
-
-
-def _judged(apart: FloatArray, joint: FloatArray, names: Sequence[str]) -> str:
-    """Whether a difference is chance, by the standard deviations."""
-    ratio = np.abs(apart) / np.maximum(joint, 1e-12)
-    worst = int(np.argmax(ratio))
-    if ratio[worst] > _DISAGREE:
-        return (
-            f"which is more than chance: {names[worst]} by {ratio[worst]:.1f} standard deviations. "
-            "Do not trust the result beyond that difference"
-        )
-    return (
-        f"which may be chance: the largest, {names[worst]}, is {ratio[worst]:.1f} standard "
-        "deviations"
-    )
+    return f"{text}.{missing}{_downsampled(evidence.halves)}"
 
 
 def of_streams(seen: StreamView) -> str:
@@ -251,7 +218,11 @@ def of_streams(seen: StreamView) -> str:
         f"{gaps[1]} in the child stream."
     )
     if not seen.is_whole:
-        return f"{_WHAT_COINCIDES[seen.quantity]} {_half_of_the_time(seen)} {bars}"
+        apart = length(seen.apart) if seen.quantity == "speed" else angle(seen.apart)
+        differ = f"Here they differ by less than {apart}/s half of the time."
+        if not np.isfinite(seen.apart):
+            differ = "Here the streams never overlap."
+        return f"{_WHAT_COINCIDES[seen.quantity]} {differ} {bars}"
     text = (
         "Two sensors on one rigid body have the same angular rate at every moment. Each motion "
         "rotates both by the same angle and moves both equally far along its rotation axis, "
@@ -260,40 +231,18 @@ def of_streams(seen: StreamView) -> str:
     )
     if not len(seen.angles):
         return text + "Here the streams have 0 motions in common: there is nothing to compare."
-    apart = np.abs(np.diff(seen.angles, axis=1))
-    text += (
-        f"Here half of the {len(seen.angles)} motions over {seen.lag_s:g} s differ by less than "
-        f"{angle(float(np.median(apart)))}"
-    )
+    differences = [angle(float(np.median(np.abs(np.diff(seen.angles, axis=1)))))]
     if len(seen.along_axis):
-        text += f" and {length(float(np.median(np.abs(np.diff(seen.along_axis, axis=1)))))}"
-    return f"{text}. {bars}"
+        differences.append(length(float(np.median(np.abs(np.diff(seen.along_axis, axis=1))))))
+    return (
+        f"{text}Here half of the {len(seen.angles)} motions over {seen.lag_s:g} s differ by less "
+        f"than {listing(differences)}. {bars}"
+    )
 
 
-_WHAT_COINCIDES = {
-    "angular rate": "Two sensors on one rigid body have the same angular rate at every moment, "
-    "however they are mounted: the two curves must coincide, up to the bias of a gyroscope.",
-    "speed": "Two points of one rigid body have the same speed while it does not rotate: the two "
-    "curves must have the same course.",
-}
-
-
-def _half_of_the_time(seen: StreamView) -> str:
-    if not np.isfinite(seen.apart):
-        return "Here the streams never overlap."
-    apart = length(seen.apart) if seen.quantity == "speed" else angle(seen.apart)
-    return f"Here they differ by less than {apart}/s half of the time."
-
-
-_CAPTIONS: dict[str, Caption] = {
-    "trajectories": _of_trajectories,
-    "residuals": _of_residuals,
-    "convergence": _of_convergence,
-    "excitation": _of_excitation,
-    "methods": _of_methods,
-    "halves": _of_halves,
-    "streams": lambda calibration, evidence: of_streams(evidence.streams),
-}
+def relative_to(calibration: Calibration, answers: Sequence[Calibration]) -> FloatArray:
+    """Deviations (N, 6) of answers from the result, in m and rad."""
+    return np.array([deviation(one.T_parent_child, calibration.T_parent_child) for one in answers])
 
 
 def _downsampled(estimates: Sequence[Answer]) -> str:
@@ -317,7 +266,3 @@ def _largest(difference: FloatArray, known: BoolArray) -> str:
             name = AXES[first + index]
             texts.append(f"{amount(name, values[index])} ({name})")
     return listing(texts)
-
-
-def _distance(difference: FloatArray, known: BoolArray) -> float:
-    return float(np.linalg.norm(np.where(known, difference, 0.0)))

@@ -3,18 +3,16 @@
 from collections.abc import Sequence
 
 from hand_eye_calib.checks.check import CheckResult
-from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.checks.findings import Finding
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import view_streams
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, of_streams
-from hand_eye_calib.report.report import environment
+from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.report.report_figures import draw_streams
 
 # A smaller time offset (s) is not mentioned.
 _SHOWN_S = 5e-4
-
-_MARKS = {"good": "✓", "warn": "!", "bad": "✗"}
 
 
 def render_check(
@@ -45,44 +43,22 @@ def render_check(
     -------
     str
     """
+    figures = []
     # Without any correlation the streams were not looked at: they are too short, or their stamps
     # are in doubt.
-    is_seen = bool(checked.correlation.overlap_s)
-    svg, said = _figure(parent, child, checked, max_gap_s) if is_seen else ("", "")
-    tone = _tone(findings)
-    return (
-        environment()
-        .get_template("check.html")
-        .render(
-            inputs=inputs,
-            findings=findings,
-            tone=tone,
-            mark=_MARKS[tone],
-            verdict=verdict.partition(": ")[0],
-            meaning=verdict.partition(": ")[2],
-            title=TITLES["streams"],
-            svg=svg,
-            said=said,
-        )
+    if checked.correlation.overlap_s:
+        offset_s = checked.correlation.offset_s if checked.correlation.is_clear else 0.0
+        seen = view_streams(parent, child.shifted(offset_s), max_gap_s)
+        text = of_streams(seen)
+        if abs(offset_s) >= _SHOWN_S:
+            text += (
+                f" In the figure {offset_s:.3f} s are added to the child's stamps: with that "
+                f"offset both have the same {seen.quantity}."
+            )
+        svg = draw_streams(seen, ("parent", "child"))
+        figures = [{"name": "streams", "title": TITLES["streams"], "said": text, "svg": svg}]
+    word, _, said = verdict.partition(": ")
+    told = findings
+    return page(
+        "check.html", TONES[word], word, said, inputs=inputs, findings=told, figures=figures
     )
-
-
-def _figure(
-    parent: Trajectory, child: Trajectory, checked: CheckResult, max_gap_s: float
-) -> tuple[str, str]:
-    """SVG and caption of both streams, with the time offset that was found."""
-    offset_s = checked.correlation.offset_s if checked.correlation.is_clear else 0.0
-    seen = view_streams(parent, child.shifted(offset_s), max_gap_s)
-    caption = of_streams(seen)
-    if abs(offset_s) >= _SHOWN_S:
-        caption += (
-            f" In the figure {offset_s:.3f} s are added to the child's stamps: with that offset "
-            f"both have the same {seen.quantity}."
-        )
-    return draw_streams(seen, ("parent", "child")), caption
-
-
-def _tone(findings: Sequence[Finding]) -> str:
-    if any(finding.makes_unusable for finding in findings):
-        return "bad"
-    return "warn" if any(each.severity is Severity.WARNING for each in findings) else "good"

@@ -2,7 +2,7 @@
 
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -19,7 +19,7 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, captions
 from hand_eye_calib.report.report_figures import draw_all
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, Reason, Verdict
+from hand_eye_calib.results.calibration import Calibration, Reason, Verdict
 from hand_eye_calib.results.records import Noise
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
@@ -38,11 +38,18 @@ from hand_eye_calib.text import (
 
 Plain = Mapping[str, Any]
 
+MARKS = {"good": "✓", "warn": "!", "bad": "✗"}
+TONES = {
+    Verdict.USE.value: "good",
+    Verdict.USE_WITH_CARE.value: "warn",
+    Verdict.DO_NOT_USE.value: "bad",
+}
+
 _WORDS = {
-    DofVerdict.OBSERVED: "determined by the motion",
-    DofVerdict.WEAK: "determined, but not well",
-    DofVerdict.UNOBSERVABLE: "do not use this value",
-    DofVerdict.PRIOR: "mostly from the prior",
+    "observed": "determined by the motion",
+    "weak": "determined, but not well",
+    "unobservable": "do not use this value",
+    "prior": "mostly from the prior",
 }
 _AXIS_NAMES = {"roll": "about x (roll)", "pitch": "about y (pitch)", "yaw": "about z (yaw)"}
 
@@ -50,6 +57,32 @@ _AXIS_NAMES = {"roll": "about x (roll)", "pitch": "about y (pitch)", "yaw": "abo
 _BAR_DECADES, _BAR_ABOVE = 4.0, 1.0
 
 _REFUSED = {"refused_duplicate": "with a repeated stamp", "refused_late": "late arrivals"}
+
+
+def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> str:
+    """A page from its template: every page begins with a verdict, in words and by a tone.
+
+    Parameters
+    ----------
+    template : str
+    tone : {"good", "warn", "bad"}
+    verdict, said : str
+        In a word and in a sentence.
+    **values
+        What else the template shows.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": fixed, "in_words": in_words, "printable": printable}
+    values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
+    return environment.get_template(template).render(
+        **values, marks=MARKS, said=f"{said[:1].upper()}{said[1:]}"
+    )
 
 
 def render(
@@ -80,91 +113,50 @@ def render(
     """
     inputs = inputs or {}
     parent, child = printable(calibration.parent_frame), printable(calibration.child_frame)
-    return (
-        environment()
-        .get_template("report.html")
-        .render(
-            **_result(calibration),
-            rotating=child if evidence.has_positions_of_parent else parent,
-            advice=_advice(calibration, evidence),
-            command=command,
-            figures=_figures(calibration, evidence),
-            findings=calibration.findings,
-            summary=_summary(calibration, evidence),
-            streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
-            reasons=[_reason(reason) for reason in shown(calibration.reasons)],
-            unknown=_by_hand(calibration),
-            target=_targets(calibration),
-            provenance=_provenance(inputs),
-            options={name: value for name, value in config.to_options().items() if value != ""},
-        )
+    verdict, _, said = calibration.headline.partition(": ")
+    document, numbers = calibration.to_dict(), calibration.usable_numbers()
+    svgs = draw_all(calibration, evidence)
+    is_poor = calibration.verdict is Verdict.DO_NOT_USE
+    unknown = {*calibration.out_of_reach}
+    return page(
+        "report.html",
+        TONES[calibration.verdict.value],
+        verdict,
+        said,
+        calibration=calibration,
+        document=document,
+        parent=parent,
+        child=child,
+        rotating=child if evidence.has_positions_of_parent else parent,
+        kind="Position" if unknown & {*ROTATIONS} else "Orientation" if unknown else "Pose",
+        directions=[
+            _direction(document[key], unknown) for key in ("T_parent_child", "T_child_parent")
+        ],
+        axes=list(_axes(calibration)),
+        differences=list(_differences(calibration)),
+        advice="" if is_poor else what_is_missing(evidence.excitation, calibration),
+        command=command,
+        unknown=listing([value for value in numbers.values() if isinstance(value, str)]),
+        target=_targets(calibration),
+        reasons=[_reason(reason) for reason in shown(calibration.reasons)],
+        figures=[
+            {"name": name, "title": TITLES[name], "said": text, "svg": svgs.get(name)}
+            for name, text in captions(calibration, evidence).items()
+        ],
+        findings=calibration.findings,
+        summary=_summary(calibration, evidence),
+        streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
+        provenance=list(_provenance(inputs)),
+        options={name: value for name, value in config.to_options().items() if value != ""},
     )
 
 
 def _targets(calibration: Calibration) -> str:
     """Target of x, y and z, of the rotations, and of the axes that have their own."""
     single = [f"{axis} {amount(axis, value)}" for axis, value in calibration.target_axes.items()]
-    common = amount("x", calibration.target_translation), amount("yaw", calibration.target_rotation)
-    return listing([*common, *single])
-
-
-def _result(calibration: Calibration) -> dict[str, Any]:
-    """What the page says of the result alone."""
-    document = calibration.to_dict()
-    return {
-        "calibration": calibration,
-        "parent": printable(calibration.parent_frame),
-        "child": printable(calibration.child_frame),
-        "document": document,
-        **verdict_of(calibration),
-        "kind": _kind(calibration),
-        "directions": [
-            _direction(document[key], calibration) for key in ("T_parent_child", "T_child_parent")
-        ],
-        "axes": _axes(calibration),
-        "differences": _differences(calibration),
-    }
-
-
-def _figures(calibration: Calibration, evidence: Evidence) -> list[dict[str, Any]]:
-    svgs = draw_all(calibration, evidence)
-    texts = captions(calibration, evidence)
-    return [
-        {"name": name, "title": TITLES[name], "said": said, "svg": svgs.get(name)}
-        for name, said in texts.items()
-    ]
-
-
-def environment() -> jinja2.Environment:
-    """The templates of pages, and what they may use."""
-    made = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    return listing(
+        [length(calibration.target_translation), angle(calibration.target_rotation), *single]
     )
-    made.filters["number"] = fixed
-    made.filters["in_words"] = in_words
-    made.filters["printable"] = printable
-    return made
-
-
-# ---------------------------------------------------------------- the verdict
-
-
-_LOOKS = {
-    Verdict.USE: ("✓", "good"),
-    Verdict.USE_WITH_CARE: ("!", "warn"),
-    Verdict.DO_NOT_USE: ("✗", "bad"),
-}
-
-
-def verdict_of(calibration: Calibration) -> dict[str, str]:
-    """Verdict, what it says in a sentence, a mark and a tone for it."""
-    mark, tone = _LOOKS[calibration.verdict]
-    verdict, _, said = calibration.headline.partition(": ")
-    return {"mark": mark, "tone": tone, "verdict": verdict, "said": f"{said[:1].upper()}{said[1:]}"}
 
 
 def _reason(reason: Reason) -> dict[str, str]:
@@ -173,93 +165,42 @@ def _reason(reason: Reason) -> dict[str, str]:
     return {"sentence": reason.sentence, "what_to_do": what_to_do}
 
 
-def _advice(calibration: Calibration, evidence: Evidence) -> str:
-    """The motion that would help, if the result is one to improve."""
-    if calibration.verdict is Verdict.DO_NOT_USE:
-        return ""
-    return what_is_missing(evidence.excitation, calibration)
-
-
-def _by_hand(calibration: Calibration) -> str:
-    """Words of the command that stand for axes to be measured."""
-    words = [value for value in calibration.usable_numbers().values() if isinstance(value, str)]
-    return listing(words)
-
-
-def _kind(calibration: Calibration) -> str:
-    """What the result is, in a word."""
-    unknown = {*calibration.out_of_reach}
-    return "Position" if unknown & {*ROTATIONS} else "Orientation" if unknown else "Pose"
-
-
-def _direction(transform: Plain, calibration: Calibration) -> dict[str, Any]:
+def _direction(transform: Plain, unknown: set[str]) -> dict[str, Any]:
     """A transform as rows: each printed number with its standard deviation."""
-    unknown = {*calibration.out_of_reach}
-    rows = [
-        {"name": name, "value": with_sigma(value, sigma, 3), "unit": " m"}
-        for name, value, sigma in zip(
-            "xyz", transform["translation"], transform["sigma_translation"], strict=True
-        )
-    ]
     is_locked = "rotation_vector_deg" in transform
     kind = "rotation_vector" if is_locked else "rpy"
-    names = ("rx", "ry", "rz") if is_locked else ("roll", "pitch", "yaw")
-    angles = zip(names, transform[f"{kind}_deg"], transform[f"sigma_{kind}_deg"], strict=True)
-    turned = [
-        {"name": name, "value": with_sigma(value, sigma, 2), "unit": "°"}
-        for name, value, sigma in angles
-    ]
-    none = {"value": "not shown by these streams", "unit": ""}
-    if unknown & {*TRANSLATIONS}:
-        rows = [none | {"name": "x, y, z"}]
-    if unknown & {*ROTATIONS}:
-        turned = [none | {"name": "roll, pitch, yaw"}]
+    turned = ("rx", "ry", "rz") if is_locked else ROTATIONS
+    rows = []
+    for axes, names, values, sigmas, unit, decimals in (
+        (TRANSLATIONS, "xyz", "translation", "sigma_translation", " m", 3),
+        (ROTATIONS, turned, f"{kind}_deg", f"sigma_{kind}_deg", "°", 2),
+    ):
+        if unknown & {*axes}:
+            rows.append({"name": ", ".join(axes), "value": "not shown by these streams"})
+            continue
+        for name, value, sigma in zip(names, transform[values], transform[sigmas], strict=True):
+            text = with_sigma(value, sigma, decimals).replace("+/-", "±")
+            rows.append({"name": name, "value": text + (text != "unknown") * unit})
     return {
         "maps": printable(transform["maps"]),
-        "rows": [row | {"value": row["value"].replace("+/-", "±")} for row in rows + turned],
+        "rows": rows,
         "quat_xyzw": transform["quat_xyzw"],
         "is_locked": is_locked,
     }
 
 
-def _axes(calibration: Calibration) -> list[dict[str, Any]]:
+def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
     """Rows of the table of uncertainties, along and about the parent's axes."""
-    rows = []
     for dof in calibration.observability:
-        limit = target_of(dof.name, calibration)
-        if dof.name in calibration.out_of_reach:
-            continue
-        rows.append(
-            {
+        if dof.name not in calibration.out_of_reach:
+            yield {
                 "name": dof.name,
                 "title": _AXIS_NAMES.get(dof.name, f"along {dof.name}"),
                 "sigma": amount(dof.name, dof.sigma) if np.isfinite(dof.sigma) else "unknown",
                 "verdict": dof.verdict.value,
-                "words": _WORDS[dof.verdict],
-                "bar": _bar(dof.sigma / limit),
+                "words": _WORDS[dof.verdict.value],
+                "bar": _bar(dof.sigma / target_of(dof.name, calibration)),
             }
-        )
-    return rows
-
-
-def _differences(calibration: Calibration) -> list[dict[str, str]]:
-    """Rows of the comparison with what is installed; none without one."""
-    if not calibration.comparison:
-        return []
-    (difference,) = calibration.comparison.differences
-    return [
-        {
-            "title": _AXIS_NAMES.get(axis, f"along {axis}"),
-            "difference": _known(axis, row.difference) + f" ± {_known(axis, row.sigma)}",
-            "visible": _known(axis, row.visible),
-            "verdict": row.verdict,
-        }
-        for axis, row in difference.axes.items()
-    ]
-
-
-def _known(axis: str, value: float | None) -> str:
-    return "unknown" if value is None else amount(axis, value)
 
 
 def _bar(ratio: float) -> float:
@@ -271,6 +212,22 @@ def _bar(ratio: float) -> float:
     return float(np.clip(100 * (1 - (_BAR_ABOVE - math.log10(ratio)) / _BAR_DECADES), 1, 100))
 
 
+def _differences(calibration: Calibration) -> Iterable[dict[str, str]]:
+    """Rows of the comparison with what is installed; none without one."""
+    for compared in calibration.comparison.differences if calibration.comparison else ():
+        for axis, row in compared.axes.items():
+            difference, sigma, visible = (
+                "unknown" if value is None else amount(axis, value)
+                for value in (row.difference, row.sigma, row.visible)
+            )
+            yield {
+                "title": _AXIS_NAMES.get(axis, f"along {axis}"),
+                "difference": f"{difference} ± {sigma}",
+                "visible": visible,
+                "verdict": row.verdict,
+            }
+
+
 # ---------------------------------------------------------------- data and provenance
 
 
@@ -279,11 +236,9 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
     offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
     scale = (calibration.scale, calibration.scale_sigma)
     span = duration(evidence.tracks.times_s[-1])
-    method = f"{calibration.method} ({calibration.backend})"
-    if calibration.method_reason:
-        method += f"; {calibration.method_reason}"
+    reason = calibration.method_reason
     rows = {
-        "Method": method,
+        "Method": f"{calibration.method} ({calibration.backend})" + (reason and f"; {reason}"),
         "Reference": calibration.reference_reason or calibration.reference,
         "Poses": f"{calibration.n_poses:,} synchronised pose pairs over {span}",
         "Motion pairs": f"{calibration.n_inliers:,} of {calibration.n_pairs:,} are inliers",
@@ -311,61 +266,51 @@ def _noise(noise: Noise) -> str:
 
 def _stream(name: str, inputs: Plain, streams: Mapping[str, Trajectory]) -> dict[str, str]:
     """Where a stream came from, how many poses, their rate, the longest gap, the path length."""
-    known = dict(inputs.get(name, {}))
+    known = inputs.get(name, {})
     count = known.get("messages", known.get("poses"))
-    first_ns, last_ns = known.get("first_stamp_ns"), known.get("last_stamp_ns")
-    span_s = None if first_ns is None or last_ns is None else (last_ns - first_ns) * 1e-9
     refused = [f"{known[key]:,} {words}" for key, words in _REFUSED.items() if known.get(key)]
-    row = {
+    row = dict.fromkeys(("rate", "duration", "gap", "path"), "-") | {
         "name": name,
         "source": known.get("topic") or Path(known.get("file", "-")).name,
         "poses": "-" if count is None else f"{count:,}",
-        "rate": f"{(count - 1) / span_s:.1f} Hz" if count and count > 1 and span_s else "-",
-        "duration": "-" if span_s is None else duration(span_s),
-        "gap": "-",
-        "path": "-",
         "refused": "; ".join(refused) or "none",
     }
     stream = streams.get(name)
     # In a very long recording only the newest poses are at hand: of the stream as a whole they say
     # nothing.
     if stream is not None and len(stream) >= max(2, count or 0):
-        row |= _of_whole(stream)
+        whole = summarise(stream)
+        return row | {
+            "gap": f"{whole.longest_interval_s:.2f} s",
+            "path": "-" if whole.path_m is None else length(whole.path_m),
+            "duration": duration(whole.duration_s),
+            "poses": f"{whole.poses:,}",
+            "rate": f"{whole.rate_hz:.1f} Hz",
+        }
+    span_s = ((known.get("last_stamp_ns") or 0) - (known.get("first_stamp_ns") or 0)) * 1e-9
+    if span_s > 0:
+        row["duration"] = duration(span_s)
+        row["rate"] = f"{(count - 1) / span_s:.1f} Hz" if count and count > 1 else "-"
     return row
 
 
-def _of_whole(stream: Trajectory) -> dict[str, str]:
-    whole = summarise(stream)
-    return {
-        "gap": f"{whole.longest_interval_s:.2f} s",
-        "path": "-" if whole.path_m is None else length(whole.path_m),
-        "duration": duration(whole.duration_s),
-        "poses": f"{whole.poses:,}",
-        "rate": f"{whole.rate_hz:.1f} Hz",
-    }
-
-
-def _provenance(inputs: Plain) -> list[tuple[str, str]]:
+def _provenance(inputs: Plain) -> Iterable[tuple[str, str]]:
     """Versions, files and the rest of the inputs, as names and values."""
-    versions = {name: _version(name) for name in ("hand_eye_calib", "numpy", "scipy")}
-    rows = [
-        ("Written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")),
-        ("Versions", in_words(versions | {"python": platform.python_version()})),
-    ]
+    versions = {"python": platform.python_version()}
+    for name in ("hand_eye_calib", "numpy", "scipy"):
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    yield "Written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    yield "Versions", in_words(versions)
     # Without folders, which are nobody's business who gets this page; extrinsic.yaml has them.
-    rows += [
-        (name.capitalize(), in_words(_without_folders(value)))
-        for name, value in inputs.items()
-        if name not in ("parent", "child", "options", "files")
-    ]
-    rows += [
-        (
-            f"File {Path(file['file']).name}",
-            f"{file['bytes']:,} bytes, SHA-256 {file['sha256']}",
-        )
-        for file in inputs.get("files", ())
-    ]
-    return rows
+    for name, value in inputs.items():
+        if name not in ("parent", "child", "options", "files"):
+            yield name.capitalize(), in_words(_without_folders(value))
+    for file in inputs.get("files", ()):
+        said = f"{file['bytes']:,} bytes, SHA-256 {file['sha256']}"
+        yield f"File {Path(file['file']).name}", said
 
 
 def _without_folders(value: Any) -> Any:
@@ -376,10 +321,3 @@ def _without_folders(value: Any) -> Any:
         return [_without_folders(item) for item in value]
     is_path = isinstance(value, str) and (value.startswith(("/", "~", "./", "../")))
     return Path(value).name if is_path and Path(value).exists() else value
-
-
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return "not installed"

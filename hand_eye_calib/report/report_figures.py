@@ -1,12 +1,6 @@
-"""The figures of the report: SVG that takes its colours from the page, so that one drawing is right
-in light, in dark and on paper.
-"""
+"""The figures of the report."""
 
-import io
-import re
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,50 +10,22 @@ from matplotlib.figure import Figure
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import MIN_ROTATION
-from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.evidence import Evidence, StreamView
-from hand_eye_calib.errors import printable
-from hand_eye_calib.report.captions import (
-    figures_of,
-    measured_axes,
-    residual_sizes,
-    time_axis,
+from hand_eye_calib.report.captions import measured_axes, relative_to, residual_sizes, time_axis
+from hand_eye_calib.report.style import (
+    BAD,
+    BAND,
+    CHILD,
+    INK,
+    MUTED,
+    PARENT,
+    WIDTH,
+    as_svg,
+    page_style,
+    plain_decades,
+    plain_label,
 )
-from hand_eye_calib.report.style import drawing_style, house_style, plain_decades
 from hand_eye_calib.results.calibration import Calibration
-
-# Colours as drawn, each with the name of the page's own colour that replaces it.
-INK, MUTED, GRID, PAPER = "#1b1f24", "#5c6670", "#d9dee3", "#fefefd"
-PARENT, CHILD, BAD, BAND = "#0072b2", "#d98300", "#c8452f", "#0072b3"
-_VARIABLES = {
-    INK: "ink",
-    MUTED: "muted",
-    GRID: "grid",
-    PAPER: "card",
-    PARENT: "parent",
-    CHILD: "child",
-    BAD: "bad",
-    BAND: "parent",
-}
-
-WIDTH = 8.6  # inches; the page shows them at about 96 pixels an inch
-
-_TEXT_COLOURS = ("text.color", "axes.labelcolor", "axes.titlecolor")
-_STYLE: dict[str, Any] = {
-    **dict.fromkeys(_TEXT_COLOURS, INK),
-    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
-    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), MUTED),
-    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
-    **dict.fromkeys(("font.size", "axes.labelsize"), 9.0),
-    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 8.5),
-    "axes.titlesize": 9.5,
-    "font.family": "sans-serif",
-    "grid.color": GRID,
-    "axes.grid.axis": "both",
-    "legend.frameon": False,
-    "lines.linewidth": 1.5,
-    "path.simplify_threshold": 0.3,
-}
 
 # Points drawn of a line, and of dots that each stand alone.
 _MOST_ON_A_LINE, _MOST_DOTS, _MOST_OUTLIERS = 1500, 600, 300
@@ -67,32 +33,28 @@ _MOST_ON_A_LINE, _MOST_DOTS, _MOST_OUTLIERS = 1500, 600, 300
 # Share of a motion's length that may well be noise.
 _NOISE_SHARE = 0.3
 
-_SMALLEST_CM, _SMALLEST_DEG = 1e-4, 1e-5
-
 # A path is flat if it extends less than this share of its second extent along the third.
 _FLAT = 0.5
 
-# From metres and radians, for translations and rotations.
+# From m and rad to the units of the figures, and the smallest residual that is drawn.
 _TO_CM, _TO_DEG = 100.0, 180 / np.pi
-
-_Maker = Callable[[Calibration, Evidence], Figure | None]
+_FACTORS = np.repeat([_TO_CM, _TO_DEG], 3)
+_SMALLEST = 1e-5
 
 
 def draw_all(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
     """SVG of every figure, by name; without those for which there is too little data."""
-    makers: dict[str, _Maker] = {
+    makers: dict[str, Callable[[Calibration, Evidence], Figure | None]] = {
         "trajectories": _trajectories,
         "residuals": _residuals,
         "convergence": _convergence,
         "excitation": _excitation,
-        "methods": _methods,
-        "halves": _halves,
+        "answers": _answers,
     }
-    wanted = figures_of(calibration)
+    if calibration.measured == "rotations":
+        del makers["trajectories"]
     with page_style():
-        drawn = {
-            name: make(calibration, evidence) for name, make in makers.items() if name in wanted
-        }
+        drawn = {name: make(calibration, evidence) for name, make in makers.items()}
         names = (calibration.parent_frame, calibration.child_frame)
         drawn["streams"] = _streams(evidence.streams, names)
         return {name: as_svg(figure, name) for name, figure in drawn.items() if figure}
@@ -111,44 +73,15 @@ def draw_streams(seen: StreamView, names: tuple[str, str]) -> str:
         return as_svg(_streams(seen, names), "streams")
 
 
-@contextmanager
-def page_style() -> Iterator[None]:
-    with house_style(), drawing_style(_STYLE), warnings.catch_warnings():
-        # Text is drawn by the browser, with its own fonts.
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
-        yield
-
-
-def as_svg(figure: Figure, name: str) -> str:
-    """The figure as an element of a page: no prologue, ids of its own, the page's colours."""
-    written = io.StringIO()
-    figure.savefig(
-        written, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    )
-    svg = written.getvalue()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg)
-    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
-    hidden = r'\1 aria-hidden="true" focusable="false"'
-    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', hidden, svg, count=1)
-    svg = re.sub(r'\bid="', f'id="{name}-', svg)
-    svg = re.sub(r'href="#', f'href="#{name}-', svg).replace("url(#", f"url(#{name}-")
-    svg = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px var(--sans)", svg)
-    svg = re.sub(r"<!--.*?-->\n?", "", svg, flags=re.DOTALL)
-    for drawn, variable in _VARIABLES.items():
-        svg = svg.replace(drawn, f"var(--{variable})")
-    return svg
-
-
 def _figure(
     height: float,
     rows: int,
     columns: int,
     *,
     left: float,
-    bottom: float,
+    bottom: float = 0.5,
     gap: float = 0.2,
-    between: float = 0.25,
+    between: float = 0.15,
     top: float = 0.3,
     **options: Any,
 ) -> tuple[Figure, Any]:
@@ -167,24 +100,28 @@ def _figure(
         "wspace": gap / width,
         "hspace": between / tall,
     }
-    return figure, figure.subplots(rows, columns, gridspec_kw=spacing, **options)
+    panels = figure.subplots(rows, columns, gridspec_kw=spacing, squeeze=False, **options)
+    return figure, panels
 
 
-def _trajectories(calibration: Calibration, evidence: Evidence) -> Figure | None:
+def _legend(figure: Figure, panel: Axes) -> None:
+    handles = panel.get_legend_handles_labels()
+    figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
+
+
+def _trajectories(calibration: Calibration, evidence: Evidence) -> Figure:
     tracks = evidence.tracks
     shown = _downsample(len(tracks.times_s), _MOST_ON_A_LINE)
     factor, unit = time_axis(tracks.times_s[-1])
     first, second, across = _plane_of_motion(tracks.parent)
-    figure, (plane, side) = _figure(4.1, 1, 2, left=0.7, bottom=0.85, gap=0.7)
-    names = [calibration.parent_frame, calibration.child_frame]
+    figure, ((plane, side),) = _figure(4.1, 1, 2, left=0.7, bottom=0.85, gap=0.7)
+    labels = [calibration.parent_frame, calibration.child_frame]
     is_reversed = calibration.measured == "positions" and not evidence.has_positions_of_parent
-    names[0 if is_reversed else 1] += ", through the result"
-    for points, colour, width, label in (
-        (tracks.parent, PARENT, 3.2, names[0]),
-        (tracks.child, CHILD, 1.1, names[1]),
-    ):
-        look: dict[str, Any] = {"color": colour, "ls": "-", "lw": width}
-        plane.plot(points[shown, first], points[shown, second], label=_plain(label), **look)
+    labels[0 if is_reversed else 1] += ", through the result"
+    paths = ((tracks.parent, PARENT, 3.2), (tracks.child, CHILD, 1.1))
+    for (points, colour, width), label in zip(paths, labels, strict=True):
+        look: dict[str, Any] = {"color": colour, "lw": width}
+        plane.plot(points[shown, first], points[shown, second], label=plain_label(label), **look)
         side.plot(tracks.times_s[shown] * factor, points[shown, across], **look)
     plane.plot(*tracks.parent[0, [first, second]], "o", color=INK, ms=6, label="start")
     names = [f"{axis} (m)" for axis in "xyz"]
@@ -196,7 +133,7 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Figure | None
     low, high = side.get_ylim()
     if high - low < 0.5:  # rounding is no relief
         side.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)
-    figure.legend(*plane.get_legend_handles_labels(), loc="lower center", ncols=3, borderaxespad=0)
+    _legend(figure, plane)
     return figure
 
 
@@ -214,38 +151,33 @@ def _plane_of_motion(points: FloatArray) -> tuple[int, int, int]:
     return first, second, across
 
 
-def _residuals(calibration: Calibration, evidence: Evidence) -> Figure | None:
+def _residuals(calibration: Calibration, evidence: Evidence) -> Figure:
     residuals, sizes = evidence.residuals, residual_sizes(calibration, evidence)
     factor, unit = time_axis(evidence.tracks.times_s[-1])
-    figure, panels = _figure(
-        4.2 if len(sizes) == 2 else 2.6, len(sizes), 1,
-        left=0.7, bottom=0.8, between=0.15, top=0.1, sharex=True, squeeze=False,
-    )  # fmt: skip
-    panels = panels[:, 0]
-    dots = _sample(np.flatnonzero(~residuals.is_outlier), _MOST_DOTS)
-    crosses = np.flatnonzero(residuals.is_outlier)
+    height = 1.0 + 1.6 * len(sizes)
+    figure, panels = _figure(height, len(sizes), 1, left=0.7, bottom=0.8, top=0.1, sharex=True)
+    dots, crosses = (np.flatnonzero(residuals.is_outlier == is_out) for is_out in (False, True))
+    dots = dots[_downsample(len(dots), _MOST_DOTS)]
     largest = next(iter(sizes.values()))
     crosses = crosses[np.argsort(-largest[crosses])[:_MOST_OUTLIERS]]
-    looks = {
-        "x": (_TO_CM, "translation (cm)", _SMALLEST_CM),
-        "yaw": (_TO_DEG, "rotation (deg)", _SMALLEST_DEG),
-    }
     times = residuals.times_s * factor
     used = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
     rejected = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
-    for panel, (axis, values) in zip(panels, sizes.items(), strict=True):
-        to_unit, name, smallest = looks[axis]
-        values = np.maximum(values * to_unit, smallest)
+    for panel, (axis, radians_or_metres) in zip(panels[:, 0], sizes.items(), strict=True):
+        to_unit, name = (_TO_CM, "translation (cm)") if axis == "x" else (_TO_DEG, "rotation (deg)")
+        values = np.maximum(radians_or_metres * to_unit, _SMALLEST)
         panel.plot(times[dots], values[dots], "o", **used)
         panel.plot(times[crosses], values[crosses], "x", **rejected)
         panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
         panel.set_ylabel(name)
         panel.yaxis.set_label_coords(-0.06, 0.5)
-        _magnitude_axis(panel, values)
-    panels[-1].set_xlabel(f"time ({unit})")
-    figure.legend(
-        *panels[0].get_legend_handles_labels(), loc="lower center", ncols=3, borderaxespad=0
-    )
+        if values.max() > 15 * np.median(values):  # the largest would hide the others
+            panel.set_yscale("log")
+            plain_decades(panel.yaxis)
+        else:
+            panel.set_ylim(0, 1.08 * values.max())
+    panels[-1, 0].set_xlabel(f"time ({unit})")
+    _legend(figure, panels[0, 0])
     return figure
 
 
@@ -255,20 +187,18 @@ def _convergence(calibration: Calibration, evidence: Evidence) -> Figure | None:
         return None
     factor, unit = time_axis(estimates[-1].until_s)
     times = np.array([estimate.until_s for estimate in estimates]) * factor
-    moved, sigmas = _relative_to(calibration, [one.calibration for one in estimates])
+    moved, sigmas = _in_units(calibration, [one.calibration for one in estimates])
     axes = np.flatnonzero(measured_axes(calibration))
-    figure, panels = _figure(
-        4.4 if len(axes) == 6 else 2.6, len(axes) // 3, 3,
-        left=0.7, bottom=0.5, gap=0.15, between=0.4, sharex=True, squeeze=False,
-    )  # fmt: skip
+    height = 0.8 + 0.6 * len(axes)
+    figure, panels = _figure(height, len(axes) // 3, 3, left=0.7, between=0.4, sharex=True)
     for index, panel in zip(axes.tolist(), panels.flat, strict=True):
         limit = _limit(moved, sigmas, calibration.sigmas * _FACTORS, index)
         _draw_convergence(panel, times, moved[:, index], sigmas[:, index], limit)
         panel.set(ylim=(-limit, limit), title=AXES[index], xlim=(0, times[-1] * 1.04))
         if index % 3:
             panel.set_yticklabels([])
-    for row, first in zip(panels, axes[::3].tolist(), strict=True):
-        row[0].set_ylabel(f"{'cm' if first < 3 else 'deg'} from the result")
+        else:
+            panel.set_ylabel(f"{'cm' if index < 3 else 'deg'} from the result")
     for panel in panels[-1]:
         panel.set_xlabel(f"recording used ({unit})")
         panel.locator_params(axis="x", nbins=5, prune="upper")
@@ -301,47 +231,31 @@ def _excitation(calibration: Calibration, evidence: Evidence) -> Figure | None:
         return None
     factor, unit = time_axis(evidence.tracks.times_s[-1])
     shown = _downsample(len(rotations.times_s), _MOST_ON_A_LINE)
-    figure, panels = _figure(4.2, 3, 1, left=0.8, bottom=0.5, between=0.15, top=0.1, sharex=True)
+    figure, panels = _figure(4.2, 3, 1, left=0.8, top=0.1, sharex=True)
     enough = np.degrees(MIN_ROTATION)
-    for index, panel in enumerate(panels):
+    for index, panel in enumerate(panels[:, 0]):
         values = np.degrees(rotations.vectors[shown, index])
         panel.axhspan(-enough, enough, color=MUTED, alpha=0.16, lw=0)
         panel.plot(rotations.times_s[shown] * factor, values, color=PARENT, lw=1.2)
         limit = 1.1 * max(np.abs(values).max(), 1.3 * enough)
         panel.set(ylim=(-limit, limit), ylabel=f"{AXES[3 + index]}\nabout {'xyz'[index]} (deg)")
-    panels[2].set_xlabel(f"time ({unit})")
-    for panel in panels:
         panel.yaxis.set_label_coords(-0.06, 0.5)
+    panels[2, 0].set_xlabel(f"time ({unit})")
     return figure
 
 
-def _methods(calibration: Calibration, evidence: Evidence) -> Figure | None:
-    if not evidence.comparison:
-        return None
-    others = [(one.label, one.calibration) for one in evidence.comparison]
-    return _answers(calibration, [("this result", calibration), *others])
-
-
-def _halves(calibration: Calibration, evidence: Evidence) -> Figure | None:
-    if len(evidence.halves) < 2:
-        return None
-    halves = [(half.label, half.calibration) for half in evidence.halves]
-    return _answers(calibration, [("whole recording", calibration), *halves])
-
-
-def _answers(calibration: Calibration, rows: Sequence[tuple[str, Calibration]]) -> Figure:
+def _answers(calibration: Calibration, evidence: Evidence) -> Figure | None:
     """A dot with an error bar for each answer (down) and axis (across), relative to the result."""
-    labels = [_plain(label) for label, _ in rows]
-    moved, sigmas = _relative_to(calibration, [answer for _, answer in rows])
+    others = [(one.label, one.calibration) for one in (*evidence.comparison, *evidence.halves)]
+    if not others:
+        return None
+    rows = [("this result", calibration), *others]
+    labels = [plain_label(label) for label, _ in rows]
+    moved, sigmas = _in_units(calibration, [answer for _, answer in rows])
     axes = np.flatnonzero(measured_axes(calibration))
-    figure, panels = _figure(
-        0.85 + 0.235 * len(rows),
-        1,
-        len(axes),
-        left=0.25 + 0.068 * max(map(len, labels)),
-        bottom=0.5,
-        gap=0.1,
-        sharey=True,
+    left = 0.25 + 0.068 * max(map(len, labels))
+    figure, (panels,) = _figure(
+        0.85 + 0.235 * len(rows), 1, len(axes), left=left, gap=0.1, sharey=True
     )
     for index, panel in zip(axes.tolist(), panels, strict=True):
         limit = _limit(moved, sigmas, sigmas[0], index)
@@ -377,20 +291,30 @@ def _draw_answers(panel: Axes, values: FloatArray, sigmas: FloatArray, limit: fl
             panel.plot(value, place, "o", color=colour, ms=4.5)
 
 
-# From m and rad to the units of the panels.
-_FACTORS = np.repeat([_TO_CM, _TO_DEG], 3)
-
-
-def _relative_to(
+def _in_units(
     calibration: Calibration, answers: Sequence[Calibration]
 ) -> tuple[FloatArray, FloatArray]:
     """Distances (N, 6) of answers from the result and their standard deviations, in cm and deg."""
-    moved = [deviation(one.T_parent_child, calibration.T_parent_child) for one in answers]
-    sigmas = [one.sigmas for one in answers]
-    return np.array(moved) * _FACTORS, np.array(sigmas) * _FACTORS
+    sigmas = np.array([one.sigmas for one in answers])
+    return relative_to(calibration, answers) * _FACTORS, sigmas * _FACTORS
+
+
+def _limit(moved: FloatArray, sigmas: FloatArray, result: FloatArray, index: int) -> float:
+    """How far the panel of an axis reaches, the same for all translations and for all rotations:
+    what is far off is shown at the edge.
+    """
+    columns = slice(0, 3) if index < 3 else slice(3, 6)
+    values, sigmas, result = moved[:, columns], sigmas[:, columns], result[columns]
+    known = np.isfinite(sigmas)
+    if not known.any():
+        return 1.0
+    reach = (np.abs(values) + sigmas)[known]
+    nearest = 4 * np.max(result[np.isfinite(result)], initial=0.0)
+    return float(max(1.25 * np.percentile(reach, 70), nearest, 1e-3))
 
 
 def _streams(seen: StreamView, names: tuple[str, str]) -> Figure:
+    """Rates of both streams, when there are poses, and for whole poses the motions of both."""
     factor, unit = time_axis(max(times[-1] if len(times) else 0.0 for times, _ in seen.rates))
     height = 6.6 if seen.is_whole else 2.95
     figure = Figure(figsize=(WIDTH, height))
@@ -402,48 +326,35 @@ def _streams(seen: StreamView, names: tuple[str, str]) -> Figure:
     across = WIDTH - 0.8 - 0.12
     rate = panel(0.8, height - 2.0, across, 1.7)
     strip = panel(0.8, height - 2.45, across, 0.32, sharex=rate)
-    _draw_rates(rate, strip, seen, names, factor)
-    strip.set_xlabel(f"time ({unit})")
-    if not seen.is_whole:
-        return figure
-    half = (across - 0.75) / 2
-    angles, along_axis = (panel(0.8 + n * (half + 0.75), 0.55, half, 2.9) for n in range(2))
-    angles.set(
-        title=f"Rotation angle of motions over {seen.lag_s:g} s",
-        xlabel="parent (deg)",
-        ylabel="child (deg)",
-    )
-    along_axis.set(
-        title="Translation along the rotation axis", xlabel="parent (m)", ylabel="child (m)"
-    )
-    _identity(angles, np.degrees(seen.angles))
-    # On flat ground nothing moves along the axis, and noise should not look like motion.
-    _identity(along_axis, seen.along_axis, _NOISE_SHARE * seen.rms_translation)
-    return figure
-
-
-def _draw_rates(
-    rate: Axes, strip: Axes, seen: StreamView, names: tuple[str, str], factor: float
-) -> None:
-    """Angular rates of both streams, and below them when there are poses."""
     looks = ((PARENT, 2.6), (CHILD, 1.0))
     streams = zip(seen.rates, seen.spans_s, names, looks, strict=True)
     for row, ((times, rates), spans, name, (colour, width)) in enumerate(streams):
         values = rates if seen.quantity == "speed" else np.degrees(rates)
-        rate.plot(times * factor, values, "-", color=colour, lw=width, label=_plain(name))
+        rate.plot(times * factor, values, color=colour, lw=width, label=plain_label(name))
         bars = [(start * factor, (end - start) * factor) for start, end in spans]
         strip.broken_barh(bars, (0.6 - row, 0.8), color=colour, lw=0)
-    in_unit = {"speed": "speed (m/s)", "angular rate": "angular rate (deg/s)"}[seen.quantity]
+    in_unit = "speed (m/s)" if seen.quantity == "speed" else "angular rate (deg/s)"
     rate.set(ylabel=in_unit, ylim=(0, None))
     rate.tick_params(labelbottom=False)
     rate.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
-    strip.set_ylim(-0.6, 1.6)
+    strip.set(ylim=(-0.6, 1.6), xlabel=f"time ({unit})")
     strip.set_yticks([1.0, 0.0], ["parent", "child"])
     strip.tick_params(axis="y", length=0)
     strip.grid(visible=False)
+    if seen.is_whole:
+        half = (across - 0.75) / 2
+        # On flat ground nothing moves along the axis, and noise should not look like motion.
+        for number, title, unit, values, least in (
+            (0, f"Rotation angle of motions over {seen.lag_s:g} s", "deg", seen.angles, 0.0),
+            (1, "Translation along the rotation axis", "m", seen.along_axis, seen.rms_translation),
+        ):
+            each = panel(0.8 + number * (half + 0.75), 0.55, half, 2.9)
+            each.set(title=title, xlabel=f"parent ({unit})", ylabel=f"child ({unit})")
+            _identity(each, values if number else np.degrees(values), _NOISE_SHARE * least)
+    return figure
 
 
-def _identity(panel: Axes, values: FloatArray, least: float = 0.0) -> None:
+def _identity(panel: Axes, values: FloatArray, least: float) -> None:
     """Dots of the child's values (N, 2) over the parent's, and the line they should be on; the axes
     reach to ``least`` at least.
     """
@@ -461,46 +372,10 @@ def _identity(panel: Axes, values: FloatArray, least: float = 0.0) -> None:
     panel.set(xlim=(low, reach), ylim=(low, reach))
 
 
-def _limit(moved: FloatArray, sigmas: FloatArray, result: FloatArray, index: int) -> float:
-    """How far the panel of an axis reaches, the same for all translations and for all rotations:
-    what is far off is shown at the edge.
-    """
-    columns = slice(0, 3) if index < 3 else slice(3, 6)
-    values, sigmas, result = moved[:, columns], sigmas[:, columns], result[columns]
-    known = np.isfinite(sigmas)
-    if not known.any():
-        return 1.0
-    reach = (np.abs(values) + sigmas)[known]
-    nearest = 4 * np.max(result[np.isfinite(result)], initial=0.0)
-    return float(max(1.25 * np.percentile(reach, 70), nearest, 1e-3))
-
-
-def _magnitude_axis(panel: Axes, values: FloatArray) -> None:
-    """From zero; logarithmic if the largest would hide the others."""
-    if values.max() > 15 * np.median(values):
-        panel.set_yscale("log")
-        plain_decades(panel.yaxis)
-    else:
-        panel.set_ylim(0, 1.08 * values.max())
-
-
 def _write(panel: Axes, text: str) -> None:
     panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", va="center", color=MUTED)
-
-
-def _plain(label: str) -> str:
-    """A name that matplotlib takes as it is: no formulas, and no leading underscore, which would
-    hide it from the legend.
-    """
-    text = printable(label).replace("$", r"\$")
-    return f"\u200b{text}" if text.startswith("_") else text
 
 
 def _downsample(count: int, most: int) -> IntArray:
     """Indices of at most ``most`` of so many points, first and last among them."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-
-
-def _sample(indices: IntArray, most: int) -> IntArray:
-    """Some of the indices, evenly."""
-    return indices[_downsample(len(indices), most)] if len(indices) else indices

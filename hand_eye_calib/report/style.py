@@ -4,8 +4,12 @@ colour-blind can tell apart.
 Figures are made without pyplot: no display, no global state.
 """
 
+import io
+import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+from hand_eye_calib.errors import printable
 
 # Okabe, Ito 2008, without the yellow that vanishes on white.
 BLACK, SKY, GREEN, BLUE, VERMILION, PURPLE = (
@@ -54,6 +60,40 @@ _STYLE: dict[str, Any] = {
     # The same figure gives the same file.
     "svg.hashsalt": "hand_eye_calib",
     "svg.fonttype": "none",
+}
+
+
+# Colours as drawn on a page, each with the name of the page's own colour that replaces it.
+INK, MUTED, GRID, PAPER = "#1b1f24", "#5c6670", "#d9dee3", "#fefefd"
+PARENT, CHILD, BAD, BAND = "#0072b2", "#d98300", "#c8452f", "#0072b3"
+_VARIABLES = {
+    INK: "ink",
+    MUTED: "muted",
+    GRID: "grid",
+    PAPER: "card",
+    PARENT: "parent",
+    CHILD: "child",
+    BAD: "bad",
+    BAND: "parent",
+}
+
+WIDTH = 8.6  # inches; a page shows them at about 96 pixels an inch
+
+_TEXT_COLOURS = ("text.color", "axes.labelcolor", "axes.titlecolor")
+_PAGE_STYLE: dict[str, Any] = {
+    **dict.fromkeys(_TEXT_COLOURS, INK),
+    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), MUTED),
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
+    **dict.fromkeys(("font.size", "axes.labelsize"), 9.0),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 8.5),
+    "axes.titlesize": 9.5,
+    "font.family": "sans-serif",
+    "grid.color": GRID,
+    "axes.grid.axis": "both",
+    "legend.frameon": False,
+    "lines.linewidth": 1.5,
+    "path.simplify_threshold": 0.3,
 }
 
 
@@ -111,40 +151,53 @@ def save(figure: Figure, stem: Path) -> list[Path]:
     return paths
 
 
-# Wanted positions, and indices of the members.
-_Group = tuple[list[float], list[int]]
-
-
 def spread(positions: Sequence[float], gap: float) -> list[float]:
-    """Positions moved apart as little as needed to be ``gap`` from each other, in their order:
-    where labels can be read.
-
-    Parameters
-    ----------
-    positions : sequence of float
-    gap : float
-
-    Returns
-    -------
-    list of float
-        In the order given.
+    """Positions moved up as little as needed to be ``gap`` from each other, in their order: where
+    labels can be read.
     """
-    order = sorted(range(len(positions)), key=lambda index: positions[index])
-    groups: list[_Group] = []
-    for index in order:
-        groups.append(([positions[index]], [index]))
-        while len(groups) > 1 and _start(groups[-2], gap) + gap * len(groups[-2][1]) > _start(
-            groups[-1], gap
-        ):
-            wanted, members = groups.pop()
-            groups[-1] = (groups[-1][0] + wanted, groups[-1][1] + members)
-    placed = [0.0] * len(positions)
-    for group in groups:
-        for place, index in enumerate(group[1]):
-            placed[index] = _start(group, gap) + gap * place
+    placed = list(positions)
+    order = sorted(range(len(placed)), key=lambda index: placed[index])
+    for before, after in pairwise(order):
+        placed[after] = max(placed[after], placed[before] + gap)
     return placed
 
 
-def _start(group: _Group, gap: float) -> float:
-    wanted, members = group
-    return sum(position - gap * place for place, position in enumerate(wanted)) / len(members)
+# ------------------------------------------------------------ figures of pages
+
+
+@contextmanager
+def page_style() -> Iterator[None]:
+    """Draw in the style of HTML pages inside the block."""
+    with house_style(), drawing_style(_PAGE_STYLE), warnings.catch_warnings():
+        # Text is drawn by the browser, with its own fonts.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        yield
+
+
+def as_svg(figure: Figure, name: str) -> str:
+    """The figure as an element of a page: no prologue, ids of its own, the page's colours."""
+    written = io.StringIO()
+    figure.savefig(
+        written, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    )
+    svg = written.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg)
+    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
+    hidden = r'\1 aria-hidden="true" focusable="false"'
+    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', hidden, svg, count=1)
+    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    svg = re.sub(r'href="#', f'href="#{name}-', svg).replace("url(#", f"url(#{name}-")
+    svg = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px var(--sans)", svg)
+    svg = re.sub(r"<!--.*?-->\n?", "", svg, flags=re.DOTALL)
+    for drawn, variable in _VARIABLES.items():
+        svg = svg.replace(drawn, f"var(--{variable})")
+    return svg
+
+
+def plain_label(label: str) -> str:
+    """A name that matplotlib takes as it is: no formulas, and no leading underscore, which would
+    hide it from the legend.
+    """
+    text = printable(label).replace("$", r"\$")
+    return f"\u200b{text}" if text.startswith("_") else text

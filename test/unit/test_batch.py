@@ -188,7 +188,7 @@ def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
 
 def test_a_defect_in_one_bag_leaves_the_others_alone(fleet, monkeypatch):
     tasks = read_batch(fleet, {}, {})
-    monkeypatch.setattr(workers, "replay", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(workers, "read_bags", lambda *_, **__: 1 / 0)
     outcome = work(tasks[0])
     assert outcome["error"] == "unexpected ZeroDivisionError: division by zero"
     assert "ZeroDivisionError" in outcome["traceback"]
@@ -592,7 +592,8 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
     outcomes.append({**outcomes[0], "name": "lost", "calibration": None, "error": "no <bag>"})
     rows = [row_of(one) for one in outcomes]
     vehicles = [vars(one) for one in vehicles_of(outcomes)]
-    page = render_batch("path/fleet.yaml", rows, vehicles, [True] * 8 + [False])
+    with_report = {row["name"] for row in rows[:-1]}
+    page = render_batch("path/fleet.yaml", rows, vehicles, with_report)
     assert "<b>" not in page
     assert "no &lt;bag&gt;" in page
     assert page.count("<svg") == 2
@@ -601,4 +602,4 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
     assert page.count("/report.html") == 8
     for address in re.findall(r'(?:href|src)="([^"]*)"', page):
         assert not re.match(r"\w+:|//", address), f"not on this disk: {address}"
-    assert page == render_batch("path/fleet.yaml", rows, vehicles, [True] * 8 + [False])
+    assert page == render_batch("path/fleet.yaml", rows, vehicles, with_report)

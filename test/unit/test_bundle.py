@@ -10,7 +10,7 @@ import yaml
 import hand_eye_calib as hec
 from hand_eye_calib.cli.bundle import MOST_BYTES, tum_text
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.cli.replaying import replay
+from hand_eye_calib.cli.reading import read_bags
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.io.results import save_result
 
@@ -33,8 +33,9 @@ def folder(tmp_path_factory):
         assert main(["calibrate", PARENT, CHILD, *OPTIONS, "--out", "files"]) == 0
         # As replay --out saves it, without the report.
         config = CalibratorConfig.from_options(CONFIG)
-        replayed = replay(["secret/run_01/bag"], "/parent/odometry", "/child/odometry", config)
-        save_result(replayed.calibration, "bag", replayed.inputs)
+        topics = {"parent": "/parent/odometry", "child": "/child/odometry"}
+        recording = read_bags(["secret/run_01/bag"], topics, config)
+        save_result(recording.solved(), "bag", recording.inputs)
     return folder
 
 

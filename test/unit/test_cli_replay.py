@@ -8,11 +8,11 @@ import re
 import numpy as np
 import pytest
 from bag_making import TF, path_message, tf_message, write_messages
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from motions import as_trajectory, child_of, disturbed, wandering_poses
 from published_data import data_folder
 
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.cli.replaying import replay_journal
+from hand_eye_calib.cli.reading import read_journal_of
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.journal import JournalWriter
@@ -93,7 +93,7 @@ def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
 
 def test_what_was_set_in_a_session_counts_as_set_in_its_replay(tmp_path):
     write_session(tmp_path, {"time_offset": 0.0, "scale": "none"}, "time_offset")
-    config = replay_journal(tmp_path, {"reference": "B5"}).calibrator.config
+    config = read_journal_of(tmp_path, {"reference": "B5"}).snapshot.config
     assert config.given == {"time_offset", "reference"}
 
 
@@ -163,14 +163,12 @@ def test_a_topic_and_frames_together(run, bag, tmp_path):
             "argument --parent-tf: expected two frames as WORLD:SENSOR",
         ),
         (["bag", "--parent-tf", "a:b", "--parent-topic", "/a"], "not allowed with argument"),
-        (["bag", "--every", "soon"], "argument --every: expected a duration such as 5s"),
-        (["bag", "--every", "0s"], "argument --every: expected a duration such as 5s"),
         (["bag", "--jobs", "2"], "--jobs and --dask are for --batch"),
         (
             ["--batch", "fleet.yaml", "bag"],
-            "--batch cannot be combined with BAG, --list or --every",
+            "--batch cannot be combined with PATH or --list",
         ),
-        ([], "the following arguments are required: BAG, or --batch FILE"),
+        ([], "the following arguments are required: PATH, or --batch FILE"),
     ],
 )
 def test_wrong_usage(run, arguments, message):
@@ -293,8 +291,18 @@ def test_list_shows_topics_types_counts_rates_durations_and_frames(run, tmp_path
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list")
     assert (code, err) == (0, "")
     rows = [line.split() for line in out.splitlines() if line.strip().startswith("/")]
-    assert ["/a", ODOMETRY, "100", "10.0", "Hz", "9.9", "s", "map:lidar"] in rows
-    assert ["/b", "geometry_msgs/msg/PoseStamped", "100", "10.0", "Hz", "9.9", "s", "odom"] in rows
+    assert ["/a", ODOMETRY, "100", "10.0", "Hz", "9.9", "s", "map:lidar", "yes"] in rows
+    assert [
+        "/b",
+        "geometry_msgs/msg/PoseStamped",
+        "100",
+        "10.0",
+        "Hz",
+        "9.9",
+        "s",
+        "odom",
+        "yes",
+    ] in rows
     assert ["/tf_static", TF, "1", "base:lidar"] in rows
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list", "--json")
     document = json.loads(out)
@@ -310,40 +318,6 @@ def test_list_shows_topics_types_counts_rates_durations_and_frames(run, tmp_path
         "frames": ["map:lidar"],
         "is_usable": True,
     }
-
-
-# ---- convergence
-
-
-def test_every_estimates_on_the_way_and_over_everything_in_the_end(run, bag):
-    code, out, err = run(bag, *STREAMS, "--every", "2s", "--json", "--reference", "B5")
-    document = json.loads(out)
-    assert code == 0
-    history = document["convergence"]
-    assert [entry["bag_time_s"] for entry in history] == [2.0, 4.0, 6.0, 8.0]
-    assert [entry["calibration"]["n_poses"] for entry in history] == [20, 40, 60, 80]
-    errors = [
-        np.linalg.norm(np.array(entry["calibration"]["T_parent_child"]["matrix"]) - T_PARENT_CHILD)
-        for entry in history
-    ]
-    assert max(errors) < 0.05
-    assert document["n_poses"] == 100
-    np.testing.assert_array_equal(
-        matrix(out), matrix(run(bag, *STREAMS, "--json", "--reference", "B5")[1])
-    )
-    lines = [line for line in err.splitlines() if "note: after " in line]
-    assert [
-        re.search(r"after (\d) s: x .* m, roll .* deg, (\d+) poses, USE", line).groups()
-        for line in lines
-    ] == [("2", "20"), ("4", "40"), ("6", "60"), ("8", "80")]
-
-
-def test_every_says_why_there_is_no_estimate_yet(run, bag):
-    code, out, err = run(bag, *STREAMS, "--every", "500ms", "--json", "--reference", "B5")
-    assert code == 0
-    first = json.loads(out)["convergence"][0]
-    assert (first["bag_time_s"], first["calibration"]) == (0.5, None)
-    assert "after 0.5 s: no estimate yet, 10 synchronised pose pairs are needed, found 5" in err
 
 
 # ---- bags of others

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import importlib
 import re
 import shlex
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hand_eye_calib.cli.main import COMMANDS, main
+from hand_eye_calib.cli.main import COMMANDS, main, module_of
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
 from hand_eye_calib.io import limits
 
@@ -168,7 +167,7 @@ def test_command_parses(words):
     name, *arguments = words
     assert name in COMMANDS
     parser = argparse.ArgumentParser(allow_abbrev=False, exit_on_error=False)
-    importlib.import_module(f"hand_eye_calib.cli.{name}").add_arguments(parser)
+    module_of(name).add_arguments(parser)
     if name == "calibrator":
         assert arguments[:1] in ([], ["--ros-args"])
     elif arguments:

@@ -36,7 +36,7 @@ from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import REALISTIC
 from hand_eye_calib.text import amount, with_sigma
 
-FIGURES = ("trajectories", "residuals", "convergence", "excitation", "methods", "halves", "streams")
+FIGURES = ("trajectories", "residuals", "convergence", "excitation", "answers", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 
 
@@ -219,7 +219,7 @@ def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, n
     calibration, text, page = partial[name]
     assert page.errors == []
     assert len(page.ids) == len(set(page.ids))
-    shown = [figure for figure in FIGURES if figure != "methods"]
+    shown = [*FIGURES]
     shown.remove("trajectories") if name == "rates" else None
     assert [attributes["id"] for attributes in page.all("figure")] == [
         f"figure-{figure}" for figure in shown

@@ -148,8 +148,8 @@ def test_topics_of_a_bag(rig, tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert document["sensors"] == ["lidar_link", "front_link", "rear_link"]
     assert document["inputs"]["topics"] == list(streams)
-    assert main(["replay", bag, "--every", "5s", "--topics", *streams]) == 2
-    assert "--topics and --every do not go together" in capsys.readouterr().err
+    assert main(["replay", bag, "--list", "--topics", *streams]) == 2
+    assert "--topics and --list do not go together" in capsys.readouterr().err
     assert main(["replay", bag, "--topics", "/lidar/odometry", "/lidar/odometry", "/x"]) == 2
     assert "of one sensor, 'lidar_link'" in capsys.readouterr().err
 

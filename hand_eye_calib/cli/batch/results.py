@@ -14,7 +14,8 @@ from typing import Any
 
 from hand_eye_calib.cli.batch.tasks import STATE, Task
 from hand_eye_calib.cli.batch.workers import Outcome
-from hand_eye_calib.cli.reporting import REPORT, save_page
+from hand_eye_calib.cli.options import STREAMS
+from hand_eye_calib.cli.reporting import REPORT, save_text
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration
@@ -84,26 +85,14 @@ def store(task: Task, outcome: Outcome, page: str | None, directory: Path) -> No
     """
     from hand_eye_calib.io.results import save_result
 
+    folder = directory / task.name
     if outcome["calibration"]:
-        save_result(
-            Calibration.from_dict(outcome["calibration"]), directory / task.name, outcome["inputs"]
-        )
+        save_result(Calibration.from_dict(outcome["calibration"]), folder, outcome["inputs"])
     if page:
-        save_page(directory / task.name / REPORT, page)
+        save_text(folder / REPORT, page)
     # What failed is done again in any case, and its bag may be out of reach.
     key = "" if outcome["error"] else task.key()
-    write_json(directory / task.name / STATE, {"key": key, "outcome": outcome})
-
-
-def write_json(path: Path, document: Any) -> None:
-    """Write a JSON document in one step.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    _write(path, json_text(document) + "\n")
+    save_text(folder / STATE, json_text({"key": key, "outcome": outcome}) + "\n")
 
 
 def write_rows(path: Path, outcomes: Iterable[Outcome]) -> None:
@@ -118,9 +107,8 @@ def write_rows(path: Path, outcomes: Iterable[Outcome]) -> None:
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
     writer.writeheader()
     for outcome in outcomes:
-        row = row_of(outcome)
-        writer.writerow({name: _as_cell(value) for name, value in row.items()})
-    _write(path, text.getvalue())
+        writer.writerow({name: _as_cell(value) for name, value in row_of(outcome).items()})
+    save_text(path, text.getvalue())
 
 
 def _as_cell(value: Any) -> Any:
@@ -129,26 +117,14 @@ def _as_cell(value: Any) -> Any:
     return f"'{value}" if is_formula else value
 
 
-def _write(path: Path, text: str) -> None:
-    from hand_eye_calib.io.files import write_atomically
-
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically({path: text})
-    except OSError as error:
-        raise InputError(
-            f"cannot write {path}: {error.strerror}; choose another directory with --out"
-        ) from None
-
-
 def row_of(outcome: Outcome) -> Row:
     """The row of an outcome; what is not known is None.
 
     Nothing in it depends on when or where the work was done.
     """
     row: Row = dict.fromkeys(COLUMNS)
-    row |= {"name": outcome["name"], "vehicle": outcome["vehicle"]}
-    row |= {"bags": " ".join(outcome["bags"]), "error": outcome["error"]}
+    row |= {name: outcome[name] for name in ("name", "vehicle", "error")}
+    row["bags"] = " ".join(outcome["bags"])
     row |= _recording(outcome["inputs"])
     row["findings"] = " ".join(finding["code"] for finding in outcome["findings"])
     if calibration := outcome["calibration"]:
@@ -160,21 +136,16 @@ def row_of(outcome: Outcome) -> Row:
 def _recording(inputs: Mapping[str, Any]) -> Row:
     """When a recording was made, for how long, and the digest of its content."""
     row: Row = {}
-    starts = [
-        inputs[stream]["first_stamp_ns"] for stream in ("parent", "child") if stream in inputs
-    ]
+    streams = [inputs[stream] for stream in STREAMS if stream in inputs]
+    starts = [stream["first_stamp_ns"] for stream in streams]
     if starts and None not in starts:
-        ends = [inputs[stream]["last_stamp_ns"] for stream in ("parent", "child")]
-        row |= {"start_ns": max(starts), "duration_s": (min(ends) - max(starts)) * 1e-9}
-        row["start"] = _date(max(starts))
+        start_ns, end_ns = max(starts), min(stream["last_stamp_ns"] for stream in streams)
+        date = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC)
+        row |= {"start_ns": start_ns, "duration_s": (end_ns - start_ns) * 1e-9}
+        row["start"] = date.isoformat(timespec="seconds")
     if files := inputs.get("files"):
         row |= {"sha256": content_hash(files), "bytes": sum(file["bytes"] for file in files)}
     return row
-
-
-def _date(stamp_ns: int) -> str:
-    """A stamp as a date in UTC, to the second."""
-    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).isoformat(timespec="seconds")
 
 
 def content_hash(files: list[Mapping[str, Any]]) -> str:

@@ -1,30 +1,24 @@
-"""The command ``replay --batch``: tasks, workers, results, and what is printed of them."""
+"""The command ``calibrate --batch``: tasks, workers, results, and what is printed of them."""
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from hand_eye_calib.cli.batch.results import (
-    row_of,
-    store,
-    stored_outcomes,
-    write_json,
-    write_rows,
-)
+from hand_eye_calib.cli.batch.results import row_of, store, stored_outcomes, write_rows
 from hand_eye_calib.cli.batch.tasks import INDEX, SOURCES, SUMMARY, TABLE, Task, read_batch
-from hand_eye_calib.cli.batch.vehicles import Vehicle, document_of, n_without_vehicle, vehicles_of
+from hand_eye_calib.cli.batch.vehicles import Vehicle, vehicles_of
 from hand_eye_calib.cli.batch.workers import Outcome, on_cores, on_dask
 from hand_eye_calib.cli.console import note, print_table, waiting_for, with_progress
 from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.present import exit_code, wrapped
-from hand_eye_calib.cli.reporting import REPORT, can_draw, save_page
-from hand_eye_calib.errors import printable
+from hand_eye_calib.cli.reporting import REPORT, can_draw, save_text
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.text import with_sigma
+from hand_eye_calib.text import listing, with_sigma
 
-_HEADINGS = ("x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg", "poses", "warnings")
+_HEADINGS = (" x m", " y m", " z m", " roll deg", " pitch deg", " yaw deg", " poses", " warnings")
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
@@ -36,16 +30,42 @@ def run_batch(arguments: argparse.Namespace) -> int:
         If the file cannot be used; a bag that fails is a row in the result.
     """
     out: Path | None = arguments.out
+    given = {name: getattr(arguments, name) for name in SOURCES}
+    sources = {
+        name: value if isinstance(value, str) else ":".join(value)
+        for name, value in given.items()
+        if value
+    }
     with waiting_for(f"reading {arguments.batch}"):
         tasks = read_batch(
             arguments.batch,
             options_from(arguments),
-            _sources_from(arguments),
+            sources,
             with_fingerprints=bool(out),
             with_report=bool(out) and can_draw(REPORT),
         )
-    outcomes = _outcomes(tasks, arguments)
-    return _finish([outcomes[task.name] for task in tasks], arguments)
+    found = _outcomes(tasks, arguments)
+    outcomes = [found[task.name] for task in tasks]
+    vehicles = vehicles_of(outcomes)
+    written = write_summary(out, str(arguments.batch), outcomes, vehicles) if out else []
+    if arguments.json:
+        print(json_text(_document(str(arguments.batch), outcomes, vehicles)))
+    else:
+        _print_results(outcomes, vehicles)
+    alone = sum(bool(one["calibration"] and not one["vehicle"]) for one in outcomes)
+    if alone > 1:
+        note(
+            f"{alone} recordings are not compared with each other: name their vehicles with "
+            f"'vehicle:' in {arguments.batch}"
+        )
+    errors = {one["name"]: one["error"] for one in outcomes if one["error"]}
+    for name, error in errors.items():
+        note(f"{name} failed: {error}")
+    for path in written:
+        note(f"wrote {path}")
+    if errors:
+        return 1
+    return max(exit_code(Calibration.from_dict(outcome["calibration"])) for outcome in outcomes)
 
 
 def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace) -> dict[str, Outcome]:
@@ -56,12 +76,8 @@ def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace) -> dict[str,
     if found:
         note(f"{len(found)} of {len(tasks)} bags are done already; their results are in {out}")
     waiting = [task for task in tasks if task.name not in found]
-    on_dask_or_here = (
-        on_dask(arguments.dask)
-        if arguments.dask
-        else on_cores(arguments.jobs or os.cpu_count() or 1)
-    )
-    with on_dask_or_here as do:
+    jobs = arguments.jobs or os.cpu_count() or 1
+    with on_dask(arguments.dask) if arguments.dask else on_cores(jobs) as do:
         for task, outcome in with_progress(do(waiting), len(waiting), "calibrating"):
             page = outcome.pop("page", None)
             found[task.name] = outcome
@@ -70,41 +86,16 @@ def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace) -> dict[str,
     return found
 
 
-def _sources_from(arguments: argparse.Namespace) -> dict[str, str]:
-    """Topics and frames that the command line gives for all bags."""
-    given = {name: getattr(arguments, name) for name in SOURCES}
+def _document(
+    batch: str, outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]
+) -> dict[str, object]:
+    """Everything as plain values."""
     return {
-        name: value if isinstance(value, str) else ":".join(value)
-        for name, value in given.items()
-        if value
+        "batch": batch,
+        "results": list(outcomes),
+        "failures": [outcome["name"] for outcome in outcomes if outcome["error"]],
+        "vehicles": [vehicle.to_dict() for vehicle in vehicles],
     }
-
-
-def _finish(outcomes: Sequence[Outcome], arguments: argparse.Namespace) -> int:
-    """Write and print the summary; returns the exit code."""
-    vehicles = vehicles_of(outcomes)
-    written = []
-    if arguments.out:
-        with waiting_for("writing the summary"):
-            written = write_summary(arguments.out, str(arguments.batch), outcomes, vehicles)
-    if arguments.json:
-        document = document_of(str(arguments.batch), outcomes, vehicles)
-        print(json_text(document))
-    else:
-        print_results(outcomes, vehicles)
-    if (alone := n_without_vehicle(outcomes)) > 1:
-        note(
-            f"{alone} recordings are not compared with each other: name their vehicles with "
-            f"'vehicle:' in {arguments.batch}"
-        )
-    for outcome in outcomes:
-        if outcome["error"]:
-            note(f"{outcome['name']} failed: {outcome['error']}")
-    for path in written:
-        note(f"wrote {path}")
-    if any(outcome["error"] for outcome in outcomes):
-        return 1
-    return max(exit_code(Calibration.from_dict(outcome["calibration"])) for outcome in outcomes)
 
 
 def write_summary(
@@ -118,60 +109,52 @@ def write_summary(
     InputError
         If they cannot be written.
     """
-    write_json(directory / SUMMARY, document_of(batch, outcomes, vehicles))
-    write_rows(directory / TABLE, outcomes)
-    paths = [directory / TABLE]
-    if can_draw(INDEX):
-        from hand_eye_calib.report.batch_page import render_batch
+    with waiting_for("writing the summary"):
+        text = json_text(_document(batch, outcomes, vehicles))
+        save_text(directory / SUMMARY, text + "\n")
+        paths = [directory / TABLE]
+        write_rows(paths[0], outcomes)
+        if can_draw(INDEX):
+            from hand_eye_calib.report.batch_page import render_batch
 
-        rows = [row_of(outcome) for outcome in outcomes]
-        with_report = [(directory / row["name"] / REPORT).exists() for row in rows]
-        page = render_batch(batch, rows, [vars(vehicle) for vehicle in vehicles], with_report)
-        paths.append(save_page(directory / INDEX, page))
+            rows = [row_of(outcome) for outcome in outcomes]
+            with_report = {
+                row["name"] for row in rows if (directory / row["name"] / REPORT).exists()
+            }
+            paths.append(directory / INDEX)
+            save_text(paths[1], render_batch(batch, rows, [*map(vars, vehicles)], with_report))
     return paths
 
 
-def print_results(outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]) -> None:
+def _print_results(outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]) -> None:
     """Print a row for each recording, and what those of each vehicle say together."""
-    from rich import box
-    from rich.table import Table
-
-    with_vehicles = any(outcome["vehicle"] for outcome in outcomes)
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    for heading in ("recording", *(["vehicle"] if with_vehicles else []), "verdict"):
-        table.add_column(heading)
-    for heading in _HEADINGS:
-        table.add_column(heading, justify="right")
-    for outcome in outcomes:
-        of_vehicle = [outcome["vehicle"]] if with_vehicles else []
-        table.add_row(outcome["name"], *of_vehicle, *_cells(outcome))
-    print_table(table)
-    failed = sum(bool(outcome["error"]) for outcome in outcomes)
-    print(f"{len(outcomes) - failed} of {len(outcomes)} bags calibrated, {failed} failed")
+    of_vehicle = ["vehicle"] if any(outcome["vehicle"] for outcome in outcomes) else []
+    headings = ("recording", *of_vehicle, "verdict", *_HEADINGS)
+    print_table("", headings, (_cells(outcome, of_vehicle) for outcome in outcomes))
+    verdicts = Counter(
+        "failed" if one["error"] else one["calibration"]["verdict"] for one in outcomes
+    )
+    solved = len(outcomes) - verdicts["failed"]
+    print(f"{solved} of {len(outcomes)} bags calibrated, {verdicts.pop('failed', 0)} failed")
+    if verdicts:
+        print(listing([f"{count} {verdict}" for verdict, count in verdicts.most_common()]))
     for vehicle in vehicles:
         if len(vehicle.rows) > 1:
-            newest = vehicle.rows[-1]["name"]
-            tail = (
-                f" {newest} against the earlier ones: {vehicle.newest.sentence}."
-                if vehicle.newest
-                else ""
-            )
-            for line in wrapped(f"{vehicle.name}: {vehicle.sentence}{tail}", "", "  "):
-                print(printable(line))
+            text = f"{vehicle.name}: {vehicle.sentence} {vehicle.of_newest}"
+            print("\n".join(wrapped(text, "", "  ")))
 
 
-def _cells(outcome: Outcome) -> list[str]:
-    """Verdict, numbers with their standard deviations, counts."""
+def _cells(outcome: Outcome, of_vehicle: Sequence[str]) -> Iterator[str]:
+    """Names, verdict, numbers with their standard deviations, counts."""
     calibration = outcome["calibration"]
+    yield from (outcome[name] for name in ("name", *of_vehicle))
     if outcome["error"] or not calibration:
-        return ["failed", *[""] * len(_HEADINGS)]
+        yield "failed"
+        return
     transform = calibration["T_parent_child"]
-    lengths = zip(transform["translation"], transform["sigma_translation"], strict=True)
-    angles = zip(transform["rpy_deg"], transform["sigma_rpy_deg"], strict=True)
-    return [
-        calibration["verdict"],
-        *(with_sigma(value, sigma, 3) for value, sigma in lengths),
-        *(with_sigma(value, sigma, 2) for value, sigma in angles),
-        str(calibration["n_poses"]),
-        str(len(calibration["warnings"])),
-    ]
+    yield calibration["verdict"]
+    for kind, sigma, decimals in (("translation", "translation", 3), ("rpy_deg", "rpy_deg", 2)):
+        numbers = zip(transform[kind], transform[f"sigma_{sigma}"], strict=True)
+        yield from (with_sigma(*each, decimals) for each in numbers)
+    yield str(calibration["n_poses"])
+    yield str(len(calibration["warnings"]))

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -11,9 +10,10 @@ from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from hand_eye_calib.cli.options import Options
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.cli.options import STREAMS, Options
+from hand_eye_calib.config import CalibratorConfig, split_frames
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.io import remote
 
 SOURCES = ("parent_topic", "child_topic", "parent_tf", "child_tf")
 _KEYS = ("bag", "name", "vehicle", "options", *SOURCES)
@@ -60,24 +60,17 @@ class Task:
         InputError
             If a store cannot be reached.
         """
-        state = [_state(bag) for bag in self.bags]
-        return hashlib.sha256(
-            json.dumps([asdict(self), state], sort_keys=True).encode()
-        ).hexdigest()
+        text = json.dumps([asdict(self), list(map(_state, self.bags))], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _state(bag: str) -> list[Any]:
-    """What changes if a bag does."""
-    from hand_eye_calib.io import remote
-
+    """What changes if a bag does: names, sizes and times of its files."""
     if remote.is_url(bag):
         return remote.states(bag)
-    return [[file, os.path.getsize(file), os.stat(file).st_mtime_ns] for file in _files(bag)]
-
-
-def _files(bag: str) -> list[str]:
     path = Path(bag)
-    return sorted(map(str, path.iterdir())) if path.is_dir() else [bag] if path.exists() else []
+    files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
+    return [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
 
 
 def read_batch(
@@ -121,114 +114,90 @@ def read_batch(
         raise ConfigError(f"{path}: expected a list of bags, or a mapping with one under 'bags'")
     common = {name: value for name, value in document.items() if name != "bags"}
     given = {"options": options} | dict(sources)
-    defaults = _merged(given, _checked(path, common, "beside 'bags'"))
-    wanted = {"with_fingerprints": with_fingerprints, "with_report": with_report}
-    recordings = list(_recordings(path, bags, defaults))
-    names = _names(recordings)
+    defaults = _merged(given, _checked(f"{path}, beside 'bags'", common))
+    recordings: list[_Recording] = []
+    for number, entry in enumerate(bags, start=1):
+        where = f"{path}, entry {number}"
+        entry = _checked(where, entry if isinstance(entry, dict) else {"bag": entry})
+        merged = _merged(defaults, entry)
+        recordings += [(where, found, merged) for found in _expanded(path, entry, where)]
     return [
-        _task(where, name, paths, entry, wanted)
-        for name, (where, paths, entry) in zip(names, recordings, strict=True)
+        Task(
+            name=name,
+            bags=tuple(found),
+            with_fingerprints=with_fingerprints,
+            with_report=with_report,
+            **_settings(where, entry),
+        )
+        for name, (where, found, entry) in zip(_names(recordings), recordings, strict=True)
     ]
 
 
+# Where it stands in the file, its bags, what holds for it.
 _Recording = tuple[str, list[str], dict[str, Any]]
 
 
-def _recordings(
-    path: Path, bags: Sequence[Any], defaults: Mapping[str, Any]
-) -> Iterator[_Recording]:
-    """Each recording of a batch file: where it stands in the file, its bags, what holds for it."""
-    for number, entry in enumerate(bags, start=1):
-        where = f"entry {number}"
-        entry = _checked(path, entry if isinstance(entry, dict) else {"bag": entry}, where)
-        for paths in _expanded(path, entry, where):
-            yield f"{path}, {where}", paths, _merged(defaults, entry)
-
-
-def _checked(path: Path, entry: dict[str, Any], where: str) -> dict[str, Any]:
+def _checked(where: str, entry: dict[str, Any]) -> dict[str, Any]:
     unknown = [str(name) for name in entry if name not in _KEYS]
     if unknown:
-        raise ConfigError(
-            f"{path}, {where}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}"
-        )
+        raise ConfigError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")
     if not isinstance(entry.get("options", {}), dict):
-        raise ConfigError(f"{path}, {where}: options must be a mapping of names to values")
+        raise ConfigError(f"{where}: options must be a mapping of names to values")
     return entry
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """``over`` before ``base``; the topic of a stream replaces its frames, and the reverse."""
-    merged = {name: value for name, value in base.items() if _other(name) not in over} | dict(over)
+    replaced = {
+        f"{stream}_{other}"
+        for stream in STREAMS
+        for kind, other in (("topic", "tf"), ("tf", "topic"))
+        if f"{stream}_{kind}" in over
+    }
+    merged = {name: value for name, value in base.items() if name not in replaced} | dict(over)
     return merged | {"options": base.get("options", {}) | over.get("options", {})}
 
 
-def _other(name: str) -> str | None:
-    stream, _, kind = name.partition("_")
-    return {"topic": f"{stream}_tf", "tf": f"{stream}_topic"}.get(kind)
-
-
-def _expanded(path: Path, entry: Mapping[str, Any], where: str) -> list[list[str]]:
+def _expanded(path: Path, entry: Mapping[str, Any], where: str) -> Iterator[list[str]]:
     """Bags of each recording: one recording, or several if a pattern stands for many."""
-    from hand_eye_calib.io import remote
-
     bags = entry.get("bag")
     named: list[Any] = bags if isinstance(bags, list) else [bags]
     if not named or not all(isinstance(bag, str) and bag for bag in named):
-        raise ConfigError(
-            f"{path}, {where}: expected a bag's path or a list of paths; got {bags!r}"
-        )
+        raise ConfigError(f"{where}: expected a bag's path or a list of paths; got {bags!r}")
     if any("\0" in bag for bag in named):
-        raise ConfigError(f"{path}, {where}: a bag's path has a zero byte")
+        raise ConfigError(f"{where}: a bag's path has a zero byte")
     places = [bag if remote.is_url(bag) else str(path.parent / bag) for bag in named]
-    if len(places) > 1 or not _is_pattern(places[0]):
-        return [places]
-    found = remote.expanded(places[0]) if remote.is_url(places[0]) else sorted(glob(places[0]))
-    if not found:
-        raise ConfigError(f"{path}, {where}: no bag matches {named[0]}")
-    return [[place] for place in found]
+    pattern = places[0]
+    if remote.is_url(pattern):  # a question mark begins its query
+        found = remote.expanded(pattern) if "*" in pattern else None
+    else:
+        is_pattern = has_magic(pattern) and not Path(pattern).exists()
+        found = sorted(glob(pattern, recursive=True)) if is_pattern else None
+    if len(places) > 1 or found is None:
+        yield places
+    elif not found:
+        raise ConfigError(f"{where}: no bag matches {named[0]}")
+    else:
+        yield from ([place] for place in found)
 
 
-def _is_pattern(place: str) -> bool:
-    from hand_eye_calib.io import remote
-
-    # A question mark begins the query of a URL.
-    return "*" in place if remote.is_url(place) else has_magic(place) and not Path(place).exists()
-
-
-def _task(
-    where: str,
-    name: str,
-    bags: Sequence[str],
-    entry: Mapping[str, Any],
-    wanted: Mapping[str, bool],
-) -> Task:
-    from hand_eye_calib.io.transforms import TfSource
-
-    try:
-        CalibratorConfig.from_options(entry["options"])
-        for source in ("parent_tf", "child_tf"):
-            if source in entry:
-                TfSource.parse(str(entry[source]))
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+def _settings(where: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Vehicle, options and sources of a recording."""
     sources = {source: str(entry[source]) for source in SOURCES if source in entry}
-    return Task(
-        name=name,
-        bags=tuple(bags),
-        vehicle=_vehicle(where, entry.get("vehicle", "")),
-        options=dict(entry["options"]),
-        sources=sources,
-        **wanted,
-    )
-
-
-def _vehicle(where: str, given: Any) -> str:
+    given = entry.get("vehicle", "")
     if isinstance(given, bool) or not isinstance(given, (str, int, float)):
         raise ConfigError(f"{where}: expected the name of a vehicle; got {given!r}")
     vehicle = str(given)
     if not vehicle.isprintable() or len(vehicle.encode()) > _LONGEST_NAME:
         raise ConfigError(f"{where}: {vehicle[:_LONGEST_NAME]!r} cannot name a vehicle")
-    return vehicle
+    try:
+        CalibratorConfig.from_options(entry["options"])
+        for source, text in sources.items():
+            if source.endswith("_tf"):
+                split_frames(text)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    return {"vehicle": vehicle, "options": dict(entry["options"]), "sources": sources}
 
 
 def _names(recordings: Sequence[_Recording]) -> list[str]:
@@ -240,12 +209,14 @@ def _names(recordings: Sequence[_Recording]) -> list[str]:
     places = list(dict.fromkeys(unnamed))
     stems = Counter(place[-1] for place in places)
     alike = [place for place in places if stems[place[-1]] > 1]
-    names: list[str] = []
+    names: dict[str, None] = {}
     for where, paths, entry in recordings:
         place = _place(paths[0])
         usual = "_".join(_distinct(place, alike) if place in alike else place[-1:])
-        names.append(_free(_name(where, entry.get("name") or usual), set(names)))
-    return names
+        name = _folder(where, entry.get("name") or usual)
+        numbered = chain([name], (f"{name}_{number}" for number in count(2)))
+        names[next(one for one in numbered if one not in names)] = None
+    return [*names]
 
 
 def _place(bag: str) -> tuple[str, ...]:
@@ -261,13 +232,7 @@ def _distinct(place: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> tupl
     return place[first : len(place) - last + 1] or place[-1:]
 
 
-def _free(name: str, taken: set[str]) -> str:
-    """The name, with a number if it is taken."""
-    numbered = (f"{name}_{number}" for number in count(2))
-    return next(one for one in chain([name], numbered) if one not in taken)
-
-
-def _name(where: str, given: Any) -> str:
+def _folder(where: str, given: Any) -> str:
     """Name of a recording, and of its folder in ``--out``."""
     if not isinstance(given, (str, int, float)):
         raise ConfigError(f"{where}: expected a name; got {given!r}")

@@ -31,6 +31,8 @@ class Vehicle:
         What the comparison of all found.
     newest : Comparison or None
         Of the newest recording with what the earlier ones say together.
+    of_newest : str
+        The same in a sentence; empty without one.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Vehicle:
     agreement: Agreement
     sentence: str
     newest: Comparison | None
+    of_newest: str
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values."""
@@ -69,46 +72,28 @@ def vehicles_of(outcomes: Sequence[Outcome]) -> list[Vehicle]:
     groups: dict[tuple[str, tuple[str, str]], list[tuple[Row, Calibration]]] = {}
     for outcome in outcomes:
         if outcome["calibration"] and outcome["vehicle"]:
-            row, calibration = row_of(outcome), Calibration.from_dict(outcome["calibration"])
+            calibration = Calibration.from_dict(outcome["calibration"])
             if calibration.status not in _FAILURES:
                 frames = (calibration.parent_frame, calibration.child_frame)
-                groups.setdefault((row["vehicle"], frames), []).append((row, calibration))
+                group = groups.setdefault((outcome["vehicle"], frames), [])
+                group.append((row_of(outcome), calibration))
     return [_vehicle(name, frames, group) for (name, frames), group in sorted(groups.items())]
 
 
-def n_without_vehicle(outcomes: Sequence[Outcome]) -> int:
-    """Number of calibrated recordings whose vehicle is not known."""
-    return sum(bool(one["calibration"] and not one["vehicle"]) for one in outcomes)
-
-
 def _vehicle(name: str, frames: tuple[str, str], group: list[tuple[Row, Calibration]]) -> Vehicle:
-    ordered = sorted(group, key=lambda one: (one[0]["start_ns"] or 0, one[0]["name"]))
-    rows = tuple(row for row, _ in ordered)
-    calibrations = [calibration for _, calibration in ordered]
-    found = agreement_of_results(calibrations)
+    group.sort(key=lambda one: (one[0]["start_ns"] or 0, one[0]["name"]))
+    rows = tuple(row for row, _ in group)
+    *earlier, last = (calibration for _, calibration in group)
+    found = agreement_of_results([*earlier, last])
+    newest, of_newest = None, ""
+    if earlier:
+        before = agreement_of_results(earlier)
+        to_child = np.kron(np.eye(2), before.T_parent_child[:3, :3].T)
+        covariance = to_child @ before.covariance @ to_child.T
+        common = Extrinsic(
+            before.T_parent_child, "earlier recordings", covariance, is_calibration=True
+        )
+        newest = compare([last], common, [rows[-1]["name"]])
+        of_newest = f"{rows[-1]['name']} against the earlier ones: {newest.sentence}."
     said = found.sentence([row["name"] for row in rows])
-    return Vehicle(name, frames, rows, found, said, _newest(calibrations, rows[-1]["name"]))
-
-
-def _newest(calibrations: Sequence[Calibration], name: str) -> Comparison | None:
-    """The newest recording against what the earlier ones say together; None if there are none."""
-    *earlier, newest = calibrations
-    if not earlier:
-        return None
-    found = agreement_of_results(earlier)
-    to_child = np.kron(np.eye(2), found.T_parent_child[:3, :3].T)
-    covariance = to_child @ found.covariance @ to_child.T
-    common = Extrinsic(found.T_parent_child, "earlier recordings", covariance, is_calibration=True)
-    return compare([newest], common, [name])
-
-
-def document_of(
-    batch: str, outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]
-) -> dict[str, Any]:
-    """Everything as plain values."""
-    return {
-        "batch": batch,
-        "results": list(outcomes),
-        "failures": [outcome["name"] for outcome in outcomes if outcome["error"]],
-        "vehicles": [vehicle.to_dict() for vehicle in vehicles],
-    }
+    return Vehicle(name, frames, rows, found, said, newest, of_newest)

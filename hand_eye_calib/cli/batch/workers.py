@@ -15,10 +15,11 @@ from queue import SimpleQueue
 from typing import Any
 
 from hand_eye_calib.cli.batch.tasks import Task
-from hand_eye_calib.cli.replaying import fingerprints, replay
+from hand_eye_calib.cli.console import silence
+from hand_eye_calib.cli.options import STREAMS
+from hand_eye_calib.cli.reading import read_bags
 from hand_eye_calib.cli.reporting import rendered, with_cross_check
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.run import review
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io.limits import ReadingMemory
 from hand_eye_calib.io.remote import local_copies, public
@@ -46,7 +47,7 @@ def work(task: Task) -> Outcome:
         the task wants one, and a ``traceback`` for errors that are defects of the program.
     """
     try:
-        with local_copies(task.bags) as (paths, as_given):
+        with silence(), local_copies(task.bags) as (paths, as_given):
             return failed(task, None) | as_given(_calibrated(task, paths))
     except HandEyeCalibError as error:
         return failed(task, str(error))
@@ -70,35 +71,31 @@ def failed(task: Task, reason: str | None) -> Outcome:
 
 def _calibrated(task: Task, paths: list[str]) -> Outcome:
     """What a task adds to its outcome if nothing goes wrong."""
-    config = CalibratorConfig.from_options(task.options)
-    sources = (_source(task, "parent"), _source(task, "child"))
+    from hand_eye_calib.io.transforms import TfSource
+
     ReadingMemory.switch_on()  # this may be a process of its own
-    replayed = replay(paths, *sources, config=config, quiet=True)
+    sources: dict[str, Any] = {
+        stream: task.sources.get(f"{stream}_topic")
+        or (f"{stream}_tf" in task.sources and TfSource.parse(task.sources[f"{stream}_tf"]))
+        or None
+        for stream in STREAMS
+    }
+    recording = read_bags(paths, sources, CalibratorConfig.from_options(task.options))
+    calibration = recording.solved()
     if task.with_fingerprints:
-        replayed.inputs["files"] = fingerprints(replayed.files, quiet=True)
-    reviewed = review(replayed.calibration, replayed.calibrator.snapshot())
-    calibration, snapshot = reviewed.calibration, reviewed.snapshot
-    calibration, evidence = with_cross_check(calibration, snapshot)
-    inputs = replayed.inputs | {"options": snapshot.config.to_options()}
+        recording.with_fingerprints()
+    calibration, evidence = with_cross_check(calibration, recording.snapshot)
     found: Outcome = {
         "calibration": calibration.to_dict(),
         "findings": plain(calibration.findings),
-        "inputs": inputs,
+        "inputs": recording.inputs,
     }
     if calibration.status.failure:
         found["error"] = calibration.status.failure
     if task.with_report:
-        found["page"] = rendered(calibration, evidence, snapshot.config, inputs)
+        config = recording.snapshot.config
+        found["page"] = rendered(calibration, evidence, config, recording.inputs)
     return found
-
-
-def _source(task: Task, stream: str) -> Any:
-    """Topic, pair of frames or nothing."""
-    from hand_eye_calib.io.transforms import TfSource
-
-    if frames := task.sources.get(f"{stream}_tf"):
-        return TfSource.parse(frames)
-    return task.sources.get(f"{stream}_topic")
 
 
 @contextmanager
@@ -106,9 +103,7 @@ def on_cores(jobs: int, do: Work = work) -> Iterator[Workers]:
     """Processes of this machine. What a process that dies had to do is done again at the end, one
     task at a time: it may have died for lack of memory.
     """
-    # One thread each: the matrices are small, and all cores are taken already.
-    threads = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = threads or "1"
+    # One process each, so that one that dies takes no other task along.
     processes: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
     for _ in range(jobs):
         processes.put(_process())
@@ -149,8 +144,6 @@ def on_cores(jobs: int, do: Work = work) -> Iterator[Workers]:
         lanes.shutdown()
         for _ in range(jobs):
             processes.get().shutdown()
-        if threads is None:
-            del os.environ["OMP_NUM_THREADS"]
 
 
 def _process() -> ProcessPoolExecutor:
@@ -188,9 +181,8 @@ def on_dask(address: str, do: Work = work) -> Iterator[Workers]:
     try:
         client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"no Dask scheduler at {address}: {' '.join(str(error).split())}"
-        ) from None
+        reason = " ".join(str(error).split())
+        raise InputError(f"no Dask scheduler at {address}: {reason}") from None
 
     def outcomes(tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
         futures = {client.submit(do, task, pure=False): task for task in tasks}

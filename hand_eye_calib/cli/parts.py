@@ -1,0 +1,132 @@
+"""Parts of one recording, or several recordings? They look alike on the command line."""
+
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry.trajectory import Trajectory
+
+# Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
+_LONGEST_PAUSE_S = 60.0
+# A vehicle hardly moves so many times faster in a pause than it ever does beside it.
+_FASTER = 2.0
+
+
+class _Part(NamedTuple):
+    """The poses of one source in one of the bags."""
+
+    path: Path | str
+    poses: Trajectory
+    # Whether another bag has the same pose at a stamp, if it is of this recording. A path is
+    # corrected as it grows; positions and rates begin anew in each bag.
+    is_fixed: bool
+
+    def last_ns(self) -> int:
+        return int(self.poses.stamps_ns[-1])
+
+
+def refuse_recordings(
+    paths: Sequence[Path | str], source: Any, max_gap_s: float, measures: str = "auto"
+) -> None:
+    """Refuse bags that are not parts of one recording.
+
+    Parts continue each other, hold different topics, or repeat the same poses, as two recorders do
+    that run side by side.
+
+    Parameters
+    ----------
+    paths : sequence of path-like
+    source : str or TfSource
+        A topic or a pair of frames.
+    max_gap_s : float
+        Poses of two parts may be out of order for so long.
+    measures : str
+        What the poses are read as.
+
+    Raises
+    ------
+    InputError
+        If two bags are recordings of their own; the message names them and says why.
+    """
+    if len(paths) < 2:
+        return
+    read = (_part(path, source, measures) for path in paths)
+    parts = sorted(filter(None, read), key=lambda part: int(part.poses.stamps_ns[0]))
+    differences = [
+        (first, second, _overlap(first, second, max_gap_s))
+        for first, second in combinations(parts, 2)
+    ]
+    for number, part in enumerate(parts[1:], start=1):
+        latest = max(parts[:number], key=_Part.last_ns)
+        differences.append((latest, part, _break(latest, part)))
+    for first, second, difference in differences:
+        if difference:
+            raise InputError(
+                f"{first.path} and {second.path} are two recordings, not parts of one: {source} "
+                f"{difference}; calibrate each by itself, or all with --batch FILE, which lists "
+                "them"
+            )
+
+
+def _part(path: Path | str, source: Any, measures: str) -> _Part | None:
+    """The poses of a source in one bag; None without any."""
+    from hand_eye_calib.io.bags import PoseBag, trajectory_of
+    from hand_eye_calib.io.bags.messages import PATH_TYPE
+
+    with PoseBag(path) as bag:
+        paths = {topic.name for topic in bag.topics() if topic.type == PATH_TYPE}
+        try:
+            poses, _ = trajectory_of(bag, source, measures)
+            return _Part(path, poses, poses.measures == "poses" and source not in paths)
+        except InputError:
+            # It is no recording of its own: without the topic, or without the static transforms
+            # that only a first part has. What is damaged is said when all parts are read.
+            return None
+
+
+def _overlap(first: _Part, second: _Part, max_gap_s: float) -> str:
+    """What tells that poses of one time are not the same; empty for nothing."""
+    one, two = first.poses, second.poses
+    last_ns = min(first.last_ns(), second.last_ns())
+    overlap_s = (last_ns - two.stamps_ns[0]) * 1e-9
+    if overlap_s <= max_gap_s:
+        return ""
+    shared, rows, others = np.intersect1d(
+        one.stamps_ns, two.stamps_ns, assume_unique=True, return_indices=True
+    )
+    is_same = np.ones(len(shared), dtype=bool)
+    if first.is_fixed and second.is_fixed:
+        is_same = (one.poses[rows] == two.poses[others]).all(axis=(1, 2))
+    count = min(
+        int(((each.stamps_ns >= two.stamps_ns[0]) & (each.stamps_ns <= last_ns)).sum())
+        for each in (one, two)
+    )
+    if is_same.sum() >= count / 2:
+        return ""
+    return f"has different poses in both for {overlap_s:.1f} s of the same time"
+
+
+def _break(first: _Part, second: _Part) -> str:
+    """What tells that a part does not continue one before; empty for nothing."""
+    pause_s = float(second.poses.stamps_ns[0] - first.last_ns()) * 1e-9
+    if pause_s > _LONGEST_PAUSE_S:
+        return f"pauses for {pause_s:.0f} s between them"
+    steps = [_steps(part.poses) for part in (first, second) if len(part.poses) > 1]
+    if pause_s < 0 or not first.is_fixed or not steps:
+        return ""
+    distance = float(np.linalg.norm(second.poses.poses[0, :3, 3] - first.poses.poses[-1, :3, 3]))
+    lengths, times_s = np.concatenate(steps, axis=1)
+    furthest = _FASTER * (lengths / times_s).max() * max(pause_s, float(np.median(times_s)))
+    if distance > furthest:
+        return f"goes on {distance:.1f} m away after {pause_s:.1f} s, as if it had started again"
+    return ""
+
+
+def _steps(trajectory: Trajectory) -> np.ndarray:
+    """Lengths (m) and times (s) from pose to pose, (2, N - 1)."""
+    lengths = np.linalg.norm(np.diff(trajectory.poses[:, :3, 3], axis=0), axis=1)
+    return np.stack([lengths, np.diff(trajectory.stamps_ns) * 1e-9])
