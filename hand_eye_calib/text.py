@@ -31,7 +31,9 @@ def angle(radians: float) -> str:
 
 
 def amount(axis: str, value: float) -> str:
-    """A length (m) along x, y or z, otherwise an angle (rad)."""
+    """A length (m) along x, y or z, otherwise an angle (rad); "unknown" if it is not finite."""
+    if not math.isfinite(value):
+        return "unknown"
     return length(value) if axis in ("x", "y", "z") else angle(value)
 
 

@@ -196,7 +196,7 @@ def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
             yield {
                 "name": dof.name,
                 "title": _AXIS_NAMES.get(dof.name, f"along {dof.name}"),
-                "sigma": amount(dof.name, dof.sigma) if np.isfinite(dof.sigma) else "unknown",
+                "sigma": amount(dof.name, dof.sigma),
                 "verdict": dof.verdict.value,
                 "words": _WORDS[dof.verdict.value],
                 "bar": _bar(dof.sigma / target_of(dof.name, calibration)),
@@ -216,14 +216,11 @@ def _differences(calibration: Calibration) -> Iterable[dict[str, str]]:
     """Rows of the comparison with what is installed; none without one."""
     for compared in calibration.comparison.differences if calibration.comparison else ():
         for axis, row in compared.axes.items():
-            difference, sigma, visible = (
-                "unknown" if value is None else amount(axis, value)
-                for value in (row.difference, row.sigma, row.visible)
-            )
+            difference, sigma = amount(axis, row.difference), amount(axis, row.sigma)
             yield {
                 "title": _AXIS_NAMES.get(axis, f"along {axis}"),
                 "difference": f"{difference} ± {sigma}",
-                "visible": visible,
+                "visible": amount(axis, row.visible),
                 "verdict": row.verdict,
             }
 

@@ -32,6 +32,7 @@ from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
+from hand_eye_calib.results.finding import Finding, Severity
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -275,7 +276,7 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
 def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     """The headline of planar motion names the second reason, too."""
     assert run("replay", new_bag(*drive(planar=True)), *TOPICS, "--out", tmp_path / "out")[0] == 3
-    jumps = {"code": "jumps", "what": "many jumps", "advice": "find out why", "severity": "warning"}
+    jumps = Finding("jumps", Severity.WARNING, "many jumps", "find out why")
     calibration = dataclasses.replace(load_result(tmp_path / "out"), findings=(jumps,))
     lines = as_text(calibration).splitlines()
     assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"

@@ -31,6 +31,7 @@ from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.report.report import render
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.results.finding import Finding, Severity
 from hand_eye_calib.session.compare import with_comparison
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import REALISTIC
@@ -252,14 +253,7 @@ def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(pa
 def test_hostile_names_stay_text():
     hostile = ('<script>alert("x")</script>', "_a$b$ & 'c' id=\"y\" --> ünï 雷")
     snapshot, calibration = simulated(poses=60, frames=hostile)
-    finding = {
-        "code": "x",
-        "severity": "note",
-        "stream": "<em>",
-        "confidence": "likely",
-        "what": "<img src=x>",
-        "advice": "</li>",
-    }
+    finding = Finding("x", Severity.NOTE, "<img src=x>", "</li>", stream="<em>")
     inputs = {
         "bag": "</td><script>",
         "parent": {"topic": "<em>"},
