@@ -276,7 +276,9 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
 def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     """The headline of planar motion names the second reason, too."""
     assert run("replay", new_bag(*drive(planar=True)), *TOPICS, "--out", tmp_path / "out")[0] == 3
-    jumps = Finding("jumps", Severity.WARNING, "many jumps", "find out why")
+    jumps = Finding(
+        code="jumps", severity=Severity.WARNING, what="many jumps", advice="find out why"
+    )
     calibration = dataclasses.replace(load_result(tmp_path / "out"), findings=(jumps,))
     lines = as_text(calibration).splitlines()
     assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"

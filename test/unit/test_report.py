@@ -253,7 +253,9 @@ def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(pa
 def test_hostile_names_stay_text():
     hostile = ('<script>alert("x")</script>', "_a$b$ & 'c' id=\"y\" --> ünï 雷")
     snapshot, calibration = simulated(poses=60, frames=hostile)
-    finding = Finding("x", Severity.NOTE, "<img src=x>", "</li>", stream="<em>")
+    finding = Finding(
+        code="x", severity=Severity.NOTE, stream="<em>", what="<img src=x>", advice="</li>"
+    )
     inputs = {
         "bag": "</td><script>",
         "parent": {"topic": "<em>"},
