@@ -113,7 +113,7 @@ def _checked(
         return check_streams(parent, child, *known, config_from(arguments).max_gap)
     from hand_eye_calib.engine.checking import check_partial
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-    
+
     config = offline_config(parent, child, options_from(arguments))
     return check_partial(whole_snapshot(config, parent, child))
 
