@@ -326,7 +326,7 @@ def test_a_solve_that_did_not_converge_fails(run, new_bag, tmp_path, monkeypatch
     from hand_eye_calib.engine.snapshot import Snapshot
 
     calibration = some_calibration(run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED)
-    monkeypatch.setattr(Snapshot, "estimate", lambda self: calibration)
+    monkeypatch.setattr(Snapshot, "estimate", lambda self, **_: calibration)
     code, out, err = run("replay", tmp_path / "drive", *TOPICS, "--json")
     assert (code, json.loads(out)["status"]) == (1, "not_converged")
     assert err.startswith("hand_eye_calib: error: the solver did not converge")
@@ -705,7 +705,7 @@ def test_commands_that_need_ros_say_how_to_get_it(refused, monkeypatch):
 def test_a_defect_keeps_its_traceback(new_bag, monkeypatch):
     from hand_eye_calib.engine.snapshot import Snapshot
 
-    def defect(self):
+    def defect(self, **_):
         raise ZeroDivisionError
 
     monkeypatch.setattr(Snapshot, "estimate", defect)
@@ -716,7 +716,7 @@ def test_a_defect_keeps_its_traceback(new_bag, monkeypatch):
 def test_a_configuration_that_the_engine_refuses_is_wrong_usage(refused, new_bag, monkeypatch):
     from hand_eye_calib.engine.snapshot import Snapshot
 
-    def refuse(self):
+    def refuse(self, **_):
         raise ConfigError("these options do not go together")
 
     monkeypatch.setattr(Snapshot, "estimate", refuse)
