@@ -27,7 +27,13 @@ from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.aligned import Aligned, check_aligned, check_same, solved
+from hand_eye_calib.checks.aligned import (
+    Aligned,
+    check_aligned,
+    check_independent,
+    check_same,
+    solved,
+)
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
 from hand_eye_calib.checks.hypotheses import (
     LAGS_S,
@@ -37,11 +43,10 @@ from hand_eye_calib.checks.hypotheses import (
     StreamPair,
     explain,
 )
-from hand_eye_calib.checks.independence import check_independent
-from hand_eye_calib.checks.lengths import check_lengths
 from hand_eye_calib.checks.streams import (
     check_flat,
     check_frozen,
+    check_lengths,
     check_positions,
     check_sampling,
     check_stamps,

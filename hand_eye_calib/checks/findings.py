@@ -10,8 +10,8 @@ from hand_eye_calib.results.finding import Confidence, Finding, Severity, graves
 
 __all__ = ["Confidence", "Finding", "Severity", "answered", "finding", "gravest_first"]
 
-_NOTE, _WARNING, _ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
-_CERTAIN, _LIKELY, _POSSIBLE = Confidence.CERTAIN, Confidence.LIKELY, Confidence.POSSIBLE
+_NOTE, _WARNING = Severity.NOTE, Severity.WARNING
+_CERTAIN, _POSSIBLE = Confidence.CERTAIN, Confidence.POSSIBLE
 
 # Jumps up to this share hardly matter to the methods that reject outliers.
 _FEW_JUMPS = 0.02
@@ -24,11 +24,11 @@ class _Row:
     is the row's own key unless several rows share it.
     """
 
-    severity: Severity
-    confidence: Confidence
     what: str
     advice: str
     cause: str = ""
+    severity: Severity = Severity.ERROR
+    confidence: Confidence = Confidence.LIKELY
     evidence: tuple[str, ...] = ()
     code: str = ""
 
@@ -41,90 +41,82 @@ _SHARES = ("unexplained_share", "unexplained_share_mended")
 _ROWS = {
     # ------------------------------------------------------------------ of one stream
     "duplicates": _Row(
-        _NOTE,
-        _CERTAIN,
         "{repeated} of {poses} {stream} poses repeat a stamp",
         "the first of each is used",
+        severity=_NOTE,
+        confidence=_CERTAIN,
     ),
     "disorder": _Row(
-        _NOTE,
-        _CERTAIN,
         "{backwards} {stream} stamps are earlier than the one before",
         "poses are sorted by stamp",
+        severity=_NOTE,
+        confidence=_CERTAIN,
     ),
-    "repaired_file": _Row(_NOTE, _CERTAIN, "{text}", "repair the file's source", code="disorder"),
+    "repaired_file": _Row(
+        "{text}", "repair the file's source", code="disorder", severity=_NOTE, confidence=_CERTAIN
+    ),
     "too_few_poses": _Row(
-        _ERROR,
-        _CERTAIN,
         "the {stream} stream has {poses} poses",
         "record longer, or check the topic",
         code="too_short",
+        confidence=_CERTAIN,
     ),
-    "leap": _Row(_ERROR, _CERTAIN, "{whose} {text}", "{remedy}"),
+    "leap": _Row("{whose} {text}", "{remedy}", confidence=_CERTAIN),
     "gaps": _Row(
-        _NOTE,
-        _CERTAIN,
         "the {stream} stream has {gaps} gaps of up to {longest_s:.2f} s ({share:.0%} of the time)",
         "nothing is paired across a gap; raise max_gap if the motion there is smooth",
+        severity=_NOTE,
+        confidence=_CERTAIN,
     ),
     "jumps": _Row(
-        _WARNING,
-        _LIKELY,
         "{share:.1%} of {whose} steps are jumps: far from the motion before and after",
         "keep a method that rejects outliers; better, repair the source",
         "relocalisations, loop closures or wrong detections",
         evidence=("share",),
+        severity=_WARNING,
     ),
     "frozen": _Row(
-        _ERROR,
-        _CERTAIN,
         "the {stream} stream repeats the same pose for {share:.0%} of the time while the other "
         "sensor moves",
         "find out why its source stopped, and cut that part out",
+        confidence=_CERTAIN,
     ),
     "repeated": _Row(
-        _ERROR,
-        _CERTAIN,
         "the {stream} stream has each position {times} times in a row under new stamps: its source "
         "is slower than the stream",
         "keep the first of each, with the stamp of its measurement",
+        confidence=_CERTAIN,
     ),
     "stamp_unit": _Row(
-        _ERROR,
-        _CERTAIN,
         "{whose} stamps are {unit} instead of nanoseconds: they are {factor:g} times nearer to "
         "1970 than the {other}'s",
         "multiply {whose} stamps by {factor:g}",
+        confidence=_CERTAIN,
     ),
     "interleaved": _Row(
-        _ERROR,
-        _LIKELY,
         "{whose} poses alternate between two levels {distance_m:.2g} m apart",
         "give each its own topic, and calibrate one",
         "two sensors, or two programs, publish on one topic",
         evidence=("roughness_ratio", "distance_m"),
     ),
     "coarse_positions": _Row(
-        _NOTE,
-        _CERTAIN,
         "{whose} positions are multiples of {step_m:.3g} m",
         "write positions with 64 bits and all digits, or relative to a near origin",
         "{why}",
         evidence=("step_m",),
+        severity=_NOTE,
+        confidence=_CERTAIN,
     ),
     "flat": _Row(
-        _ERROR,
-        _CERTAIN,
         "the {stream} stream has only x, y and yaw, while the {other} tilts by {tilt_deg:.1f} deg "
         "(root mean square)",
         "give poses with all six degrees of freedom, or record on level ground and measure height, "
         "roll and pitch by hand",
         "odometry in 2D, such as that of wheels",
         evidence=("tilt_rad",),
+        confidence=_CERTAIN,
     ),
     "lengths": _Row(
-        _ERROR,
-        _LIKELY,
         "the parent moves at {speed_m_s:.0f} m/s and changes its velocity by "
         "{acceleration_m_s2:.0f} m/s within a second, as no vehicle does: its lengths can hardly "
         "be in metres",
@@ -135,48 +127,34 @@ _ROWS = {
     ),
     # ------------------------------------------------------------------ of both together
     "unrelated_rates": _Row(
-        _ERROR,
-        _LIKELY,
         "the {quantity} of the two streams do not agree at any clock offset: {doubt}",
         "check that both sensors are on one rigid body, that the topics are of the same recording, "
         "and that neither is derived from another body",
         code="unrelated",
     ),
     "no_turning": _Row(
-        _ERROR,
-        _LIKELY,
         "the streams hardly rotate, or at a constant rate, so that neither clock nor extrinsic can "
         "be checked",
         "rotate about several axes (a vehicle: curves, and slopes if there are any)",
     ),
-    "too_short": _Row(_ERROR, _CERTAIN, "{text}", "record longer"),
+    "too_short": _Row("{text}", "record longer", confidence=_CERTAIN),
     "not_one_body": _Row(
-        _ERROR,
-        _LIKELY,
         "no extrinsic, scale or usual mistake explains both streams: {share:.0%} of the motion "
         "stays unexplained (at most {limit:.0%} would be good)",
         "check that both sensors are on one rigid body and that the poses are those of the sensors",
         code="unrelated",
     ),
     "unrelated_parts": _Row(
-        _ERROR,
-        _LIKELY,
-        "{share:.0%} of the {part} is not that of the {other}",
-        _ONE_BODY,
-        code="unrelated",
+        "{share:.0%} of the {part} is not that of the {other}", _ONE_BODY, code="unrelated"
     ),
-    "unsolved": _Row(_ERROR, _POSSIBLE, "{text}", _ONE_BODY, code="unrelated"),
+    "unsolved": _Row("{text}", _ONE_BODY, code="unrelated", confidence=_POSSIBLE),
     "not_independent": _Row(
-        _ERROR,
-        _LIKELY,
         "The two streams are not independent: one seems to be computed from the other. This result "
         "only repeats the transform that was used for it.",
         "give the poses that each sensor measured by itself",
         evidence=("residual_rad",),
     ),
     "swapped_coordinates": _Row(
-        _ERROR,
-        _LIKELY,
         "latitude and longitude of the {stream} seem to be swapped: its distances along x (east) "
         "must be multiplied by {factor_x:.3g} and along y (north) by {factor_y:.3g}, as if the "
         "true latitude were {latitude:.0f} deg and the true longitude {longitude:.0f} deg, north "
@@ -185,8 +163,6 @@ _ROWS = {
         evidence=("factor_x", "factor_y", *_SHARES),
     ),
     "mirrored_positions": _Row(
-        _ERROR,
-        _LIKELY,
         "the {stream}'s positions are mirrored: with x and y swapped "
         "{unexplained_share_mended:.1%} of the motion stays unexplained instead of "
         "{unexplained_share:.0%}",
@@ -196,8 +172,6 @@ _ROWS = {
         code="left_handed",
     ),
     "longitude_scale": _Row(
-        _ERROR,
-        _LIKELY,
         "the {stream}'s distances along x (east) must be multiplied by {factor_x:.3g}, those along "
         "y (north) are right; " + _MENDED,
         "multiply x by the cosine of the latitude, or give latitude and longitude themselves",
@@ -205,103 +179,81 @@ _ROWS = {
         evidence=("factor_x", "factor_y", *_SHARES),
     ),
     "rate_unit": _Row(
-        _ERROR,
-        _LIKELY,
         "the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are {unit} "
         "and were read as {read_as}",
         "name the unit in the header, such as wx_deg_s or wx_rad_s; a message has rad/s",
         evidence=("ratio",),
     ),
     "noisy": _Row(
-        _NOTE,
-        _LIKELY,
         "the streams rotate together, but {share:.0%} of the motion stays unexplained: noise or "
         "jumps are strong",
         "expect large standard deviations; record longer and with more motion, or repair the "
         "source",
+        severity=_NOTE,
     ),
     "quaternion_order": _Row(
-        _ERROR,
-        _LIKELY,
         "{whose} quaternions seem to be written w x y z and read as x y z w",
         "write them as x y z w",
     ),
     "inverse_orientation": _Row(
-        _ERROR,
-        _LIKELY,
         "{whose} orientations seem to be inverted (of the world in the sensor), while the "
         "positions are those of the sensor in its world",
         "invert the orientations alone: negate x, y and z of every quaternion",
     ),
     "left_handed": _Row(
-        _ERROR,
-        _LIKELY,
         "{whose} axes are left-handed: with all positions mirrored the streams agree",
         "convert the stream to right-handed axes (REP 103)",
     ),
     "axes": _Row(
-        _ERROR,
-        _LIKELY,
         "{whose} positions are in other axes than its orientations: (x, y, z) should be ({detail})",
         "write positions and orientations in the same right-handed axes",
     ),
     "inverse": _Row(
-        _ERROR,
-        _LIKELY,
         "the {stream} stream seems to hold inverse poses (of the world in the sensor, not of the "
         "sensor in its world)",
         "invert every pose of the {stream} stream",
     ),
     "inverse_both": _Row(
-        _ERROR,
-        _LIKELY,
         "both streams seem to hold inverse poses (of the world in the sensor): inverted, their "
         "paths and the lever arm between them are shorter",
         "invert every pose of both streams, or the result is the pose of one world in the other "
         "(which is what a fixed camera beside an arm needs)",
     ),
     "time_offset": _Row(
-        _ERROR,
-        _CERTAIN,
         "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's",
         "add {total_s} s to the child's stamps, or have it estimated",
         evidence=("offset_s", "sigma_s"),
+        confidence=_CERTAIN,
     ),
     "units": _Row(
-        _ERROR,
-        _CERTAIN,
         "the child's lengths are {unit} while the parent's are metres (factor {scale:.5g} +/- "
         "{sigma:.2g})",
         "convert them to metres",
         evidence=("scale", "sigma"),
+        confidence=_CERTAIN,
     ),
     "scale": _Row(
-        _ERROR,
-        _CERTAIN,
         "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f} to agree with the "
         "parent's",
         "have the scale estimated, or find out which of the two measures wrongly",
         evidence=("scale", "sigma"),
+        confidence=_CERTAIN,
     ),
     "one_axis": _Row(
-        _NOTE,
-        _LIKELY,
         "nearly all rotation is about one axis, ({axis}) in the parent sensor's frame: the "
         "translation along it, {hidden}, will be unobservable",
         "rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {main} and "
         "give it",
+        severity=_NOTE,
     ),
     "unseen_axes": _Row(
-        _NOTE,
-        _LIKELY,
         "{axes} cannot be determined from this motion, and will be unobservable",
         "rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {it} and give "
         "a prior",
         code="one_axis",
+        severity=_NOTE,
     ),
     "same_frame": _Row(
-        _ERROR,
-        _LIKELY,
         "both streams are of one and the same frame: the extrinsic is the identity, to {size}",
         "give the stream of the child sensor itself",
         "such as two topics of one odometry, or odometry of the robot's base that was derived from "
@@ -309,8 +261,6 @@ _ROWS = {
         evidence=("translation_m", "rotation_rad"),
     ),
     "same_position": _Row(
-        _ERROR,
-        _LIKELY,
         "both streams have the same positions and other orientations: the translation between the "
         "sensors is zero ({size})",
         "give positions of the child sensor itself",
@@ -319,8 +269,6 @@ _ROWS = {
         evidence=("translation_m", "sigma_m"),
     ),
     "rotation_gain": _Row(
-        _ERROR,
-        _LIKELY,
         "the child rotates {gain:.4f} +/- {sigma:.4f} times as far as the parent about ({axis}) in "
         "the parent sensor's frame",
         "calibrate that scale first",
@@ -328,54 +276,38 @@ _ROWS = {
         evidence=("gain", "sigma"),
     ),
     "position_clock": _Row(
-        _ERROR,
-        _LIKELY,
         "the {stream}'s positions are {size_s:.3f} +/- {sigma_s:.3f} s {late} against its "
         "orientations: at this speed a shift of {shift_m:.2g} m",
         "use the poses before that filter, or correct the delay of the positions",
         "positions and orientations of one stream come from different sources or filters",
         evidence=("delay_s", "sigma_s", "shift_m"),
     ),
-    "smoothed_positions": _Row(
-        _ERROR,
-        _LIKELY,
-        "{whose} positions are smoothed over about {smoothing_s:.2f} s, which the other's are not: "
+    "smoothed": _Row(
+        "{whose} {part} are smoothed over about {smoothing_s:.2f} s, which the other's are not: "
         "the translation may be off by {shift_m:.2g} m",
         "use the poses before that filter",
         "a low-pass or smoothing filter",
         evidence=("smoothing_s", "sigmas", "shift_m"),
-    ),
-    "smoothed_orientations": _Row(
-        _ERROR,
-        _LIKELY,
-        "{whose} orientations are smoothed over about {smoothing_s:.2f} s, which the other's are "
-        "not: the translation may be off by {shift_m:.2g} m",
-        "use the poses before that filter",
-        "a low-pass or smoothing filter",
-        evidence=("smoothing_s", "sigmas", "shift_m"),
+        code="smoothed_{part}",
     ),
     "world_drift": _Row(
-        _WARNING,
-        _LIKELY,
         "the child's world turns by {deg_per_minute:.2g} deg and moves by {m_per_minute:.2g} m a "
         "minute against the parent's: at {percent:.2g} % of the sensor's speed",
         "use the poses before that correction, in the frame of the odometry",
         "a map that is corrected bit by bit, a heading that drifts, or poses published in a frame "
         "that moves",
         evidence=("evidence", "rate_rad_s", "speed_m_s", "share_of_speed"),
+        severity=_WARNING,
     ),
     "unit_unseen": _Row(
-        _WARNING,
-        _LIKELY,
         "the body rotates about one of the sensors, so that this motion cannot tell whether both "
         "streams have one unit of length: the translation is as long as the other sensor's stream "
         "has it",
         "nothing, if both measure in metres; otherwise move the body as well",
         "a pan-tilt unit, or a robot that rotates on the spot",
+        severity=_WARNING,
     ),
     "mount_moved": _Row(
-        _ERROR,
-        _LIKELY,
         "the extrinsic {when} by {size}",
         "tighten it and record again, or calibrate the parts before and after on their own",
         "{why}",
@@ -411,7 +343,7 @@ def finding(
     whose = "both streams'" if stream == "both" else f"the {stream} stream's"
     values |= {"stream": stream, "whose": whose}
     return Finding(
-        code=row.code or key,
+        code=row.code.format(**values) or key,
         stream=stream,
         severity=severity or row.severity,
         confidence=confidence or row.confidence,

@@ -21,6 +21,7 @@ that the parent is.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -46,53 +47,30 @@ _LITTLE = 0.1
 
 # Farthest step of a stencil. Rotation vectors near half a turn may point either way.
 _FAR = 4
-_MAX_ROTATION = 2.8
+MAX_ROTATION = 2.8
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A value and its standard deviation, by the jackknife over blocks of time."""
+    """A value, its standard deviation by the jackknife over blocks of time, and by how much noise
+    of the rotations may push it.
+    """
 
     value: float
     sigma: float
+    bias: float
 
     def exceeds(self, least: float, sigmas: float) -> bool:
         """Whether the value is more than ``least``, and more than so many standard deviations."""
         return self.value > max(least, sigmas * self.sigma)
 
 
-@dataclass(frozen=True)
-class Biased(Quantity):
-    """A value, its standard deviation, and by how much noise of the rotations may push it."""
-
-    bias: float
+#: Smoothing (s^2) by part ("position", "rotation") and stream ("parent", "child").
+Smoothing: TypeAlias = dict[tuple[str, str], Quantity]
+_Regression: TypeAlias = tuple[FloatArray, FloatArray, float]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Smoothing:
-    """By how much each stream is smoothed: c in s^2."""
-
-    parent: Biased
-    child: Biased
-
-
-@dataclass(frozen=True, kw_only=True)
-class Response:
-    """Response of the child's motion to the parent's.
-
-    Attributes
-    ----------
-    rotation_smoothing, position_smoothing : Smoothing
-    interval_s : float
-        Typical time from one pose to the next, s.
-    """
-
-    rotation_smoothing: Smoothing
-    position_smoothing: Smoothing
-    interval_s: float
-
-
-def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Biased, ...], FloatArray]:
+def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Quantity, ...], FloatArray]:
     """Factors of the child's rotations about the principal axes of the motion, the axis with the
     most rotation first, and those axes in the parent sensor's frame, as columns.
 
@@ -105,23 +83,24 @@ def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Biased, ...
     """
     x = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
     y = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3]) @ R.T
-    keep = np.maximum(*(np.linalg.norm(vectors, axis=1) for vectors in (x, y))) < _MAX_ROTATION
+    keep = np.maximum(*(np.linalg.norm(vectors, axis=1) for vectors in (x, y))) < MAX_ROTATION
     x, y = x[keep], y[keep]
     axes = np.linalg.eigh(x.T @ x)[1][:, ::-1]
     columns = np.concatenate([(x @ axes)[:, None, :] * axes[None], -se3.skew(x)], axis=2)
-    found = _regress(columns, y - x)
-    variance = median(((y - x - columns @ found.values) ** 2).sum(axis=1)) / MEDIAN_LENGTH**2
+    values, sigmas, _ = _regress(columns, y - x)
+    variance = median(((y - x - columns @ values) ** 2).sum(axis=1)) / MEDIAN_LENGTH**2
     squared = ((x @ axes) ** 2).mean(axis=0)
     # Little rotation beside much may come from an axis that is slightly off.
     biases = np.where(squared < _LITTLE**2 * squared[0], 1.0, variance / (squared + 1e-300))
-    gains = zip(found.values, found.sigmas, biases, strict=False)
-    return tuple(Biased(1.0 + value, sigma, bias) for value, sigma, bias in gains), axes
+    gains = zip(values, sigmas, biases, strict=False)
+    return tuple(Quantity(1.0 + value, sigma, bias) for value, sigma, bias in gains), axes
 
 
-def response(
-    pose_pairs: PosePairs, T_parent_child: FloatArray, gain: FloatArray | None = None
-) -> Response | None:
-    """Response of the child's motion to the parent's; None if too few poses follow each other.
+def find_smoothing(
+    pose_pairs: PosePairs, T_parent_child: FloatArray, gain: FloatArray
+) -> tuple[Smoothing, float] | None:
+    """By how much each stream is smoothed, and the typical time from one pose to the next, s; None
+    if too few poses follow each other.
 
     Parameters
     ----------
@@ -129,77 +108,19 @@ def response(
         In one unit of length.
     T_parent_child : (4, 4) array
         About X.
-    gain : (3, 3) array, optional
+    gain : (3, 3) array
         Matrix from the parent's rotation vectors to the child's, both in the parent's axes.
     """
-    stencil = _Stencil.of(pose_pairs.stamps_ns)
+    stencil = _stencil(pose_pairs.stamps_ns)
     if stencil is None:
         return None
+    at, step_s, interval_s = stencil
     R = T_parent_child[:3, :3]
-    gain = np.eye(3) if gain is None else gain
-    of_rotations, variance = _rotations(pose_pairs, stencil, R, gain)
-    return Response(
-        rotation_smoothing=of_rotations,
-        position_smoothing=_positions(pose_pairs, stencil, R, variance),
-        interval_s=stencil.interval_s,
-    )
-
-
-@dataclass(frozen=True)
-class _Stencil:
-    """Poses around K instants.
-
-    Attributes
-    ----------
-    at : dict
-        Indices (K,) by the number of steps from the instant, -4 to 4.
-    step_s, interval_s : float
-        A step, and the typical time from one pose to the next.
-    """
-
-    at: dict[int, IntArray]
-    step_s: float
-    interval_s: float
-
-    @classmethod
-    def of(cls, stamps_ns: IntArray) -> _Stencil | None:
-        """The stencil around as many poses as have others at all distances."""
-        if len(stamps_ns) < _MIN_INSTANTS:
-            return None
-        interval_s = median(np.diff(stamps_ns)) * 1e-9
-        n = max(round(_HALF_SPAN_S / 2 / interval_s), 1)
-        reach = _FAR * n
-        centres = np.arange(reach, len(stamps_ns) - reach)
-        valid = np.ones(len(centres), dtype=bool)
-        for k in range(-reach, reach + 1, n):
-            elapsed_s = (stamps_ns[centres + k] - stamps_ns[centres]) * 1e-9
-            valid &= np.abs(elapsed_s - k * interval_s) < _TOLERANCE * (n + abs(k)) * interval_s
-        centres = centres[valid]
-        if len(centres) < _MIN_INSTANTS:
-            return None
-        centres = centres[:: -(-len(centres) // _MAX_INSTANTS)]
-        at = {k: centres + n * k for k in range(-_FAR, _FAR + 1)}
-        return cls(at, n * interval_s, interval_s)
-
-
-def _rotations(
-    pose_pairs: PosePairs, stencil: _Stencil, R: FloatArray, gain: FloatArray
-) -> tuple[Smoothing, float]:
-    """Smoothing of both streams' orientations, and variance of what remains (rad^2 per axis)."""
-    turns, bends, changes = [], [], []
-    for poses, to_parent in ((pose_pairs.Ts_pw_p, np.eye(3)), (pose_pairs.Ts_cw_c, R)):
-        angles = _Angles(poses[:, :3, :3], stencil.at, to_parent)
-        turns.append(angles.between(-2, 2))
-        changes.append(angles.between(1, 3) - angles.between(-3, -1))
-        bends.append(
-            angles.between(3, 4)
-            - angles.between(0, 1)
-            - angles.between(-1, 0)
-            + angles.between(-4, -3)
-        )
-    x, y = turns[0] @ gain.T, turns[1]
-    tilt, step_s = -se3.skew(x), stencil.step_s
-    found = [
+    streams = ((pose_pairs.Ts_pw_p, np.eye(3)), (pose_pairs.Ts_cw_c, R))
+    rotations = [_rotations(poses[:, :3, :3], to_parent, at) for poses, to_parent in streams]
+    x, y = rotations[0][0] @ gain.T, rotations[1][0]
+    tilt = -se3.skew(x)
+    of_rotations = [
         _regress(
             np.concatenate(
                 [
@@ -211,110 +132,107 @@ def _rotations(
             ),
             y - x,
         )
-        for change, bend in zip(changes, bends, strict=True)
+        for _, change, bend in rotations
     ]
-    smoothing = _smoothing(found[0].quantity(4), found[1].quantity(4), 0.0)
-    return smoothing, found[0].sigma ** 2
+    positions = [_displacements(poses, to_parent, at) for poses, to_parent in streams]
+    of_positions, bias = _positions(pose_pairs, positions, at, step_s, of_rotations[0][2] ** 2)
+    found = {}
+    for part, column, regressions, pushed in (
+        ("rotation", 4, of_rotations, 0.0),
+        ("position", 6, of_positions, bias),
+    ):
+        # A smoother parent is a child that is less smooth.
+        for stream, sign, (values, sigmas, _) in zip(
+            ("parent", "child"), (-1.0, 1.0), regressions, strict=True
+        ):
+            quantity = Quantity(sign * float(values[column]), float(sigmas[column]), pushed)
+            found[part, stream] = quantity
+    return found, interval_s
 
 
-@dataclass(frozen=True)
-class _Angles:
-    """Rotation vectors of a stream between instants of a stencil, in the parent's axes."""
+def _stencil(stamps_ns: IntArray) -> tuple[dict[int, IntArray], float, float] | None:
+    """Indices (K,) of poses by the number of steps from K instants, -4 to 4, around as many poses
+    as have others at all distances; a step, and the typical time from one pose to the next (s).
+    """
+    if len(stamps_ns) < _MIN_INSTANTS:
+        return None
+    interval_s = median(np.diff(stamps_ns)) * 1e-9
+    n = max(round(_HALF_SPAN_S / 2 / interval_s), 1)
+    reach = _FAR * n
+    centres = np.arange(reach, len(stamps_ns) - reach)
+    valid = np.ones(len(centres), dtype=bool)
+    for k in range(-reach, reach + 1, n):
+        elapsed_s = (stamps_ns[centres + k] - stamps_ns[centres]) * 1e-9
+        valid &= np.abs(elapsed_s - k * interval_s) < _TOLERANCE * (n + abs(k)) * interval_s
+    centres = centres[valid]
+    if len(centres) < _MIN_INSTANTS:
+        return None
+    centres = centres[:: -(-len(centres) // _MAX_INSTANTS)]
+    return {k: centres + n * k for k in range(-_FAR, _FAR + 1)}, n * interval_s, interval_s
 
-    rotations: FloatArray
-    at: dict[int, IntArray]
-    to_parent: FloatArray
 
-    def between(self, k: int, m: int) -> FloatArray:
-        """From k steps to m steps after each instant."""
-        start, end = self.rotations[self.at[k]], self.rotations[self.at[m]]
-        return se3.rotation_log(np.swapaxes(start, 1, 2) @ end) @ self.to_parent.T
+def _rotations(
+    rotations: FloatArray, to_parent: FloatArray, at: dict[int, IntArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotation vectors (K, 3) of a stream over four steps, in the parent's axes; how they change,
+    and how their changes do, from other poses.
+    """
+
+    def between(k: int, m: int) -> FloatArray:
+        start, end = rotations[at[k]], rotations[at[m]]
+        return se3.rotation_log(np.swapaxes(start, 1, 2) @ end) @ to_parent.T
+
+    change = between(1, 3) - between(-3, -1)
+    bend = between(3, 4) - between(0, 1) - between(-1, 0) + between(-4, -3)
+    return between(-2, 2), change, bend
 
 
-def _smoothing(by_parent: Quantity, by_child: Quantity, bias: float) -> Smoothing:
-    """A smoother parent is a child that is less smooth."""
-    return Smoothing(
-        parent=Biased(-by_parent.value, by_parent.sigma, bias),
-        child=Biased(by_child.value, by_child.sigma, bias),
-    )
+def _displacements(
+    poses: FloatArray, to_parent: FloatArray, at: dict[int, IntArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Displacements (K, 3) of a stream over four steps, in the parent's axes; and the difference of
+    the accelerations at both ends, times 3 steps squared, from other poses than those ends, and
+    turned by other orientations.
+    """
+    p = {k: poses[rows, :3, 3] for k, rows in at.items()}
+
+    def in_body(vectors: FloatArray, k: int = 0) -> FloatArray:
+        return np.einsum("kji,kj->ki", poses[at[k], :3, :3], vectors) @ to_parent.T
+
+    bend = (p[4] - p[3] - p[1] + p[0]) - (p[0] - p[-1] - p[-3] + p[-4])
+    return in_body(p[2] - p[-2]), 0.5 * (in_body(bend, -1) + in_body(bend, 1))
 
 
 def _positions(
-    pose_pairs: PosePairs, stencil: _Stencil, R: FloatArray, variance: float
-) -> Smoothing:
-    """Smoothing of both streams' positions.
+    pose_pairs: PosePairs,
+    displacements: list[tuple[FloatArray, FloatArray]],
+    at: dict[int, IntArray],
+    step_s: float,
+    variance: float,
+) -> tuple[list[_Regression], float]:
+    """Regressions for the smoothing of both streams' positions, and by how much noise may push it.
 
     Noise of the parent's orientations, half of the ``variance`` of the rotations, is in the columns
     of the lever arm.
     """
-    at, step_s = stencil.at, stencil.step_s
-    parent = _Displacements(pose_pairs.Ts_pw_p, np.eye(3), at)
-    child = _Displacements(pose_pairs.Ts_cw_c, R, at)
-    x = parent.over(2)
+    (x, _), (y, _) = displacements
     rotations = pose_pairs.Ts_pw_p[:, :3, :3]
     chords = np.swapaxes(rotations[at[0]], 1, 2) @ (rotations[at[2]] - rotations[at[-2]])
     base = np.concatenate([chords, -se3.skew(x)], axis=2)
-    target = child.over(2) - x
-    bends = [bend / (3 * step_s**2) for bend in (parent.bend(), child.bend())]
-    smoothing = [
-        _regress(np.concatenate([base, bend[:, :, None]], axis=2), target, variance).quantity(6)
+    bends = [bend / (3 * step_s**2) for _, bend in displacements]
+    found = [
+        _regress(np.concatenate([base, bend[:, :, None]], axis=2), y - x, variance)
         for bend in bends
     ]
     # The same noise of an orientation turns a displacement and its bend.
-    bias = variance * _rms(x) / max(_rms(bends[0]), 1e-12)
-    return _smoothing(smoothing[0], smoothing[1], bias)
-
-
-def _rms(vectors: FloatArray) -> float:
-    """Robust root mean square length."""
-    return median(np.linalg.norm(vectors, axis=1))
-
-
-@dataclass(frozen=True)
-class _Displacements:
-    """Displacements of a stream around instants, in the parent's axes there."""
-
-    poses: FloatArray
-    to_parent: FloatArray
-    at: dict[int, IntArray]
-
-    def _p(self, k: int) -> FloatArray:
-        return self.poses[self.at[k], :3, 3]
-
-    def _in_body(self, vectors: FloatArray, k: int = 0) -> FloatArray:
-        rotations = self.poses[self.at[k], :3, :3]
-        return np.einsum("kji,kj->ki", rotations, vectors) @ self.to_parent.T
-
-    def over(self, k: int) -> FloatArray:
-        """From k steps before each instant to k after."""
-        return self._in_body(self._p(k) - self._p(-k))
-
-    def bend(self) -> FloatArray:
-        """Difference of the accelerations at both ends of :meth:`over` two steps, times 3 steps
-        squared, from other poses than those ends, and turned by other orientations.
-        """
-        ahead = self._p(4) - self._p(3) - self._p(1) + self._p(0)
-        behind = self._p(0) - self._p(-1) - self._p(-3) + self._p(-4)
-        bend = ahead - behind
-        return 0.5 * (self._in_body(bend, -1) + self._in_body(bend, 1))
-
-
-@dataclass(frozen=True)
-class _Regression:
-    """Values and standard deviations (m,), and the standard deviation of what remains."""
-
-    values: FloatArray
-    sigmas: FloatArray
-    sigma: float
-
-    def quantity(self, k: int) -> Quantity:
-        return Quantity(float(self.values[k]), float(self.sigmas[k]))
+    lengths = [median(np.linalg.norm(vectors, axis=1)) for vectors in (x, bends[0])]
+    return found, variance * lengths[0] / max(lengths[1], 1e-12)
 
 
 def _regress(columns: FloatArray, target: FloatArray, variance: float = 0.0) -> _Regression:
-    """Robust linear regression of (K, 3) on (K, 3, m), with the jackknife over blocks of time.
-    ``variance`` is that of noise in the first three columns, which would make their values too
-    small.
+    """Values and standard deviations (m,), and the standard deviation of what remains: robust
+    linear regression of (K, 3) on (K, 3, m), with the jackknife over blocks of time. ``variance``
+    is that of noise in the first three columns, which would make their values too small.
     """
     K, _, m = columns.shape
     flat = np.concatenate([columns, target[:, :, None]], axis=2)
@@ -335,7 +253,7 @@ def _regress(columns: FloatArray, target: FloatArray, variance: float = 0.0) -> 
     left_out = np.linalg.solve(shares, rest[:, :m, m:])[..., 0]
     spread = left_out - left_out.mean(axis=0)
     sigmas = np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum(axis=0))
-    return _Regression(values, sigmas, sigma)
+    return values, sigmas, sigma
 
 
 def _of_noise(gram: FloatArray, amount: float) -> FloatArray:

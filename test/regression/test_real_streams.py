@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.checks.lengths import check_lengths
-from hand_eye_calib.checks.streams import tidy
+from hand_eye_calib.checks.streams import check_lengths, tidy
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory

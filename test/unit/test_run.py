@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
 from hand_eye_calib.checks.check import CheckResult, check_streams
-from hand_eye_calib.checks.lengths import check_lengths
+from hand_eye_calib.checks.streams import check_lengths
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.run import review, run, with_options
