@@ -4,10 +4,9 @@ The one engine of the node, of the replay of bags and of the Python API. It know
 files.
 """
 
-import sys
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -209,20 +208,27 @@ class Calibrator:
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         poses = np.concatenate([positions, quats_xyzw], axis=1, dtype=float)
         names = np.broadcast_to(np.asarray(stream), len(stamps_ns))
-        columns = [
-            _Column.of(buffer, np.flatnonzero(names == name), stamps_ns, poses)
-            for name, buffer in self._buffers.items()
-        ]
-        others = _rows_that_are_not_plain(columns, len(stamps_ns))
+        rows_of = {name: np.flatnonzero(names == name) for name in self._buffers}
+        is_plain = np.zeros(len(stamps_ns), dtype=bool)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for name, rows in rows_of.items():
+                is_newer = self._buffers[name].are_newer(stamps_ns[rows])
+                is_plain[rows] = _is_pose(*poses[rows].T) & is_newer
+        others = [*np.flatnonzero(~is_plain).tolist(), len(stamps_ns)]
         taken = np.ones(len(stamps_ns), dtype=bool)
         first = 0
         while first < len(stamps_ns):
             # Up to the next pose that is not plain, or that needs pairing first, they are only
             # stored.
             stop = others[bisect_left(others, first)]
-            stop = min([stop, *(column.next_pairing(first) for column in columns)])
-            for column in columns:
-                column.store(first, stop)
+            for name, rows in rows_of.items():
+                due = int(rows.searchsorted(first)) + self._buffers[name].room_until_pairing
+                if due < len(rows):
+                    stop = min(stop, int(rows[due]))
+            for name, rows in rows_of.items():
+                part = rows[rows.searchsorted(first) : rows.searchsorted(stop)]
+                if len(part):
+                    self._buffers[name].extend(stamps_ns[part], poses[part])
             if stop < len(stamps_ns):
                 taken[stop] = self._add_row(stop, str(names[stop]), stamps_ns, poses)
             first = stop + 1
@@ -358,56 +364,6 @@ class Calibrator:
             except NotEnoughDataError:
                 return None
         return replace(self._config, time_offset=self._time_offset.seconds)
-
-
-@dataclass(frozen=True)
-class _Column:
-    """Many poses of one stream, on their way into its buffer.
-
-    Attributes
-    ----------
-    buffer : PoseBuffer
-    rows : list of int
-        Their indices among the poses of both streams.
-    stamps_ns : (M,) int64 array
-    poses : (M, 7) array
-    is_plain : (M,) bool array
-        Poses that are usable and newer than all before.
-    """
-
-    buffer: PoseBuffer
-    rows: list[int]
-    stamps_ns: IntArray
-    poses: FloatArray
-    is_plain: BoolArray
-
-    @classmethod
-    def of(
-        cls, buffer: PoseBuffer, rows: IntArray, stamps_ns: IntArray, poses: FloatArray
-    ) -> "_Column":
-        own_stamps_ns, own_poses = stamps_ns[rows], poses[rows]
-        with np.errstate(over="ignore", invalid="ignore"):
-            is_plain = _is_pose(*own_poses.T) & buffer.are_newer(own_stamps_ns)
-        return cls(buffer, rows.tolist(), own_stamps_ns, own_poses, is_plain)
-
-    def next_pairing(self, first: int) -> int:
-        """The first row, from ``first`` on, before whose pose pairs must be made."""
-        due = bisect_left(self.rows, first) + self.buffer.room_until_pairing
-        return self.rows[due] if due < len(self.rows) else sys.maxsize
-
-    def store(self, first: int, stop: int) -> None:
-        """Store the poses of the rows from ``first`` to before ``stop``."""
-        begin, end = bisect_left(self.rows, first), bisect_left(self.rows, stop)
-        if begin < end:
-            self.buffer.extend(self.stamps_ns[begin:end], self.poses[begin:end])
-
-
-def _rows_that_are_not_plain(columns: Sequence[_Column], n_rows: int) -> list[int]:
-    """The rows, in order, and their number."""
-    is_plain = np.zeros(n_rows, dtype=bool)
-    for column in columns:
-        is_plain[column.rows] = column.is_plain
-    return [*np.flatnonzero(~is_plain).tolist(), n_rows]
 
 
 def _is_pose(x: Any, y: Any, z: Any, qx: Any, qy: Any, qz: Any, qw: Any) -> Any:

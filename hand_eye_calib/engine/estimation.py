@@ -21,13 +21,11 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
 from hand_eye_calib.gls.increments import SYSTEMATIC, Streams, course_of
-from hand_eye_calib.gls.part_delays import PartDelay, spread_by_delays
-from hand_eye_calib.gls.world_drift import WorldDrift
+from hand_eye_calib.gls.part_delays import spread_by_delays
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
-from hand_eye_calib.results.records import Noise
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
 
@@ -57,6 +55,8 @@ class _Evaluation:
         Of the mount within the recording.
     is_beside : bool
         It is only to be compared with a result, and has no floor.
+    model : AdaptiveSolution or None
+        The adaptive estimator's solution, if there is one: with method adaptive this one.
     """
 
     solution: Solution | AdaptiveSolution
@@ -69,19 +69,16 @@ class _Evaluation:
     method_reason: str = ""
     reference_reason: str = ""
     proved_global: str = "not tried"
-    noise: Noise | None = None
-    scale_correction: float = 1.0
-    scale_sigma: float = 0.0
-    time_correction_s: float = 0.0
-    time_sigma_s: float = 0.0
     warnings: tuple[str, ...] = ()
     other_answer: tuple[FloatArray, FloatArray] | None = None
-    delays: tuple[PartDelay, ...] = ()
-    clock: PartDelay | None = None
-    drift: WorldDrift | None = None
     shift: PossibleShift | None = None
     is_beside: bool = False
     model: AdaptiveSolution | None = None
+
+    @property
+    def adaptive(self) -> AdaptiveSolution | None:
+        """The solution, if it is the adaptive estimator's."""
+        return self.model if self.method == "adaptive" else None
 
     def spread(self, clock_offset_s: float) -> FloatArray:
         """Covariance (6, 6) of xi by what is not in the model.
@@ -91,9 +88,12 @@ class _Evaluation:
         clock_offset_s : float
             As estimated before; zero if it was given.
         """
-        spread = spread_by_delays(self.delays, clock_offset_s, self.clock)
-        if self.drift is not None and self.drift.is_significant:
-            spread = spread + np.outer(self.drift.shift, self.drift.shift)
+        found, spread = self.adaptive, np.zeros((6, 6))
+        if found:
+            spread = spread_by_delays(found.delays or (), clock_offset_s, found.clock)
+            drift = found.world_drift
+            if drift is not None and drift.is_significant:
+                spread = spread + np.outer(drift.shift, drift.shift)
         return spread if self.shift is None else spread + self.shift.spread
 
 
@@ -124,13 +124,18 @@ class Solved:
         fused = fuse(T_method, without_axes(self.assessment, T_method, hidden), self.config.prior())
         result = _calibration(evaluation, fused, self.stamps_ns, self.config)
         offset_s = offset.seconds if offset else fixed_time_offset(self.config)
+        offset_sigma_s = offset.sigma_s if offset else 0.0
+        scale_sigma = scale.estimate.sigma if scale.estimate else 0.0
+        if found := evaluation.adaptive:
+            offset_s += found.time_offset_s
+            offset_sigma_s = found.time_offset_sigma_s or offset_sigma_s
+            scale_sigma = scale.value * found.scale_sigma or scale_sigma
         return replace(
             result,
-            time_offset_s=offset_s + evaluation.time_correction_s,
-            time_offset_sigma_s=evaluation.time_sigma_s or (offset.sigma_s if offset else 0.0),
-            scale=scale.value * evaluation.scale_correction,
-            scale_sigma=scale.value * evaluation.scale_sigma
-            or (scale.estimate.sigma if scale.estimate else 0.0),
+            time_offset_s=offset_s,
+            time_offset_sigma_s=offset_sigma_s,
+            scale=scale.value * found.scale if found else scale.value,
+            scale_sigma=scale_sigma,
             warnings=scale.warnings + result.warnings,
         )
 
@@ -168,10 +173,10 @@ def solve_poses(
     solve = _SOLVE.get(config.method, _solve_only_pairs)
     scaled = child_scaled(pose_pairs, scale.value)
     evaluation = solve(scaled, config, is_clock_free=time_offset is not None)
-    T_method = evaluation.solution.T_parent_child
+    T_method, found = evaluation.solution.T_parent_child, evaluation.adaptive
     # A model with a time offset knows how uncertain that is.
     spread = _spread_by_alignment(
-        scale.estimate, None if evaluation.time_correction_s else time_offset
+        scale.estimate, None if found and found.time_offset_s else time_offset
     )
     spread += evaluation.spread(time_offset.seconds if time_offset else 0.0)
     return Solved(
@@ -218,7 +223,7 @@ def _calibration(
         method_reason=evaluation.method_reason,
         reference=evaluation.reference,
         reference_reason=evaluation.reference_reason,
-        noise=evaluation.noise,
+        noise=evaluation.adaptive.describe(stamps_ns) if evaluation.adaptive else None,
         backend=config.backend,
         n_poses=len(stamps_ns),
         n_pairs=len(residuals),
@@ -423,7 +428,7 @@ def _without_biases(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePa
 
 def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation:
     """An answer of the adaptive estimator, assessed."""
-    stamps_ns, Ts_cw_c = pose_pairs.stamps_ns, _corrected(pose_pairs, solution).Ts_cw_c
+    Ts_cw_c = _corrected(pose_pairs, solution).Ts_cw_c
     jumps = float(np.mean(solution.jumps))
     warning = (
         f"{jumps:.0%} of the increments are jumps: the errors do not fit the adaptive noise "
@@ -437,14 +442,6 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
         weights=(~solution.jumps).astype(float),
         spans=_spans(pose_pairs.Ts_pw_p, Ts_cw_c, solution.left_out),
-        noise=solution.describe(stamps_ns),
-        scale_correction=solution.scale,
-        scale_sigma=solution.scale_sigma,
-        time_correction_s=solution.time_offset_s,
-        time_sigma_s=solution.time_offset_sigma_s,
-        delays=solution.delays or (),
-        clock=solution.clock,
-        drift=solution.world_drift,
         warnings=(warning,) if jumps > _MAX_JUMPS else (),
         model=solution,
         shift=possible_shift(solution.part_products, solution.misfit),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -42,7 +42,7 @@ class BufferLimits:
     share_kept: float = 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class StreamStatistics:
     """What a stream has delivered in this session.
 
@@ -121,10 +121,7 @@ class PoseBuffer:
         self._count = 0
         self._dropped_until_ns: int | None = None
         self.frame = ""
-        self._received = self._refused_duplicate = self._refused_late = self._dropped_unpaired = 0
-        # Of all stamps taken.
-        self._first_ns: int | None = None
-        self._last_ns: int | None = None
+        self._seen = StreamStatistics()
 
     def __len__(self) -> int:
         return self._count
@@ -137,39 +134,32 @@ class PoseBuffer:
     @property
     def statistics(self) -> StreamStatistics:
         """StreamStatistics so far."""
-        return StreamStatistics(
-            received=self._received,
-            refused_duplicate=self._refused_duplicate,
-            refused_late=self._refused_late,
-            dropped_unpaired=self._dropped_unpaired,
-            first_stamp_ns=self._first_ns,
-            last_stamp_ns=self._last_ns,
-        )
+        return replace(self._seen)
 
     def add(self, stamp_ns: int, position: Any, quat_xyzw: Any) -> bool:
         """Take a pose; False if the stamp is a duplicate or too late."""
         if self._dropped_until_ns is not None and stamp_ns <= self._dropped_until_ns:
-            self._refused_late += 1
+            self._seen.refused_late += 1
             return False
-        index = self._count
-        if self._first_ns is None or self._last_ns is None:
-            self._first_ns = self._last_ns = stamp_ns
-        elif stamp_ns > self._last_ns:
-            self._last_ns = stamp_ns
+        index, seen = self._count, self._seen
+        if seen.first_stamp_ns is None or seen.last_stamp_ns is None:
+            seen.first_stamp_ns = seen.last_stamp_ns = stamp_ns
+        elif stamp_ns > seen.last_stamp_ns:
+            seen.last_stamp_ns = stamp_ns
         else:
             index = int(np.searchsorted(self.stamps_ns, stamp_ns))
             if index < self._count and self._stamps_ns[index] == stamp_ns:
-                self._refused_duplicate += 1
+                seen.refused_duplicate += 1
                 return False
             self._stamps_ns[index + 1 : self._count + 1] = self._stamps_ns[index : self._count]
             self._poses[index + 1 : self._count + 1] = self._poses[index : self._count]
-            self._first_ns = min(self._first_ns, stamp_ns)
+            seen.first_stamp_ns = min(seen.first_stamp_ns, stamp_ns)
         self._stamps_ns[index] = stamp_ns
         row = self._poses[index]
         row[0], row[1], row[2] = position
         row[3], row[4], row[5], row[6] = quat_xyzw
         self._count += 1
-        self._received += 1
+        seen.received += 1
         return True
 
     def extend(self, stamps_ns: IntArray, poses: FloatArray) -> None:
@@ -177,15 +167,16 @@ class PoseBuffer:
         end = self._count + len(stamps_ns)
         self._stamps_ns[self._count : end] = stamps_ns
         self._poses[self._count : end] = poses
-        self._last_ns = int(stamps_ns[-1])
-        if self._first_ns is None:
-            self._first_ns = int(stamps_ns[0])
+        self._seen.last_stamp_ns = int(stamps_ns[-1])
+        if self._seen.first_stamp_ns is None:
+            self._seen.first_stamp_ns = int(stamps_ns[0])
         self._count = end
-        self._received += len(stamps_ns)
+        self._seen.received += len(stamps_ns)
 
     def are_newer(self, stamps_ns: IntArray) -> BoolArray:
         """(N,) whether each stamp is newer than all before it."""
-        last_ns = np.iinfo(np.int64).min if self._last_ns is None else self._last_ns
+        last_ns = self._seen.last_stamp_ns
+        last_ns = np.iinfo(np.int64).min if last_ns is None else last_ns
         return stamps_ns > np.maximum.accumulate(np.concatenate([[last_ns], stamps_ns]))[:-1]
 
     @property
@@ -194,7 +185,7 @@ class PoseBuffer:
         due.
         """
         until_start = max(self._limits.pairing_starts + 1 - self._count, 0)
-        until_due = until_start + -(self._received + until_start) % self._limits.batch_every
+        until_due = until_start + -(self._seen.received + until_start) % self._limits.batch_every
         return min(until_due, self._limits.capacity - self._count)
 
     @property
@@ -207,7 +198,7 @@ class PoseBuffer:
         """Whether it is time to make a batch of pairs."""
         return (
             self._count > self._limits.pairing_starts
-            and self._received % self._limits.batch_every == 0
+            and self._seen.received % self._limits.batch_every == 0
         )
 
     def stamp_at(self, share: float) -> int:
@@ -235,7 +226,7 @@ class PoseBuffer:
         after = int(np.searchsorted(self.stamps_ns, until_ns, side="right"))
         split = max(after - REACH, 0)
         if unpaired:
-            self._dropped_unpaired += split
+            self._seen.dropped_unpaired += split
         rest = self._count - split
         self._stamps_ns[:rest] = self._stamps_ns[split : self._count].copy()
         self._poses[:rest] = self._poses[split : self._count].copy()
