@@ -2,7 +2,7 @@
 #   make demo          simulate a drive, calibrate it offline and on the live node, compare with the truth
 #   make test          the whole test suite
 #   make test-oldest   the same without slow tests, on the oldest supported versions
-#   make fuzz          5,400 structured files, damaged on purpose (FUZZ_ARGS="--inputs 500")
+#   make fuzz          5,400 structured files, damaged on purpose (INPUTS=500)
 #   make lint          style and types
 #   make coverage      the test suite, and the lines that no test runs
 #   make paper DATA=x  every figure and table of the paper from its published data in x, to reproduced/
@@ -54,7 +54,7 @@ coverage: $(VENV)/.ready-test
 	$(VENV)/bin/python -m pytest --cov --cov-report=term:skip-covered $(PYTEST_ARGS)
 
 fuzz: $(VENV)/.ready-test
-	$(VENV)/bin/python test/fuzz/run.py $(FUZZ_ARGS)
+	FUZZ_INPUTS=$(or $(INPUTS),5400) $(VENV)/bin/python -m pytest test/fuzz $(PYTEST_ARGS)
 
 paper: $(VENV)/.ready-test
 	$(VENV)/bin/python -m reproduction all $(if $(DATA),--data-folder $(DATA)) $(PAPER_ARGS)

@@ -5,6 +5,8 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags import PoseBag
+from hand_eye_calib.io.bags.writer import write_streams
 
 JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 NOETIC.register(
@@ -14,6 +16,34 @@ NOETIC.register(
     get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf/msg/tfMessage")
 )
 TF, PATH = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Path"
+ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+STORAGES = ("mcap", "sqlite3", "rosbag1")
+
+
+def bag_path(folder, storage, name="bag"):
+    return folder / (f"{name}.bag" if storage == "rosbag1" else name)
+
+
+def storage_file(path):
+    """The file that holds the messages of a bag."""
+    files = (part for part in path.iterdir() if part.suffix in (".mcap", ".db3"))
+    return path if path.is_file() else next(files)
+
+
+def all_poses(path, parent="/a", child="/b"):
+    with PoseBag(path) as bag:
+        return list(bag.poses(parent, child))
+
+
+def write_compressed(path, streams, storage="mcap", mode="STORAGE"):
+    """A rosbag2 compressed by zstd in some way, or not at all."""
+    plugin = rosbag2.StoragePlugin[storage.upper()]
+    writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+    if mode:
+        writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        write_streams(writer, streams, storage)
+    return path
 
 
 def header(typestore, stamp_ns, frame):
@@ -102,20 +132,15 @@ def fix(status, latitude=60.0, longitude=25.0, altitude=30.0, stamp_ns=12_000_00
     return bytes(JAZZY.serialize_cdr(message, message.__msgtype__))
 
 
-def write_messages(path, messages, storage="mcap", mode=None):
-    """Write (bag time, topic, type, make) messages, in the order of bag time; ``mode`` is rosbag2's
-    compression mode.
-    """
-    typestore = NOETIC if storage == "rosbag1" else JAZZY
+def write_messages(path, messages, storage="mcap"):
+    """Write (bag time, topic, type, make) messages, in the order of bag time."""
+    typestore, serialize = JAZZY, JAZZY.serialize_cdr
     if storage == "rosbag1":
-        writer, serialize = rosbag1.Writer(path), NOETIC.serialize_ros1
+        typestore, serialize = NOETIC, NOETIC.serialize_ros1
+        writer = rosbag1.Writer(path)
     else:
-        writer = rosbag2.Writer(
-            path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()]
-        )
-        serialize = JAZZY.serialize_cdr
-        if mode:
-            writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+        plugin = rosbag2.StoragePlugin[storage.upper()]
+        writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
     with writer:
         connections = {}
         for bag_ns, topic, message_type, make in sorted(messages, key=lambda message: message[0]):

@@ -5,6 +5,7 @@ Only plain URDF is understood. A file with xacro macros is refused, as nobody ca
 value comes from.
 """
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ from hand_eye_calib.io.files import read_bytes
 
 LARGEST_URDF = 64 << 20
 
+# A tag: attributes may have > in them.
+_TAG = re.compile(rb"(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 # Decimals of the numbers that are written: a millionth of a millimetre.
 _DECIMALS = 9
 
@@ -33,6 +36,7 @@ class _Joint:
     kind: str
     parent: str = ""
     child: str = ""
+    xyz_rpy: tuple[float, ...] = (0.0,) * 6
     T_parent_child: FloatArray | None = None
     start: tuple[int, int] = (0, 0)
     origin: tuple[int, int] | None = None
@@ -143,8 +147,11 @@ class _Reader:
         for joint in self.joints:
             if not joint.parent or not joint.child:
                 raise InputError(f"{path}: joint {joint.name!r} has no parent or no child")
-            if joint.T_parent_child is None:
-                joint.T_parent_child = np.eye(4)
+        values = np.array([joint.xyz_rpy for joint in self.joints]).reshape(-1, 6)
+        rotations = se3.rotation_from_rpy(values[:, 3:])
+        poses = se3.from_rotation_translation(rotations, values[:, :3])
+        for joint, pose in zip(self.joints, poses, strict=True):
+            joint.T_parent_child = pose
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         if not self._open and name != "robot":
@@ -172,33 +179,26 @@ class _Reader:
                     "rpy; change the file by hand"
                 )
             joint.origin = self._place()
-            joint.T_parent_child = self._pose(joint, attributes)
+            joint.xyz_rpy = self._numbers(joint, attributes)
 
-    def _pose(self, joint: _Joint, attributes: dict[str, str]) -> FloatArray:
-        xyz, rpy = (attributes.get(name, "0 0 0").split() for name in ("xyz", "rpy"))
+    def _numbers(self, joint: _Joint, attributes: dict[str, str]) -> tuple[float, ...]:
         try:
-            values = np.array([float(text) for text in (*xyz, *rpy)])
+            texts = (attributes.get(name, "0 0 0").split() for name in ("xyz", "rpy"))
+            values = tuple(float(text) for three in texts for text in three)
         except ValueError:
-            values = np.array([np.nan])
-        if len(values) != 6 or not np.isfinite(values).all():
+            values = ()
+        if len(values) != 6 or not all(map(math.isfinite, values)):
             raise InputError(
                 f"{self._path}: the origin of joint {joint.name!r} is not six numbers: "
                 f"{attributes}; xacro expressions must be evaluated first"
             )
-        return se3.from_rotation_translation(se3.rotation_from_rpy(values[3:]), values[:3])
+        return values
 
     def _place(self) -> tuple[int, int]:
         """Bytes from the beginning to the end of the tag that is being read."""
         start = self._parser.CurrentByteIndex
-        quote, end = 0, start
-        while quote or self._data[end] != ord(">"):
-            letter = self._data[end]
-            if quote:
-                quote = 0 if letter == quote else quote
-            elif letter in b"\"'":
-                quote = letter
-            end += 1
-        return start, end + 1
+        found = _TAG.match(self._data, start)
+        return start, found.end() if found else start
 
     def _end(self, name: str) -> None:
         self._open.pop()

@@ -1,5 +1,5 @@
-"""Bags that are cut off or have a flipped bit, at hundreds of places: a right answer, a warning, or
-one line - never a traceback.
+"""Bags that are cut off, damaged or made to do harm: a right answer, a warning, or one line - never
+a traceback, and never more memory than any bag should take.
 
 What cannot be noticed is a flipped bit that moves one pose by less than noise might (some
 centimetres here), in a file without checksums; robust methods then give nearly the same answer, and
@@ -8,35 +8,46 @@ how nearly is tested. Bits of what is not read (covariances, twists, other topic
 
 import faulthandler
 import json
+import os
+import re
+import sqlite3
+import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from backports import zstd
+from bag_making import (
+    JAZZY,
+    ODOMETRY,
+    POSE_STAMPED,
+    STORAGES,
+    all_poses,
+    bag_path,
+    storage_file,
+    write_compressed,
+)
 from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from rosbags import rosbag1, rosbag2
 
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.bags import PoseBag, write_bag
+from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags import PoseBag, storage, write_bag
+from hand_eye_calib.io.bags.writer import write_streams
 
+MIB = 1 << 20
+# What a command may take: LARGEST_GROWTH, the interpreter and its libraries.
+MOST_MIB = 1000
 PLACES = 100
-ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 POSES = wandering_poses(60)
 STREAMS = {
     "/a": (as_trajectory(POSES, sensor_frame="lidar", world_frame="map"), ODOMETRY),
     "/b": (as_trajectory(child_of(POSES), sensor_frame="camera", world_frame="odom"), POSE_STAMPED),
 }
-COMMAND = [
-    "--parent-topic",
-    "/a",
-    "--child-topic",
-    "/b",
-    "--child-frame",
-    "camera",
-    "--reference",
-    "B5",
-    "--json",
-]
-FILES = {"mcap": "bag.mcap", "sqlite3": "bag.db3", "rosbag1": ""}
-
+TOPICS = ["--parent-topic", "/a", "--child-topic", "/b"]
 # Largest error of an entry of T_parent_child that may go unnoticed.
 UNNOTICED = 5e-3
 
@@ -49,39 +60,43 @@ def _nothing_hangs():
     faulthandler.cancel_dump_traceback_later()
 
 
-@pytest.fixture(params=FILES)
+@pytest.fixture(params=STORAGES)
 def bag(request, tmp_path):
     """Bytes of a bag's file, and where to put damaged ones."""
-    path = tmp_path / ("bag.bag" if request.param == "rosbag1" else "bag")
+    path = bag_path(tmp_path, request.param)
     write_bag(path, STREAMS, request.param)
-    file = path / FILES[request.param] if path.is_dir() else path
+    file = storage_file(path)
     return file.read_bytes(), tmp_path / f"damaged{file.suffix}"
 
 
 def read(path):
-    """Poses and warnings, or the one line of an error."""
+    """Poses and warnings, or None and the one line of an error."""
     try:
         with PoseBag(path) as bag:
-            bag.select_topics("/a", "/b")
             poses = list(bag.poses("/a", "/b"))
-            return poses, bag.warnings
+            found = poses, bag.warnings
     except InputError as error:
-        return None, [str(error)]
+        found = None, [str(error)]
+    assert "\n" not in "".join(found[1])
+    return found
 
 
 def replay(path, capsys):
-    """Exit code, JSON document or None, lines of errors on stderr."""
-    code = main(["replay", str(path), *COMMAND])
+    """Exit code and JSON document or None; a code without a document has one line of an error."""
+    options = [*TOPICS, "--child-frame", "camera", "--reference", "B5", "--json"]
+    code = main(["replay", str(path), *options])
     out, err = capsys.readouterr()
-    return (
-        code,
-        json.loads(out) if out else None,
-        [line for line in err.splitlines() if ": error: " in line],
-    )
+    if not out:
+        assert (code, err.count(": error: ")) == (1, 1)
+    return json.loads(out) if out else None
 
 
 def places(size, seed):
     return np.random.default_rng(seed).integers(0, size, PLACES).tolist()
+
+
+def stamped(poses):
+    return [(pose.stream, pose.stamp_ns, pose.position, pose.quat_xyzw) for pose in poses]
 
 
 def test_cut_off_anywhere(bag, capsys):
@@ -95,23 +110,18 @@ def test_cut_off_anywhere(bag, capsys):
         poses, warnings = read(path)
         # A database may be opened and fail later, which is said too.
         assert len(warnings) in ((1, 2) if path.suffix == ".db3" else (1,)), size
-        assert "\n" not in "".join(warnings)
         outcomes.add("refused" if poses is None else "recovered")
         if poses is not None:
             if path.suffix == ".db3":  # rows of other pages may be missing
                 assert set(stamped(poses)) <= set(stamped(whole))
             else:
                 assert poses == whole[: len(poses)]
-        if number % 20 == 0:
-            code, document, errors = replay(path, capsys)
-            if document is None:
-                assert (code, len(errors)) == (1, 1)
-                continue
+        document = replay(path, capsys) if number % 20 == 0 else None
+        if document is not None:
             assert any("lost" in warning for warning in document["warnings"])
             if document["verdict"] != "DO NOT USE":
-                np.testing.assert_allclose(
-                    document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
-                )
+                found = document["T_parent_child"]["matrix"]
+                np.testing.assert_allclose(found, T_PARENT_CHILD, atol=1e-6)
     assert outcomes == {"refused", "recovered"}
 
 
@@ -120,8 +130,8 @@ def test_a_bit_flipped_anywhere(bag, capsys):
     data, path = bag
     path.write_bytes(data)
     whole, _ = read(path)
-    code, document, _ = replay(path, capsys)
-    np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-9)
+    found = replay(path, capsys)["T_parent_child"]["matrix"]
+    np.testing.assert_allclose(found, T_PARENT_CHILD, atol=1e-9)
     harmed = 0
     bits = np.random.default_rng(3).integers(0, 8, PLACES).tolist()
     for place, bit in zip(places(len(data), seed=2), bits, strict=True):
@@ -129,25 +139,298 @@ def test_a_bit_flipped_anywhere(bag, capsys):
         damaged[place] ^= 1 << bit
         path.write_bytes(damaged)
         poses, _ = read(path)
-        if poses is not None and without_bag_times(poses) == without_bag_times(whole):
+        if poses is not None and sorted(stamped(poses)) == sorted(stamped(whole)):
             continue  # the engine gets what it got before
         harmed += 1
-        code, document, errors = replay(path, capsys)
-        if document is None:
-            assert (code, len(errors)) == (1, 1), place
-        elif not document["warnings"]:
-            np.testing.assert_allclose(
-                document["T_parent_child"]["matrix"],
-                T_PARENT_CHILD,
-                atol=UNNOTICED,
-                err_msg=str(place),
-            )
+        document = replay(path, capsys)
+        if document is not None and not document["warnings"]:
+            found = document["T_parent_child"]["matrix"]
+            np.testing.assert_allclose(found, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place))
     assert harmed >= 10
 
 
-def stamped(poses):
-    return [(pose.stream, pose.stamp_ns, pose.position, pose.quat_xyzw) for pose in poses]
+@pytest.mark.parametrize("kind", STORAGES)
+def test_many_flipped_bits_give_poses_or_one_line(tmp_path, kind):
+    write_bag(bag_path(tmp_path, kind), STREAMS, kind)
+    file = storage_file(bag_path(tmp_path, kind))
+    data, random, refused = file.read_bytes(), np.random.default_rng(3), 0
+    for flips in [1, 10, 100] * 8:
+        damaged = bytearray(data)
+        for position in random.integers(0, len(data), flips):
+            damaged[position] ^= 1 << int(random.integers(8))
+        file.write_bytes(damaged)
+        refused += read(file)[0] is None
+    assert refused
 
 
-def without_bag_times(poses):
-    return sorted(repr(pose._replace(bag_ns=0)) for pose in poses)
+# ---- files cut off, in chunks, and without an index
+
+STAMPS_NS = 1_000 + 100_000_007 * np.arange(4000)
+LONG = Trajectory(STAMPS_NS, se3.exp(np.random.default_rng(1).normal(size=(4000, 6))))
+LONG = dict.fromkeys(STREAMS, (LONG, ODOMETRY))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.9])
+@pytest.mark.parametrize("kind", [*STORAGES, "zstd"])
+def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind, share):
+    """The recorder lost power: no index, the last chunk incomplete, no metadata.yaml."""
+    path = bag_path(tmp_path, kind)
+    if kind == "zstd":
+        write_compressed(path, LONG)
+    else:
+        write_bag(path, LONG, kind)
+    whole, file = all_poses(path), storage_file(path)
+    file.write_bytes(file.read_bytes()[: int(file.stat().st_size * share)])
+    if path.is_dir():
+        (path / "metadata.yaml").unlink()
+    recovered, (warning,) = read(path)
+    if kind == "sqlite3" and recovered is None:
+        assert share == 0.3  # the list of topics is not there
+        return
+    assert share - 0.35 < len(recovered) / len(whole) < share + 0.1
+    assert recovered == whole[: len(recovered)]
+    assert re.search(r"cut off or damaged .* lost", warning)
+    assert re.search(rf"recovered are {len(recovered)} messages covering [0-9.]+ s$", warning)
+
+
+def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):
+    path = write_compressed(tmp_path / "bag", LONG)
+    whole, file = all_poses(path), storage_file(path)
+    data = bytearray(file.read_bytes())
+    data[100_000:100_100] = bytes(100)  # in the second of six chunks
+    file.write_bytes(data)
+    poses, warnings = read(path)
+    assert len(whole) * 0.5 < len(poses) < len(whole)
+    assert set(stamped(poses)) < set(stamped(whole))
+    assert re.search(r"the chunk at byte \d+ is damaged", " ".join(warnings))
+
+
+FOOTER = struct.pack("<BQQQI", 2, 20, 0, 0, 0)
+
+
+def without_index(data):
+    """The records of an mcap without its summary, as a recorder writes it that makes no index."""
+    (summary,) = struct.unpack_from("<Q", data, len(data) - 8 - 20)
+    return data[:summary] + FOOTER + data[-8:]
+
+
+def without_chunks(data):
+    """The same messages outside chunks, the second half first: not in the order of time."""
+    (size,) = struct.unpack_from("<Q", data, 9)
+    position, messages, others, begin = 17 + size, [], [], data[: 17 + size]
+    while data[position] != 0x0F:
+        (size,) = struct.unpack_from("<Q", data, position + 1)
+        if data[position] == 6:
+            body, end = position + 9 + 28 + 4 + 8, position + 9 + size
+            while body < end:
+                (length,) = struct.unpack_from("<Q", data, body + 1)
+                (messages if data[body] == 5 else others).append(data[body : body + 9 + length])
+                body += 9 + length
+        position += 9 + size
+    half = len(messages) // 2
+    swapped = messages[half:] + messages[:half]
+    return begin + b"".join(others + swapped) + FOOTER + data[-8:]
+
+
+@pytest.mark.parametrize("change", [without_index, without_chunks])
+def test_mcap_files_without_index_and_without_chunks_are_whole(tmp_path, monkeypatch, change):
+    write_bag(tmp_path / "bag", STREAMS)
+    changed = tmp_path / "changed.mcap"
+    changed.write_bytes(change(storage_file(tmp_path / "bag").read_bytes()))
+    assert read(changed) == (all_poses(tmp_path / "bag"), [])
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    with pytest.raises(MissingDependencyError, match="needs mcap, .*: pip install mcap$"):
+        PoseBag(changed)
+
+
+# ---- what is no bag
+
+
+def test_paths_that_are_no_bag(tmp_path):
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "fifo.mcap")
+    messages = {
+        "absent": "no bag at .*absent",
+        "notes.txt": r"notes\.txt is not a bag; expected",
+        "folder": r"no bag in .*: expected metadata\.yaml or files that end in .*check the path",
+        "fifo.mcap": "is not a regular file",
+    }
+    for suffix in ("bag", "mcap", "db3"):
+        (tmp_path / f"empty.{suffix}").touch()
+        (tmp_path / f"text.{suffix}").write_text("this is not a bag\n" * 100)
+        messages[f"empty.{suffix}"] = f"empty.{suffix} is an empty file"
+        kind = "it is cut off, damaged or of an unsupported kind"
+        messages[f"text.{suffix}"] = f"text.{suffix}: {kind}"
+    for name, message in messages.items():
+        assert re.search(message, *read(tmp_path / name)[1]), name
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "unpack_from requires a buffer|expected plain CDR"),
+        (b"\x00\x01\x00\x00" + b"\x01" * 11, "requires a buffer"),
+        (b"\x00\x07\x00\x00" + b"\x00" * 100, "expected plain CDR, found encoding 0x0007"),
+    ],
+)
+def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, data, reason):
+    with_message(tmp_path / "bag", "sqlite3", data)
+    message = f"/a, message 61: not a readable nav_msgs/msg/Odometry .*{reason}|{reason}"
+    with pytest.raises(InputError, match=message):
+        all_poses(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("name", ["run#1.db3", "run%41.db3", "what?.db3", "a?mode=rw&b.db3"])
+def test_a_path_is_not_read_as_an_address(tmp_path, name):
+    write_bag(tmp_path / "bag", STREAMS, "sqlite3")
+    storage_file(tmp_path / "bag").rename(tmp_path / name)
+    assert len(all_poses(tmp_path / name)) == 120
+
+
+def test_hostile_metadata_leaves_the_bag_beside_it_readable(tmp_path):
+    write_bag(tmp_path / "bag", STREAMS, "mcap")
+    aliases = (f"a{k}: &a{k} {{<<: [{', '.join([f'*a{k - 1}'] * 9)}]}}" for k in range(1, 12))
+    texts = ["\n".join(["a0: &a0 {x: 1}", *aliases]), "[" * 100_000, "a: &a {b: *a}"]
+    texts += ["x: 2024-13-45", "n: " + "9" * 5000, "!!float abc", "\x00", "é: \udcff"]
+    for text in texts:
+        metadata = tmp_path / "bag" / "metadata.yaml"
+        metadata.write_bytes(text.encode("utf-8", "surrogateescape"))
+        poses, (warning,) = read(tmp_path / "bag")
+        assert (len(poses), "metadata.yaml is damaged" in warning) == (120, True)
+
+
+def test_a_rosbag2_of_more_files_than_are_read_is_refused(tmp_path, monkeypatch):
+    write_bag(tmp_path / "bag", STREAMS, "mcap")
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    data = storage_file(tmp_path / "bag").read_bytes()
+    for number in range(4):
+        (tmp_path / "bag" / f"bag_{number}.mcap").write_bytes(data)
+    monkeypatch.setattr(storage, "MOST_BAG_FILES", 4)
+    with pytest.raises(InputError, match="has more than 4 files; read it in parts"):
+        PoseBag(tmp_path / "bag")
+
+
+# ---- bags made to do harm
+
+# Three gigabytes of zeros, in frames.
+BOMB = zstd.compress(bytes(64 * MIB)) * 48
+
+# Not ru_maxrss, which a process has from the one that started it.
+REPLAY = """
+import pathlib, re, sys
+from hand_eye_calib.cli.main import main
+code = main(["replay", *sys.argv[1:]])
+peak = re.search(r"VmHWM:\\s+(\\d+) kB", pathlib.Path("/proc/self/status").read_text())
+print(code, int(peak[1]) // 1024)
+"""
+
+
+def with_message(path, kind, data):
+    """A bag of poses with one more message on /a."""
+    plugin = rosbag2.StoragePlugin[kind.upper()]
+    with rosbag2.Writer(path, version=9, storage_plugin=plugin) as writer:
+        write_streams(writer, STREAMS, kind)
+        connection = next(each for each in writer.connections if each.topic == "/a")
+        writer.write(connection, int(STREAMS["/a"][0].stamps_ns[-1]) + 1, data)
+    return path
+
+
+def mcap_bomb(path):
+    return with_message(path / "bag", "mcap", BOMB)
+
+
+def sqlite3_bomb(path):
+    return with_message(path / "bag", "sqlite3", BOMB)
+
+
+def rosbag1_bomb(path):
+    """A chunk of 700 MiB of zeros."""
+    path = path / "bag.bag"
+    writer = rosbag1.Writer(path)
+    writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+    with writer:
+        write_streams(writer, STREAMS, "rosbag1")
+        connection = next(each for each in writer.connections if each.topic == "/a")
+        last_ns = int(STREAMS["/a"][0].stamps_ns[-1])
+        writer.write(connection, last_ns + 1, memoryview(np.zeros(700 * MIB, dtype=np.uint8)))
+    return path
+
+
+@pytest.mark.parametrize("make", [mcap_bomb, sqlite3_bomb, rosbag1_bomb])
+def test_a_command_ends_in_one_line_and_within_its_memory(tmp_path, make):
+    command = [sys.executable, "-c", REPLAY, str(make(tmp_path)), *TOPICS]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    code, mib = map(int, done.stdout.split())
+    errors = [line for line in done.stderr.splitlines() if ": error: " in line]
+    assert (code, len(errors)) == (1, 1), done.stderr
+    assert "takes more memory than any bag should" in errors[0]
+    assert mib < MOST_MIB
+    assert "Traceback" not in done.stderr
+
+
+def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path):
+    path = tmp_path / "bag.mcap.zstd"
+    path.write_bytes(zstd.compress(bytes(300 * MIB)))
+    with pytest.raises(InputError, match="unpacks to more than 256 times .* not believable"):
+        PoseBag(path)
+
+
+def database(path, rows, script=""):
+    connection = sqlite3.connect(path)
+    connection.executescript(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
+        " serialization_format TEXT, offered_qos_profiles TEXT);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+        " data BLOB);"
+    )
+    connection.execute("INSERT INTO topics VALUES(1, '/a', ?, 'cdr', '')", (ODOMETRY,))
+    connection.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", rows)
+    connection.executescript(script)
+    connection.commit()
+    connection.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def odometry():
+    """Bytes of a message."""
+    types = JAZZY.types
+    zero, none = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(36)
+    stamp = types["builtin_interfaces/msg/Time"](1, 0)
+    pose = types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0),
+        types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+    )
+    twist = types["geometry_msgs/msg/Twist"](zero, zero)
+    message = types[ODOMETRY](
+        types["std_msgs/msg/Header"](stamp, "odom"),
+        "lidar",
+        types["geometry_msgs/msg/PoseWithCovariance"](pose, none),
+        types["geometry_msgs/msg/TwistWithCovariance"](twist, none),
+    )
+    return bytes(JAZZY.serialize_cdr(message, ODOMETRY))
+
+
+@pytest.mark.parametrize(
+    "bad", [(5, "text"), (5, 7), (5, None), ("five", b""), (1e300, b""), (-5, b""), (None, b"")]
+)
+def test_values_of_other_types_are_left_out_or_refused(tmp_path, odometry, bad):
+    poses, said = read(database(tmp_path / "bag.db3", [(1, odometry), bad, (9, odometry)]))
+    assert poses is None or [pose.bag_ns for pose in poses] == [1, 9]
+    assert poses is None or "not bytes with a time were left out" in " ".join(said)
+
+
+def test_messages_without_an_index_of_times_are_read_in_order(tmp_path, odometry):
+    path = database(tmp_path / "bag.db3", [(stamp, odometry) for stamp in (7, 3, 5)])
+    assert [pose.bag_ns for pose in all_poses(path)] == [3, 5, 7]
+
+
+def test_rows_that_are_computed_are_refused(tmp_path):
+    computed = (
+        "DROP TABLE messages; CREATE VIEW messages AS WITH RECURSIVE n(k) AS (SELECT 1 UNION"
+        " ALL SELECT k + 1 FROM n) SELECT 1 AS topic_id, k AS timestamp, zeroblob(1000) AS data"
+        " FROM n;"
+    )
+    with pytest.raises(InputError, match="it has no tables 'topics' and 'messages'"):
+        PoseBag(database(tmp_path / "bag.db3", [], computed))

@@ -1,38 +1,46 @@
-"""Bags: all storages give the same poses, and a bag that cannot be read says so in one line."""
+"""Bags: all storages give the same poses, from all kinds of topics; what is asked for wrongly is
+answered with what is there.
+"""
 
 import re
-import sys
 
 import numpy as np
 import pytest
 import yaml
+from bag_making import (
+    JAZZY,
+    NOETIC,
+    ODOMETRY,
+    PATH,
+    POSE_STAMPED,
+    STORAGES,
+    TF,
+    all_poses,
+    bag_path,
+    path_message,
+    storage_file,
+    tf_message,
+    write_compressed,
+    write_messages,
+)
+from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
 from published_data import data_folder
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_typestore
 
-from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
+import hand_eye_calib as hec
+from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
+from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, POSE_TYPES
 from hand_eye_calib.io.bags.writer import stamped_messages, write_streams
+from hand_eye_calib.io.transforms import TfSource
 
-ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
-STORAGES = ("mcap", "sqlite3", "rosbag1")
-JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
-
-
-def trajectory(first_ns, count=40, seed=1, **frames):
-    stamps_ns = first_ns + 100_000_007 * np.arange(count)
-    return Trajectory(
-        stamps_ns, se3.exp(np.random.default_rng(seed).normal(size=(count, 6))), **frames
-    )
-
-
-PARENT = trajectory(1317375625661736123, sensor_frame="lidar", world_frame="map")
-CHILD = trajectory(
-    1317375625661736130, count=30, seed=2, sensor_frame="camera_left", world_frame="odom_camera"
-)
-STREAMS = {"/lidar/odom": (PARENT, ODOMETRY), "/camera/pose": (CHILD, POSE_STAMPED)}
+SECOND = 10**9
+POSES = wandering_poses(120)
+PARENT = as_trajectory(POSES, sensor_frame="lidar", world_frame="map")
+CHILD = as_trajectory(child_of(POSES)[:90], sensor_frame="camera", world_frame="odom")
+STREAMS = {"/a": (PARENT, ODOMETRY), "/b": (CHILD, POSE_STAMPED)}
 
 
 @pytest.fixture
@@ -40,112 +48,113 @@ def new_bag(tmp_path):
     """Writes a bag and returns its path."""
 
     def write(storage="mcap", streams=STREAMS, name="bag"):
-        path = tmp_path / (name + (".bag" if storage == "rosbag1" else ""))
+        path = bag_path(tmp_path, storage, name)
         write_bag(path, streams, storage)
         return path
 
     return write
 
 
-def storage_file(path):
-    """The file that holds the messages."""
-    return (
-        path
-        if path.is_file()
-        else next(part for part in path.iterdir() if part.suffix in (".mcap", ".db3"))
-    )
-
-
-def read(path, parent="/lidar/odom", child="/camera/pose"):
-    with PoseBag(path) as bag:
-        return list(bag.poses(parent, child))
+def assert_same_motion(trajectory, stamps_ns, poses, atol=1e-12):
+    assert trajectory.stamps_ns.tolist() == list(stamps_ns)
+    np.testing.assert_allclose(trajectory.poses, poses, atol=atol)
 
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(new_bag, storage):
-    poses = read(new_bag(storage))
+    poses = all_poses(new_bag(storage))
     assert [pose.stamp_ns for pose in poses] == sorted([*PARENT.stamps_ns, *CHILD.stamps_ns])
-    for stream, source, world, sensor in (
-        ("parent", PARENT, "map", "lidar"),
-        ("child", CHILD, "odom_camera", None),
+    for stream, source, frames in (
+        ("parent", PARENT, ("map", "lidar")),
+        ("child", CHILD, ("odom", None)),
     ):
         found = [pose for pose in poses if pose.stream == stream]
         assert [pose.stamp_ns for pose in found] == source.stamps_ns.tolist()
         assert [pose.number for pose in found] == list(range(1, len(source) + 1))
-        assert {(pose.world_frame, pose.sensor_frame) for pose in found} == {(world, sensor)}
-        np.testing.assert_array_equal([pose.position for pose in found], source.poses[:, :3, 3])
-        np.testing.assert_array_equal(
-            [pose.quat_xyzw for pose in found], se3.to_quat_xyzw(source.poses)
-        )
+        assert {(pose.world_frame, pose.sensor_frame) for pose in found} == {frames}
+        values = [[*pose.position, *pose.quat_xyzw] for pose in found]
+        quats_xyzw = se3.to_quat_xyzw(source.poses)
+        np.testing.assert_array_equal(values, np.c_[source.poses[:, :3, 3], quats_xyzw])
 
 
-def test_storage_files_read_alone(new_bag):
-    for storage in ("mcap", "sqlite3"):
-        path = new_bag(storage, name=storage)
-        assert read(storage_file(path)) == read(path)
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("message_type", POSE_TYPES)
+def test_every_type_of_stamped_pose(new_bag, storage, message_type):
+    path = new_bag(storage, {"/a": (PARENT, message_type), "/b": (CHILD, ODOMETRY)})
+    trajectory = hec.read_trajectory(path, topic="/a")
+    assert_same_motion(trajectory, PARENT.stamps_ns, PARENT.poses)
+    sensor = "lidar" if MESSAGE_TYPES[message_type].has_child_frame else ""
+    assert (trajectory.world_frame, trajectory.sensor_frame) == ("map", sensor)
 
 
-def test_topics_lists_everything_in_the_bag(new_bag):
-    with PoseBag(new_bag()) as bag:
-        assert bag.topics() == [("/camera/pose", POSE_STAMPED, 30), ("/lidar/odom", ODOMETRY, 40)]
-        assert str(bag.topics()[0]) == "/camera/pose (geometry_msgs/msg/PoseStamped, 30 messages)"
+def test_reading_from_a_bag_takes_no_options_of_text_files(tmp_path):
+    for options in ({"format": "csv"}, {"columns": "t"}, {"repair": True}, {"tf": "a:b"}):
+        with pytest.raises(ConfigError, match="topic and tf are for bags"):
+            hec.read_trajectory(tmp_path, topic="/a", **options)
 
 
-def add_text_topic(path):
-    """A rosbag2 with poses and a topic of strings."""
+# ---- which topics are meant
+
+
+def with_others(path, *others):
+    """A bag of both streams and a message of each other topic: name, type and how to make it."""
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         write_streams(writer, STREAMS, "mcap")
-        connection = writer.add_connection("/log", "std_msgs/msg/String", typestore=JAZZY)
-        text = JAZZY.types["std_msgs/msg/String"]("hello")
-        writer.write(
-            connection, int(PARENT.stamps_ns[3]), JAZZY.serialize_cdr(text, "std_msgs/msg/String")
-        )
+        for topic, message_type, make in others:
+            connection = writer.add_connection(topic, message_type, typestore=JAZZY)
+            data = JAZZY.serialize_cdr(make(JAZZY), message_type)
+            writer.write(connection, int(PARENT.stamps_ns[3]), data)
     return path
 
 
-def test_other_topics_do_not_get_in_the_way(tmp_path, new_bag):
-    path = add_text_topic(tmp_path / "with_text")
-    assert read(path) == read(new_bag())
+LOG = ("/log", "std_msgs/msg/String", lambda types: types.types["std_msgs/msg/String"]("hello"))
+
+
+def test_topics_are_listed_and_others_do_not_get_in_the_way(tmp_path, new_bag):
+    path = with_others(tmp_path / "others", LOG, ("/path", PATH, path_message([], [])))
+    assert all_poses(path) == all_poses(new_bag())
     with PoseBag(path) as bag:
-        assert bag.select_topics() == ("/lidar/odom", "/camera/pose")
+        assert bag.select_topics() == ("/a", "/b")
+        assert bag.topics()[:2] == [("/a", ODOMETRY, 120), ("/b", POSE_STAMPED, 90)]
+        assert str(bag.topics()[2]) == "/log (std_msgs/msg/String, 1 messages)"
 
 
 @pytest.mark.parametrize(
     ("named", "selected"),
-    [
-        (("/lidar/odom", "/camera/pose"), ("/lidar/odom", "/camera/pose")),
-        (("/lidar/odom", None), ("/lidar/odom", "/camera/pose")),
-        ((None, "/lidar/odom"), ("/camera/pose", "/lidar/odom")),
-        ((None, None), ("/lidar/odom", "/camera/pose")),
-    ],
+    [(("/a", None), ("/a", "/b")), ((None, "/a"), ("/b", "/a")), ((None, None), ("/a", "/b"))],
 )
 def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
-    with PoseBag(new_bag()) as bag:
-        assert bag.select_topics(*named) == selected
+    goal = {"/goal_pose": (PARENT[:1], POSE_STAMPED)}  # published once: no sensor
+    for streams in (STREAMS, STREAMS | goal):
+        with PoseBag(new_bag(streams=streams, name=f"bag{len(streams)}")) as bag:
+            assert bag.select_topics(*named) == selected
+
+
+def test_a_path_counts_where_there_are_not_two_others(tmp_path):
+    path = (PARENT.stamps_ns[0], "/path", PATH, path_message(PARENT.stamps_ns, POSES))
+    write_messages(tmp_path / "path", [path])
+    write_bag(tmp_path / "poses", {"/z": STREAMS["/a"]})
+    with PoseBag(tmp_path / "path", tmp_path / "poses") as bag:
+        assert bag.select_topics() == ("/path", "/z")
 
 
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        (("/odom", "/camera/pose"), "no topic /odom in "),
-        (
-            ("/lidar/odom", "/log"),
-            r"topic /log of .* is of type std_msgs/msg/String; accepted are "
-            r"nav_msgs/msg/Odometry, ",
-        ),
-        (("/lidar/odom", "/lidar/odom"), "parent and child topic are both /lidar/odom"),
+        (("/odom", "/b"), "no topic /odom in "),
+        (("/a", "/log"), r"/log of .* is of type std_msgs/msg/String; accepted are nav_msgs/msg/O"),
+        (("/a", "/a"), "parent and child topic are both /a"),
     ],
 )
 def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, message):
     with (
-        PoseBag(add_text_topic(tmp_path / "bag")) as bag,
+        PoseBag(with_others(tmp_path / "bag", LOG)) as bag,
         pytest.raises(InputError, match=message) as caught,
     ):
         bag.select_topics(*named)
     listing = (
-        "The bag has /camera/pose (geometry_msgs/msg/PoseStamped, 30 messages), "
-        "/lidar/odom (nav_msgs/msg/Odometry, 40 messages), "
-        "/log (std_msgs/msg/String, 1 messages)"
+        "The bag has /a (nav_msgs/msg/Odometry, 120 messages), "
+        "/b (geometry_msgs/msg/PoseStamped, 90 messages), /log (std_msgs/msg/String, 1 messages)"
     )
     assert listing in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -153,177 +162,257 @@ def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, me
 
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_without_names_there_must_be_exactly_two_pose_topics(new_bag, count):
-    path = new_bag(streams={f"/odom_{number}": (PARENT, ODOMETRY) for number in range(count)})
-    with (
-        PoseBag(path) as bag,
-        pytest.raises(
-            InputError, match="name the topics of poses with --parent-topic and --child-topic"
-        ),
-    ):
+    path = new_bag(streams={f"/odom_{number}": STREAMS["/a"] for number in range(count)})
+    message = "name the topics of poses with --parent-topic and --child-topic"
+    with PoseBag(path) as bag, pytest.raises(InputError, match=message):
         bag.select_topics()
 
 
-def one_line(error):
-    assert "\n" not in str(error.value)
-    return str(error.value)
+def test_several_publishers_and_types_on_one_topic(tmp_path):
+    """Two connections of one type are one stream; of two types, the topic is refused."""
+    for name, second_type in (("one.bag", ODOMETRY), ("two.bag", "std_msgs/msg/String")):
+        with rosbag1.Writer(tmp_path / name) as writer:
+            write_streams(writer, STREAMS, "rosbag1")
+            connection = writer.add_connection(
+                "/a", second_type, typestore=NOETIC, callerid="/second"
+            )
+            later = Trajectory(PARENT.stamps_ns[-1:] + 1, PARENT.poses[-1:])
+            stamp_ns, message = next(stamped_messages(NOETIC.types, later, ODOMETRY, True))
+            text = NOETIC.types["std_msgs/msg/String"]("hello")
+            message = message if second_type == ODOMETRY else text
+            writer.write(connection, stamp_ns, NOETIC.serialize_ros1(message, second_type))
+    poses = all_poses(tmp_path / "one.bag")
+    assert sum(pose.stream == "parent" for pose in poses) == len(PARENT) + 1
+    with (
+        PoseBag(tmp_path / "two.bag") as bag,
+        pytest.raises(InputError, match="topic /a of .* is of type several types"),
+    ):
+        bag.select_topics("/a", "/b")
 
 
-def cut_off(path, share):
-    data = storage_file(path).read_bytes()
-    storage_file(path).write_bytes(data[: int(len(data) * share)])
+# ---- transforms
 
 
-LONG = {topic: (trajectory(1_000, count=4000), ODOMETRY) for topic in STREAMS}
+def transforms(moving, static=()):
+    """Messages of edges: (child, parent, Trajectory) each, and (child, parent, matrix)."""
+    messages = [
+        (stamp_ns, "/tf", TF, tf_message([(stamp_ns, parent, child, matrix)]))
+        for child, parent, trajectory in moving
+        for stamp_ns, matrix in zip(trajectory.stamps_ns, trajectory.poses, strict=True)
+    ]
+    edges = [(0, parent, child, matrix) for child, parent, matrix in static]
+    before_ns = int(PARENT.stamps_ns[0]) - 1
+    return [*messages, *[(before_ns, "/tf_static", TF, tf_message(edges))][: len(edges)]]
 
 
-@pytest.mark.parametrize(
-    ("storage", "compression", "share"),
-    [
-        *((storage, "", share) for storage in ("mcap", "rosbag1") for share in (0.3, 0.5, 0.9)),
-        *(("mcap", "zstd", share) for share in (0.3, 0.5, 0.9)),
-        *(("sqlite3", "", share) for share in (0.5, 0.9)),
-    ],
-)
-def test_a_bag_cut_off_gives_what_came_before(tmp_path, storage, compression, share):
-    """The recorder lost power: no index, the last chunk incomplete, no metadata.yaml."""
-    path = tmp_path / ("bag.bag" if storage == "rosbag1" else "bag")
-    if compression:
-        write_compressed(path, LONG)
-    else:
-        write_bag(path, LONG, storage)
-    whole = read(path)
-    cut_off(path, share)
-    if path.is_dir():
-        (path / "metadata.yaml").unlink()
-    with PoseBag(path) as bag:
-        recovered = list(bag.poses("/lidar/odom", "/camera/pose"))
-        (warning,) = bag.warnings
-        assert sum(topic.count for topic in bag.topics()) == len(recovered)
-    # Chunks are of 1 MiB, an uncompressed one can be used up to its last whole message. What leads
-    # to the rows of a table may lie behind the cut.
-    lost = 0.2 * (compression == "zstd") + 0.25 * (storage == "sqlite3")
-    assert 0.9 * share - lost < len(recovered) / len(whole) < share + 0.1
-    assert recovered == whole[: len(recovered)]
-    assert re.search(r"cut off or damaged .* lost", warning)
-    assert re.search(rf"recovered are {len(recovered)} messages covering [0-9.]+ s$", warning)
-
-
-def write_compressed(path, streams):
-    writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
-    writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
-    with writer:
-        write_streams(writer, streams, "mcap")
-
-
-def test_an_mcap_of_which_nothing_can_be_recovered_is_refused(new_bag):
-    path = new_bag()
-    cut_off(path, 0.05)
-    with pytest.raises(InputError, match="nothing before that can be recovered") as caught:
-        read(path)
-    one_line(caught)
-
-
-def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):
-    path = tmp_path / "bag"
-    write_compressed(path, LONG)
-    whole = read(path)
-    file = storage_file(path)
-    data = bytearray(file.read_bytes())
-    data[100_000:100_100] = bytes(100)  # in the second of six chunks
-    file.write_bytes(data)
-    with PoseBag(path) as bag:
-        poses = list(bag.poses("/lidar/odom", "/camera/pose"))
-        warnings = bag.warnings
-    assert len(whole) * 0.5 < len(poses) < len(whole)
-    found = {(pose.stream, pose.stamp_ns) for pose in poses}
-    assert found < {(pose.stream, pose.stamp_ns) for pose in whole}
-    assert len(found) == len(poses)
-    assert re.search(r"the chunk at byte \d+ is damaged", " ".join(warnings))
-
-
-def test_an_mcap_that_needs_the_library_mcap_says_so(new_bag, monkeypatch):
-    path = new_bag()
-    cut_off(path, 0.9)
-    monkeypatch.setitem(sys.modules, "mcap", None)
-    with pytest.raises(MissingDependencyError, match="needs mcap, .*: pip install mcap") as caught:
-        read(path)
-    one_line(caught)
+MOUNT = se3.exp(np.array([0.3, 0.1, -0.4, 0.2, 0.5, -0.9]))
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_flipped_bits_give_poses_or_one_line(new_bag, storage):
-    path = new_bag(storage)
-    data = storage_file(path).read_bytes()
-    random = np.random.default_rng(3)
-    refused = []
-    for flips in [1, 10, 100] * 8:
-        damaged = bytearray(data)
-        for position in random.integers(0, len(data), flips):
-            damaged[position] ^= 1 << int(random.integers(8))
-        storage_file(path).write_bytes(damaged)
-        try:
-            read(path)
-        except InputError as error:
-            refused.append(str(error))
-    assert refused
-    assert not [message for message in refused if "\n" in message]
+def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
+    """map <- odom at 4 Hz, odom <- base at 10 Hz, base <- lidar fixed: poses of the lidar in the
+    map, at the slow one's stamps.
+    """
+    slow = Trajectory(
+        PARENT.stamps_ns[0] + 250_000_000 * np.arange(40) + 20_000_000,
+        se3.exp(np.linspace(0, 1, 40)[:, None] * np.full(6, 0.2)),
+    )
+    moving = [("odom", "map", slow), ("base", "odom", PARENT)]
+    static = [("lidar", "base", MOUNT), ("rear", "base", T_PARENT_CHILD)]
+    path = write_messages(bag_path(tmp_path, storage), transforms(moving, static), storage)
+    trajectory = hec.read_trajectory(path, tf="map:lidar")
+    stamps_ns = slow.stamps_ns[slow.stamps_ns <= PARENT.stamps_ns[-1]]
+    expected = slow.poses[: len(stamps_ns)] @ PARENT.at(stamps_ns, straight=True) @ MOUNT
+    assert_same_motion(trajectory, stamps_ns, expected)
+    assert (trajectory.world_frame, trajectory.sensor_frame) == ("map", "lidar")
+    # Up and down again, through the common ancestor; and against the direction of the tree.
+    other = hec.read_trajectory(path, tf="odom:lidar")
+    assert_same_motion(other, PARENT.stamps_ns, PARENT.poses @ MOUNT)
+    backwards = hec.read_trajectory(path, tf="lidar:odom")
+    assert_same_motion(backwards, PARENT.stamps_ns, se3.inverse(PARENT.poses @ MOUNT))
+    said = (
+        r"transform lidar:rear does not move: all of its transforms are static; it has "
+        r"base:lidar \(static\), base:rear \(static\), map:odom"
+    )
+    with pytest.raises(InputError, match=said):
+        hec.read_trajectory(path, tf="lidar:rear")
 
 
-def test_paths_that_are_no_bag(tmp_path, new_bag):
-    with pytest.raises(InputError, match=r"no bag at .*absent"):
-        PoseBag(tmp_path / "absent")
-    (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(InputError, match=r"notes\.txt is not a bag; expected"):
-        PoseBag(tmp_path / "notes.txt")
-    for suffix in ("bag", "mcap", "db3"):
-        path = tmp_path / f"empty.{suffix}"
-        path.touch()
-        with pytest.raises(InputError, match=f"empty.{suffix} is an empty file"):
-            PoseBag(path)
-        path = tmp_path / f"text.{suffix}"
-        path.write_text("this is not a bag\n" * 100)
-        with pytest.raises(
-            InputError, match=f"text.{suffix}: it is cut off, damaged or of an unsupported kind"
-        ) as caught:
-            PoseBag(path)
-        one_line(caught)
+def test_old_transforms_with_slashes_and_of_the_old_type_count_once(tmp_path):
+    old = "tf/msg/tfMessage"
+    messages = [
+        (stamp_ns, "/tf", old, tf_message([(stamp_ns, "/odom", "/base", matrix)], old))
+        for stamp_ns, matrix in zip(PARENT.stamps_ns, PARENT.poses, strict=True)
+    ]
+    path = write_messages(tmp_path / "old.bag", messages * 2, "rosbag1")
+    assert_same_motion(hec.read_trajectory(path, tf="odom:base"), PARENT.stamps_ns, PARENT.poses)
+
+
+def test_both_sensors_from_transforms(tmp_path):
+    path = write_messages(
+        tmp_path / "bag", transforms([("lidar", "map", PARENT), ("camera", "odom", CHILD)])
+    )
+    with PoseBag(path) as bag:
+        sources = bag.select_topics(TfSource("map", "lidar"), TfSource("odom", "camera"))
+        poses = list(bag.poses(*sources))
+        assert bag.warnings == []
+    assert [pose.bag_ns for pose in poses] == sorted(pose.bag_ns for pose in poses)
+    assert {pose[0:1] + pose[3:5] for pose in poses} == {
+        ("parent", "map", "lidar"),
+        ("child", "odom", "camera"),
+    }
+
+
+def test_a_gap_in_a_chain_is_not_bridged(tmp_path):
+    holey = PARENT[(np.arange(120) < 40) | (np.arange(120) >= 60)]
+    steady = Trajectory(PARENT.stamps_ns[::2], np.repeat(np.eye(4)[None], 60, axis=0))
+    moving = [("base", "odom", holey), ("odom", "map", steady)]
+    path = write_messages(tmp_path / "bag", transforms(moving))
+    said = r"transform map:base: 10 of 60 poses were left out, .* not known within 0\.5 s"
+    with pytest.warns(UserWarning, match=said):
+        assert len(hec.read_trajectory(path, tf="map:base")) == 50
+
+
+@pytest.mark.parametrize(
+    ("edges", "message"),
+    [
+        (["base odom"], r"no frame 'lidar' in the bag's transforms; it has odom:base"),
+        (
+            ["lidar base", "odom map"],
+            "frames 'odom' and 'lidar' are not connected; it has base:lidar, map:odom",
+        ),
+        (["lidar odom", "lidar map"], "frame 'lidar' has two parents, 'odom' and 'map'"),
+        (["lidar odom", "odom lidar"], "the bag's transforms form a loop through frame"),
+        ([], r"no transforms in .*The bag has /a \(nav_msgs/msg/Odometry, 120 messages\)"),
+    ],
+)
+def test_transforms_that_do_not_lead_there(tmp_path, new_bag, edges, message):
+    moving = [(*edge.split(), PARENT) for edge in edges]
+    path = write_messages(tmp_path / "tf", transforms(moving)) if edges else new_bag()
+    with pytest.raises(InputError, match=message) as caught:
+        hec.read_trajectory(path, tf="odom:lidar")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["odom", "odom:", ":lidar", "a:b:c", "odom:odom", "odom:/odom"])
+def test_frames_that_are_not_a_pair(text):
+    with pytest.raises(ConfigError, match="expected two frames as WORLD:SENSOR"):
+        TfSource.parse(text)
+
+
+# ---- paths
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_growing_path_is_its_newest_message(tmp_path, storage):
+    """A SLAM publishes its whole past again and again; the last correction counts, the time of the
+    first appearance is kept.
+    """
+    messages = []
+    for end in range(10, 121, 10):
+        corrected = POSES[:end].copy()
+        corrected[:, 0, 3] += 0.01 * (120 - end)
+        path = path_message(PARENT.stamps_ns[:end], corrected)
+        messages.append((PARENT.stamps_ns[end - 1], "/path", PATH, path))
+    path = write_messages(bag_path(tmp_path, storage), messages, storage)
+    assert_same_motion(hec.read_trajectory(path, topic="/path"), PARENT.stamps_ns, POSES)
+    bag_ns = [pose.bag_ns for pose in all_poses(path, "/path", "/none")]
+    assert bag_ns == np.repeat(PARENT.stamps_ns[9::10], 10).tolist()
+
+
+def test_a_path_that_drops_its_oldest_poses_is_put_together(tmp_path):
+    parts = [slice(max(end - 30, 0), end) for end in range(10, 121, 10)]
+    messages = [
+        (PARENT.stamps_ns[p.stop - 1], "/path", PATH, path_message(PARENT.stamps_ns[p], POSES[p]))
+        for p in parts
+    ]
+    found = hec.read_trajectory(write_messages(tmp_path / "bag", messages), topic="/path")
+    assert_same_motion(found, PARENT.stamps_ns, POSES)
+
+
+def test_a_path_whose_poses_have_no_stamps_is_refused(tmp_path):
+    without = (SECOND, "/path", PATH, path_message(np.zeros(5, dtype=int), POSES[:5]))
+    path = write_messages(tmp_path / "bag", [without, (SECOND, "/p", PATH, path_message([], []))])
+    with pytest.raises(InputError, match="the poses of path /path have no stamps"):
+        hec.read_trajectory(path, topic="/path")
+    with pytest.raises(InputError, match="no poses on /p of"):
+        hec.read_trajectory(path, topic="/p")
+
+
+# ---- several bags, single files, compressed ones, metadata
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
+    paths = []
+    for number, part in enumerate([slice(80, 120), slice(0, 40), slice(40, 80)]):
+        streams = {"/a": (PARENT[part], ODOMETRY), "/b": (PARENT[part], ODOMETRY)}
+        paths.append(new_bag(storage, streams, f"part{number}"))
+    with PoseBag(*paths) as bag:
+        poses = list(bag.poses("/a", "/b"))
+        assert bag.topics() == [("/a", ODOMETRY, 120), ("/b", ODOMETRY, 120)]
+        assert (bag.start_ns, bag.end_ns) == (PARENT.stamps_ns[0], PARENT.stamps_ns[-1])
+    assert [pose.stamp_ns for pose in poses if pose.stream == "parent"] == PARENT.stamps_ns.tolist()
+    assert [pose.number for pose in poses if pose.stream == "child"] == list(range(1, 121))
+
+
+def test_bags_of_one_sensor_each_are_read_side_by_side(new_bag):
+    lidar = new_bag("rosbag1", {"/a": STREAMS["/a"]}, "lidar")
+    with PoseBag(lidar, new_bag("mcap", {"/b": STREAMS["/b"]}, "camera")) as bag:
+        assert bag.select_topics() == ("/a", "/b")
+        poses = list(bag.poses("/a", "/b"))
+    assert [pose.bag_ns for pose in poses] == sorted([*PARENT.stamps_ns, *CHILD.stamps_ns])
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_directory_without_metadata_or_with_damaged_one_is_read_by_its_files(
-    tmp_path, new_bag, storage
-):
+@pytest.mark.parametrize("mode", ["STORAGE", "MESSAGE", "FILE", None])
+def test_compressed_bags_and_their_files_alone(tmp_path, new_bag, storage, mode):
+    if (storage, mode) == ("sqlite3", "STORAGE"):
+        pytest.skip("only mcap has chunks to compress")
+    expected = all_poses(new_bag(storage, name="plain"))
+    path = write_compressed(tmp_path / "bag", STREAMS, storage, mode)
+    assert all_poses(path) == expected
+    (path / "metadata.yaml").unlink()
+    assert all_poses(path) == expected
+    (file,) = path.iterdir()
+    assert (file.suffix == ".zstd") == (mode == "FILE")
+    assert all_poses(file) == expected
+
+
+@pytest.mark.parametrize("compression", list(rosbag1.Writer.CompressionFormat))
+def test_compressed_chunks_of_rosbag1(tmp_path, new_bag, compression):
+    writer = rosbag1.Writer(tmp_path / "chunks.bag")
+    writer.set_compression(compression)
+    with writer:
+        write_streams(writer, STREAMS, "rosbag1")
+    assert all_poses(tmp_path / "chunks.bag") == all_poses(new_bag("rosbag1"))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_directory_with_damaged_metadata_or_without_is_read_by_its_files(new_bag, storage):
     path = new_bag(storage)
-    whole = read(path)
-    for text in (
-        "",
-        "nothing: here",
-        "[",
-        "{}",
-        "rosbag2_bagfile_information: {relative_file_paths: 3}",
-    ):
+    whole = all_poses(path)
+    for text in ("", "nothing: here", "[", "{}", "rosbag2_bagfile_information: 3"):
         (path / "metadata.yaml").write_text(text)
         with PoseBag(path) as bag:
-            assert list(bag.poses("/lidar/odom", "/camera/pose")) == whole
+            assert list(bag.poses("/a", "/b")) == whole
             (warning,) = bag.warnings
         assert "metadata.yaml is damaged" in warning
     (path / "metadata.yaml").unlink()
     with PoseBag(path) as bag:
-        assert list(bag.poses("/lidar/odom", "/camera/pose")) == whole
+        assert list(bag.poses("/a", "/b")) == whole
         assert bag.warnings == []
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(
-        InputError,
-        match=r"no bag in .*folder: expected metadata\.yaml or files that end in .*check the path",
-    ):
-        PoseBag(tmp_path / "folder")
+
+
+def changed_metadata(path, change):
+    metadata = yaml.safe_load((path / "metadata.yaml").read_text())
+    change(metadata["rosbag2_bagfile_information"])
+    (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
 
 
 def test_a_file_that_metadata_names_and_that_is_missing_is_named(new_bag):
     path = new_bag()
-    metadata = yaml.safe_load((path / "metadata.yaml").read_text())
-    metadata["rosbag2_bagfile_information"]["relative_file_paths"].append("bag_1.mcap")
-    (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    changed_metadata(path, lambda about: about["relative_file_paths"].append("bag_1.mcap"))
     with PoseBag(path) as bag:
         assert bag.warnings == [
             f"{path}: bag_1.mcap of 2 files in metadata.yaml is missing; its messages are left out"
@@ -333,118 +422,113 @@ def test_a_file_that_metadata_names_and_that_is_missing_is_named(new_bag):
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_qos_that_differs_between_metadata_and_storage_hides_no_message(new_bag, storage):
     path = new_bag(storage)
-    before = read(path)
-    metadata = yaml.safe_load((path / "metadata.yaml").read_text())
-    qos = {
-        "history": "keep_last",
-        "depth": 5,
-        "reliability": "reliable",
-        "durability": "volatile",
-        "liveliness": "automatic",
-        "deadline": {"sec": 0, "nsec": 0},
-        "lifespan": {"sec": 0, "nsec": 0},
-        "liveliness_lease_duration": {"sec": 0, "nsec": 0},
-        "avoid_ros_namespace_conventions": False,
-    }
-    for topic in metadata["rosbag2_bagfile_information"]["topics_with_message_count"]:
-        topic["topic_metadata"]["offered_qos_profiles"] = [qos]
-    (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
-    assert read(path) == before
+    before = all_poses(path)
+    never = {"sec": 0, "nsec": 0}
+    qos = {"history": "keep_last", "depth": 5, "reliability": "reliable", "durability": "volatile"}
+    qos |= {"liveliness": "automatic", "liveliness_lease_duration": never, "deadline": never}
+    qos |= {"lifespan": never, "avoid_ros_namespace_conventions": False}
+
+    def change(about):
+        for topic in about["topics_with_message_count"]:
+            topic["topic_metadata"]["offered_qos_profiles"] = [qos]
+
+    changed_metadata(path, change)
+    assert all_poses(path) == before
 
 
-@pytest.mark.parametrize(
-    ("data", "reason"),
-    [
-        (b"", "unpack_from requires a buffer|expected plain CDR"),
-        (b"\x00\x01\x00\x00" + b"\x01" * 11, "requires a buffer"),
-        (b"\x00\x07\x00\x00" + b"\x00" * 100, "expected plain CDR, found encoding 0x0007"),
-    ],
-)
-def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, data, reason):
-    with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
-        write_streams(writer, {"/camera/pose": (CHILD, POSE_STAMPED)}, "sqlite3")
-        connection = writer.add_connection("/lidar/odom", ODOMETRY, typestore=JAZZY)
-        writer.write(connection, 1, data)
-    with pytest.raises(
-        InputError,
-        match=f"/lidar/odom, message 1: not a readable nav_msgs/msg/Odometry .*{reason}|{reason}",
-    ):
-        read(tmp_path / "bag")
+# ---- poses that cannot be right
 
 
-def test_several_publishers_and_types_on_one_topic(tmp_path):
-    """Two connections of one type are one stream; of two types, the topic is refused."""
-    for name, second_type in (("one.bag", ODOMETRY), ("two.bag", "std_msgs/msg/String")):
-        with rosbag1.Writer(tmp_path / name) as writer:
-            write_streams(
-                writer, {"/odom": (PARENT, ODOMETRY), "/pose": (CHILD, POSE_STAMPED)}, "rosbag1"
-            )
-            connection = writer.add_connection(
-                "/odom", second_type, typestore=NOETIC, callerid="/second"
-            )
-            stamp_ns = int(PARENT.stamps_ns[-1]) + 1
-            message = next(
-                stamped_messages(NOETIC.types, trajectory(stamp_ns, count=1), ODOMETRY, True)
-            )[1]
-            text = NOETIC.types["std_msgs/msg/String"]("hello")
-            message = message if second_type == ODOMETRY else text
-            writer.write(connection, stamp_ns, NOETIC.serialize_ros1(message, second_type))
-    poses = read(tmp_path / "one.bag", "/odom", "/pose")
-    assert sum(pose.stream == "parent" for pose in poses) == len(PARENT) + 1
-    with (
-        PoseBag(tmp_path / "two.bag") as bag,
-        pytest.raises(InputError, match="topic /odom of .* is of type several types"),
-    ):
-        bag.select_topics("/odom", "/pose")
+def moved(matrix):
+    return matrix + np.pad([[0.0, 0.0, 0.0, 40.0]], ((1, 2), (0, 0)))
+
+
+def turned(matrix):
+    return matrix @ se3.exp(np.array([0, 0, 0, 1.5, 0, 0]))
+
+
+@pytest.mark.parametrize(("change", "by", "unit"), [(moved, 40, "m"), (turned, 1.5, "rad")])
+@pytest.mark.parametrize("index", [0, 1, 60, 119])
+def test_a_pose_that_jumps_away_and_back_is_warned_about(new_bag, change, by, unit, index):
+    poses = wandering_poses(120, step_rad=0.02)
+    poses[index] = change(poses[index])
+    path = new_bag(streams=STREAMS | {"/b": (as_trajectory(poses), ODOMETRY)})
+    with PoseBag(path) as bag:
+        list(bag.poses("/a", "/b"))
+        (warning,) = bag.warnings
+        assert bag.warnings == [warning]  # asking twice changes nothing
+    assert f"/b: 1 of 120 poses jump away and back (first message {index + 1}, stamp " in warning
+    found, found_unit = re.search(r"by ([\d.]+) (\w+)", warning).groups()
+    assert (float(found), found_unit) == (pytest.approx(by, rel=0.1), unit)
+
+
+def test_lasting_jumps_and_quick_motion_are_nothing_unusual(new_bag):
+    jumped = CHILD.poses.copy()
+    jumped[50:, 0, 3] += 5.0
+    quick = as_trajectory(wandering_poses(120, step_m=3.0))
+    jumped = Trajectory(CHILD.stamps_ns, jumped)
+    with PoseBag(new_bag(streams={"/a": (quick, POSE_STAMPED), "/b": (jumped, ODOMETRY)})) as bag:
+        list(bag.poses("/a", "/b"))
+        assert bag.warnings == []
+
+
+def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
+    stamps_ns = PARENT.stamps_ns.copy()
+    stamps_ns[30] += 64 * SECOND
+    poses = zip(PARENT.stamps_ns, stamps_ns, PARENT.poses, strict=True)
+    messages = []
+    for bag_ns, stamp_ns, matrix in poses:
+        one = Trajectory(np.array([stamp_ns]), matrix[None])
+        ((_, message),) = stamped_messages(JAZZY.types, one, ODOMETRY, is_ros1=False)
+        messages.append((bag_ns, "/a", ODOMETRY, lambda _, message=message: message))
+    path = write_messages(tmp_path / "bag", messages)
+    expected = (
+        r"/a: 1 of 120 stamps jump away and back against the bag's own time \(first message "
+        r"31, .*by 64 s\); their poses were left out"
+    )
+    with pytest.warns(UserWarning, match=expected):
+        found = hec.read_trajectory(path, topic="/a")
+    rest = np.arange(120) != 30
+    assert_same_motion(found, PARENT.stamps_ns[rest], PARENT.poses[rest])
+
+
+# ---- writing, and bags of others
 
 
 def test_writing_refuses_what_it_cannot_do(tmp_path, new_bag):
     path = new_bag()
-    with pytest.raises(InputError, match="exists already"):
-        write_bag(path, STREAMS)
-    with pytest.raises(InputError, match=r"must be named \.bag"):
-        write_bag(tmp_path / "new", STREAMS, "rosbag1")
-    with pytest.raises(InputError, match=r"must be named \.bag"):
-        write_bag(tmp_path / "new.bag", STREAMS, "mcap")
-    with pytest.raises(
-        ConfigError, match="unknown bag storage 'zip'; known are mcap, sqlite3, rosbag1"
+    new, text = tmp_path / "new", {"/a": (PARENT, "std_msgs/msg/String")}
+    for error, message, arguments in (
+        (InputError, "exists already", (path, STREAMS)),
+        (InputError, r"must be named \.bag", (new, STREAMS, "rosbag1")),
+        (InputError, r"must be named \.bag", (tmp_path / "new.bag", STREAMS, "mcap")),
+        (ConfigError, "unknown bag storage 'zip'; known are mcap, sql", (new, STREAMS, "zip")),
+        (ConfigError, "cannot write messages of type 'std_msgs/msg/String'", (new, text)),
+        (InputError, "cannot write bag", (storage_file(path) / "new", STREAMS)),
     ):
-        write_bag(tmp_path / "new", STREAMS, "zip")
-    with pytest.raises(ConfigError, match="cannot write messages of type 'std_msgs/msg/String'"):
-        write_bag(tmp_path / "new", {"/a": (PARENT, "std_msgs/msg/String")})
-    with pytest.raises(InputError, match="cannot write bag"):
-        write_bag(storage_file(path) / "new", STREAMS)
-    assert not (tmp_path / "new").exists()
-    assert not (tmp_path / "new.bag").exists()
+        with pytest.raises(error, match=message):
+            write_bag(*arguments)
+    assert not {*tmp_path.iterdir()} - {path}
 
 
 def test_bags_of_other_programs_read_or_are_refused_in_one_line():
     """Recordings of rosbag, rosbag2 and others: split, converted, compressed, unsorted, empty, of
     wrong formats.
     """
-    folder = data_folder() / "bags"
-    paths = [
-        path
-        for path in folder.rglob("*")
-        if path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").exists()
-    ]
-    assert paths
+    folder, suffixes = data_folder() / "bags", (".bag", ".mcap", ".db3")
+    paths = [p for p in folder.rglob("*") if p.suffix in suffixes or (p / "metadata.yaml").exists()]
     refused = {}
     for path in paths:
         try:
             with PoseBag(path) as bag:
-                topics = bag.topics()
-                assert len(list(bag._messages([topic.name for topic in topics]))) == sum(
-                    topic.count for topic in topics
-                )
+                counts = {topic.name: topic.count for topic in bag.topics()}
+                assert len(list(bag._messages([*counts]))) == sum(counts.values())
         except InputError as error:
             refused[path.name] = str(error)
     assert refused.keys() == {"empty-file.bag", "wrong_rmw_test", "wrong_rmw_test_0.mcap"}
     assert not [message for message in refused.values() if "\n" in message]
-    with PoseBag(folder / "fuse" / "turtlebot3.bag") as bag:
-        poses = list(bag.poses("/odom", "/none"))
+    poses = all_poses(folder / "fuse" / "turtlebot3.bag", "/odom", "/none")
     assert len(poses) == 2741
     assert {(pose.world_frame, pose.sensor_frame) for pose in poses} == {("odom", "base_footprint")}
-    np.testing.assert_allclose(
-        np.linalg.norm([pose.quat_xyzw for pose in poses], axis=1), 1.0, atol=1e-6
-    )
+    lengths = np.linalg.norm([pose.quat_xyzw for pose in poses], axis=1)
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-6)
