@@ -55,8 +55,9 @@ def write(name: str, results: Results) -> list[Path]:
     proofs = [proof for found in in_parallel(prove_level, tasks, results.jobs) for proof in found]
     groups: dict[tuple[str, str], list[Proof]] = {}
     for proof in proofs:
-        groups.setdefault((proof.dataset, proof.answer), []).append(proof)
-    rows = [_row(group) for group in groups.values()]
+        kind = "KITTI" if proof.dataset in KITTI else "simulated"
+        groups.setdefault((kind, proof.answer), []).append(proof)
+    rows = [_row(kind, group) for (kind, _), group in groups.items()]
     return [
         write_csv(results.out / f"{name}.csv", rows),
         write_text(
@@ -117,10 +118,10 @@ def _false_minima(Q: FloatArray, T_parent_child: FloatArray) -> Iterator[FloatAr
             yield T
 
 
-def _row(proofs: list[Proof]) -> dict[str, object]:
+def _row(kind: str, proofs: list[Proof]) -> dict[str, object]:
     milliseconds = [1e3 * proof.seconds for proof in proofs]
     return {
-        "data set": proofs[0].dataset,
+        "data sets": kind,
         "answer": proofs[0].answer,
         "answers": len(proofs),
         "proved": sum(proof.at_once for proof in proofs),

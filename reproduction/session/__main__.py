@@ -5,6 +5,7 @@ are shifts found? alarms, delays, loops: of the mount monitor.
 """
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -60,7 +61,11 @@ def _stop(arguments: argparse.Namespace) -> str:
         store = Store(arguments.rows / f"stop_{name}.jsonl", {"study": "stop"})
         tasks = {recorded.name: (recorded,) for recorded in recordings}
         found = solve(stop.stops, tasks, arguments.jobs, store).values()
-        tables.append(stop.table([stop.Stop(**each) for plain in found for each in plain]))
+        tables.append(
+            stop.table(
+                [stop.Stop(**each) for plain in found for each in plain], name == "simulated"
+            )
+        )
     return "\n\n".join(["Simulated:", tables[0], "Real, cut off in the same way:", tables[1]])
 
 
@@ -91,21 +96,25 @@ def _watched(found: Sequence[mount.Watched]) -> str:
     def told(values: np.ndarray, most: float) -> str:
         return ", ".join(f"{value:.2g}" if value < most else "-" for value in values)
 
-    rows = (
-        {
-            "recordings": each.name,
-            "hours": f"{each.hours:g}",
-            "alarms": each.alarms,
-            "f": f"{each.long_run:.1f}",
-            "x, y, z (cm)": told(100 * each.visible[:3], 100.0),
-            "roll, pitch, yaw (deg)": told(np.degrees(each.visible[3:]), 17.0),
-        }
-        for each in found
-    )
+    groups: dict[str, list[mount.Watched]] = {}
+    for each in found:
+        groups.setdefault(re.split("[ _]", each.name)[0], []).append(each)
+    rows = []
+    for name, group in groups.items():
+        visible = np.max([each.visible for each in group], axis=0)
+        rows.append(
+            {
+                "recordings": f"{name} ({len(group)})",
+                "hours": f"{sum(each.hours for each in group):g}",
+                "alarms": sum(each.alarms for each in group),
+                "x, y, z (cm)": told(100 * visible[:3], 100.0),
+                "about x, y, z (deg)": told(np.degrees(visible[3:]), 17.0),
+            }
+        )
     hours, alarms = sum(each.hours for each in found), sum(each.alarms for each in found)
     return (
         f"{alarms} alarms in {hours:g} h of motion without a shift. The last columns: which shift "
-        f"ten minutes of motion would show nine times out of ten.\n\n{markdown_table(rows)}"
+        f"ten minutes of any of them would show nine times out of ten.\n\n{markdown_table(rows)}"
     )
 
 

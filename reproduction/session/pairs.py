@@ -18,7 +18,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.compare import Change, Difference, compare
 from reproduction.recordings import Rig
-from reproduction.writing import markdown_table
+from reproduction.writing import counted, markdown_table
 
 # Injected along and about each axis of the parent sensor.
 INJECTED = {"3 cm": 0.03, "0.3 deg": float(np.radians(0.3))}
@@ -91,23 +91,28 @@ def _moved(result: Calibration, axis: int, size: float) -> Calibration:
 
 
 def table(pairs: Sequence[Pair]) -> str:
-    """A row per pair."""
-    return markdown_table(map(_row, pairs))
+    """A row per rig."""
+    rigs: dict[str, list[Pair]] = {}
+    for pair in pairs:
+        rigs.setdefault(pair.rig.split(" ")[0], []).append(pair)
+    return markdown_table(_row(rig, of_rig) for rig, of_rig in rigs.items())
 
 
-def _row(pair: Pair) -> dict[str, object]:
-    visible = pair.difference.visible
-    centimetres, degrees = 100 * visible[:3].max(), np.degrees(visible[3:].max())
-    announced = int(pair.announced.sum())
-    as_said = f"{int((pair.announced & pair.found).sum())} of {announced}"
-    along = f"{centimetres:.1f} cm, " if np.isfinite(centimetres) else ""
+def _row(rig: str, pairs: Sequence[Pair]) -> dict[str, object]:
+    metres, radians = (
+        min(pair.difference.visible[part].max() for pair in pairs)
+        for part in (slice(0, 3), slice(3, 6))
+    )
     return {
-        "rig": pair.rig,
-        "recordings": pair.names,
-        "chi2 of 6": f"{pair.difference.chi2:.1f}",
-        "verdict": pair.difference.verdict.value,
-        "would be seen from": f"{along}{degrees:.2f} deg",
-        "as said found": as_said if announced else "-",
+        "rig": rig,
+        "pairs": len(pairs),
+        "verdicts": counted(pair.difference.verdict.value for pair in pairs),
+        "largest chi2 of 6": f"{max(pair.difference.chi2 for pair in pairs):.1f}",
+        "best pair: would be seen from": (f"{100 * metres:.1f} cm, {np.degrees(radians):.2f} deg"),
+        "shifts as said found": (
+            f"{sum(int((pair.announced & pair.found).sum()) for pair in pairs)} of "
+            f"{sum(int(pair.announced.sum()) for pair in pairs)}"
+        ),
     }
 
 
