@@ -3,18 +3,21 @@ differs.
 """
 
 import csv
+import dataclasses
 import json
 
 import pytest
 from published_data import FALSE_MINIMA_OF_DNL, data_folder
 
-from reproduction import paper_figures
+from reproduction import catalogue, paper_figures
 from reproduction.command import main
 from reproduction.published import METHODS
 from reproduction.tables import PRINTED
 
-# Four methods in every simulated and every KITTI case; Ali as published in the simulated cases.
-ROWS_OF_FOUR_METHODS, ROWS_OF_ONE = 17_376, 4_344
+# Levels of the simulated cases that are solved here: ``make paper`` takes a minute for all.
+LEVELS = (None, 0.0, 0.004, 0.01, 4.0, 10.0, 0.03, 0.05)
+# Of one method: 38 drives at 11 levels and both KITTI drives, with six references.
+ROWS = (38 * 11 + 2) * 6
 
 
 def run(capsys, *arguments):
@@ -71,6 +74,16 @@ def test_variant_tables_hold_every_method_on_both_drives(tmp_path, capsys):
 
 
 @pytest.fixture
+def few_levels(monkeypatch):
+    """Solve some levels only."""
+    some = [
+        dataclasses.replace(each, cells=[cell for cell in each.cells if cell.level in LEVELS])
+        for each in catalogue.GROUPS["all"]
+    ]
+    monkeypatch.setitem(catalogue.GROUPS, "all", some)
+
+
+@pytest.fixture
 def one_error_figure(monkeypatch):
     """Draw the first of the eight figures of errors only: they take as long as all the solves."""
     drawn, draw = [], paper_figures.draw_errors
@@ -86,12 +99,12 @@ def one_error_figure(monkeypatch):
 
 
 @pytest.mark.slow
-def test_everything_from_one_command(tmp_path, capsys, one_error_figure):
+def test_everything_from_one_command(tmp_path, capsys, few_levels, one_error_figure):
     document = run(capsys, "all", "--out", str(tmp_path))
     agreement = {item["method"]: item for item in document["agreement"]}
     four = [agreement[method] for method in ("park", "taylor", "zhuang", "dnl")]
-    assert sum(item["rows"] for item in four) == ROWS_OF_FOUR_METHODS
-    assert sum(item["agreeing"] for item in four) >= 0.995 * ROWS_OF_FOUR_METHODS
+    assert sum(item["rows"] for item in four) == 4 * ROWS
+    assert sum(item["agreeing"] for item in four) >= 0.995 * 4 * ROWS
     # What differs must be explained, and our objectives must not be above the published answers'.
     reasons = {why for item in four for why in item["differing"]}
     assert not reasons & {"unexplained", "our objective is higher"}
@@ -107,9 +120,9 @@ def test_everything_from_one_command(tmp_path, capsys, one_error_figure):
     assert all("does not settle" in line["why"] for line in differing.get("zhuang", ()))
     assert agreement["ali"]["agreeing"] >= 12
     objective = agreement["dnlo"]["objective"]
-    assert sum(objective.values()) == ROWS_OF_ONE
+    assert sum(objective.values()) == ROWS
     assert objective["higher"] == 0
-    assert objective["lower"] > 500
+    assert objective["lower"] > 250
     for figure, exact in (
         ("figS1", 1.0),
         ("figS2", 0.95),
@@ -119,7 +132,7 @@ def test_everything_from_one_command(tmp_path, capsys, one_error_figure):
         ("fig3", 0.5),
     ):
         points = [line["agrees"] == "True" for line in read(tmp_path / f"{figure}_comparison.csv")]
-        assert len(points) == 19 * 6 * 4
+        assert len(points) == 11 * 6 * 4
         assert sum(points) >= exact * len(points), figure
     assert [path.suffix for path in one_error_figure] == [".png", ".svg"]
     verdicts = [line["verdict"] for line in read(tmp_path / "conclusions.csv")]
