@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.simulation.noise import add_noise
@@ -14,6 +14,9 @@ from hand_eye_calib.simulation.options import PUBLISHED_DRIVE, DriveConfig, Nois
 
 # Start of the published drives, heading along x; in units of the surface's arguments.
 _START = np.array([0.0, 0.5])
+
+# Time from their start to the first pose (s), and time for which their first yaw rate is held.
+_LEAD_S, _FIRST_HOLD_S = 0.1, 0.4
 
 
 @dataclass(frozen=True)
@@ -59,33 +62,22 @@ def simulate_drive(
     parent_times_s = np.arange(config.poses) / config.parent_rate
     child_times_s = config.child_delay + np.arange(n_child) / config.child_rate
     Ts_pw_p, Ts_pw_p_at_child = _vehicle_poses(
-        config, motion_rng, config.lead_time + parent_times_s, config.lead_time + child_times_s
+        config, motion_rng, _LEAD_S + parent_times_s, _LEAD_S + child_times_s
     )
     T_parent_child = _random_extrinsic(extrinsic_rng, config.max_offset)
     T_pw_cw = _random_world(extrinsic_rng)
     Ts_pw_p, Ts_cw_c = add_noise(
         Ts_pw_p, se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child, noise, noise_rng
     )
-    return SimulatedDrive(
-        Trajectory(
-            _stamps_ns(config, parent_times_s),
-            Ts_pw_p,
-            config.parent_frame,
-            f"{config.parent_frame}_odom",
-        ),
-        Trajectory(
-            _stamps_ns(config, child_times_s),
-            Ts_cw_c,
-            config.child_frame,
-            f"{config.child_frame}_odom",
-        ),
-        T_parent_child,
-        T_pw_cw,
+    start_ns = round(config.start_time * 1e9)
+    parent, child = (
+        Trajectory(start_ns + np.round(times_s * 1e9).astype(np.int64), Ts, frame, f"{frame}_odom")
+        for times_s, Ts, frame in (
+            (parent_times_s, Ts_pw_p, config.parent_frame),
+            (child_times_s, Ts_cw_c, config.child_frame),
+        )
     )
-
-
-def _stamps_ns(config: DriveConfig, times_s: FloatArray) -> IntArray:
-    return round(config.start_time * 1e9) + np.round(times_s * 1e9).astype(np.int64)
+    return SimulatedDrive(parent, child, T_parent_child, T_pw_cw)
 
 
 def _random_extrinsic(rng: np.random.Generator, max_offset: float) -> FloatArray:
@@ -111,7 +103,7 @@ def _vehicle_poses(
     """
     duration = max(times[-1] for times in times_s)
     holds = np.full(int(duration // config.hold_time) + 2, config.hold_time)
-    holds[0] = config.first_hold_time
+    holds[0] = _FIRST_HOLD_S
     yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds))
     return [
         _poses_on_terrain(config, *_ground_track(config, yaw_rates, holds, times))
@@ -125,21 +117,14 @@ def _ground_track(
     """Positions (N, 2) and headings (N,) along circular arcs, exact at any time; each yaw rate
     lasts for its hold time.
     """
-    starts = _sums_before(holds)
-    headings = _sums_before(yaw_rates * holds)
-    corners = _START * config.terrain_scale + _sums_before(
-        _arc(config.speed, headings, yaw_rates, holds)
-    )
+    starts = np.cumsum(holds) - holds
+    headings = np.cumsum(yaw_rates * holds) - yaw_rates * holds
+    arcs = _arc(config.speed, headings, yaw_rates, holds)
+    corners = _START * config.terrain_scale + (np.cumsum(arcs, axis=0) - arcs)
     k = np.searchsorted(starts, times_s, side="right") - 1
     elapsed = times_s - starts[k]
     positions = corners[k] + _arc(config.speed, headings[k], yaw_rates[k], elapsed)
     return positions, headings[k] + yaw_rates[k] * elapsed
-
-
-def _sums_before(values: FloatArray) -> FloatArray:
-    """Sums of all values before each."""
-    sums: FloatArray = np.cumsum(values, axis=0) - values
-    return sums
 
 
 def _arc(

@@ -1,8 +1,15 @@
 """Options of simulated drives and their noise (Välimäki et al. 2023, section 4.1)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from hand_eye_calib.config import OptionSet, option
+
+
+def _number(
+    default: float, doc: str, unit: str = "", least: float = 0.0, most: float = 10_000.0
+) -> Any:
+    return option(default, doc, unit=unit, minimum=least, maximum=most)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -12,58 +19,25 @@ class DriveConfig(OptionSet):
     """
 
     poses: int = option(100, "Number of poses of the parent sensor.", minimum=2, maximum=10_000_000)
-    parent_rate: float = option(
-        10.0, "Poses of the parent sensor per second.", unit="Hz", minimum=0.01, maximum=10_000.0
+    parent_rate: float = _number(10.0, "Poses of the parent sensor per second.", "Hz", 0.01)
+    child_rate: float = _number(10.0, "Poses of the child sensor per second.", "Hz", 0.01)
+    child_delay: float = _number(
+        0.0, "Time from the first pose of the parent to the first of the child.", "s", most=60.0
     )
-    child_rate: float = option(
-        10.0, "Poses of the child sensor per second.", unit="Hz", minimum=0.01, maximum=10_000.0
+    start_time: float = _number(0.0, "Stamp of the first pose of the parent.", "s", most=4e9)
+    speed: float = _number(0.5, "Horizontal speed.", "m/s", most=100.0)
+    max_yaw_rate: float = _number(
+        2.0, "Yaw rates are drawn between plus and minus this.", "rad/s", most=100.0
     )
-    child_delay: float = option(
-        0.0,
-        "Time from the first pose of the parent to the first of the child.",
-        unit="s",
-        minimum=0.0,
-        maximum=60.0,
+    hold_time: float = _number(0.5, "Time for which a yaw rate is held.", "s", 1e-3)
+    terrain_height: float = _number(
+        0.1, "Height of the terrain per unit of peaks.", "m", most=100.0
     )
-    start_time: float = option(
-        0.0, "Stamp of the first pose of the parent.", unit="s", minimum=0.0, maximum=4e9
+    terrain_scale: float = _number(
+        1.0, "Horizontal size of the terrain per unit of peaks' arguments.", "m", 0.01
     )
-    speed: float = option(0.5, "Horizontal speed.", unit="m/s", minimum=0.0, maximum=100.0)
-    max_yaw_rate: float = option(
-        2.0,
-        "Yaw rates are drawn between plus and minus this.",
-        unit="rad/s",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    hold_time: float = option(
-        0.5, "Time for which a yaw rate is held.", unit="s", minimum=1e-3, maximum=1e4
-    )
-    first_hold_time: float = option(
-        0.4, "Time for which the first yaw rate is held.", unit="s", minimum=1e-3, maximum=1e4
-    )
-    lead_time: float = option(
-        0.1,
-        "Time from the start of the drive to the first pose of the parent.",
-        unit="s",
-        minimum=0.0,
-        maximum=1e4,
-    )
-    terrain_height: float = option(
-        0.1, "Height of the terrain per unit of peaks.", unit="m", minimum=0.0, maximum=100.0
-    )
-    terrain_scale: float = option(
-        1.0,
-        "Horizontal size of the terrain per unit of peaks' arguments.",
-        unit="m",
-        minimum=0.01,
-        maximum=1e4,
-    )
-    terrain_limit: float = option(
-        5.0,
-        "Beyond this argument of peaks the terrain continues mirrored.",
-        minimum=1.0,
-        maximum=1e6,
+    terrain_limit: float = _number(
+        5.0, "Beyond this argument of peaks the terrain continues mirrored.", "", 1.0, 1e6
     )
     attitude: str = option(
         "vehicle",
@@ -72,12 +46,8 @@ class DriveConfig(OptionSet):
         "heading).",
         choices=("published", "vehicle"),
     )
-    max_offset: float = option(
-        0.5,
-        "Largest offset of the child sensor along each axis of the parent.",
-        unit="m",
-        minimum=0.0,
-        maximum=100.0,
+    max_offset: float = _number(
+        0.5, "Largest offset of the child sensor along each axis of the parent.", "m", most=100.0
     )
     parent_frame: str = option("parent", "Frame of the parent sensor.")
     child_frame: str = option("child", "Frame of the child sensor.")
@@ -107,32 +77,28 @@ HILLY_DRIVE = DriveConfig(
 class NoiseConfig(OptionSet):
     """Level of each kind of noise; the default is none."""
 
-    gaussian: float = option(
+    gaussian: float = _number(
         0.0,
         "Standard deviation of each pose's translation error per axis (published: 0 to 0.010).",
-        unit="m",
-        minimum=0.0,
-        maximum=10.0,
+        "m",
+        most=10.0,
     )
-    rotation_per_metre: float = option(
+    rotation_per_metre: float = _number(
         2.0,
         "Standard deviation of each pose's Euler angles over that of its translation.",
-        unit="rad/m",
-        minimum=0.0,
-        maximum=100.0,
+        "rad/m",
+        most=100.0,
     )
-    outliers: float = option(
+    outliers: float = _number(
         0.0,
         "Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).",
-        minimum=0.0,
-        maximum=1.0,
+        most=1.0,
     )
-    drift: float = option(
+    drift: float = _number(
         0.0,
         "Drift of the child sensor along one of its axes (published: 0 to 0.05).",
-        unit="m/m",
-        minimum=0.0,
-        maximum=10.0,
+        "m/m",
+        most=10.0,
     )
 
 
