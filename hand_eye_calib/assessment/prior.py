@@ -14,6 +14,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import (
+    AXES,
     ROTATIONS,
     TRANSLATIONS,
     UNKNOWN_ROTATION,
@@ -120,21 +121,20 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
         normal = np.eye(6) + jacobian.T @ jacobian
         deviations = inverse_root @ _difference(T_parent_child, T) - targets
         step = -root @ np.linalg.solve(normal, deviations + jacobian.T @ residuals)
-        T = se3.from_rotation_translation(
-            T[:3, :3] @ se3.rotation_exp(step[3:]), T[:3, 3] + T[:3, :3] @ step[:3]
-        )
+        T = _moved(T, step)
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     if not prior:
         return Fused(T, assessment, contradictions)
     posterior = root @ np.linalg.inv(normal) @ root.T
-    verdicts = _verdicts(
-        assessment.observability,
-        _sigmas_in_parent(T[:3, :3], posterior),
-        _sigmas_in_parent(T_parent_child[:3, :3], covariance),
-        prior,
-    )
-    return Fused(T, Assessment(posterior, verdicts), contradictions)
+    sigmas = _sigmas_in_parent(T[:3, :3], posterior).tolist()
+    before = _sigmas_in_parent(T_parent_child[:3, :3], covariance)
+    verdicts = [judged(axis, sigma) for axis, sigma in zip(AXES, sigmas, strict=True)]
+    for k, (axis, sigma) in enumerate(zip(AXES, sigmas, strict=True)):
+        is_known = verdicts[k].verdict is not DofVerdict.UNOBSERVABLE
+        if is_known and axis in prior and sigma**2 < _MOSTLY_PRIOR * before[k] ** 2:
+            verdicts[k] = DofObservability(axis, DofVerdict.PRIOR, sigma)
+    return Fused(T, Assessment(posterior, tuple(verdicts)), contradictions)
 
 
 def widened(assessment: Assessment, rotation: FloatArray, spread: FloatArray) -> Assessment:
@@ -209,16 +209,21 @@ def _difference(T_from: FloatArray, T_to: FloatArray) -> FloatArray:
     ]
 
 
+def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
+    """A transform with a small deviation (rho, phi)."""
+    rotation = T[:3, :3]
+    return se3.from_rotation_translation(
+        rotation @ se3.rotation_exp(step[3:]), T[:3, 3] + rotation @ step[:3]
+    )
+
+
 def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
     """Weighted residuals (P,) of the prior and their derivatives (P, 6) by (rho, phi)."""
     residuals, jacobian = _weighted(T, prior), np.zeros((len(prior), 6))
     for column, step in enumerate(_DIFFERENCE * np.eye(6)):
         for sign in (-1, 1):
-            moved = se3.from_rotation_translation(
-                T[:3, :3] @ se3.rotation_exp(sign * step[3:]),
-                T[:3, 3] + sign * T[:3, :3] @ step[:3],
-            )
-            jacobian[:, column] += sign * _weighted(moved, prior) / (2 * _DIFFERENCE)
+            weighted = _weighted(_moved(T, sign * step), prior)
+            jacobian[:, column] += sign * weighted / (2 * _DIFFERENCE)
     return residuals, jacobian
 
 
@@ -265,25 +270,6 @@ def _contradictions(
             else axis in TRANSLATIONS and abs(value) > _MAX_LEVER_ARM
         )
     }
-
-
-def _verdicts(
-    before: tuple[DofObservability, ...],
-    sigmas: FloatArray,
-    sigmas_before: FloatArray,
-    prior: Prior,
-) -> tuple[DofObservability, ...]:
-    """Verdicts for the axes of the parent sensor's frame, with the prior, from those without."""
-    verdicts = []
-    for dof, sigma, sigma_before in zip(
-        before, sigmas.tolist(), sigmas_before.tolist(), strict=True
-    ):
-        found = judged(dof.name, sigma)
-        is_known = found.verdict is not DofVerdict.UNOBSERVABLE
-        if is_known and dof.name in prior and sigma**2 < _MOSTLY_PRIOR * sigma_before**2:
-            found = DofObservability(dof.name, DofVerdict.PRIOR, sigma)
-        verdicts.append(found)
-    return tuple(verdicts)
 
 
 def _sigmas_in_parent(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
