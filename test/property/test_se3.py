@@ -55,13 +55,6 @@ def test_inverse_and_quaternions_go_round(xi):
     np.testing.assert_allclose(se3.from_quat_xyzw(T[:3, 3], se3.to_quat_xyzw(T)), T, atol=1e-9)
 
 
-@given(tangents())
-def test_rotation_angle_is_the_length_of_the_rotation_vector(xi):
-    np.testing.assert_allclose(
-        se3.rotation_angle(se3.exp(xi)[:3, :3]), np.linalg.norm(xi[3:]), rtol=1e-7, atol=1e-15
-    )
-
-
 @given(tangents(), tangents(), st.floats(0, 1))
 def test_interpolation_runs_at_constant_twist(start_xi, step_xi, fraction):
     start = se3.exp(start_xi)
@@ -131,22 +124,6 @@ def test_roll_pitch_yaw_agree_with_scipy_up_to_gimbal_lock(roll, pitch, yaw):
 def test_a_quaternion_of_length_zero_is_refused():
     with pytest.raises(ValueError, match="length zero"):
         se3.from_quat_xyzw(np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, 0]])
-
-
-def test_conversions_of_a_stack_are_those_of_each_and_empty_stacks_stay_empty():
-    vectors = np.random.default_rng(1).normal(size=(4, 5, 3)) * 2
-    rotations = se3.rotation_exp(vectors)
-    transforms = se3.from_rotation_translation(rotations, np.zeros(3))
-    for convert, stack in (
-        (se3.rotation_exp, vectors),
-        (se3.to_quat_xyzw, transforms),
-        (se3.rotation_to_rpy, rotations),
-        (se3.rotation_from_rpy, vectors),
-    ):
-        np.testing.assert_allclose(
-            convert(stack), [[convert(one) for one in row] for row in stack], rtol=0, atol=1e-15
-        )
-        assert len(convert(stack[:0])) == 0
 
 
 @given(DIRECTIONS, st.one_of(ANGLES, st.just(np.pi)))

@@ -98,20 +98,6 @@ def test_worlds_do_not_matter(method, seed, truth, parent_world, child_world):
     np.testing.assert_allclose(moved, answer(method, Ts_pw_p, Ts_cw_c), atol=1e-6)
 
 
-@pytest.mark.parametrize("method", PAPER_METHODS)
-@few_examples
-@given(seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=transforms)
-def test_answer_follows_the_sensor_frames_without_noise(
-    method, seed, truth, T_parent_new, T_child_new
-):
-    expected = se3.inverse(T_parent_new) @ truth @ T_child_new
-    assume(method != "zhuang" or rotation_angle(expected) < ZHUANG_IS_SURE_TO)
-    Ts_pw_p, Ts_cw_c = trajectories(seed, truth)
-    np.testing.assert_allclose(
-        answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6
-    )
-
-
 @few_examples
 @given(
     seed=seeds,

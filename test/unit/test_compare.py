@@ -61,27 +61,6 @@ def test_an_unknown_axis_is_neither_the_same_nor_moved():
     assert found.sentence.startswith("cannot tell about z; x, y, roll, pitch and yaw the same: ")
 
 
-def test_axes_that_only_together_have_moved_are_told_without_those_that_are_unknown():
-    to_child = np.kron(np.eye(2), X[:3, :3].T)
-    together = np.array([1.0, 0.0, 1.0, 0, 0, 0]) / np.sqrt(2)
-    loose = np.diag(np.r_[9.0, 1e-6, 9.0, np.full(3, 1e-8)])
-    tight = np.linalg.inv(np.linalg.inv(loose) + 1e6 * np.outer(together, together))
-    off = shift("x", 0.2) + shift("z", 0.2)
-    moved = dataclasses.replace(result(off), covariance=to_child @ tight @ to_child.T)
-    found = compare([moved], Extrinsic(X, "drawing")).differences[0]
-    assert found.verdict is Change.MOVED
-    assert found.sigmas[[0, 2]].tolist() == [np.inf, np.inf]
-    assert found.sentence == "moved: by what the axes show together, none of them alone"
-    some = compare([dataclasses.replace(moved, T_parent_child=nudged(moved))], Extrinsic(X, "d"))
-    assert some.differences[0].sentence.startswith("moved: y by 3 cm +/- 2 cm")
-
-
-def nudged(moved):
-    T = moved.T_parent_child.copy()
-    T[1, 3] += 0.03
-    return T
-
-
 def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recording():
     floor = np.diag(np.r_[np.zeros(3), np.full(3, np.radians(0.2) ** 2)])
     first, second = result(floor=floor), result(shift("yaw", np.radians(0.6)), floor=floor)

@@ -91,16 +91,6 @@ class TestFloor:
             result.covariance_with_floor, result.covariance + result.floor
         )
 
-    def test_files_keep_it_and_older_ones_have_none(self):
-        result = hec.calibrate(*streams())
-        document = result.to_dict()
-        np.testing.assert_array_equal(hec.Calibration.from_dict(document).floor, result.floor)
-        del document["floor"]
-        older = hec.Calibration.from_dict(document)
-        assert older.floor is None
-        np.testing.assert_array_equal(older.sigmas_with_floor, older.sigmas)
-        np.testing.assert_array_equal(older.covariance_with_floor, older.covariance)
-
 
 class TestHalves:
     """Two halves of equal information, sigma of each 1, so that of the whole is sqrt(1/2)."""
