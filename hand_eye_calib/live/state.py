@@ -1,0 +1,224 @@
+"""The state of the node as one document: published as JSON, and the source of ``/diagnostics`` and
+of what ``watch`` shows.
+
+All values are in SI units. Mappings by axis have x, y, z, roll, pitch and yaw; None stands for what
+is not known.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+AxisValues = dict[str, float | None]
+
+
+class Level(IntEnum):
+    """As of diagnostic_msgs/DiagnosticStatus: WARN if a person should act, ERROR if something is
+    broken.
+    """
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+class Broadcast(Enum):
+    """What is done about ``/tf_static``."""
+
+    OFF = "off"
+    WAITING = "not yet"
+    ON = "broadcast"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One part of the node: what it says, and whether a person should act."""
+
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultState:
+    """The session's result.
+
+    Attributes
+    ----------
+    pose, pose_sigma : mapping by axis
+        x, y, z (m), roll, pitch, yaw (rad) as they are printed, and their standard deviations;
+        None if an axis is not determined.
+    age_s, newest_pose_age_s : float or None
+        None while the node's clock does not run.
+    """
+
+    parent_frame: str
+    child_frame: str
+    verdict: str
+    status: str
+    reasons: list[str]
+    warnings: list[str]
+    pose: AxisValues
+    pose_sigma: AxisValues
+    axis_verdict: dict[str, str]
+    method: str
+    n_poses: int
+    n_pairs: int
+    inlier_share: float
+    time_offset_s: float
+    time_offset_sigma_s: float
+    scale: float
+    scale_sigma: float
+    age_s: float
+    newest_pose_age_s: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExtrinsicState(Part):
+    """The solver, what has been seen of the motion, and the result if there is one."""
+
+    accepts_poses: bool
+    is_solving: bool
+    solves: int
+    last_solve_s: float
+    last_failure: str
+    n_poses: int
+    path_m: float
+    rotation_deg: dict[str, float]
+    tf_static: Broadcast
+    tf_static_reason: str
+    result: ResultState | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonState:
+    """The result against what is installed: same, moved, cannot tell or not yet."""
+
+    verdict: str
+    sentence: str
+    installed_from: str = ""
+    installed: AxisValues = field(default_factory=dict)
+    difference: AxisValues = field(default_factory=dict)
+    difference_sigma: AxisValues = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressState(Part):
+    """How far the session is from its goal; the text says what to do now.
+
+    Standard deviations are along (m) and about (rad) the axes of the parent sensor's frame.
+    """
+
+    has_result: bool
+    is_done: bool
+    is_faulty: bool
+    limiting_axis: str
+    sigma: AxisValues
+    target: AxisValues
+    seconds_left: AxisValues
+    comparison: ComparisonState | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputState(Part):
+    """What an input has delivered.
+
+    Attributes
+    ----------
+    lost : int or None
+        Messages that were published and never arrived; None if the middleware does not tell.
+    delay_s, delay_99_s : float or None
+        Median and 99th percentile of the node's clock minus the stamps.
+    clock_offset_s : float or None
+        What the other input's delay is more than this one's.
+    """
+
+    topic: str
+    rate_hz: float
+    messages: int
+    poses_taken: int
+    refused: dict[str, int]
+    dropped_unpaired: int
+    ignored_while_disabled: int
+    lost: int | None
+    lost_share: float | None
+    late: int
+    longest_wait_s: float
+    longest_gap_s: float
+    gaps_above_max_gap: int
+    silent_s: float | None
+    delay_s: float | None
+    delay_99_s: float | None
+    clock_offset_s: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChecksState(Part):
+    """Findings of the stream checks; ``age_s`` is None before the first one."""
+
+    age_s: float | None
+    correlation: float | None
+    findings: list[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JournalState(Part):
+    """Whether a crash would lose the session."""
+
+    directory: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountState(Part):
+    """A mount that is watched.
+
+    Attributes
+    ----------
+    shift, shift_sigma : mapping by axis
+        The alarm's, if there is one.
+    visible_1min, visible_10min : mapping by axis
+        Shift that so much motion would show; None if none would.
+    since_ns : int or None
+        Stamp from which on it has been moved.
+    """
+
+    is_learning: bool
+    seconds_of_motion: int
+    alarms: int
+    long_run: float
+    shift: AxisValues
+    shift_sigma: AxisValues
+    visible_1min: AxisValues
+    visible_10min: AxisValues
+    since_ns: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeState:
+    """Everything that the node says of itself; a node that watches the mount has no result,
+    progress, checks and journal, and only it has a mount.
+
+    Attributes
+    ----------
+    node : str
+        Fully qualified name.
+    inputs : dict of str to InputState
+        By name: parent, child, child2 and so on.
+    """
+
+    node: str
+    extrinsic: ExtrinsicState | None = None
+    progress: ProgressState | None = None
+    mount: MountState | None = None
+    inputs: dict[str, InputState] = field(default_factory=dict)
+    checks: ChecksState | None = None
+    journal: JournalState | None = None
+
+    def parts(self) -> Iterator[tuple[str, Part]]:
+        """The parts that there are, by the names that ``/diagnostics`` has for them."""
+        before = {"extrinsic": self.extrinsic, "progress": self.progress, "mount": self.mount}
+        after = {"stream checks": self.checks, "journal": self.journal}
+        inputs = {f"{name} input": each for name, each in self.inputs.items()}
+        for name, part in (before | inputs | after).items():
+            if part is not None:
+                yield name, part
