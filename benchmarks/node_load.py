@@ -96,7 +96,7 @@ def drive(first, n_poses, rate_hz, seed=0):
 SLOW = "HAND_EYE_CALIB_SLOW"
 SLOW_SOLVER = """
 import time
-from hand_eye_calib.ros import solving
+from hand_eye_calib.live import solving
 excitation = solving.excitation
 def slow(pose_pairs):
     end = time.process_time() + 2.0
@@ -113,14 +113,14 @@ def measured_node(report, arguments):
     """The node as it is, with a stopwatch at its pose callback; writes what it saw when it is told
     to end.
     """
-    from hand_eye_calib.ros import solve_cycle
+    from hand_eye_calib.live import cycle
+    from hand_eye_calib.live.processes import SolvingProcess
     from hand_eye_calib.ros.calibrator_node import CalibratorNode
     from hand_eye_calib.ros.inputs import TopicInput
     from hand_eye_calib.ros.node import main
-    from hand_eye_calib.ros.solving_process import SolvingProcess
 
     if SLOW in os.environ:
-        solve_cycle.SolvingProcess = functools.partial(SolvingProcess, command=SLOW_SOLVER)
+        cycle.SolvingProcess = functools.partial(SolvingProcess, command=SLOW_SOLVER)
 
     latencies, durations, used = [], [], []
     receive, sent_at = TopicInput.receive, place_of_sending_time()
@@ -143,7 +143,7 @@ def measured_node(report, arguments):
         result = self._cycle.result
         document = {
             "received": len(latencies),
-            "lost_as_reported": sum(each.monitor.delivery.lost for each in self._inputs),
+            "lost_as_reported": sum(each.delivery.lost for each in self._inputs),
             "cpu": (end_cpu_s - start_cpu_s) / (end_s - start_s),
             "latency": np.percentile(latencies, [50, 99, 99.9, 100]).tolist(),
             "duration": np.percentile(durations, [50, 99, 99.9, 100]).tolist(),

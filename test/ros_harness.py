@@ -107,7 +107,7 @@ def matrix(transform):
 # Importing is most of what a start takes: nodes are forked from a process that has done so.
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
-    ["pytest", "hand_eye_calib.cli.main", "hand_eye_calib.ros.running", "ros_harness"]
+    ["pytest", "hand_eye_calib.cli.main", "hand_eye_calib.ros.calibrator_node", "ros_harness"]
 )
 
 

@@ -17,9 +17,9 @@ from hand_eye_calib.assessment.covariance import (
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.results.calibration import Calibration, DofObservability, DofVerdict
+from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.stats import median, quantile
-from hand_eye_calib.text import amount, angle, length, listing
+from hand_eye_calib.text import amount, angle, axes_in_words, length, listing
 
 # Most poses that are looked at, evenly over the session: enough to see curves, and few enough to
 # cost a few milliseconds.
@@ -39,8 +39,6 @@ _STEP_NS = 1_000_000_000
 # directions. Directions of the shorter steps, below this share of the median, are noise. (Road
 # vehicles: 0.95 to 1; handheld devices, drones and robot arms: 0.4 to 0.85.)
 _ALONG_ONE_AXIS, _LONG_STEP = 0.9, 0.3
-
-_ROTATION_ABOUT = dict(zip(TRANSLATIONS, ROTATIONS, strict=True))
 
 
 @dataclass(frozen=True)
@@ -158,7 +156,7 @@ def seconds_of_motion(pose_pairs: PosePairs) -> float:
 
 
 def what_is_missing(seen: Excitation, calibration: Calibration | None = None) -> str:
-    """What the motion so far does not show, and what to do about it, in one sentence.
+    """What the motion so far does not show, and the motion that would, in one sentence.
 
     Parameters
     ----------
@@ -176,65 +174,54 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     if calibration:
         reach = set(calibration.out_of_reach)
         hidden = tuple(axis for axis in calibration.unobservable() if axis not in reach)
-    if not hidden:
-        return _weak(calibration, seen) if calibration else ""
-    angles = dict(zip("xyz", seen.rotation.tolist(), strict=True))
-    most = max(angles.values())
-    if most < MIN_ROTATION:
-        turn = "drive curves in both directions" if seen.drives else "rotate about all axes"
+    if hidden:
         return (
-            f"hardly any rotation so far (at most {_degrees(most)}): {listing(hidden)} not "
-            f"observable, {turn}"
+            f"{axes_in_words(hidden)} cannot be determined from the motion so far: "
+            f"{helpful_motion(hidden, seen)}"
         )
-    fine = [axis for axis, angle in angles.items() if angle >= MIN_ROTATION]
-    small = [axis for axis in angles if axis not in fine]
-    text = (
-        f"rotation about {listing(fine)} is fine ({listing([_degrees(angles[a]) for a in fine])})"
-    )
-    if small:
-        below = _degrees(max(angles[axis] for axis in small), round_up=True)
-        text += f"; {listing([_ROTATION_ABOUT[axis] for axis in small])} under {below}"
-    vertical = TRANSLATIONS[int(np.argmax(seen.rotation))] if seen.drives else ""
-    names = listing([_described(name, vertical) for name in hidden])
-    return f"{text}: {names} not observable, {_advice(hidden, small, seen.drives)}"
-
-
-def _described(name: str, vertical: str) -> str:
-    if name == vertical:
-        return f"vertical offset ({name})"
-    return f"offset {name}" if name in TRANSLATIONS else name
-
-
-_ROTATE_ABOUT_OTHERS = "rotate by 20 deg and more about the other two axes"
-
-
-def _advice(hidden: Sequence[str], small: Sequence[str], drives: bool) -> str:
-    if not any(name in TRANSLATIONS for name in hidden):
-        return "rotate about other axes as well"
-    if len(small) >= 2:
-        them = "it" if len(hidden) == 1 else "them"
-        tilt = "drive over a ramp or a kerb" if drives else _ROTATE_ABOUT_OTHERS
-        return f"{tilt}, or measure {them} by hand"
-    return "rotate further about the other axes"
-
-
-def _weak(calibration: Calibration, seen: Excitation) -> str:
-    weak = [dof for dof in calibration.observability if dof.verdict is DofVerdict.WEAK]
+    known = calibration.observability if calibration else ()
+    weak = [dof for dof in known if dof.verdict is DofVerdict.WEAK]
     if not weak:
         return ""
+    told = [f"{axes_in_words([dof.name])} (+/- {amount(dof.name, dof.sigma)})" for dof in weak]
     limits = f"{length(WEAK_TRANSLATION)} or {angle(WEAK_ROTATION)}"
     return (
-        f"{listing([_with_sigma(dof) for dof in weak])} still more uncertain than {limits}: "
-        f"continue, with {'more curves' if seen.drives else 'larger rotations about all axes'}"
+        f"{listing(told)} still more uncertain than {limits}: continue; "
+        f"{helpful_motion([dof.name for dof in weak], seen)}"
     )
 
 
-def _with_sigma(dof: DofObservability) -> str:
-    return f"{dof.name} (+/- {amount(dof.name, dof.sigma)})"
+def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
+    """The motion that would show most about these axes, in words.
+
+    A rotation about one axis shows offsets and angles across it, never those along it.
+
+    Parameters
+    ----------
+    axes : sequence of str
+        Of x, y, z, roll, pitch and yaw, about the axes of the parent sensor.
+    seen : Excitation
+        The motion so far.
+    """
+    return listing([*dict.fromkeys(_motion_for(axis, seen) for axis in axes)])
 
 
-def _degrees(angle: float, round_up: bool = False) -> str:
-    degrees = float(np.degrees(angle))
-    if round_up:
-        return f"{max(np.ceil(degrees), 1.0):.0f} deg"
-    return f"{degrees:.0f} deg" if degrees >= 10 else f"{degrees:.1f} deg"
+def _motion_for(axis: str, seen: Excitation) -> str:
+    rotation = seen.rotation
+    if rotation.max() < MIN_ROTATION:
+        return (
+            "move in curves, to both sides" if seen.drives else "rotate the sensors, about all axes"
+        )
+    main = int(np.argmax(rotation))
+    along = (TRANSLATIONS if axis in TRANSLATIONS else ROTATIONS).index(axis)
+    is_planar = int((rotation < MIN_ROTATION).sum()) == 2 and (seen.drives or along == main)
+    if not is_planar:
+        least = min((each for each in range(3) if each != along), key=lambda each: rotation[each])
+        return f"rotations about {'xyz'[least]} help most"
+    if along != main:
+        return "tighter curves to both sides help most"
+    if axis in ROTATIONS:
+        return "move farther, straight on and in curves"
+    others = " and ".join(name for index, name in enumerate("xyz") if index != main)
+    tilt = "over a ramp or a kerb" if seen.drives else f"about {others}"
+    return f"tilt the sensors {tilt}, or measure it by hand"

@@ -403,7 +403,7 @@ def read_journal_of(directory: Path, options: Mapping[str, Any]) -> Recording:
         If the journal cannot be used.
     """
     from hand_eye_calib.io.journal import read_journal
-    from hand_eye_calib.ros.session_journal import give
+    from hand_eye_calib.live.journal import give
 
     with waiting_for(f"reading {directory}"):
         journal = read_journal(directory)
@@ -413,7 +413,7 @@ def read_journal_of(directory: Path, options: Mapping[str, Any]) -> Recording:
         given = [name for name in names if name in session.get("given", ())]
         given += CalibratorConfig.from_options(options).given
         calibrator = Calibrator(dataclasses.replace(config, given=given))
-        give(journal, directory, calibrator)
+        give(journal, directory, {"child": calibrator})
     sources = {stream: journal.about.get(stream, {}).get("topic") or stream for stream in STREAMS}
     inputs = {"journal": str(directory), **calibrator.inputs(sources)}
     return Recording(calibrator.snapshot(), inputs, sorted(directory.glob("*.tum")))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.engine.evidence import Evidence
     from hand_eye_calib.engine.snapshot import Snapshot
     from hand_eye_calib.geometry.trajectory import Trajectory
-    from hand_eye_calib.ros.report_process import SessionResult
+    from hand_eye_calib.live.processes import SessionResult
 
 REPORT, CHECK = "report.html", "check.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
@@ -171,7 +171,7 @@ def save_text(path: Path, text: str | bytes) -> None:
 def write_session() -> None:
     """Write the pages of a session into the directory that is the only argument of this process.
 
-    It reads the result from standard input, as ``ros/report_process.py`` writes it. The results of
+    It reads the result from standard input, as ``live/processes.py`` writes it. The results of
     further child sensors go to standard output.
     """
     os.nice(_NICENESS)

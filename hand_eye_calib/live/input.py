@@ -1,172 +1,353 @@
-"""What one input of the node has delivered: rate, gaps, refused and lost messages."""
+"""One input of the session: counts its messages, judges their stamps, hands the poses over."""
 
 import time
 from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.engine.pose_buffer import StreamStatistics
-from hand_eye_calib.ros.delivery import Delivery, DeliveryReport
-from hand_eye_calib.ros.status import ERROR, OK, WARN, Report
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+from hand_eye_calib.io.bags.messages import PoseFields, measured_as
+from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.session import LiveSession
+from hand_eye_calib.live.stamp_guard import Judgement, StampGuard
+from hand_eye_calib.live.state import InputState, Level
 
 # An input without a message for so long is silent, and a bad message is reported for so long (s).
 STALE_AFTER_S = 2.0
 BAD_INPUT_FOR_S = 10.0
 
+# A message that waited so long in the node's queue is late: the node falls behind (s).
+_LATE_S = 1.0
 # Shares of lost and of late messages from which on somebody should look.
 _MUCH_LOST, _MUCH_LATE = 0.01, 0.05
+# A message may be overtaken by so many others of its publisher; farther back, the publisher was
+# started again.
+_MOST_OVERTAKEN = 1000
+# Reports (one a second) over which rates and shares are taken, and most delays looked at in one.
+_REPORTS, _MOST_DELAYS = 10, 5000
+# Inputs whose stamps differ by more than this (s) from what time_offset says are suspected of
+# different clocks.
+_SUSPICIOUS_OFFSET_S = 2.0
 
-# Reports over which the rate is taken, and most delays looked at in one.
-_RATE_REPORTS = 5
-_MOST_DELAYS = 5000
 
-
-class InputMonitor:
-    """Counts the messages of one input between two reports.
+class Delivery:
+    """Counts the messages of one topic, and by the numbers that their publisher gives them the lost
+    ones.
 
     Attributes
     ----------
-    arrived, ignored : int
-        Messages, and those of them that came while the node was disabled.
-    refused : Counter
-        Messages that could not be used, by reason.
-    delay_s : float or None
-        Median of the node's clock minus the stamps, in the last report with messages.
-    delivery : Delivery
+    received, lost, late : int
+        Messages since the first one.
+    longest_wait_s : float
+        In the node's queue, since it was last set to 0.
+    has_one_publisher : bool
+        Otherwise nothing is known of lost messages.
+    is_known : bool
+        The middleware numbers messages.
     """
 
     def __init__(self) -> None:
-        self.arrived = 0
-        self.ignored = 0
-        self.refused: Counter[str] = Counter()
-        self.delay_s: float | None = None
-        self.delivery = Delivery()
-        self._bad = ""
-        self._bad_at_s = -np.inf
-        self._arrived_at_s: float | None = None
-        self._last_stamp_ns: int | None = None
-        self._delays_ns: deque[int] = deque(maxlen=_MOST_DELAYS)
-        self._longest_gap_ns = 0
-        self._long_gaps = 0
-        self._counts = deque([(time.monotonic(), 0)], maxlen=_RATE_REPORTS + 1)
+        self.received = self.lost = self.late = 0
+        self.longest_wait_s = 0.0
+        self.has_one_publisher, self.is_known = True, False
+        self._next: int | None = None
 
-    def note(self, stamp_ns: int, clock_ns: int, steady_s: float, max_gap_ns: float) -> None:
-        """Count a message; ``clock_ns`` is the node's clock, 0 if it does not run yet."""
-        self.arrived += 1
-        self._arrived_at_s = steady_s
-        if clock_ns:
+    def note(self, sequence_number: int | None, waited_s: float) -> None:
+        """Count a message.
+
+        Parameters
+        ----------
+        sequence_number : int or None
+            Of its publication; None if the middleware does not tell.
+        waited_s : float
+            Time from its arrival in this process to its callback.
+        """
+        self.received += 1
+        self.late += waited_s > _LATE_S
+        self.longest_wait_s = max(self.longest_wait_s, waited_s)
+        self.is_known = sequence_number is not None and self.has_one_publisher
+        if sequence_number is None or not self.has_one_publisher:
+            self._next = None
+            return
+        missing = 0 if self._next is None else sequence_number - self._next
+        if -_MOST_OVERTAKEN <= missing < 0 < self.lost:
+            self.lost -= 1  # it was counted when a later one overtook it
+            return
+        self.lost += max(missing, 0)
+        self._next = sequence_number + 1
+
+
+class PoseInput:
+    """Hands the poses of one sensor to the session, wherever they come from.
+
+    Parameters
+    ----------
+    name : str
+        "parent", "child", or one of :func:`~hand_eye_calib.config.other_names`.
+    topic : str
+        Where they come from, for messages.
+    session : LiveSession
+    log : NodeLog
+    clock_ns : callable
+        The node's clock; 0 while it does not run.
+    on_jump_back : callable
+        Called with this input when its stamps have jumped back: a new session has to begin.
+
+    Attributes
+    ----------
+    is_enabled : bool
+        Whether poses are taken.
+    problem : str
+        Why the topic is not used; empty if it is.
+    ignored : int
+        Messages that came while it was not enabled.
+    refused : Counter
+        Messages that could not be used, by reason.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        topic: str,
+        session: LiveSession,
+        log: NodeLog,
+        clock_ns: Callable[[], int],
+        on_jump_back: Callable[["PoseInput"], None],
+    ) -> None:
+        self.name, self.topic = name, topic
+        self.is_enabled = True
+        self.problem = ""
+        self.ignored, self.refused = 0, Counter[str]()
+        self.delivery = Delivery()
+        self._guard = StampGuard()
+        self._session, self._log, self._clock_ns = session, log, clock_ns
+        self._on_jump_back = on_jump_back
+        self._sensor_frame = ""
+        self._max_gap_ns, self._wanted, self._is_watching = 0.0, "auto", False
+        self._arrived = 0
+        self._arrived_s: float | None = None
+        self._bad, self._bad_at_s = "", -np.inf
+        self._delay_s: float | None = None
+        self._delays_ns: deque[int] = deque(maxlen=_MOST_DELAYS)
+        self._counts = deque([(time.monotonic(), 0, 0, 0, 0)], maxlen=_REPORTS + 1)
+        self._begin_gaps()
+
+    def _begin_gaps(self) -> None:
+        self._last_stamp_ns: int | None = None
+        self._longest_gap_ns = self._long_gaps = 0
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether there was a pose in this session."""
+        return self._guard.last_ns is not None
+
+    def configure(self, config: CalibratorConfig, is_watching: bool) -> None:
+        """Follow the options; ``is_watching`` if the mount is watched."""
+        self._max_gap_ns = config.max_gap * 1e9
+        self._wanted = getattr(config, f"{self.name}_measures", "auto")
+        self._is_watching = is_watching
+
+    def restart(self, because_of: "PoseInput | None") -> None:
+        """Begin a new session: asked for, or because the stamps of an input have jumped back."""
+        self._sensor_frame = ""
+        self._begin_gaps()
+        if because_of is None:
+            self._guard.restart()
+        elif because_of is not self:
+            self._guard.restart(time.monotonic())
+
+    def resume(self) -> None:
+        """Go on where a session on disk has ended."""
+        self._guard.resume(self._session.statistics(self.name).last_stamp_ns)
+
+    def measures_as(self, type_name: str) -> str:
+        """What messages of a type (empty for transforms) are read as here.
+
+        Raises
+        ------
+        ConfigError
+            If they cannot be used.
+        """
+        measures = measured_as(type_name, self._wanted, self.topic)
+        if self._is_watching and measures != "poses":
+            raise ConfigError(f"monitor needs poses; {self.topic} has {measures}")
+        return measures
+
+    # -------------------------------------------------------------- messages
+
+    def accept(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
+        """Take a message; it is read when its stamp is believed."""
+        if not self.is_enabled:
+            self.ignored += 1
+            return
+        steady_s = time.monotonic()
+        self._note(stamp_ns, steady_s)
+        last_ns = self._guard.last_ns
+        judgement = self._guard.check(stamp_ns, read, steady_s)
+        if judgement.jumped_back:
+            self._say_jump_back(judgement.taken[0][0], last_ns)
+            self._on_jump_back(self)
+        self._use(judgement, is_first=last_ns is None)
+
+    def flush(self) -> None:
+        """Take messages that waited for others, if none came; to be called often."""
+        is_first = not self.has_poses
+        self._use(self._guard.flush(time.monotonic()), is_first)
+
+    def refuse(self, which: str, reason: str, text: str) -> None:
+        """Count a message that cannot be used, and say why."""
+        self.refused[reason] += 1
+        self._bad, self._bad_at_s = text, time.monotonic()
+        self._log.warning(
+            f"{self.topic}: message {which} refused: {text} "
+            f"({self.refused.total()} refused so far)",
+            ("refused", self.name),
+        )
+
+    def _note(self, stamp_ns: int, steady_s: float) -> None:
+        self._arrived += 1
+        self._arrived_s = steady_s
+        if clock_ns := self._clock_ns():
             self._delays_ns.append(clock_ns - stamp_ns)
         if self._last_stamp_ns is not None:
             gap_ns = stamp_ns - self._last_stamp_ns
             self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
-            self._long_gaps += gap_ns > max_gap_ns
+            self._long_gaps += gap_ns > self._max_gap_ns
         self._last_stamp_ns = stamp_ns
 
-    def note_refused(self, reason: str, text: str, steady_s: float) -> None:
-        """Count a message that could not be used."""
-        self.refused[reason] += 1
-        self._bad, self._bad_at_s = text, steady_s
+    def _use(self, judgement: Judgement, is_first: bool) -> None:
+        for stamp_ns in judgement.dropped:
+            text = "its stamp does not fit those before and after it"
+            self.refuse(with_stamp(stamp_ns), "corrupt stamp", text)
+        for stamp_ns, read in judgement.taken:
+            try:
+                self._take(stamp_ns, read())
+            except HandEyeCalibError as error:
+                self.refuse(with_stamp(stamp_ns), "unusable", str(error))
+        if is_first and judgement.taken:
+            first_s = judgement.taken[0][0] * 1e-9
+            self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
 
-    def restart(self) -> None:
-        """Begin a new session: gaps are counted anew."""
-        self._last_stamp_ns = None
-        self._longest_gap_ns = self._long_gaps = 0
+    def _take(self, stamp_ns: int, pose: PoseFields) -> None:
+        frame = pose.sensor_frame
+        # An empty name is the one before, too: parameters or a default name it.
+        if frame is not None and frame != self._sensor_frame:
+            self._session.set_frame(self.name, frame)
+            self._sensor_frame = frame
+        self._session.add_pose(self.name, stamp_ns, pose.position, pose.quat_xyzw)
+
+    def _say_jump_back(self, stamp_ns: int, last_ns: int | None) -> None:
+        jump_s = ((last_ns or 0) - stamp_ns) * 1e-9
+        self._log.warning(
+            f"{self.topic} jumped back by {jump_s:.3f} s (a bag that loops? a clock that was "
+            "reset?): new session, earlier poses forgotten"
+        )
+
+    # ----------------------------------------------------------------- state
 
     def is_silent(self, steady_s: float) -> bool:
         """Whether messages have come, but not lately."""
-        return self._arrived_at_s is not None and steady_s - self._arrived_at_s > STALE_AFTER_S
+        return self._arrived_s is not None and steady_s - self._arrived_s > STALE_AFTER_S
 
-    def report(
-        self,
-        topic: str,
-        steady_s: float,
-        statistics: StreamStatistics,
-        may_rest: bool = False,
-        missing: str = "",
-    ) -> Report:
-        """State of this input; begins a new interval.
+    def state(self, steady_s: float, may_rest: bool) -> InputState:
+        """What has come in; begins a new interval, to be called once a second.
 
         Parameters
         ----------
-        topic : str
         steady_s : float
-        statistics : StreamStatistics
         may_rest : bool
             Silence is nothing to look at: there is a result, and the other input is silent too.
-        missing : str
-            Why no message has come yet, if that is known.
         """
-        self._counts.append((steady_s, self.arrived))
-        (start_s, start), (end_s, end) = self._counts[0], self._counts[-1]
-        rate_hz = (end - start) / (end_s - start_s) if end_s > start_s else 0.0
-        delivery = self.delivery.report()
+        delivery, taken = self.delivery, self._session.statistics(self.name)
+        newest = steady_s, self._arrived, delivery.received, delivery.lost, delivery.late
+        self._counts.append(newest)
+        seconds, arrived, received, lost, late = np.subtract(newest, self._counts[0]).tolist()
+        rate_hz = arrived / seconds if seconds > 0 else 0.0
+        lost_share, late_share = lost / max(received + lost, 1), late / max(received, 1)
         delays_s = np.array(self._delays_ns) * 1e-9
         self._delays_ns.clear()
         if delays_s.size:
-            self.delay_s = float(np.median(delays_s))
-        level, text = self._judge(topic, steady_s, rate_hz, delivery, may_rest)
-        if self._arrived_at_s is None and missing:
-            text = f"{text}: {missing}"
-        values = {
-            "topic": topic,
-            "rate (Hz)": f"{rate_hz:.1f}",
-            **self._counts_of(statistics),
-            **self._delivery_values(delivery),
-            "longest gap (s)": f"{self._longest_gap_ns * 1e-9:.3f}",
-            "gaps above max_gap": self._long_gaps,
-            "silent for (s)": self._silence(steady_s),
-            "node clock minus stamps, median (s)": _delay(delays_s, 50),
-            "node clock minus stamps, 99 % (s)": _delay(delays_s, 99),
-        }
-        return Report(level, text, values)
+            self._delay_s = float(np.median(delays_s))
+        level, text = self._judge(steady_s, rate_hz, lost_share, late_share, may_rest)
+        refused = {"repeated stamp": taken.refused_duplicate, "too late": taken.refused_late}
+        outdated = {"of the session before": self._guard.outdated} if self._guard.outdated else {}
+        state = InputState(
+            level=level,
+            text=text,
+            topic=self.topic,
+            rate_hz=rate_hz,
+            messages=self._arrived,
+            poses_taken=taken.received,
+            refused=refused | outdated | dict(sorted(self.refused.items())),
+            dropped_unpaired=taken.dropped_unpaired,
+            ignored_while_disabled=self.ignored,
+            lost=delivery.lost if delivery.is_known else None,
+            lost_share=lost_share if delivery.is_known else None,
+            late=delivery.late,
+            longest_wait_s=delivery.longest_wait_s,
+            longest_gap_s=self._longest_gap_ns * 1e-9,
+            gaps_above_max_gap=self._long_gaps,
+            silent_s=None if self._arrived_s is None else steady_s - self._arrived_s,
+            delay_s=self._delay_s,
+            delay_99_s=float(np.percentile(delays_s, 99)) if delays_s.size else None,
+        )
+        delivery.longest_wait_s = 0.0
+        return state
 
     def _judge(
-        self, topic: str, steady_s: float, rate_hz: float, delivery: DeliveryReport, may_rest: bool
-    ) -> tuple[bytes, str]:
-        if self._arrived_at_s is None:
-            return WARN, f"no message on {topic} yet"
+        self,
+        steady_s: float,
+        rate_hz: float,
+        lost_share: float,
+        late_share: float,
+        may_rest: bool,
+    ) -> tuple[Level, str]:
+        if self._arrived_s is None:
+            text = f"no message on {self.topic} yet"
+            return Level.WARN, ": ".join(filter(None, [text, self.problem]))
         if steady_s - self._bad_at_s < BAD_INPUT_FOR_S:
-            return ERROR, f"{topic}: {self._bad}"
+            return Level.ERROR, f"{self.topic}: {self._bad}"
         if self.is_silent(steady_s):
-            text = f"{topic} has been silent for {steady_s - self._arrived_at_s:.0f} s"
-            return (OK if may_rest else WARN), text
+            text = f"{self.topic} has been silent for {steady_s - self._arrived_s:.0f} s"
+            return (Level.OK if may_rest else Level.WARN), text
         problems = []
-        if delivery.lost >= _MUCH_LOST:
-            problems.append(f"{delivery.lost:.1%} of the messages are lost")
-        if delivery.late >= _MUCH_LATE:
-            waited = f"waited up to {delivery.longest_wait_s:.1f} s in the node"
-            problems.append(f"{delivery.late:.0%} of the messages are late, they {waited}")
+        if lost_share >= _MUCH_LOST:
+            problems.append(f"{lost_share:.1%} of the messages are lost")
+        if late_share >= _MUCH_LATE:
+            waited = f"waited up to {self.delivery.longest_wait_s:.1f} s in the node"
+            problems.append(f"{late_share:.0%} of the messages are late, they {waited}")
         if not problems:
-            return OK, f"{rate_hz:.1f} Hz"
+            return Level.OK, f"{rate_hz:.1f} Hz"
         advice = "give the node more processor time, or publish at a lower rate"
-        return WARN, f"{rate_hz:.1f} Hz; {'; '.join(problems)}: {advice}"
-
-    def _counts_of(self, statistics: StreamStatistics) -> dict[str, object]:
-        return {
-            "messages": self.arrived,
-            "poses taken": statistics.received,
-            "refused: repeated stamp": statistics.refused_duplicate,
-            "refused: too late": statistics.refused_late,
-            **{f"refused: {reason}": count for reason, count in sorted(self.refused.items())},
-            "dropped: no pose of the other input at their time": statistics.dropped_unpaired,
-            "ignored while disabled": self.ignored,
-        }
-
-    def _delivery_values(self, delivery: DeliveryReport) -> dict[str, object]:
-        counts: dict[str, object] = {
-            "late messages": self.delivery.late,
-            "longest wait in the node (s)": f"{delivery.longest_wait_s:.3f}",
-        }
-        if not self.delivery.is_known:
-            return {"lost messages": "unknown", **counts}
-        shares = {"lost messages (%), last 10 s": f"{100 * delivery.lost:.2f}"}
-        return {"lost messages": self.delivery.lost, **shares, **counts}
-
-    def _silence(self, steady_s: float) -> str:
-        if self._arrived_at_s is None:
-            return "no message yet"
-        return f"{steady_s - self._arrived_at_s:.1f}"
+        return Level.WARN, f"{rate_hz:.1f} Hz; {'; '.join(problems)}: {advice}"
 
 
-def _delay(delays_s: np.ndarray, percentile: float) -> str:
-    return f"{np.percentile(delays_s, percentile):.4f}" if delays_s.size else "-"
+def with_stamp(stamp_ns: int) -> str:
+    """Which message, in words."""
+    return f"with stamp {stamp_ns * 1e-9:.9f} s"
+
+
+def with_clock_offset(
+    parent: InputState, child: InputState, used_s: float | str
+) -> tuple[InputState, InputState]:
+    """The states of both inputs with the clock offset seen between them, in s to be added to the
+    child's stamps; a warning if it is far from ``used_s``, what is added.
+    """
+    if parent.delay_s is None or child.delay_s is None:
+        return parent, child
+    seen_s = child.delay_s - parent.delay_s
+    parent, child = (replace(each, clock_offset_s=seen_s) for each in (parent, child))
+    if isinstance(used_s, str) or abs(seen_s - used_s) <= _SUSPICIOUS_OFFSET_S:
+        return parent, child
+    told = (
+        f"; the stamps of the two inputs are {seen_s:.3f} s apart but time_offset is "
+        f"{used_s:.3f}: if their clocks differ, set time_offset"
+    )
+    warned = [
+        replace(each, level=Level.WARN, text=each.text + told) if each.level is Level.OK else each
+        for each in (parent, child)
+    ]
+    return warned[0], warned[1]

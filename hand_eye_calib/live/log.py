@@ -1,7 +1,7 @@
 """The node's log: a message that repeats is written once in a while."""
 
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from typing import Protocol
 
 from hand_eye_calib.errors import printable
@@ -34,24 +34,32 @@ class NodeLog:
         self._logger = logger
         self._written_at_s: dict[Hashable, float] = {}
 
+    # rclpy ties a place in the code to its severity: each method writes by itself.
+
     def info(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
         """Write what a person may want to know."""
-        self._write(self._logger.info, text, key, period_s)
+        if self._is_due(key, period_s):
+            self._logger.info(_escaped(text))
 
     def warning(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
         """Write what a person should look at."""
-        self._write(self._logger.warning, text, key, period_s)
+        if self._is_due(key, period_s):
+            self._logger.warning(_escaped(text))
 
     def error(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
         """Write what went wrong."""
-        self._write(self._logger.error, text, key, period_s)
+        if self._is_due(key, period_s):
+            self._logger.error(_escaped(text))
 
-    def _write(
-        self, write: Callable[[str], bool], text: str, key: Hashable, period_s: float
-    ) -> None:
+    def _is_due(self, key: Hashable, period_s: float) -> bool:
         now_s = time.monotonic()
+        if now_s - self._written_at_s.get(key, -float("inf")) < period_s:
+            return False
         if key is not None:
-            if now_s - self._written_at_s.get(key, -float("inf")) < period_s:
-                return
             self._written_at_s[key] = now_s
-        write("\n".join(map(printable, text.split("\n"))))  # without other control characters
+        return True
+
+
+def _escaped(text: str) -> str:
+    """Text of one or more lines without other control characters."""
+    return "\n".join(map(printable, text.split("\n")))

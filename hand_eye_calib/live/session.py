@@ -1,6 +1,6 @@
-"""The session of the node: the engine, the number of the session, and its journal on disk."""
+"""The live session: its engines, its number, and its journal on disk."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,9 @@ from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
 from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.journal import Journal, has_session, read_journal
-from hand_eye_calib.ros.log import NodeLog
-from hand_eye_calib.ros.session_journal import (
-    DirectoryLock,
-    Poses,
-    SessionJournal,
-    give,
-    poses_so_far,
-    takers,
-)
+from hand_eye_calib.live.journal import DirectoryLock, SessionJournal, give, poses_so_far, takers
+from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.state import JournalState, Level
 
 # How long a disk may hold up the end of the program.
 _GRACE_S = 0.3
@@ -35,11 +29,10 @@ class LiveSession:
 
     Attributes
     ----------
-    calibrator : Calibrator
+    engines : dict of str to Calibrator
+        By child sensor: that of "child", and those of further ones, each with the parent.
     number : int
         Rises with every new session; a result of another number is out of date.
-    others : dict of str to Calibrator
-        Further child sensors by the names of their inputs, each with the parent.
     topics : dict of str to str
         Where the poses of each stream come from, for the journal.
     has_new_poses : bool
@@ -47,61 +40,60 @@ class LiveSession:
     """
 
     def __init__(self, log: NodeLog) -> None:
-        self.calibrator = Calibrator()
-        self._is_solved = True
+        self.engines = {"child": Calibrator()}
         self.number = 0
-        self.others: dict[str, Calibrator] = {}
         self.topics: dict[str, str] = {}
         self.has_new_poses = False
+        self._is_solved = True
         self._log = log
         self._measures: dict[str, Any] = {}
         self._origins: dict[str, LocalOrigin] = {}
-        self._origins_on_disk: dict[str, Any] = {}
+        self._origins_on_disk: Mapping[str, Sequence[float]] = {}
         self._journal: SessionJournal | None = None
         self._lock: DirectoryLock | None = None
 
     @property
-    def journal_directory(self) -> Path | None:
-        """Where the journal is; None if there is none."""
-        return self._journal.directory if self._journal else None
+    def calibrator(self) -> Calibrator:
+        """The engine of parent and child."""
+        return self.engines["child"]
 
     @property
-    def journal_error(self) -> str:
-        """Why the journal cannot be written; empty if it can."""
-        return self._journal.error if self._journal else ""
+    def others(self) -> dict[str, Calibrator]:
+        """The engines of further child sensors by the names of their inputs."""
+        return {name: engine for name, engine in self.engines.items() if name != "child"}
 
     def add_pose(
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
-    ) -> bool:
+    ) -> None:
         """Take a pose; see :meth:`Calibrator.add_pose`."""
-        (own_stream, first), *others = takers(stream, self.calibrator, self.others)
-        added = first.add_pose(own_stream, stamp_ns, position, quat_xyzw)
-        for _, other in others if added else ():
+        (own_stream, first), *others = takers(stream, self.engines)
+        if not first.add_pose(own_stream, stamp_ns, position, quat_xyzw):
+            return
+        for _, other in others:
             other.add_pose(own_stream, stamp_ns, position, quat_xyzw)
-        if added and self._journal is not None:
+        if self._journal is not None:
             self._journal.add_pose(stream, stamp_ns, position, quat_xyzw)
-        self.has_new_poses |= added and self._is_solved and stream in STREAMS
-        return added
+        self.has_new_poses |= self._is_solved and stream in STREAMS
 
     def take_others(self, names: Sequence[str]) -> None:
         """Take further child sensors, known by the names of their inputs, from now on."""
-        self.others = {name: Calibrator(_of_other(self.calibrator.config)) for name in names}
+        config = _of_other(self.calibrator.config)
+        self.engines |= {name: Calibrator(config) for name in names}
 
     def statistics(self, stream: str) -> StreamStatistics:
         """What the engine has taken of a stream."""
-        if stream in self.others:
-            return self.others[stream].statistics("child")
-        return self.calibrator.statistics(stream)
+        own_stream, engine = takers(stream, self.engines)[0]
+        return engine.statistics(own_stream)
 
     def watch_only(self, limits: BufferLimits) -> None:
         """Never solve, and keep few poses: somebody takes the pairs as they are made."""
         self._is_solved = False
-        self.calibrator = Calibrator(self.calibrator.config, limits)
+        self.engines = {"child": Calibrator(self.calibrator.config, limits)}
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
         """Take the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
-        for own_stream, each in takers(stream, self.calibrator, self.others):
-            each.set_frame(own_stream, sensor_frame)
+        for own_stream, engine in takers(stream, self.engines):
+            engine.set_frame(own_stream, sensor_frame)
         if self._journal is not None:
             self._journal.describe({stream: {"frame": sensor_frame}})
 
@@ -114,8 +106,8 @@ class LiveSession:
             If nothing can be calibrated with what the other stream measures.
         """
         if stream in self.others:
-            other = self.others[stream]
-            other.reconfigure(replace(other.config, child_measures=measures))
+            engine = self.engines[stream]
+            engine.reconfigure(replace(engine.config, child_measures=measures))
             return
         name = f"{stream}_measures"
         if self._measures.get(name, "poses") != measures:
@@ -135,17 +127,23 @@ class LiveSession:
             other.reconfigure(_of_other(config, other.config.child_measures))
         if self._journal is not None:
             self._journal.describe(self._about())
-        received = sum(self.calibrator.statistics(stream).received for stream in STREAMS)
-        self.has_new_poses = received > 0 and self._is_solved
+        self.has_new_poses = self._n_poses() > 0 and self._is_solved
 
     def reset(self) -> None:
         """Forget everything and begin a new session; the journal of the old one is kept aside."""
-        for calibrator in (self.calibrator, *self.others.values()):
-            calibrator.reset()
+        for engine in self.engines.values():
+            engine.reset()
         self.number += 1
         self.has_new_poses = False
         if self._journal is not None:
             self._journal.begin()
+
+    def inputs(self) -> dict[str, Any]:
+        """Where the poses came from and the options, in plain values."""
+        return self.calibrator.inputs(self.topics)
+
+    def _n_poses(self) -> int:
+        return sum(self.calibrator.statistics(stream).received for stream in STREAMS)
 
     # -------------------------------------------------------------- journal
 
@@ -159,19 +157,9 @@ class LiveSession:
         if directory and (self._lock is None or directory.parent != self._lock.directory):
             DirectoryLock(directory.parent).release()
 
-    def follow_journal(self, options: NodeConfig, resuming: bool = False) -> bool:
-        """Write the journal where the options want it.
-
-        Parameters
-        ----------
-        options : NodeConfig
-        resuming : bool
-            Go on with the session that is there.
-
-        Returns
-        -------
-        bool
-            False if it is there already.
+    def follow_journal(self, options: NodeConfig, resuming: bool = False) -> None:
+        """Write the journal where the options want it; with ``resuming``, go on with the session
+        that is there.
 
         Raises
         ------
@@ -179,34 +167,46 @@ class LiveSession:
             If another node writes there.
         """
         directory = journal_directory(options)
-        if directory == self.journal_directory:
-            return False
+        if directory == (self._journal.directory if self._journal else None):
+            return
         self.stop_journal()
         if directory is not None:
             self._lock = DirectoryLock(directory.parent)
             resumed = self._resume(directory) if resuming else None
-            self._journal = SessionJournal(directory, self._about(), self._poses(), resumed)
-        return True
+            poses = poses_so_far(self.engines)
+            self._journal = SessionJournal(directory, self._about(), poses, resumed)
 
     def flush_journal(self) -> None:
         """Hand what came in to the disk; to be called often."""
         if self._journal is not None:
             if self._known_origins() != self._origins_on_disk:
                 self._journal.describe(self._about())
-            self._journal.flush(self._poses)
+            self._journal.flush(lambda: poses_so_far(self.engines))
             self._log_notes(self._journal)
 
-    def stop_journal(self) -> bool:
-        """Write what is left; False if the disk keeps it busy."""
-        if self._journal is None:
-            return True
-        ended = self._journal.stop(self._poses, _GRACE_S)
-        self._log_notes(self._journal)
-        self._journal = None
+    def stop_journal(self) -> None:
+        """Write what is left, and leave the directory to others."""
+        if self._journal is not None:
+            self._journal.stop(lambda: poses_so_far(self.engines), _GRACE_S)
+            self._log_notes(self._journal)
+            self._journal = None
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-        return ended
+
+    def journal_state(self, options: NodeConfig) -> JournalState:
+        """Whether a crash would lose the session."""
+        directory = str(self._journal.directory) if self._journal else ""
+        if self._journal is not None and self._journal.error:
+            text = f"cannot write: {self._journal.error}; a crash would lose the session"
+            return JournalState(level=Level.ERROR, text=text, directory=directory)
+        level, text = Level.OK, "the session is being written"
+        if self._journal is None and options.journal == "off":
+            text = "off"
+        elif self._journal is None:
+            level = Level.WARN
+            text = "off: output_directory is not set, a crash would lose the session"
+        return JournalState(level=level, text=text, directory=directory)
 
     def _resume(self, directory: Path) -> Journal | None:
         """The session in a directory, which goes on; None if there is none that can."""
@@ -215,26 +215,19 @@ class LiveSession:
             return None
         try:
             journal = read_journal(directory)
-            give(journal, directory, self.calibrator, self.others)
+            give(journal, directory, self.engines)
             origins = _origins_in(directory, journal)
         except HandEyeCalibError as error:
             self._log.error(f"cannot resume: {error}; a new session begins")
-            for calibrator in (self.calibrator, *self.others.values()):
-                calibrator.reset()
+            for engine in self.engines.values():
+                engine.reset()
             return None
         for stream, geodetic in origins.items():
             self.origin(stream).geodetic = geodetic
-        poses = sum(self.calibrator.statistics(stream).received for stream in STREAMS)
+        poses = self._n_poses()
         self.has_new_poses = poses > 0
         self._log.info(f"session resumed from {directory}: {poses} poses")
         return journal
-
-    def _poses(self) -> Poses:
-        return poses_so_far(self.calibrator, self.others)
-
-    def inputs(self) -> dict[str, Any]:
-        """Where the poses came from and the options, in plain values."""
-        return self.calibrator.inputs(self.topics)
 
     def _about(self) -> dict[str, dict[str, Any]]:
         """Options, topics, frames and origins, for whoever reads the journal."""
@@ -242,16 +235,16 @@ class LiveSession:
         config = self.calibrator.config
         of_all = {"options": config.to_options(), "given": sorted(config.given)}
         about: dict[str, dict[str, Any]] = {}
-        for stream in (*STREAMS, *self.others):
+        for stream in ("parent", *self.engines):
             about[stream] = {"topic": self.topics.get(stream, ""), **of_all}
-            (own_stream, calibrator), *_ = takers(stream, self.calibrator, self.others)
-            if frame := calibrator.frame(own_stream):
+            own_stream, engine = takers(stream, self.engines)[0]
+            if frame := engine.frame(own_stream):
                 about[stream]["frame"] = frame
             if stream in self._origins_on_disk:
                 about[stream]["origin"] = self._origins_on_disk[stream]
         return about
 
-    def _known_origins(self) -> dict[str, Any]:
+    def _known_origins(self) -> dict[str, list[float]]:
         """Latitude and longitude (rad) and height (m) that positions count from, by stream."""
         known = {stream: origin.geodetic for stream, origin in self._origins.items()}
         return {stream: [*geodetic] for stream, geodetic in known.items() if geodetic}

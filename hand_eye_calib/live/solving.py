@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Any, BinaryIO
@@ -48,7 +47,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Job:
-    """A snapshot to solve. The answers carry the number of its session.
+    """A snapshot to solve, in a session of this number.
 
     Attributes
     ----------
@@ -67,8 +66,27 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Solved:
-    """How a solve ended, after how many seconds: with a calibration or with a failure.
+class Checked:
+    """How a stream check ended: with neither findings nor a failure if the motion is too short or
+    has too little rotation to tell.
+
+    Attributes
+    ----------
+    options : dict
+        Options that the check is certain of: the result is one with them.
+    told : tuple of str
+        Warnings about that.
+    """
+
+    result: CheckResult | None = None
+    failure: Failure | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    told: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How a job ended, after how many seconds: with a calibration or with a failure.
 
     Attributes
     ----------
@@ -76,6 +94,8 @@ class Solved:
         How the sensors have moved.
     time_offset : TimeOffset or None
         The time offset, if it was estimated.
+    check : Checked or None
+        If a check was asked for.
     """
 
     session: int
@@ -84,71 +104,47 @@ class Solved:
     calibration: Calibration | None = None
     time_offset: TimeOffset | None = None
     failure: Failure | None = None
+    check: Checked | None = None
 
 
-@dataclass(frozen=True)
-class Checked:
-    """How a stream check ended, after how many seconds: with neither findings nor a failure if the
-    motion is too short or has too little rotation to tell.
-
-    Attributes
-    ----------
-    options : dict
-        Options that the check is certain of: the result is of streams that were solved with them.
-    told : tuple of str
-        Warnings about that.
+def answer(job: Job) -> Answer:
+    """Solve, then check if the job asks for it. If the check is certain of other options, the
+    calibration is the one with these.
     """
-
-    session: int
-    seconds: float
-    result: CheckResult | None = None
-    failure: Failure | None = None
-    options: dict[str, Any] = field(default_factory=dict)
-    told: tuple[str, ...] = ()
-
-
-Answer = Solved | Checked
-
-
-def answers(job: Job) -> Iterator[Answer]:
-    """Solve, then check if the job asks for it."""
-    solved = _solve(job)
-    found = solved.calibration
-    # The node has no use for the noise model's whole solution.
-    yield replace(solved, calibration=replace(found, model=None) if found else None)
-    if job.check:
-        yield _check(job, found)
-
-
-def _solve(job: Job) -> Solved:
-    start, snapshot = time.monotonic(), job.snapshot
-    seen = calibration = failure = None
+    start_s = time.monotonic()
+    snapshot, seen, calibration, failure, checked = job.snapshot, None, None, None, None
     try:
         snapshot = with_options(snapshot, job.options).resolved()
         seen = excitation(snapshot.pose_pairs())
         calibration = snapshot.estimate()
     except Exception as error:  # the node reports it
         failure = _failure(error)
-    seconds = time.monotonic() - start
-    return Solved(job.session, seconds, seen, calibration, snapshot.time_offset, failure=failure)
+    if job.check:
+        calibration, checked = _check(job, calibration)
+    if calibration is not None:  # the node has no use for the noise model's whole solution
+        calibration = replace(calibration, model=None)
+    seconds = time.monotonic() - start_s
+    return Answer(
+        job.session, seconds, seen, calibration, snapshot.time_offset, failure, checked
+    )
 
 
-def _check(job: Job, calibration: Calibration | None) -> Checked:
-    """Check the streams with the time offset and the scale that the solve found; if that makes
-    certain of another one, as it is after solving with that.
+def _check(job: Job, calibration: Calibration | None) -> tuple[Calibration | None, Checked]:
+    """The calibration after a check of the streams with the time offset and the scale that it
+    found, and what the check found.
     """
-    start = time.monotonic()
     try:
         if not can_check(*job.snapshot.streams):
-            return Checked(job.session, time.monotonic() - start)
+            return calibration, Checked()
         snapshot = with_options(job.snapshot, job.options)
         if calibration is None:
-            return Checked(job.session, time.monotonic() - start, check(snapshot))
+            return None, Checked(check(snapshot))
         found = review(calibration, snapshot, job.options)
     except Exception as error:  # the node reports it
-        return Checked(job.session, time.monotonic() - start, failure=_failure(error))
-    seconds = time.monotonic() - start
-    return Checked(job.session, seconds, found.check, options=dict(found.options), told=found.told)
+        return calibration, Checked(failure=_failure(error))
+    if found.options:
+        calibration = found.calibration
+    return calibration, Checked(found.check, options=dict(found.options), told=found.told)
 
 
 def _failure(error: Exception) -> Failure:
@@ -163,22 +159,16 @@ def _failure(error: Exception) -> Failure:
 def main() -> None:
     """Answer jobs until the standard input ends, which it does with the node, however that ends."""
     os.nice(_NICENESS)
-    incoming, outgoing = _private_pipes()
-    jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
-    threading.Thread(target=_receive, args=(incoming, jobs), daemon=True).start()
-    while True:
-        for answer in answers(jobs.get()):
-            pickle.dump(answer, outgoing, pickle.HIGHEST_PROTOCOL)
-            outgoing.flush()
-
-
-def _private_pipes() -> tuple[BinaryIO, BinaryIO]:
-    """The pipes to the node; what a library prints goes to standard error instead."""
+    # What a library prints goes to standard error instead of the pipes.
     incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     with open(os.devnull, "rb") as nothing:
         os.dup2(nothing.fileno(), 0)
     os.dup2(sys.stderr.fileno(), 1)
-    return incoming, outgoing
+    jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
+    threading.Thread(target=_receive, args=(incoming, jobs), daemon=True).start()
+    while True:
+        pickle.dump(answer(jobs.get()), outgoing, pickle.HIGHEST_PROTOCOL)
+        outgoing.flush()
 
 
 def _receive(incoming: BinaryIO, jobs: "queue.SimpleQueue[Job]") -> None:

@@ -1,18 +1,16 @@
-"""When the node checks the streams, and what the last check found."""
+"""When the streams are checked, and what the last check found."""
 
 import numpy as np
 
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
 from hand_eye_calib.checks.findings import Confidence, Finding, Severity
-from hand_eye_calib.ros.status import OK, WARN, Report
+from hand_eye_calib.live.state import ChecksState, Level
 
 # The streams are checked at most this often (s), which costs a second or two each time.
 CHECK_PERIOD_S = 30.0
 
-_Key = tuple[str, str]
 
-
-class CheckMonitor:
+class StreamChecks:
     """Schedules stream checks and keeps their findings.
 
     Errors count at once; warnings, and what is merely possible, only if two checks in a row have
@@ -32,8 +30,8 @@ class CheckMonitor:
         self.has_new_poses = False
         self._result: CheckResult | None = None
         self._checked_at_s = 0.0
-        self._suspected: set[_Key] = set()
-        self._faults: dict[_Key, Finding] = {}
+        self._suspected: set[tuple[str, str]] = set()
+        self._faults: dict[tuple[str, str], Finding] = {}
         self._due_at_s = -np.inf
 
     def hasten(self) -> None:
@@ -49,13 +47,7 @@ class CheckMonitor:
         self.has_new_poses, self._due_at_s = False, steady_s + CHECK_PERIOD_S
 
     def take(self, result: CheckResult | None, steady_s: float) -> tuple[list[str], list[str]]:
-        """Take what a check found.
-
-        Parameters
-        ----------
-        result : CheckResult or None
-            None if the poses did not suffice.
-        steady_s : float
+        """Take what a check found (None: the poses did not suffice).
 
         Returns
         -------
@@ -70,41 +62,38 @@ class CheckMonitor:
         self._faults = {key: f for key, f in found.items() if _is_sure(f) or key in self._suspected}
         self._suspected = set(found)
         new = [in_parameters(finding) for key, finding in self._faults.items() if key not in before]
-        gone = [
-            f"no longer found: {finding.what}"
-            for key, finding in before.items()
-            if key not in self._faults
-        ]
-        return new, gone
+        ended = [finding for key, finding in before.items() if key not in self._faults]
+        return new, [f"no longer found: {finding.what}" for finding in ended]
 
-    def faults(self) -> tuple[str, ...]:
-        """What speaks against calibrating with these streams, the gravest first, a line each."""
-        return tuple(in_parameters(finding) for finding in self._faults.values())
-
+    @property
     def findings(self) -> tuple[Finding, ...]:
-        """The same findings: for a result and its verdict."""
+        """What speaks against calibrating with these streams, the gravest first."""
         return tuple(self._faults.values())
 
-    def report(self, steady_s: float) -> Report:
+    def faults(self) -> tuple[str, ...]:
+        """The same in a line each."""
+        return tuple(map(in_parameters, self.findings))
+
+    def state(self, steady_s: float) -> ChecksState:
         """Findings of the last check."""
         if self._result is None:
-            rotation = f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
-            text = f"not checked yet: that takes {MIN_DURATION_S:g} s of motion"
-            text += f" with rotations of {rotation}"
-            return Report(WARN, text, {"checked": "not yet"})
+            text = (
+                f"not checked yet: that takes {MIN_DURATION_S:g} s of motion with rotations of "
+                f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
+            )
+            return ChecksState(
+                level=Level.WARN, text=text, age_s=None, correlation=None, findings=[]
+            )
         faults = self.faults()
-        values = {
-            "checked": f"{steady_s - self._checked_at_s:.0f} s ago",
-            "checked again after (s)": f"{CHECK_PERIOD_S:g}",
-            "correlation of the angular rates": f"{self._result.correlation.correlation:.3f}",
-            **{
-                f"{each.severity.value} {each.code} ({each.stream})": in_parameters(each)
-                for each in self._result.findings
-            },
-        }
-        if faults:
-            return Report(WARN, "; ".join(faults), values)
-        return Report(OK, "both streams can be of one rigid body", values)
+        return ChecksState(
+            level=Level.WARN if faults else Level.OK,
+            text="; ".join(faults) or "both streams can be of one rigid body",
+            age_s=steady_s - self._checked_at_s,
+            correlation=self._result.correlation.correlation,
+            findings=[
+                f"{each.severity.value}: {in_parameters(each)}" for each in self._result.findings
+            ],
+        )
 
 
 def _is_sure(finding: Finding) -> bool:

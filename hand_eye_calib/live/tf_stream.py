@@ -30,7 +30,7 @@ class StampedTransform(NamedTuple):
 
     stamp_ns: int
     world_frame: str
-    sensor_frame: str | None
+    sensor_frame: str
     position: tuple[float, float, float]
     quat_xyzw: tuple[float, float, float, float]
 

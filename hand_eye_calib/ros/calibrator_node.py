@@ -1,44 +1,46 @@
-"""The node: topics, services, parameters and timers around the session.
+"""The node: topics, services, parameters and timers around the live session.
 
 Solves run in a process of their own; everything else happens in the executor's one thread, so
 nothing here needs a lock.
 """
 
-import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from hand_eye_calib.config import NodeConfig, other_names
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.plain import from_plain
+from hand_eye_calib.io.transforms import TfSource
+from hand_eye_calib.live.cycle import SolveCycle
+from hand_eye_calib.live.input import PoseInput
+from hand_eye_calib.live.journal import FLUSH_PERIOD_S
+from hand_eye_calib.live.log import LOG_PERIOD_S, NodeLog
+from hand_eye_calib.live.mount import LIMITS, MountWatch
+from hand_eye_calib.live.reporting import (
+    extrinsic_state,
+    input_states,
+    progress_state,
+    stale_after_s,
+)
+from hand_eye_calib.live.saving import Saver
+from hand_eye_calib.live.session import LiveSession, check_below, output_path
+from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.results.records import Progress
-from hand_eye_calib.ros.check_monitor import CheckMonitor
-from hand_eye_calib.ros.diagnostics import NodeParts, diagnostics
-from hand_eye_calib.ros.inputs import PoseInput, TopicInput, qos_parameter_names
-from hand_eye_calib.ros.live_session import LiveSession, check_below, output_path
-from hand_eye_calib.ros.log import LOG_PERIOD_S, NodeLog
-from hand_eye_calib.ros.mount import LIMITS, MountWatch
+from hand_eye_calib.ros.inputs import TfInput, TopicInput, qos_parameter_names
+from hand_eye_calib.ros.outputs import ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
-from hand_eye_calib.ros.report_process import ReportProcess, SessionResult
-from hand_eye_calib.ros.results import ResultFiles, ResultTopics
 from hand_eye_calib.ros.robot import Robot, needs_tf
-from hand_eye_calib.ros.session_journal import FLUSH_PERIOD_S
-from hand_eye_calib.ros.solve_cycle import ANSWER_PERIOD_S, SolveCycle
 from hand_eye_calib.ros.tf import TfBroadcaster, message_type
-from hand_eye_calib.ros.tf_input import TfInput, tf_source
-from hand_eye_calib.session.goal import Goal
 
 _DISCOVERY_PERIOD_S = 0.2
-_DIAGNOSTICS_PERIOD_S = 1.0
+_STATE_PERIOD_S = 1.0
 
 # Requests that come while the node is busy wait here.
 _SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -69,42 +71,41 @@ class CalibratorNode(Node):
         )
         for line in self._options.unknown:
             self._log.warning(line)
+        options, config = self._options.node, self._options.calibrator
         # From now on, participants may choose a directory below this one.
-        self._output_base = output_path(self._options.node.output_directory or ".").resolve()
-        if self._options.node.monitor:
-            self._options.calibrator.require_poses("monitor")
-        _ = self._options.calibrator.measured  # or it raises
-        self._session.reconfigure(self._options.calibrator)
-        self._checks = CheckMonitor()
-        self._files = ResultFiles()
-        self._report = ReportProcess()
+        self._output_base = output_path(options.output_directory or ".").resolve()
+        if options.monitor:
+            config.require_poses("monitor")
+        _ = config.measured  # or it raises
+        self._session.reconfigure(config)
         self._tf = TfBroadcaster(self, self._log)
-        self._robot = Robot(self, self._log, self._options.node, self._tf)
-        self._inputs = self._make_input("parent"), self._make_input("child")
-        self._others = self._make_others()
-        self._session.topics = {each.name: each.topic for each in self._inputs}
-        self._open_journal()
-        self._topics = ResultTopics(self)
-        self._tf.switch(self._options.node.publish_tf)
+        self._robot = Robot(self, self._log, options, self._tf)
+        self._others = other_names(options.other_children)
+        self._session.take_others(self._others)
+        self._inputs = [self._make_input(name) for name in ("parent", "child", *self._others)]
+        self._session.topics = {each.name: each.topic for each in self._inputs[:2]}
+        self._session.follow_journal(options, resuming=options.journal == "resume")
+        for each in self._inputs:
+            each.resume()
+        self._results, self._states = ResultTopics(self), StateTopics(self)
+        self._tf.switch(options.publish_tf)
         self._mount = None
-        if self._options.node.monitor:
+        if options.monitor:
             self._session.watch_only(LIMITS)
-            self._mount = MountWatch(self._session, self._robot, self._log)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._answered = self.create_guard_condition(self._take_answers)
+            why = self._robot
+            self._mount = MountWatch(
+                self._session, self._robot.installed, lambda: why.problem, self._log
+            )
+        self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
         self._cycle = SolveCycle(
             self._session,
-            self._checks,
             self._log,
             self._answered.trigger,
             self._robot.complete,
             self._publish_result,
-            Goal(self._options.calibrator.targets),
+            config.targets,
         )
-        self._parts = NodeParts(
-            self.get_fully_qualified_name(), self._options, self._session, self._inputs,
-            self._cycle, self._checks, self._tf, self._robot, self._mount, self._others,
-        )  # fmt: skip
+        self._saver = Saver(self._session, self._cycle, self._log)
         self._serve()
         self._start_timers()
         self._discover()
@@ -119,38 +120,25 @@ class CalibratorNode(Node):
         """
         self._cycle.stop(timeout_s)
         saved = True
-        if self._options.node.output_directory and self._cycle.result is not None:
-            saved, text = self._save()
-            self._log_outcome(saved, text)
-        elif self._cycle.result is not None:
-            self._log.warning("the result is not saved: output_directory is not set")
+        if self._cycle.result is not None:
+            if self._options.node.output_directory:
+                saved, _ = self._saver.save(self._options.node)
+            else:
+                self._log.warning("the result is not saved: output_directory is not set")
         self._session.stop_journal()
         return saved
 
     # ---------------------------------------------------------------- set-up
 
-    def _make_input(self, name: str) -> PoseInput:
-        frames = tf_source(self._options.node, name)
-        parts = self._session, self._log, self._begin_session
-        made = TfInput(self, name, frames, *parts) if frames else TopicInput(self, name, *parts)
-        made.configure(self._options)
+    def _make_input(self, name: str) -> TopicInput | TfInput:
+        options, parts = self._options.node, (self._session, self._log, self._begin_session)
+        made: TopicInput | TfInput
+        if frames := getattr(options, f"{name}_tf", ""):
+            made = TfInput(self, name, TfSource.parse(frames), *parts)
+        else:
+            made = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), *parts)
+        made.configure(self._options.calibrator, options.monitor)
         return made
-
-    def _make_others(self) -> tuple[PoseInput, ...]:
-        """Inputs of further child sensors."""
-        names = other_names(self._options.node.other_children)
-        self._session.take_others(names)
-        parts = self._session, self._log, self._begin_session
-        made = [TopicInput(self, name, *parts) for name in names]
-        for each in made:
-            each.configure(self._options)
-        return tuple(made)
-
-    def _open_journal(self) -> None:
-        resuming = self._options.node.journal == "resume"
-        self._session.follow_journal(self._options.node, resuming)
-        for each in (*self._inputs, *self._others):
-            each.resume()
 
     def _serve(self) -> None:
         # A group of its own: while it awaits a solve, it would hold up every other callback of its
@@ -171,111 +159,87 @@ class CalibratorNode(Node):
         period_s = self._options.node.solve_period
         self._solve_timer = self.create_timer(period_s, self._on_solve_timer, clock=steady)
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=steady)
-        self.create_timer(_DIAGNOSTICS_PERIOD_S, self._publish_diagnostics, clock=steady)
-        self._answer_timer = self.create_timer(ANSWER_PERIOD_S, self._answer_some, clock=steady)
+        self.create_timer(_STATE_PERIOD_S, self._publish_state, clock=steady)
         self.create_timer(FLUSH_PERIOD_S, self._session.flush_journal, clock=steady)
 
     # ---------------------------------------------------------------- timers
 
     def _discover(self) -> None:
-        self._inputs[0].discover(self._options.node.parent_type)
-        self._inputs[1].discover(self._options.node.child_type)
-        for each in self._others:
-            each.discover("auto")
-        for each in (*self._inputs, *self._others):
+        for each in self._inputs:
+            each.discover()
             each.flush()
 
     def _on_solve_timer(self) -> None:
-        inputs = (*self._inputs, *self._others)
-        silent = [each for each in inputs if each.guard.last_ns is None]
+        silent = [each for each in self._inputs if not each.has_poses]
         if silent and silent[0].is_enabled:
             text = "; ".join(each.describe_silence() for each in silent)
             self._log.info(text, "silent", 2 * LOG_PERIOD_S)
         self._cycle.start_if_due()
 
-    def _take_answers(self) -> None:
-        self._cycle.take_answers()
-        self._answer_some()
-
-    def _answer_some(self) -> None:
-        if self._cycle.answer_some():
-            self._answer_timer.reset()
-        else:
-            self._answer_timer.cancel()
-
     def _publish_result(self, calibration: Calibration) -> None:
-        self._topics.publish(calibration)
+        self._results.publish(calibration)
         if not self._robot.lacks_base(calibration):
             self._tf.add(calibration, self._cycle.goal.progress.is_done)
 
     def _publish_others(self, calibrations: Sequence[Calibration]) -> None:
         """Publish new results of the further child sensors, in their order."""
-        for each, calibration in zip(self._others, calibrations, strict=False):
-            self._topics.publish_other(each.name, calibration)
+        for name, calibration in zip(self._others, calibrations, strict=False):
+            self._results.publish_other(name, calibration)
         mounted = [self._robot.in_base(each) for each in calibrations]
         if mounted:
             self._tf.add_others([each for each in mounted if not self._robot.lacks_base(each)])
 
-    def _publish_diagnostics(self) -> None:
+    def _publish_state(self) -> None:
         self._tf.look()
-        self._publish_others(self._report.take_others())
+        self._publish_others(self._saver.take_others())
         if self._mount is not None:
             self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds
-        self._diagnostics.publish(diagnostics(self._parts, time.monotonic(), clock_ns))
+        self._states.publish(self._state(time.monotonic(), clock_ns), clock_ns)
+
+    def _state(self, steady_s: float, clock_ns: int) -> NodeState:
+        options, cycle, name = self._options.node, self._cycle, self.get_fully_qualified_name()
+        result = cycle.result
+        used_s = result.time_offset_s if result else self._options.calibrator.time_offset
+        inputs = input_states(self._inputs, cycle.has_valid_result, used_s, steady_s)
+        if self._mount is not None:
+            return NodeState(node=name, mount=self._mount.state(), inputs=inputs)
+        return NodeState(
+            node=name,
+            extrinsic=extrinsic_state(
+                cycle,
+                accepts_poses=self._inputs[0].is_enabled,
+                tf_static=self._tf.state,
+                stale_after_s=stale_after_s(self._session.has_new_poses, options.solve_period),
+                steady_s=steady_s,
+                clock_ns=clock_ns,
+            ),
+            progress=progress_state(cycle, self._robot.why_not_compared),
+            inputs=inputs,
+            checks=cycle.checks.state(steady_s),
+            journal=self._session.journal_state(options),
+        )
 
     # --------------------------------------------------------------- session
 
     def _begin_session(self, because_of: PoseInput | None = None) -> None:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._session.reset()
-        self._cycle.restart()
-        self._checks.restart()
-        self._topics.clear()
-        self._report.forget()
-        self._tf.restart()
-        if self._mount is not None:
-            self._mount.restart()
-        for each in (*self._inputs, *self._others):
+        for part in (self._cycle, self._saver, self._tf, self._mount):
+            if part is not None:
+                part.restart()
+        self._results.clear()
+        for each in self._inputs:
             each.restart(because_of)
-
-    def _save(self) -> tuple[bool, str]:
-        options, cycle = self._options.node, self._cycle
-        inputs = self._session.inputs()
-        if cycle.snapshot is not None:  # a check may have been certain of other options
-            inputs["options"] = cycle.snapshot.config.to_options()
-        result = cycle.result
-        if result is not None:
-            result = dataclasses.replace(
-                result, goal=from_plain(Progress, cycle.goal.progress.to_dict())
-            )
-        saved, text = self._files.save(result, options.output_directory, inputs)
-        others = {name: each.snapshot() for name, each in self._session.others.items()}
-        is_wanted = options.report or others
-        if saved and is_wanted and result is not None and cycle.snapshot is not None:
-            path = output_path(options.output_directory)
-            told = SessionResult(result, cycle.snapshot, inputs, options.report, others)
-            try:
-                self._report.write(path, told)
-                text += f", {told.what_follows}"
-            except OSError as error:
-                missing = f"{told.files} cannot be written: {error.strerror}"
-                self._log.warning(missing)
-                text += f"; {missing}"
-        return saved, text
-
-    def _log_outcome(self, success: bool, text: str) -> None:
-        if success:
-            self._log.info(text)
-        else:
-            self._log.warning(text)
 
     # -------------------------------------------------------------- services
 
     async def _on_solve(
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        response.success, response.message = await self._cycle.ask()
+        solved = Future()
+        self._cycle.ask(lambda good, text: solved.set_result((good, text)))
+        response.success, response.message = await solved
         return response
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -285,16 +249,15 @@ class CalibratorNode(Node):
         return response
 
     def _on_save(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self._save()
-        self._log_outcome(response.success, response.message)
+        response.success, response.message = self._saver.save(self._options.node)
         return response
 
     def _on_set_enabled(
         self, request: SetBool.Request, response: SetBool.Response
     ) -> SetBool.Response:
-        for each in (*self._inputs, *self._others):
+        for each in self._inputs:
             each.is_enabled = request.data
-        ignored = sum(each.monitor.ignored for each in self._inputs)
+        ignored = sum(each.ignored for each in self._inputs)
         verb = "accepting" if request.data else "not accepting"
         response.success, response.message = True, f"{verb} poses; {ignored} ignored so far"
         self._log.info(response.message)
@@ -312,24 +275,24 @@ class CalibratorNode(Node):
             raise ConfigError("monitor needs installed: what the mount is watched against")
         if options.monitor and options.other_children:
             raise ConfigError("monitor watches one child sensor: leave other_children at 0")
-        for name in ("parent", "child"):
-            if tf_source(options, name):
-                message_type(f"{name}_tf")
+        for name in ("parent_tf", "child_tf"):
+            if frames := getattr(options, name):
+                TfSource.parse(frames)
+                message_type(name)
         if self._output_base is not None and options.output_directory:
             check_below(self._output_base, options.output_directory)
         self._session.check_journal(options)
 
     def _follow_parameters(self) -> None:
-        options = self._options
-        if options.calibrator != self._session.calibrator.config:
-            self._session.reconfigure(options.calibrator)
-            self._checks.hasten()
-            self._cycle.aim(options.calibrator.targets)
-        for each in (*self._inputs, *self._others):
-            each.configure(options)
-        self._session.follow_journal(options.node)
-        self._tf.switch(options.node.publish_tf)
-        period_ns = round(options.node.solve_period * 1e9)
+        options, config = self._options.node, self._options.calibrator
+        if config != self._session.calibrator.config:
+            self._session.reconfigure(config)
+            self._cycle.follow(config.targets)
+        for each in self._inputs:
+            each.configure(config, options.monitor)
+        self._session.follow_journal(options)
+        self._tf.switch(options.publish_tf)
+        period_ns = round(options.solve_period * 1e9)
         if period_ns != self._solve_timer.timer_period_ns:
             self._solve_timer.timer_period_ns = period_ns
             self._solve_timer.reset()

@@ -14,14 +14,27 @@ from geometry_msgs.msg import (
     Vector3,
 )
 from nav_msgs.msg import Odometry
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.live.tf_stream import StampedTransform
 from hand_eye_calib.results.calibration import Calibration
 
 _Triple = TypeVar("_Triple", Point, Vector3)
 
+# Of a publisher: who comes later gets the last message. Of a subscription: every publisher's last
+# message fits.
+LATCHED, LISTENING = (
+    QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+    for depth in (1, 1000)
+)
 
 # Messages that are read, the likeliest first.
 MESSAGES: dict[str, type[Any]] = {
@@ -44,6 +57,18 @@ def to_time(stamp_ns: int) -> Time:
     """builtin_interfaces/Time of nanoseconds (int)."""
     sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
     return Time(sec=sec, nanosec=nanosec)
+
+
+def from_transform(message: TransformStamped) -> StampedTransform:
+    """A transform as the engine takes it."""
+    place, rotation = message.transform.translation, message.transform.rotation
+    return StampedTransform(
+        to_ns(message.header.stamp),
+        printable(message.header.frame_id).lstrip("/"),
+        printable(message.child_frame_id).lstrip("/"),
+        (place.x, place.y, place.z),
+        (rotation.x, rotation.y, rotation.z, rotation.w),
+    )
 
 
 def to_transform(calibration: Calibration) -> TransformStamped:

@@ -1,10 +1,25 @@
-"""Entry point of the node ``calibrator``."""
+"""Entry point of the node ``calibrator``: from arguments to a spinning node, and from a signal to a
+clean end.
 
+ROS and the engine are imported late, so that Ctrl-C while they load ends the program quietly too.
+"""
+
+import argparse
 import os
+import re
 import signal
 import sys
+import threading
+import traceback
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rclpy.executors import SingleThreadedExecutor
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+# How long a running solve may hold up the end of the program.
+SOLVE_GRACE_S = 0.5
 
 
 def main(args: list[str] | None = None) -> int:
@@ -22,11 +37,8 @@ def main(args: list[str] | None = None) -> int:
         saved (reported on stderr); 2 wrong usage.
     """
     signals = _signal_pipe()
-    # Imported this late so that Ctrl-C while numpy, scipy and rclpy load ends the program quietly
-    # too.
-    from hand_eye_calib.ros.running import run
-
-    code = run(sys.argv[1:] if args is None else args, signals)
+    arguments = sys.argv[1:] if args is None else args
+    code = _init(arguments) or _run_node(signals)
     # The interpreter's own clean-up would restore the defaults, and a late Ctrl-C change the exit
     # code.
     for number in STOP_SIGNALS:
@@ -46,3 +58,77 @@ def _signal_pipe() -> int:
     for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: None)
     return readable
+
+
+def _init(arguments: list[str]) -> int:
+    """Start rclpy; returns the exit code, 0 if it has started."""
+    import rclpy
+    from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+    from rclpy.logging import LoggingSeverity, set_logger_level
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args
+
+    parser = argparse.ArgumentParser(
+        prog="calibrator",
+        description="The extrinsic between two sensors from their odometry, live.",
+        epilog="ROS arguments follow --ros-args.",
+    )
+    # rcl logs an error of its own before it raises the one that says what is wrong.
+    set_logger_level("rcl", LoggingSeverity.FATAL)
+    try:
+        parser.parse_args(remove_ros_args(args=arguments))
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except UnknownROSArgsError as error:
+        print(f"calibrator: unknown ROS arguments {error}", file=sys.stderr)
+        return 2
+    except RCLError as error:
+        reason = re.sub(r", at \S+:\d+", "", " ".join(str(error).split()))
+        print(f"calibrator: {reason}", file=sys.stderr)
+        return 1
+    set_logger_level("rcl", LoggingSeverity.UNSET)
+    return 0
+
+
+def _run_node(signals: int) -> int:
+    """Run the node until ``signals`` is readable; returns the exit code."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    from hand_eye_calib.errors import HandEyeCalibError
+    from hand_eye_calib.ros.calibrator_node import CalibratorNode
+
+    # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
+    executor = SingleThreadedExecutor()
+    node, code = None, 1
+    try:
+        node = CalibratorNode()
+        executor.add_node(node)
+        _spin(executor, signals)
+        code = 0
+    except HandEyeCalibError as error:
+        print(f"calibrator: {error}", file=sys.stderr)
+    except Exception:
+        traceback.print_exc()
+    executor.shutdown()
+    if node is not None:
+        try:
+            code = code if node.stop(SOLVE_GRACE_S) else 1
+        except Exception:
+            traceback.print_exc()
+            code = 1
+        node.destroy_node()
+    rclpy.try_shutdown()
+    return code
+
+
+def _spin(executor: "SingleThreadedExecutor", signals: int) -> None:
+    stopping = threading.Event()
+
+    def wait_for_signal() -> None:
+        os.read(signals, 1)
+        # As a task: executor.wake() alone does not make spin_once() return.
+        executor.create_task(stopping.set)
+
+    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
+    while not stopping.is_set():
+        executor.spin_once()

@@ -1,41 +1,35 @@
 """Plays poses to a node ``calibrator`` in another process and waits for its answer: the far end of
-the middleware.
+the middleware, for ``demo``.
 """
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import rclpy
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.ros.conversions import to_ns, to_time
+from hand_eye_calib.live.tf_stream import StampedTransform
+from hand_eye_calib.ros.conversions import LATCHED, from_transform, to_time
 
 if TYPE_CHECKING:  # what reads bags is not needed to play poses
     from hand_eye_calib.io.bags import StampedPose
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-_LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
 _SPIN_S = 0.02
 
 
-@dataclass(frozen=True)
-class LiveExtrinsic:
-    """What the node published on ``~/extrinsic``: the (4, 4) extrinsic, its frames, the stamp of
-    the newest pose used.
-    """
+class LiveExtrinsic(NamedTuple):
+    """What the node published on ``~/extrinsic``; the stamp is of the newest pose used."""
 
     T_parent_child: FloatArray
     parent_frame: str
@@ -70,7 +64,10 @@ class Player:
     ) -> None:
         self._check, self._patience_s = check, patience_s
         self._context = rclpy.Context()
-        _init(self._context)
+        try:
+            rclpy.init(args=[], context=self._context)
+        except RCLError as error:
+            raise HandEyeCalibError(f"cannot start ROS: {' '.join(str(error).split())}") from None
         self._node = rclpy.create_node("hand_eye_calib_player", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -79,10 +76,12 @@ class Player:
             for stream, topic in topics.items()
         }
         self._solve = self._node.create_client(Trigger, "calibrator/solve")
-        self._answer = "no answer"
-        self._extrinsic: LiveExtrinsic | None = None
+        self._heard: list[StampedTransform] = []
         self._node.create_subscription(
-            TransformStamped, "calibrator/extrinsic", self._on_extrinsic, _LATCHED
+            TransformStamped,
+            "calibrator/extrinsic",
+            lambda message: self._heard.append(from_transform(message)),
+            LATCHED,
         )
 
     def __enter__(self) -> "Player":
@@ -96,24 +95,15 @@ class Player:
     def play(self, poses: Iterable["StampedPose"], speed: float) -> None:
         """Publish poses ``speed`` times as fast as they were recorded, once the node listens to
         both topics.
-
-        Parameters
-        ----------
-        poses : iterable of StampedPose
-        speed : float
         """
-        self._wait(
-            lambda: all(
-                publisher.get_subscription_count() for publisher in self._publishers.values()
-            ),
-            "to subscribe",
-        )
-        start, first_stamp_ns = time.monotonic(), None
+        publishers = self._publishers.values()
+        self._wait(lambda: all(each.get_subscription_count() for each in publishers), "subscribe")
+        start_s, first_ns = time.monotonic(), None
         for pose in poses:
-            first_stamp_ns = pose.stamp_ns if first_stamp_ns is None else first_stamp_ns
-            due = start + (pose.stamp_ns - first_stamp_ns) * 1e-9 / speed
-            while (remaining := due - time.monotonic()) > 0:
-                self._executor.spin_once(timeout_sec=remaining)
+            first_ns = pose.stamp_ns if first_ns is None else first_ns
+            due_s = start_s + (pose.stamp_ns - first_ns) * 1e-9 / speed
+            while (remaining_s := due_s - time.monotonic()) > 0:
+                self._executor.spin_once(timeout_sec=remaining_s)
             self._publishers[pose.stream].publish(_odometry(pose))
         self._check()
 
@@ -121,61 +111,30 @@ class Player:
         """Have the node solve until the newest pose in its result has this stamp or a later one.
 
         Poses and service calls share no order, so one call of ``~/solve`` would not be enough.
-
-        Returns
-        -------
-        LiveExtrinsic
         """
-        self._wait(self._solve.service_is_ready, "to serve ~/solve")
-        pending = None
+        self._wait(self._solve.service_is_ready, "serve ~/solve")
+        asked = self._solve.call_async(Trigger.Request())
 
         def is_covered() -> bool:
-            nonlocal pending
-            if self._extrinsic is not None and self._extrinsic.stamp_ns >= stamp_ns:
+            nonlocal asked
+            if self._heard and self._heard[-1].stamp_ns >= stamp_ns:
                 return True
-            if pending is None or pending.done():
-                self._answer = pending.result().message if pending else self._answer
-                pending = self._solve.call_async(Trigger.Request())
+            if asked.done():
+                asked = self._solve.call_async(Trigger.Request())
             return False
 
-        self._wait(
-            is_covered,
-            "for a result with all poses",
-            lambda: f"; its last answer was: {self._answer}",
-        )
-        assert self._extrinsic is not None
-        return self._extrinsic
+        self._wait(is_covered, "give a result with all poses")
+        found = self._heard[-1]
+        T = se3.from_quat_xyzw(found.position, found.quat_xyzw)
+        return LiveExtrinsic(T, found.world_frame, found.sensor_frame, found.stamp_ns)
 
-    def _wait(
-        self,
-        condition: Callable[[], object],
-        purpose: str,
-        details: Callable[[], str] = lambda: "",
-    ) -> None:
-        end = time.monotonic() + self._patience_s
+    def _wait(self, condition: Callable[[], object], purpose: str) -> None:
+        end_s = time.monotonic() + self._patience_s
         while not condition():
             self._check()
-            if time.monotonic() > end:
-                raise HandEyeCalibError(
-                    f"waited {self._patience_s:g} s for the node {purpose}{details()}"
-                )
+            if time.monotonic() > end_s:
+                raise HandEyeCalibError(f"waited {self._patience_s:g} s for the node to {purpose}")
             self._executor.spin_once(timeout_sec=_SPIN_S)
-
-    def _on_extrinsic(self, message: TransformStamped) -> None:
-        t, q = message.transform.translation, message.transform.rotation
-        self._extrinsic = LiveExtrinsic(
-            se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w]),
-            message.header.frame_id,
-            message.child_frame_id,
-            to_ns(message.header.stamp),
-        )
-
-
-def _init(context: rclpy.Context) -> None:
-    try:
-        rclpy.init(args=[], context=context)
-    except RCLError as error:
-        raise HandEyeCalibError(f"cannot start ROS: {' '.join(str(error).split())}") from None
 
 
 def _odometry(pose: "StampedPose") -> Odometry:

@@ -5,15 +5,15 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from hand_eye_calib.config import NodeConfig
-from hand_eye_calib.errors import HandEyeCalibError, InputError, printable
+from hand_eye_calib.errors import HandEyeCalibError, InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.io.installed import of_frames, open_installed
+from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.ros.log import NodeLog
+from hand_eye_calib.ros.conversions import LISTENING, from_transform
 from hand_eye_calib.ros.tf import STATIC_TOPIC, message_type
 from hand_eye_calib.session.compare import with_comparison
 
@@ -21,10 +21,6 @@ TF = "tf"
 
 # What could not be read is tried again after so long.
 _AGAIN_S = 5.0
-
-_QOS = QoSProfile(
-    depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
 
 
 class _Own(Protocol):
@@ -65,7 +61,8 @@ class Robot:
         self.problem = ""
         self._read = self._of_tf if self._source in ("", TF) else open_installed(self._source)
         if needs_tf(options):
-            node.create_subscription(message_type("installed"), STATIC_TOPIC, self._hear, _QOS)
+            kind = message_type("installed")
+            node.create_subscription(kind, STATIC_TOPIC, self._hear, LISTENING)
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
         """What is installed; None if nothing was given, or it is not known (yet)."""
@@ -117,14 +114,12 @@ class Robot:
         for each in message.transforms:
             if self._own.is_own(each):
                 continue
-            place, rotation = each.transform.translation, each.transform.rotation
-            position = (place.x, place.y, place.z)
-            quat_xyzw = (rotation.x, rotation.y, rotation.z, rotation.w)
-            frame = printable(each.child_frame_id).lstrip("/")
+            edge = from_transform(each)
             try:
-                parent = printable(each.header.frame_id).lstrip("/")
-                self._frames.add(parent, frame, checked_pose(position, quat_xyzw))
+                pose = checked_pose(edge.position, edge.quat_xyzw)
+                self._frames.add(edge.world_frame, edge.sensor_frame, pose)
             except HandEyeCalibError as error:
+                frame = edge.sensor_frame
                 self._report(f"{STATIC_TOPIC} has an unusable transform of {frame}: {error}")
 
 

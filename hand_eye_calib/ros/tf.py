@@ -10,26 +10,20 @@ from typing import Any
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.state import Broadcast
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.results.verdict import target_of
-from hand_eye_calib.ros.conversions import to_mounting
-from hand_eye_calib.ros.log import NodeLog
-from hand_eye_calib.text import listing
+from hand_eye_calib.ros.conversions import LATCHED, LISTENING, to_mounting
+from hand_eye_calib.text import axes_in_words
 
 STATIC_TOPIC = "/tf_static"
 DYNAMIC_TOPIC = "/tf"
 
-_STATIC_QOS = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-# Every publisher's latched message must fit.
-_LISTENING_QOS = QoSProfile(
-    depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
 _DYNAMIC_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 # The transform tree is listened to for so long before anything is broadcast (s): discovery takes up
@@ -65,19 +59,15 @@ class FrameTree:
             if other == parent:
                 return f"{topic} has the edge {parent} -> {child} already, from another node"
             return f"{child} has the parent {other} on {topic} already, and a frame has one parent"
-        if child in self._ancestors(parent):
+        above, waiting = set[str](), [parent]
+        while waiting:
+            for frame in self._parents.get(waiting.pop(), {}):
+                if frame not in above:
+                    above.add(frame)
+                    waiting.append(frame)
+        if child in above:
             return f"{parent} is below {child} in the tree already: the edge would close a circle"
         return ""
-
-    def _ancestors(self, frame: str) -> set[str]:
-        found: set[str] = set()
-        waiting = [frame]
-        while waiting:
-            for parent in self._parents.get(waiting.pop(), {}):
-                if parent not in found:
-                    found.add(parent)
-                    waiting.append(parent)
-        return found
 
 
 class TfBroadcaster:
@@ -92,50 +82,51 @@ class TfBroadcaster:
 
     def __init__(self, node: Node, log: NodeLog) -> None:
         self._node, self._log = node, log
-        self._newest: Calibration | None = None
-        self._waiting_for = "no result yet"
-        self._forbidden = ""
-        self._others: list[Calibration] = []
-        self._forbidden_others: dict[str, str] = {}
         self._tree = FrameTree()
         self._own: deque[TransformStamped] = deque(maxlen=_MOST_OWN)
         self._publisher: Publisher | None = None
         self._subscriptions: dict[str, Subscription] = {}
         self._began_s = 0.0
+        self._forget()
 
-    @property
-    def is_on(self) -> bool:
-        """Whether results are broadcast once the goal is reached."""
-        return bool(self._subscriptions)
+    def _forget(self) -> None:
+        self._newest: Calibration | None = None
+        self._others: list[Calibration] = []
+        self._waiting_for = "no result yet"
+        self._forbidden: dict[str, str] = {}  # frame to the reason
 
     @property
     def refused(self) -> str:
-        """Why nothing may be broadcast, or a further child sensor may not; empty if all may."""
-        return self._forbidden or "; ".join(self._forbidden_others.values())
+        """Why something may not be broadcast; empty if all may."""
+        return "; ".join(self._forbidden.values())
 
     @property
-    def state(self) -> str:
-        """What is done about it, in words."""
-        if not self.is_on:
-            return "off"
-        if self._forbidden:
-            return f"refused: {self._forbidden}"
+    def state(self) -> tuple[Broadcast, str]:
+        """What is done about it, and the reason."""
+        if not self._subscriptions:
+            return Broadcast.OFF, ""
         if self._publisher is not None:
-            return "; ".join(["broadcast", *self._forbidden_others.values()])
-        return f"not yet: {self._waiting_for or 'the transform tree is looked at first'}"
+            return Broadcast.ON, self.refused
+        if self._forbidden:
+            return Broadcast.REFUSED, self.refused
+        return Broadcast.WAITING, self._waiting_for or "the transform tree is looked at first"
 
     def switch(self, on: bool) -> None:
         """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
-        if on == self.is_on:
-            return
-        if on:
-            self._listen()
+        if on and not self._subscriptions:
+            kind = message_type()
+            for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, _DYNAMIC_QOS)):
+                self._subscriptions[topic] = self._node.create_subscription(
+                    kind, topic, partial(self._hear, topic), qos
+                )
+            self._began_s = time.monotonic()
+            self._tree, self._forbidden = FrameTree(), {}
             self.look()
-            return
-        for subscription in self._subscriptions.values():
-            self._node.destroy_subscription(subscription)
-        self._subscriptions.clear()
-        self._withdraw()
+        elif not on and self._subscriptions:
+            for subscription in self._subscriptions.values():
+                self._node.destroy_subscription(subscription)
+            self._subscriptions.clear()
+            self._withdraw()
 
     def is_own(self, transform: TransformStamped) -> bool:
         """Whether this node has broadcast the transform."""
@@ -156,83 +147,58 @@ class TfBroadcaster:
                 self._log.info(f"{calibration.child_frame} is not on /tf_static: {unknown}")
             else:
                 self._others.append(calibration)
-        if self._newest is not None:
-            self._broadcast()
+        self._broadcast()
 
     def look(self) -> None:
         """Go on if the transform tree has been listened to for long enough; to be called often."""
-        if self._newest is not None and self._publisher is None:
+        if self._publisher is None:
             self._broadcast()
 
     def restart(self) -> None:
         """Begin a new session: what was broadcast is withdrawn."""
-        self._newest, self._waiting_for = None, "no result yet"
-        self._others, self._forbidden_others = [], {}
+        self._forget()
         self._withdraw()
-
-    def _listen(self) -> None:
-        kind = message_type()
-        qos = {STATIC_TOPIC: _LISTENING_QOS, DYNAMIC_TOPIC: _DYNAMIC_QOS}
-        self._subscriptions = {
-            topic: self._node.create_subscription(kind, topic, partial(self._hear, topic), profile)
-            for topic, profile in qos.items()
-        }
-        self._began_s = time.monotonic()
-        self._tree, self._forbidden, self._forbidden_others = FrameTree(), "", {}
 
     def _hear(self, topic: str, message: Any) -> None:
         for transform in message.transforms:
             if not self.is_own(transform):
                 self._tree.add(transform.header.frame_id, transform.child_frame_id, topic)
-        if self._publisher is not None and topic == STATIC_TOPIC:
-            before = {*self._forbidden_others}
-            if self._check() and {*self._forbidden_others} - before:
-                self._broadcast()  # without what is forbidden now
+        if self._publisher is not None and topic == STATIC_TOPIC and self._finds_forbidden():
+            self._broadcast()
 
-    def _check(self) -> bool:
-        """Whether the newest result may be broadcast."""
+    def _finds_forbidden(self) -> bool:
+        """Whether there is another edge that may not be broadcast."""
         assert self._newest is not None
-        self._check_others()
-        forbidden = self._what_forbids(self._newest)
-        if forbidden and forbidden != self._forbidden:
+        before, self._forbidden = self._forbidden, {}
+        for each in (self._newest, *self._others):
+            if why := self._tree.what_forbids(each.mounting[0], each.child_frame):
+                self._forbidden[each.child_frame] = why
+        new = [why for frame, why in self._forbidden.items() if why != before.get(frame)]
+        for why in new:
             self._log.error(
-                f"publish_tf is refused: {forbidden}. Put the result into the robot's description "
+                f"publish_tf is refused: {why}. Put the result into the robot's description "
                 "(extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf off"
             )
             if self._publisher is not None:
                 self._log.error("restart the listeners: some of them believe the other parent")
-            self._withdraw()
-        self._forbidden = forbidden
-        return not forbidden
-
-    def _what_forbids(self, calibration: Calibration) -> str:
-        return self._tree.what_forbids(calibration.mounting[0], calibration.child_frame)
-
-    def _check_others(self) -> None:
-        """Find which further child sensors may not be broadcast, and say what is new."""
-        before = self._forbidden_others
-        forbidden = {each.child_frame: self._what_forbids(each) for each in self._others}
-        self._forbidden_others = {frame: why for frame, why in forbidden.items() if why}
-        for frame, why in self._forbidden_others.items():
-            if why != before.get(frame):
-                self._log.error(
-                    f"publish_tf is refused for {frame}: {why}. Put its result into the robot's "
-                    "description; if it was broadcast before, restart the listeners"
-                )
+        return bool(new)
 
     def _broadcast(self) -> None:
         is_looking = time.monotonic() - self._began_s < LOOK_S
-        if not self.is_on or is_looking or self._waiting_for or not self._check():
+        if not self._subscriptions or is_looking or self._waiting_for or self._newest is None:
             return
-        assert self._newest is not None
+        self._finds_forbidden()
+        if self._newest.child_frame in self._forbidden:
+            self._withdraw()
+            return
         if DYNAMIC_TOPIC in self._subscriptions:  # enough of that: it may be fast
             self._node.destroy_subscription(self._subscriptions.pop(DYNAMIC_TOPIC))
         if self._publisher is None:
-            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, _STATIC_QOS)
+            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
             self._log.info("the result is broadcast on /tf_static from now on")
-        others = [each for each in self._others if each.child_frame not in self._forbidden_others]
         # In one message: new listeners get the last one alone.
-        transforms = [to_mounting(each) for each in (self._newest, *others)]
+        found = [each for each in self._others if each.child_frame not in self._forbidden]
+        transforms = [to_mounting(each) for each in (self._newest, *found)]
         self._own.extend(transforms)
         self._publisher.publish(message_type()(transforms=transforms))
 
@@ -257,7 +223,7 @@ def what_is_unknown(calibration: Calibration) -> str:
         if not math.isfinite(dof.sigma)
         or (dof.verdict is not DofVerdict.PRIOR and dof.sigma > target_of(dof.name, calibration))
     ]
-    return f"{listing(rough)} not known to the target" if rough else ""
+    return f"{axes_in_words(rough)} not known to the target" if rough else ""
 
 
 def message_type(wanted_by: str = "publish_tf") -> type[Any]:

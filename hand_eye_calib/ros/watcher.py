@@ -1,34 +1,29 @@
 """Listens to the nodes for ``watch``, and passes the presses of its buttons on."""
 
+import json
 import os
-import re
 import time
-from collections.abc import Iterable
 from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import TransformStamped
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from hand_eye_calib.errors import printable
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.ros.status import HARDWARE_ID
-from hand_eye_calib.watch.board import Board, Pose, Status
+from hand_eye_calib.live.state import NodeState
+from hand_eye_calib.plain import from_plain
+from hand_eye_calib.ros.conversions import LATCHED
+from hand_eye_calib.ros.outputs import PROGRESS_TOPIC
+from hand_eye_calib.watch.board import Board
 
-_LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-_DIAGNOSTICS_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-_NODE_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+# New nodes are looked for so often (s), and so many are listened to.
+_LOOK_S, _MOST_NODES = 1.0, 50
 
 # A service that has not answered for so long will not (s): a solve takes seconds.
 _PATIENCE_S = 60.0
@@ -54,12 +49,11 @@ class Watcher:
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._node.create_subscription(
-            DiagnosticArray, "/diagnostics", self._take, _DIAGNOSTICS_QOS
-        )
+        self._node.create_timer(_LOOK_S, self._look)
         self._heard: set[str] = set()
         self._clients: dict[tuple[str, str], Client] = {}
         self._asked: dict[tuple[str, str], tuple[Future | None, float]] = {}
+        self._look()
 
     def __enter__(self) -> Self:
         return self
@@ -82,7 +76,7 @@ class Watcher:
 
     def ask(self, node: str, request: str) -> None:
         """Call ``solve``, ``save`` or ``reset`` of a node; the answer goes to the board."""
-        if not node:
+        if node not in self._heard:
             return
         key = node, request
         if key not in self._clients:
@@ -90,28 +84,20 @@ class Watcher:
         self._asked[key] = None, time.monotonic()
         self._answer(key, None, "asked ...")
 
-    # ------------------------------------------------------------------ input
+    def _look(self) -> None:
+        """Listen to nodes that are new: anybody may have a topic of that name."""
+        for topic, types in self._node.get_topic_names_and_types():
+            name, _, last = topic.rpartition("/")
+            is_one = last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
+            if is_one and name not in self._heard and len(self._heard) < _MOST_NODES:
+                self._heard.add(name)
+                take = partial(self._take, name)
+                self._node.create_subscription(String, topic, take, LATCHED)
 
-    def _take(self, message: DiagnosticArray) -> None:
-        now_s = time.monotonic()
-        for node, statuses in by_node(message.status).items():
-            self._board.take(node, statuses, now_s)
-            if node not in self._heard:
-                self._heard.add(node)
-                self._node.create_subscription(
-                    TransformStamped, f"{node}/extrinsic", partial(self._take_pose, node), _LATCHED
-                )
-
-    def _take_pose(self, node: str, message: TransformStamped) -> None:
-        place, rotation = message.transform.translation, message.transform.rotation
-        T_parent_child = se3.from_quat_xyzw(
-            [place.x, place.y, place.z], [rotation.x, rotation.y, rotation.z, rotation.w]
-        )
-        rpy = se3.rotation_to_rpy(T_parent_child[:3, :3]).tolist()
-        frames = printable(message.header.frame_id), printable(message.child_frame_id)
-        self._board.take_pose(node, Pose(*frames, (place.x, place.y, place.z, *rpy)))
-
-    # --------------------------------------------------------------- services
+    def _take(self, name: str, message: String) -> None:
+        state = state_of(message.data)
+        if state is not None and state.node == name:
+            self._board.take(state, time.monotonic())
 
     def _follow(self, node: str, request: str) -> None:
         """Go on with a request: wait for the service, then for the answer."""
@@ -132,21 +118,19 @@ class Watcher:
         self._board.answer(*key, good, text, time.monotonic())
 
 
-def by_node(statuses: Iterable[DiagnosticStatus]) -> dict[str, list[Status]]:
-    """The statuses of each calibrator among those of a message, by the node's name."""
-    nodes: dict[str, list[Status]] = {}
-    for each in statuses:
-        node = each.name.rpartition(": ")[0]
-        # Anybody may publish anything: services and topics must be possible below the name.
-        if each.hardware_id == HARDWARE_ID and _NODE_NAME.fullmatch(node):
-            nodes.setdefault(node, []).append(_status(each))
-    return nodes
+def state_of(text: str) -> NodeState | None:
+    """The state of a node from its JSON, without control characters; None if it is something else,
+    such as that of another version.
+    """
+    try:
+        return from_plain(NodeState, _printable(json.loads(text)))
+    except (TypeError, ValueError, KeyError, RecursionError):
+        return None
 
 
-def _status(message: DiagnosticStatus) -> Status:
-    return Status(
-        part=printable(message.name.rpartition(": ")[2]),
-        level=ord(message.level),
-        text=printable(message.message),
-        values={printable(each.key): printable(each.value) for each in message.values},
-    )
+def _printable(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {printable(key): _printable(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_printable(each) for each in value]
+    return printable(value) if isinstance(value, str) else value

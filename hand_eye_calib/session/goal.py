@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.assessment.covariance import AXES, ROTATIONS, TRANSLATIONS
-from hand_eye_calib.assessment.excitation import MIN_ROTATION, Excitation
+from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.assessment.excitation import Excitation, helpful_motion
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.text import amount, angle, length
+from hand_eye_calib.text import amount, angle, axes_in_words, duration, length
 
 # An axis is known if its standard deviation is below this share of its target ...
 _SHARE = 0.7
@@ -58,6 +58,8 @@ class Progress:
         More of this motion is of no use for the limiting axis.
     sentence : str
         What to do now, for a person next to the robot.
+    is_faulty : bool
+        The streams cannot be calibrated with.
     """
 
     sigmas: FloatArray
@@ -67,24 +69,26 @@ class Progress:
     is_done: bool
     will_not_get_there: bool
     sentence: str
+    is_faulty: bool = False
+
+    def by_axis(self) -> dict[str, dict[str, float]]:
+        """Standard deviation, target and seconds left of each axis."""
+        columns = {"sigma": self.sigmas, "target": self.targets, "seconds_left": self.seconds_left}
+        return {
+            axis: {name: float(values[index]) for name, values in columns.items()}
+            for index, axis in enumerate(AXES)
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values; None for what is unknown."""
-        columns = zip(AXES, self.sigmas, self.targets, self.seconds_left, strict=True)
-        return {
+        found: dict[str, Any] = {
             "sentence": self.sentence,
             "done": self.is_done,
             "limiting_axis": self.limiting_axis,
             "will_not_get_there": self.will_not_get_there,
-            "axes": {
-                axis: {
-                    "sigma": plain(sigma),
-                    "target": plain(target),
-                    "seconds_left": plain(left_s),
-                }
-                for axis, sigma, target, left_s in columns
-            },
+            "axes": plain(self.by_axis()),
         }
+        return found
 
 
 @dataclass(frozen=True)
@@ -175,6 +179,7 @@ class Goal:
             is_done=is_done,
             will_not_get_there=stuck,
             sentence=self._sentence(calibration, seen, faults, AXES[worst], left_s[worst], stuck),
+            is_faulty=bool(faults),
         )
         return self.progress
 
@@ -219,18 +224,15 @@ class Goal:
         if calibration.status.failure:
             return f"No usable result: {calibration.status.failure}."
         if self._best is not None:
-            return f"Done: {_precision(self._best)}. Stop and save.{_floor(self._best, self)}"
-        motion = helpful_motion(axis, seen)
+            floor = _beyond_target(self._best, self._targets)
+            return f"Done: {_precision(self._best)}. Stop and save.{floor}"
+        motion, called = helpful_motion([axis], seen), axes_in_words([axis])
         if stuck:
-            return f"This motion will not determine {_called(axis)} well enough: {motion}."
+            return f"This motion will not determine {called} well enough: {motion}."
         if not np.isfinite(left_s):
-            return f"{_called(axis)} is not determined yet: {motion}."
-        return f"Go on for about {_duration(left_s)}: {_called(axis)} takes longest, {motion}."
-
-    @property
-    def targets(self) -> FloatArray:
-        """(6,) array: targets of x, y, z (m), roll, pitch, yaw (rad)."""
-        return self._targets
+            return f"{called} is not determined yet: {motion}."
+        left = duration(max(5 * round(left_s / 5), 5))
+        return f"Go on for about {left}: {called} takes longest, {motion}."
 
 
 def _settled_by_prior(calibration: Calibration) -> BoolArray:
@@ -256,44 +258,6 @@ def _least_motion_s(calibration: Calibration) -> float:
     return max(_MIN_MOTION_S, _CORRELATION_TIMES * float(slowest_s))
 
 
-def helpful_motion(axis: str, seen: Excitation) -> str:
-    """The motion that would tell most about an axis, in words.
-
-    A rotation about one axis tells about offsets and angles across it, never about those along it.
-
-    Parameters
-    ----------
-    axis : str
-        x, y, z, roll, pitch or yaw.
-    seen : Excitation
-        The motion so far, about the axes of the parent sensor.
-    """
-    rotation = seen.rotation
-    if rotation.max() < MIN_ROTATION:
-        return (
-            "move in curves, to both sides" if seen.drives else "rotate the sensors, about all axes"
-        )
-    main = int(np.argmax(rotation))
-    others = " and ".join(name for index, name in enumerate("xyz") if index != main)
-    is_planar = int((rotation < MIN_ROTATION).sum()) == 2
-    along = (TRANSLATIONS if axis in TRANSLATIONS else ROTATIONS).index(axis)
-    is_planar = is_planar and (seen.drives or along == main)
-    if is_planar and along == main and axis in TRANSLATIONS:
-        tilt = "over a ramp or a kerb" if seen.drives else f"about {others}"
-        return f"tilt the sensors {tilt}, or measure it by hand"
-    if is_planar and along == main:
-        return "move farther, straight on and in curves"
-    if is_planar:
-        return "tighter curves to both sides help most"
-    across = [other for other in range(3) if other != along]
-    least = min(across, key=lambda other: rotation[other])
-    return f"rotations about {'xyz'[least]} help most"
-
-
-def _called(axis: str) -> str:
-    return f"the offset in {axis}" if axis in TRANSLATIONS else axis
-
-
 def _precision(calibration: Calibration) -> str:
     metres, radians = calibration.sigmas[:3].max(), calibration.sigmas[3:].max()
     told = [f"translation known to {length(metres)}", f"rotation to {angle(radians)}"]
@@ -304,20 +268,14 @@ def _precision(calibration: Calibration) -> str:
     return f"{', '.join(told)} (one sigma)"
 
 
-def _floor(calibration: Calibration, goal: Goal) -> str:
+def _beyond_target(calibration: Calibration, targets: FloatArray) -> str:
     """A note on errors that more motion does not average out, if they exceed the target."""
-    beyond = calibration.sigmas_of_floor > goal.targets
+    floor = calibration.sigmas_of_floor
     told = [
         f"{axis} {amount(axis, sigma)}"
-        for axis, sigma, is_beyond in zip(AXES, calibration.sigmas_of_floor, beyond, strict=True)
-        if is_beyond
+        for axis, sigma, target in zip(AXES, floor, targets, strict=True)
+        if sigma > target
     ]
     if not told:
         return ""
     return f" An error of 1 % in the odometry's scale would add {', '.join(told)}."
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{max(5 * round(seconds / 5), 5)} s"
-    return f"{round(seconds / 60)} min"

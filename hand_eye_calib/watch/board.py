@@ -1,22 +1,30 @@
-"""What the nodes on ``/diagnostics`` say, put into the words and bars that a person is shown.
+"""The state of the nodes, put into the words and bars that a person is shown.
 
-Nothing here knows ROS, a terminal or a browser: statuses go in, a :class:`View` comes out.
+Nothing here knows ROS, a terminal or a browser: states go in, a :class:`View` comes out.
 """
 
 import math
 import threading
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from enum import Enum
 
-from hand_eye_calib.text import angle, duration, length
+from hand_eye_calib.live.state import (
+    AxisValues,
+    Broadcast,
+    InputState,
+    Level,
+    MountState,
+    NodeState,
+    Part,
+    ProgressState,
+    ResultState,
+)
+from hand_eye_calib.text import amount, duration, two_digits
 
-AXES = {"x": "m", "y": "m", "z": "m", "roll": "rad", "pitch": "rad", "yaw": "rad"}
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 _AXES_OF_ROTATIONS = {"roll": "x", "pitch": "y", "yaw": "z"}
-
-# Levels of diagnostic_msgs/DiagnosticStatus.
-OK, WARN, ERROR = 0, 1, 2
 
 # A node that has said nothing for so long is silent; it reports once a second (s).
 SILENT_AFTER_S = 3.5
@@ -42,25 +50,6 @@ class Tone(Enum):
 
 
 @dataclass(frozen=True)
-class Status:
-    """A status of ``/diagnostics``: the part of the node it is about, and what it says."""
-
-    part: str
-    level: int
-    text: str
-    values: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Pose:
-    """The newest extrinsic: frames, and x, y, z (m), roll, pitch, yaw (rad)."""
-
-    parent_frame: str
-    child_frame: str
-    values: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class Line:
     """One line with its sign, such as the health of an input."""
 
@@ -83,16 +72,17 @@ class Bar:
     tone : Tone
     word : str
         Such as ``enough`` or ``25 s left``.
-    sigma, target, difference : str
-        With units; empty if not known.
+    against : str
+        The standard deviation against the target, such as ``± 0.065 of 0.3 deg``.
+    difference : str
+        From what is installed, with units; empty if not known.
     """
 
     axis: str
     share: float
     tone: Tone
     word: str
-    sigma: str
-    target: str
+    against: str
     difference: str
 
     @property
@@ -100,17 +90,6 @@ class Bar:
         """Such as ``along x`` or ``about z``."""
         along = _AXES_OF_ROTATIONS.get(self.axis)
         return f"about {along}" if along else f"along {self.axis}"
-
-    @property
-    def against(self) -> str:
-        """The standard deviation against the target, such as ``± 0.065 of 0.3 deg``."""
-        if not self.target:
-            return ""
-        if not self.sigma:
-            return f"wanted: {self.target}"
-        number, _, unit = self.sigma.rpartition(" ")
-        same = self.target.endswith(f" {unit}")
-        return f"± {number if same else self.sigma} of {self.target}"
 
 
 @dataclass(frozen=True)
@@ -129,34 +108,36 @@ class View:
     tone: Tone
     word: str
     sentence: str
-    title: str
-    values: tuple[tuple[str, str], ...]
-    bars: tuple[Bar, ...]
-    watched: tuple[Line, ...]
-    result: tuple[Line, ...]
-    reasons: tuple[str, ...]
-    health: tuple[Line, ...]
-    answer: Line | None
+    title: str = ""
+    values: tuple[tuple[str, str], ...] = ()
+    bars: tuple[Bar, ...] = ()
+    watched: tuple[Line, ...] = ()
+    result: tuple[Line, ...] = ()
+    reasons: tuple[str, ...] = ()
+    health: tuple[Line, ...] = ()
+    answer: Line | None = None
 
 
 class _Node:
     """What is known of one node."""
 
     def __init__(self) -> None:
-        self.statuses: dict[str, Status] = {}
-        self.heard_s = -math.inf
-        self.pose: Pose | None = None
+        self.state: NodeState | None = None
+        self.heard_s = self.answered_s = -math.inf
         self.answer: Line | None = None
-        self.answered_s = -math.inf
-
-    def values(self, part: str) -> Mapping[str, str]:
-        return self.statuses[part].values if part in self.statuses else {}
 
 
 class Board:
-    """Collects what the nodes say, and makes views of it; may be used from several threads."""
+    """Collects the states of the nodes, and makes views of them; may be used from several threads.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    most_nodes : int
+        The first so many nodes are kept.
+    """
+
+    def __init__(self, most_nodes: int = 50) -> None:
+        self._most_nodes = most_nodes
         self._nodes: dict[str, _Node] = {}
         self._lock = threading.Lock()
 
@@ -166,26 +147,19 @@ class Board:
         with self._lock:
             return tuple(sorted(self._nodes))
 
-    def take(self, node: str, statuses: Iterable[Status], now_s: float) -> None:
-        """Take what a node says on ``/diagnostics``, all of it at once."""
+    def take(self, state: NodeState, now_s: float) -> None:
+        """Take the state of a node."""
         with self._lock:
-            known = self._nodes.setdefault(node, _Node())
-            known.statuses = {status.part: status for status in statuses}
-            known.heard_s = now_s
-            if known.values("progress").get("verdict") == "no result":
-                known.pose = None
-
-    def take_pose(self, node: str, pose: Pose) -> None:
-        """Take the newest extrinsic of a node."""
-        with self._lock:
-            self._nodes.setdefault(node, _Node()).pose = pose
+            if state.node in self._nodes or len(self._nodes) < self._most_nodes:
+                known = self._nodes.setdefault(state.node, _Node())
+                known.state, known.heard_s = state, now_s
 
     def answer(self, node: str, request: str, good: bool | None, text: str, now_s: float) -> None:
         """Take the answer to a button; ``good`` is None while it is awaited."""
         tone = Tone.BUSY if good is None else Tone.GOOD if good else Tone.ACT
         with self._lock:
-            known = self._nodes.setdefault(node, _Node())
-            known.answer, known.answered_s = Line(tone, request, text), now_s
+            if known := self._nodes.get(node):
+                known.answer, known.answered_s = Line(tone, request, text), now_s
 
     def chosen(self, wanted: str, now_s: float) -> str:
         """The node to show: the one that is wanted, or else the first that is not silent; empty if
@@ -209,95 +183,97 @@ class Board:
         """
         name, names = self.chosen(wanted, now_s), self.nodes
         with self._lock:
-            return _view(name, names, self._nodes.get(name, _Node()), now_s)
+            node = self._nodes.get(name)
+            if node is None or node.state is None:
+                return _no_node(name, names)
+            is_answered = now_s - node.answered_s < ANSWER_FOR_S
+            return _view(
+                node.state, names, now_s - node.heard_s, node.answer if is_answered else None
+            )
 
 
-def _view(name: str, names: tuple[str, ...], node: _Node, now_s: float) -> View:
-    silent_s = now_s - node.heard_s
-    tone, word, sentence = _headline(name, node, silent_s)
-    values, mount = node.values("progress"), node.values("mount")
-    is_watching = "mount" in node.statuses and "progress" not in node.statuses
-    is_answered = node.answer is not None and now_s - node.answered_s < ANSWER_FOR_S
+def _no_node(name: str, names: tuple[str, ...]) -> View:
+    who = f"of {name}" if name else "of a calibrator"
+    text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and network?"
+    return View(name, names, Tone.UNKNOWN, "NO NODE", text)
+
+
+def _view(state: NodeState, names: tuple[str, ...], silent_s: float, answer: Line | None) -> View:
+    is_silent = silent_s > SILENT_AFTER_S
+    head = _headline(state)
+    if is_silent:
+        text = f"The node has said nothing for {silent_s:.0f} s. What is below is older than that."
+        head = Tone.BAD, SILENT, text
+    health = tuple(_health(state, is_silent))
+    if state.mount is not None:
+        watched = tuple(_watched(axis, state.mount) for axis in AXES)
+        return View(state.node, names, *head, watched=watched, health=health, answer=answer)
+    result = state.extrinsic.result if state.extrinsic else None
     return View(
-        node=name,
-        nodes=names,
-        tone=tone,
-        word=word,
-        sentence=sentence,
-        title="" if is_watching else _title(node.pose),
-        values=tuple(_values(node)),
-        bars=() if is_watching else tuple(_bar(axis, values) for axis in AXES),
-        watched=tuple(_watched(axis, mount) for axis in AXES) if is_watching else (),
-        result=() if is_watching else tuple(_result(node)),
-        reasons=tuple(_numbered(values, "reason")),
-        health=tuple(_health(node, silent_s)),
-        answer=node.answer if is_answered else None,
+        state.node,
+        names,
+        *head,
+        title=f"pose of {result.child_frame} in {result.parent_frame}"
+        if result
+        else "no extrinsic yet",
+        values=tuple(_values(result)) if result else (),
+        bars=tuple(_bar(axis, state.progress) for axis in AXES) if state.progress else (),
+        result=tuple(_result(state)),
+        reasons=tuple(result.reasons) if result else (),
+        health=health,
+        answer=answer,
     )
 
 
 # -------------------------------------------------------------------- headline
 
 
-def _headline(name: str, node: _Node, silent_s: float) -> tuple[Tone, str, str]:
+def _headline(state: NodeState) -> tuple[Tone, str, str]:
     """Sign, word and sentence: what a person should know or do first."""
-    if not node.statuses:
-        who = f"of {name}" if name else "of a calibrator"
-        text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and network?"
-        return Tone.UNKNOWN, "NO NODE", text
-    if silent_s > SILENT_AFTER_S:
-        text = f"The node has said nothing for {silent_s:.0f} s. What is below is older than that."
-        return Tone.BAD, SILENT, text
-    for part in ("extrinsic", "mount", "parent input", "child input", "journal"):
-        status = node.statuses.get(part)
-        if status is not None and status.level >= ERROR:
-            return Tone.BAD, _ERROR_WORDS.get(part, "BROKEN"), _sentence(status.text)
-    progress = node.statuses.get("progress")
-    for part in ("parent input", "child input"):
-        status = node.statuses.get(part)
-        if status is not None and status.level == WARN:
-            return Tone.ACT, "CHECK INPUT", _sentence(status.text)
-    checks = node.statuses.get("stream checks")
-    if checks is not None and _tone(checks) is Tone.ACT:
+    inputs = [state.inputs[name] for name in ("parent", "child") if name in state.inputs]
+    broken: list[tuple[Part | None, str]] = [
+        (state.extrinsic, "BROKEN"),
+        (state.mount, "MOUNT MOVED"),
+        *((each, "BAD INPUT") for each in inputs),
+        (state.journal, "BROKEN"),
+    ]
+    for part, word in broken:
+        if part is not None and part.level is Level.ERROR:
+            return Tone.BAD, word, _sentence(part.text)
+    for each in inputs:
+        if each.level is Level.WARN:
+            return Tone.ACT, "CHECK INPUT", _sentence(each.text)
+    checks = state.checks
+    if checks is not None and checks.level is Level.WARN and checks.age_s is not None:
         return Tone.ACT, "CHECK THE STREAMS", _sentence(checks.text)
-    if progress is not None:
-        return _of_progress(progress)
-    if "mount" in node.statuses:
-        return _of_mount(node.statuses["mount"])
-    return _of_extrinsic(node.statuses.get("extrinsic"))
+    if state.mount is not None:
+        return _of_mount(state.mount)
+    if state.progress is not None:
+        return _of_progress(state.progress)
+    return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
 
 
-_ERROR_WORDS = {"mount": "MOUNT MOVED", "parent input": "BAD INPUT", "child input": "BAD INPUT"}
-
-
-def _of_progress(progress: Status) -> tuple[Tone, str, str]:
+def _of_progress(progress: ProgressState) -> tuple[Tone, str, str]:
     sentence = _sentence(progress.text)
-    if sentence.startswith("Stop: "):  # the result was good, the streams no longer are
+    if progress.is_faulty:  # the result was good, the streams no longer are
         return Tone.ACT, "CHECK THE STREAMS", sentence
-    if progress.values.get("done") == "true":
+    if progress.is_done:
         return Tone.GOOD, "DONE", sentence
-    if progress.values.get("verdict") == "no result":
+    if not progress.has_result:
         return Tone.BUSY, "START", sentence
-    if progress.level >= WARN:
+    if progress.level >= Level.WARN:
         return Tone.ACT, "CHANGE THE MOTION", sentence
     return Tone.BUSY, "GO ON", sentence
 
 
-def _of_mount(status: Status) -> tuple[Tone, str, str]:
+def _of_mount(mount: MountState) -> tuple[Tone, str, str]:
     """Of a node that watches the mount, which has not moved."""
-    if status.level != OK:
-        return Tone.ACT, "NOT WATCHING", _sentence(status.text)
-    if status.text.startswith("learning"):
-        return Tone.BUSY, LEARNING, _sentence(status.text)
-    return Tone.GOOD, "WATCHING", _sentence(status.text)
-
-
-def _of_extrinsic(status: Status | None) -> tuple[Tone, str, str]:
-    """Of a node that sets no goal."""
-    if status is None:
-        return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
-    if status.level == OK:
-        return Tone.GOOD, "GOOD", _sentence(status.text)
-    return Tone.ACT, "GO ON", _sentence(status.text)
+    sentence = _sentence(mount.text)
+    if mount.level is not Level.OK:
+        return Tone.ACT, "NOT WATCHING", sentence
+    if mount.is_learning:
+        return Tone.BUSY, LEARNING, sentence
+    return Tone.GOOD, "WATCHING", sentence
 
 
 def _sentence(text: str) -> str:
@@ -308,21 +284,14 @@ def _sentence(text: str) -> str:
 # ------------------------------------------------------------------------ bars
 
 
-def _bar(axis: str, values: Mapping[str, str]) -> Bar:
-    sigma, target = (_number(values, f"{what}.{axis}") for what in ("sigma", "target"))
-    left_s = _number(values, f"seconds_left.{axis}")
-    unit = AXES[axis]
-    share = min(1.0, (target / sigma) ** 2) if sigma > 0 and target > 0 else float(sigma == 0)
-    tone, word = _state(sigma, target, left_s, is_behind=values.get("limiting_axis") == axis)
-    return Bar(
-        axis=axis,
-        share=share if math.isfinite(share) else 0.0,
-        tone=tone,
-        word=word,
-        sigma=small(sigma, unit),
-        target=small(target, unit),
-        difference=_difference(axis, values),
+def _bar(axis: str, progress: ProgressState) -> Bar:
+    sigma, target, left_s = (
+        math.inf if (value := values.get(axis)) is None else value
+        for values in (progress.sigma, progress.target, progress.seconds_left)
     )
+    share = min(1.0, (target / sigma) ** 2) if sigma > 0 else 1.0
+    tone, word = _state(sigma, target, left_s, is_behind=progress.limiting_axis == axis)
+    return Bar(axis, share, tone, word, _against(axis, sigma, target), _difference(axis, progress))
 
 
 def _state(sigma: float, target: float, left_s: float, is_behind: bool) -> tuple[Tone, str]:
@@ -336,129 +305,93 @@ def _state(sigma: float, target: float, left_s: float, is_behind: bool) -> tuple
     return (Tone.ACT if is_behind else Tone.BUSY), left
 
 
-def _number(values: Mapping[str, str], key: str) -> float:
-    """A value as a number; nan for a word such as ``unobservable``, or if it is missing."""
-    try:
-        return float(values[key])
-    except (KeyError, ValueError):
-        return math.nan
+def _against(axis: str, sigma: float, target: float) -> str:
+    wanted = amount(axis, target)
+    if not math.isfinite(sigma):
+        return f"wanted: {wanted}"
+    number, _, unit = amount(axis, sigma).rpartition(" ")
+    same = wanted.endswith(f" {unit}")
+    return f"± {number if same else f'{number} {unit}'} of {wanted}"
 
 
-def small(value: float, unit: str) -> str:
-    """A standard deviation or a difference, short; empty if not known."""
-    if not math.isfinite(value):
+def _difference(axis: str, progress: ProgressState) -> str:
+    """Result minus what is installed, with its standard deviation; unknown without one."""
+    comparison = progress.comparison
+    difference = comparison.difference.get(axis) if comparison else None
+    if comparison is None or difference is None:
         return ""
-    return angle(value) if unit == "rad" else length(value)
+    sigma = comparison.difference_sigma.get(axis)
+    if sigma is None:
+        return "unknown"
+    return f"{'+' * (difference >= 0)}{amount(axis, difference)} ± {amount(axis, sigma)}"
 
 
 # ------------------------------------------------------------------------ pose
 
 
-def _values(node: _Node) -> Iterator[tuple[str, str]]:
+def _values(result: ResultState) -> Iterator[tuple[str, str]]:
     """Each axis with its value and standard deviation; a question mark if it is not observed."""
-    if node.pose is None:
-        return
-    said = node.values("extrinsic")
-    for (axis, unit), value in zip(AXES.items(), node.pose.values, strict=True):
-        if unit == "m":
-            sigma = _number(said, f"sigma {axis} (mm)") / 1000.0
-            text = f"{value:.3f} m"
+    for axis in AXES:
+        value, sigma = result.pose.get(axis), result.pose_sigma.get(axis)
+        if value is None or sigma is None:
+            yield axis, "? not observed"
+        elif axis in _AXES_OF_ROTATIONS:
+            yield axis, f"{math.degrees(value):.2f} ± {two_digits(math.degrees(sigma))} deg"
         else:
-            sigma = math.radians(_number(said, f"sigma {axis} (deg)"))
-            text = f"{math.degrees(value):.2f}"
-        yield axis, f"{text} ± {small(sigma, unit)}" if math.isfinite(sigma) else "? not observed"
+            yield axis, f"{value:.3f} m ± {amount(axis, sigma)}"
 
 
 # ------------------------------------------------- health, verdict, comparison
 
-_PARTS = ("parent input", "child input", "stream checks", "journal")
-_TONES = {OK: Tone.GOOD, WARN: Tone.ACT}
-
-
-def _tone(status: Status) -> Tone:
-    """Of a part of the node; a check that has not been made yet asks for nothing."""
-    if status.values.get("checked") == "not yet":
-        return Tone.BUSY
-    return _TONES.get(status.level, Tone.BAD)
-
-
-def _health(node: _Node, silent_s: float) -> Iterator[Line]:
-    is_old = silent_s > SILENT_AFTER_S
-    for part in _PARTS:
-        status = node.statuses.get(part)
-        if status is not None:
-            tone = Tone.UNKNOWN if is_old else _tone(status)
-            topic = status.values.get("topic", "")
-            about = f"{status.text}, {topic}" if topic and topic not in status.text else status.text
-            yield Line(tone, part, about)
-
-
+_TONES = {Level.OK: Tone.GOOD, Level.WARN: Tone.ACT, Level.ERROR: Tone.BAD}
 _VERDICTS = {"USE": Tone.GOOD, "USE WITH CARE": Tone.ACT, "DO NOT USE": Tone.BAD}
-
-
-# By the first words of the state; what is broadcast begins with other ones.
-_BROADCAST = {"not yet": Tone.BUSY, "refused": Tone.ACT}
-
-
-def _verdict(word: str) -> Line:
-    text = word if word in _VERDICTS else "no result yet"
-    return Line(_VERDICTS.get(word, Tone.UNKNOWN), "verdict", text)
-
-
-def _result(node: _Node) -> Iterator[Line]:
-    values = node.values("progress")
-    yield _verdict(values.get("verdict", ""))
-    yield _comparison(values)
-    state = node.values("extrinsic").get("broadcast on /tf_static", "off")
-    if state != "off":
-        tone = _BROADCAST.get(state.partition(":")[0], Tone.GOOD)
-        yield Line(tone, "on /tf_static", state)
-
-
-def _numbered(values: Mapping[str, str], name: str) -> Iterator[str]:
-    """Values of NAME.1, NAME.2 and so on."""
-    number = 1
-    while f"{name}.{number}" in values:
-        yield values[f"{name}.{number}"]
-        number += 1
-
-
 _COMPARED = {"same": Tone.GOOD, "moved": Tone.ACT}
+_BROADCAST = {
+    Broadcast.WAITING: Tone.BUSY,
+    Broadcast.REFUSED: Tone.ACT,
+    Broadcast.ON: Tone.GOOD,
+}
 
 
-def _comparison(values: Mapping[str, str]) -> Line:
-    verdict = values.get("comparison", "")
-    if not verdict:
-        return Line(Tone.UNKNOWN, "installed", "nothing to compare with (parameter installed)")
-    text = values.get("comparison_sentence") or verdict
-    return Line(_COMPARED.get(verdict, Tone.UNKNOWN), "installed", text)
+def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
+    for name, part in state.parts():
+        if name in ("extrinsic", "progress", "mount"):
+            continue
+        tone, text = _TONES[part.level], part.text
+        if part is state.checks and state.checks.age_s is None:
+            tone = Tone.BUSY  # a check that has not been made yet asks for nothing
+        if isinstance(part, InputState) and part.topic not in text:
+            text = f"{text}, {part.topic}"
+        yield Line(Tone.UNKNOWN if is_old else tone, name, text)
 
 
-def _watched(axis: str, values: Mapping[str, str]) -> Line:
+def _result(state: NodeState) -> Iterator[Line]:
+    result = state.extrinsic.result if state.extrinsic else None
+    verdict = result.verdict if result else "no result yet"
+    yield Line(_VERDICTS.get(verdict, Tone.UNKNOWN), "verdict", verdict)
+    comparison = state.progress.comparison if state.progress else None
+    if comparison is None:
+        text = "nothing to compare with (parameter installed)"
+        yield Line(Tone.UNKNOWN, "installed", text)
+    else:
+        tone = _COMPARED.get(comparison.verdict, Tone.UNKNOWN)
+        yield Line(tone, "installed", comparison.sentence)
+    if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
+        text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
+        yield Line(_BROADCAST[broadcast], "on /tf_static", text)
+
+
+def _watched(axis: str, mount: MountState) -> Line:
     """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
-    unit = AXES[axis]
-    shift, sigma = _number(values, f"shift.{axis}"), _number(values, f"shift_sigma.{axis}")
+    shift, sigma = _number(axis, mount.shift), _number(axis, mount.shift_sigma)
     if abs(shift) > _CLEARLY * sigma:
-        return Line(Tone.BAD, axis, f"moved by {small(shift, unit)} ± {small(sigma, unit)}")
-    visible = _number(values, f"visible_10min.{axis}")
+        return Line(Tone.BAD, axis, f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}")
+    visible = _number(axis, mount.visible_10min)
     if math.isfinite(visible):
-        return Line(Tone.GOOD, axis, f"a change of {small(visible, unit)}")
+        return Line(Tone.GOOD, axis, f"a change of {amount(axis, visible)} would be seen")
     return Line(Tone.UNKNOWN, axis, "nothing yet")
 
 
-def _difference(axis: str, values: Mapping[str, str]) -> str:
-    """Result minus what is installed, with its standard deviation; unknown without one."""
-    difference = _number(values, f"difference.{axis}")
-    sigma = _number(values, f"difference_sigma.{axis}")
-    if not math.isfinite(difference):
-        return ""
-    if not math.isfinite(sigma):
-        return "unknown"
-    sign = "+" if difference >= 0 else ""
-    return f"{sign}{small(difference, AXES[axis])} ± {small(sigma, AXES[axis])}"
-
-
-def _title(pose: Pose | None) -> str:
-    if pose is None:
-        return "no extrinsic yet"
-    return f"pose of {pose.child_frame} in {pose.parent_frame}"
+def _number(axis: str, values: AxisValues) -> float:
+    value = values.get(axis)
+    return math.nan if value is None else value

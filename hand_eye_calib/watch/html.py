@@ -11,18 +11,18 @@ _CLASSES = {tone: tone.name.lower() for tone in Tone}
 
 def fragment(view: View) -> str:
     """Everything but the buttons: these stay in the page, so that none vanishes under a finger."""
+    rows = (f"<dt>{escape(axis)}</dt><dd>{escape(text)}</dd>" for axis, text in view.values)
+    watched = "the mount: what ten minutes of motion would show"
     return "".join(
         (
             _nodes(view),
             f'<section class="headline {_CLASSES[view.tone]}"><h1>{_sign(view.tone)} '
             f"{escape(view.word)}</h1><p>{escape(view.sentence)}</p></section>",
-            _answer(view.answer),
+            f'<section class="answer">{_line(view.answer)}</section>' if view.answer else "",
             _section("axes", "precision against the target", map(_bar, view.bars)),
-            _section(
-                "axes", "the mount: what ten minutes of motion would show", map(_line, view.watched)
-            ),
+            _section("axes", watched, map(_line, view.watched)),
             '<div class="side">',
-            _section("pose", view.title, _pose(view)),
+            _section("pose", view.title, ["<dl>", *rows, "</dl>"] if view.title else []),
             _section("health", "result and inputs", _health(view)),
             "</div>",
         )
@@ -38,11 +38,11 @@ def _section(name: str, title: str, parts: Iterable[str]) -> str:
 
 
 def _health(view: View) -> Iterator[str]:
-    verdict_and_comparison = [_line(line) for line in view.result]
-    yield from verdict_and_comparison[:1]
+    lines = [_line(line) for line in view.result]
+    yield from lines[:1]
     if view.reasons:
         yield f"<ul>{''.join(f'<li>{escape(reason)}</li>' for reason in view.reasons)}</ul>"
-    yield from verdict_and_comparison[1:]
+    yield from lines[1:]
     yield from map(_line, view.health)
 
 
@@ -58,7 +58,7 @@ def _nodes(view: View) -> str:
 
 
 def _bar(bar: Bar) -> str:
-    difference = f"installed: {bar.difference}" if bar.difference else ""
+    difference = f"from installed: {bar.difference}" if bar.difference else ""
     return (
         f'<div class="axis {_CLASSES[bar.tone]}"><b>{escape(bar.axis)}</b>'
         f'<progress max="1" value="{bar.share:.3f}" aria-label="{escape(bar.axis)}"></progress>'
@@ -69,21 +69,11 @@ def _bar(bar: Bar) -> str:
     )
 
 
-def _pose(view: View) -> Iterator[str]:
-    if view.title:
-        rows = (f"<dt>{escape(axis)}</dt><dd>{escape(text)}</dd>" for axis, text in view.values)
-        yield f"<dl>{''.join(rows)}</dl>"
-
-
 def _line(line: Line) -> str:
     return (
         f'<p class="line {_CLASSES[line.tone]}">{_sign(line.tone)} <b>{escape(line.name)}</b> '
         f"{escape(line.text)}</p>"
     )
-
-
-def _answer(line: Line | None) -> str:
-    return f'<section class="answer">{_line(line)}</section>' if line is not None else ""
 
 
 def _sign(tone: Tone) -> str:

@@ -2,10 +2,11 @@
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
+from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from hand_eye_calib.watch.board import COUNTING, Bar, Line, Tone, View
+from hand_eye_calib.watch.board import COUNTING, Line, Tone, View
 
 _STYLES = {
     Tone.GOOD: "bold green",
@@ -14,17 +15,14 @@ _STYLES = {
     Tone.BAD: "bold red",
     Tone.UNKNOWN: "bold magenta",
 }
-_FULL, _EMPTY = "█", "░"
 _BAR_CELLS = 16
 
 # Narrower terminals do without the column of differences.
 _WIDE = 76
-
 # Lower ones do without empty lines.
 _HIGH = 30
 
-KEYS = "s solve   w save   r reset   q quit"
-WATCHING_KEYS = "q quit"
+KEYS, WATCHING_KEYS = "s solve   w save   r reset   q quit", "q quit"
 
 
 def screen(view: View, width: int, height: int, footer: str = "") -> RenderableType:
@@ -49,12 +47,11 @@ def screen(view: View, width: int, height: int, footer: str = "") -> RenderableT
         parts += [title, _lines(view.watched), *space]
     parts.append(_lines((*view.result, *view.health)))
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
-    name = f"hand_eye_calib watch {view.node}".rstrip()
-    keys = Text(
-        " " + "   ".join(filter(None, (KEYS if view.bars else WATCHING_KEYS, footer))), style="dim"
-    )
-    body = Panel(Group(*parts), title=Text(name), title_align="left")
-    return Group(keys, *([_choices(view)] if len(view.nodes) > 1 else []), body)
+    keys = " " + "   ".join(filter(None, (KEYS if view.bars else WATCHING_KEYS, footer)))
+    title = Text(f"hand_eye_calib watch {view.node}".rstrip())
+    choices = [_choices(view)] if len(view.nodes) > 1 else []
+    body = Panel(Group(*parts), title=title, title_align="left")
+    return Group(Text(keys, style="dim"), *choices, body)
 
 
 def _bars(view: View, width: int) -> Table:
@@ -62,30 +59,21 @@ def _bars(view: View, width: int) -> Table:
     table = Table.grid(padding=(0, 2 if is_wide else 1))
     has_installed = any(bar.difference for bar in view.bars)
     for bar in view.bars:
-        sign = Text(f"{bar.tone.value} {bar.word}", style=_STYLES[bar.tone])
-        cells = [Text(bar.axis, style="bold"), _drawn(bar), sign, Text(bar.against)]
-        if is_wide and has_installed:
-            cells.append(Text(bar.difference))
-        table.add_row(*cells)
+        style = _STYLES[bar.tone]
+        drawn = ProgressBar(1.0, bar.share, _BAR_CELLS, complete_style=style, finished_style=style)
+        sign = Text(f"{bar.tone.value} {bar.word}", style=style)
+        difference = [Text(bar.difference)] * (is_wide and has_installed)
+        table.add_row(Text(bar.axis, style="bold"), drawn, sign, Text(bar.against), *difference)
     return table
 
 
 def _pose(view: View) -> list[RenderableType]:
     """Title, and three columns: x, y, z above roll, pitch, yaw."""
-    title = Text(view.title, style="dim")
-    if not view.values:
-        return [title]
     table = Table.grid(padding=(0, 3))
     texts = [Text.assemble((axis, "bold"), f" {text}") for axis, text in view.values]
     for row in (texts[:3], texts[3:]):
         table.add_row(*row)
-    return [title, table]
-
-
-def _drawn(bar: Bar) -> Text:
-    full = int(bar.share * _BAR_CELLS)
-    text = Text(_FULL * full, style=_STYLES[bar.tone])
-    return text.append(_EMPTY * (_BAR_CELLS - full), style="dim")
+    return [Text(view.title, style="dim"), *([table] if texts else [])]
 
 
 def _lines(lines: tuple[Line, ...]) -> Table:
@@ -100,8 +88,7 @@ def _choices(view: View) -> Text:
     """Which key shows which node."""
     text = Text(" nodes: ")
     for number, name in enumerate(view.nodes[:9], start=1):
-        style = "reverse" if name == view.node else ""
-        text.append(f" {number} {name} ", style=style)
+        text.append(f" {number} {name} ", style="reverse" * (name == view.node))
     return text
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.live.monitor import MountMonitor
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
-from hand_eye_calib.session.monitor import MountMonitor
 from reproduction.coverage.classes import CLASSES, simulate
 from reproduction.recordings import Rig
 

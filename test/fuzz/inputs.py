@@ -23,7 +23,7 @@ from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.journal import count_poses, has_session, read_journal
 from hand_eye_calib.io.trajectory_files import write_trajectory
-from hand_eye_calib.ros.session_journal import give
+from hand_eye_calib.live.journal import give
 from hand_eye_calib.simulation.drive import simulate_drive
 
 SOLVE = ("--method", "park", "--reference", "B3", "--scale", "1", "--time-offset", "0")
@@ -170,7 +170,7 @@ def resume(folder):
     count_poses(folder)
     calibrator = Calibrator(CalibratorConfig(reference="B3", method="park"))
     try:
-        give(read_journal(folder), folder, calibrator)
+        give(read_journal(folder), folder, {"child": calibrator})
         calibrator.estimate()
     except HandEyeCalibError as error:
         if "\n" in str(error):

@@ -13,9 +13,9 @@ from hand_eye_calib import config
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader
+from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.ros import conversions
-from hand_eye_calib.ros.log import NodeLog
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 

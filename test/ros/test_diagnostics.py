@@ -1,91 +1,85 @@
-"""What a person next to the robot reads on /diagnostics."""
+"""What the node says of itself: its state on ~/progress, and /diagnostics made of it."""
 
 import itertools
+import json
 import time
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from faults import inverted, reordered
-from ros_harness import RELIABLE_INPUTS, START_NS, drive, message
+from ros_harness import LATCHED, RELIABLE_INPUTS, START_NS, drive, message
+from std_msgs.msg import String
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.results import load_result
+from hand_eye_calib.live.state import Level
+from hand_eye_calib.ros.watcher import state_of
 
-NAMES = [
-    f"/calibrator: {name}"
-    for name in (
-        "extrinsic",
-        "progress",
-        "parent input",
-        "child input",
-        "stream checks",
-        "journal",
-    )
-]
+PARTS = ("extrinsic", "progress", "parent input", "child input", "stream checks", "journal")
 
 
 @pytest.fixture
-def heard(peer):
-    """List of mappings of names to statuses, as they come in."""
-    received = []
+def state(peer):
+    """``state(condition)``: the first state that meets a condition, among those still to come."""
+    heard = []
     peer.node.create_subscription(
-        DiagnosticArray,
-        "/diagnostics",
-        lambda array: received.append({each.name: each for each in array.status}),
-        10,
+        String, "calibrator/progress", lambda each: heard.append(state_of(each.data)), LATCHED
     )
-    return received
 
+    def wait(condition, what="such a state"):
+        start = len(heard)
 
-def wait(peer, heard, name, condition):
-    """The first status of a name that meets a condition, among those still to come."""
-    start = len(heard)
-    name = f"/calibrator: {name}"
-    peer.spin_until(
-        lambda: any(condition(each[name]) for each in heard[start:]), f"such a status of {name}"
-    )
-    return next(each[name] for each in heard[start:] if condition(each[name]))
+        def met():
+            return next((each for each in heard[start:] if condition(each)), None)
 
+        peer.spin_until(met, what)
+        return met()
 
-def values(status):
-    return {pair.key: pair.value for pair in status.values}
+    wait.heard = heard
+    return wait
 
 
 def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are_named(
-    start_node, peer, heard
+    start_node, peer, state
 ):
     start_node()
-    peer.spin_until(lambda: heard, "diagnostics")
-    assert list(heard[0]) == NAMES
-    assert {each.level for each in heard[0].values()} == {DiagnosticStatus.WARN}
-    assert heard[0]["/calibrator: parent input"].message == "no message on /parent_odom yet"
-    publishers = peer.publishers()
-    peer.feed(publishers, *drive(5))  # too few
+    first = state(lambda each: True)
+    assert tuple(name for name, _ in first.parts()) == PARTS
+    assert {part.level for _, part in first.parts()} == {Level.WARN}
+    assert first.inputs["parent"].text == "no message on /parent_odom yet"
+    peer.feed(peer.publishers(), *drive(5))  # too few
     # An input that delivers is no fault, whatever the result.
-    parent = wait(peer, heard, "parent input", lambda status: status.message.endswith("Hz"))
-    assert parent.level == DiagnosticStatus.OK
-    wait(
-        peer,
-        heard,
-        "extrinsic",
-        lambda status: "synchronised pose pairs are needed" in status.message,
-    )
-    assert all(
-        statuses["/calibrator: extrinsic"].level != DiagnosticStatus.OK for statuses in heard
-    )
+    found = state(lambda each: each.inputs["parent"].text.endswith("Hz"))
+    assert found.inputs["parent"].level is Level.OK
+    state(lambda each: "synchronised pose pairs are needed" in each.extrinsic.text)
+    assert Level.OK not in {each.extrinsic.level for each in state.heard}
 
 
-def test_two_nodes_are_told_apart(start_node, peer, heard):
-    start_node("-r __ns:=/robot1")
+def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
+    start_node("-r __ns:=/robot1", "-p target.translation:=0.03")
     start_node("-r __node:=other")
-    names = lambda: {name for statuses in heard for name in statuses}  # noqa: E731
-    peer.spin_until(lambda: len(names()) == 2 * len(NAMES), "both nodes")
-    assert {name.rpartition(": ")[0] for name in names()} == {"/robot1/calibrator", "/other"}
+    heard, states = [], []
+    peer.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    topic = "/robot1/calibrator/progress"
+    peer.node.create_subscription(String, topic, states.append, LATCHED)
+    statuses = lambda: {each.name: each for array in heard for each in array.status}  # noqa: E731
+    peer.spin_until(lambda: states and len(statuses()) == 2 * len(PARTS), "both nodes")
+    names = [f"{node}: {part}" for node in ("/robot1/calibrator", "/other") for part in PARTS]
+    assert set(statuses()) == set(names)
+    said, document = statuses()["/robot1/calibrator: progress"], json.loads(states[-1].data)
+    assert said.message == document["progress"]["text"]
+    values = {pair.key: pair.value for pair in said.values}
+    assert (said.level, said.hardware_id) == (DiagnosticStatus.WARN, "hand_eye_calib")
+    assert (values["is_done"], values["sigma.z"], values["target.z"]) == (
+        "false",
+        "unknown",
+        "0.03",
+    )
 
 
-def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, heard, tmp_path):
+def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_path):
     start_node("-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS)
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
@@ -97,33 +91,22 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, heard, tmp_pa
     ):
         for stamp_ns, T in zip(stamps_ns, Ts, strict=True):
             publisher.publish(message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame))
-    parent = wait(peer, heard, "parent input", lambda status: "set time_offset" in status.message)
-    assert parent.level == DiagnosticStatus.WARN
+    parent = state(lambda each: "set time_offset" in each.inputs["parent"].text).inputs["parent"]
+    assert parent.level is Level.WARN
     # By the times of arrival: more on a busy machine.
-    assert float(values(parent)["clock offset to the other input seen (s)"]) > 3.0
+    assert parent.clock_offset_s > 3.0
     assert peer.set_parameter("time_offset", 5.0).successful
-    good = wait(
-        peer,
-        heard,
-        "extrinsic",
-        lambda status: (
-            status.level == DiagnosticStatus.OK and "120" in values(status)["synchronised poses"]
-        ),
-    )
-    assert good.message.startswith("USE: all six axes are known to ")
-    found = values(good)
-    assert found["missing"] == "nothing"
-    assert found["status"] == "ok"
-    assert found["inliers (%)"] == "100.0"
-    assert all(float(found[f"rotation about {axis} (deg)"]) > 20 for axis in "xyz")
-    assert all(float(found[f"sigma {axis} (mm)"]) < 1.0 for axis in "xyz")
-    assert all(float(found[f"sigma {axis} (deg)"]) < 0.1 for axis in ("roll", "pitch", "yaw"))
-    assert 0 <= float(found["age of the result (s)"]) < 60
-    journal = wait(peer, heard, "journal", lambda status: status.level == DiagnosticStatus.OK)
-    assert values(journal)["directory"] == str(tmp_path / "journal")
+    good = state(lambda each: each.extrinsic.level is Level.OK and each.extrinsic.n_poses == 120)
+    assert good.extrinsic.text.startswith("USE: all six axes are known to ")
+    assert all(angle > 20 for angle in good.extrinsic.rotation_deg.values())
+    result = good.extrinsic.result
+    assert (result.status, result.inlier_share) == ("ok", 1.0)
+    assert all(result.pose_sigma[axis] < 1e-3 for axis in "xyz")
+    assert 0 <= result.age_s < 60
+    assert (good.journal.level, good.journal.directory) == (Level.OK, str(tmp_path / "journal"))
 
 
-def test_flat_ground_is_said_in_one_sentence(start_node, peer, heard):
+def test_flat_ground_is_said_in_one_sentence_and_zeros_are_no_result(start_node, peer, state):
     start_node("-p solve_period:=0.2", *RELIABLE_INPUTS)
     stamps_ns, _, _ = drive()
     s = (stamps_ns - START_NS) * 1e-9
@@ -133,98 +116,74 @@ def test_flat_ground_is_said_in_one_sentence(start_node, peer, heard):
     )
     noise = se3.exp(np.random.default_rng(0).normal(size=(2, len(s), 6)) * 1e-3)
     peer.feed(peer.publishers(), stamps_ns, flat @ noise[0], flat @ noise[1])
-    status = wait(
-        peer,
-        heard,
-        "extrinsic",
-        lambda status: (
-            "rotation about z is fine" in status.message and "sigma z (mm)" in values(status)
-        ),
-    )
-    assert status.level == DiagnosticStatus.WARN
-    assert status.message.startswith("USE WITH CARE: all but z; measure z by hand; ")
-    assert (
-        "roll and pitch under 1 deg: vertical offset (z) not observable, drive over a ramp"
-        in status.message
-    )
-    assert values(status)["sigma z (mm)"] == "unknown"
+    found = state(lambda each: "all but z" in each.extrinsic.text)
+    assert found.extrinsic.level is Level.WARN
+    assert found.extrinsic.text.startswith("USE WITH CARE: all but z; measure z by hand")
+    assert (found.extrinsic.result.pose["z"], found.extrinsic.result.pose_sigma["z"]) == (None,) * 2
 
 
-def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, heard):
+def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
     start_node(*RELIABLE_INPUTS)
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
     peer.feed(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
-    wait(peer, heard, "extrinsic", lambda status: status.level == DiagnosticStatus.OK)
+    state(lambda each: each.extrinsic.level is Level.OK)
     # Both silent with a result: the robot is parked. One of them: something is broken.
-    silent = wait(peer, heard, "child input", lambda status: "silent for" in status.message)
-    assert silent.level == DiagnosticStatus.OK
+    silent = state(lambda each: "silent for" in each.inputs["child"].text)
+    assert silent.inputs["child"].level is Level.OK
 
     later_ns = itertools.count(int(stamps_ns[-1]), 10**8)
 
-    def only_the_parent_goes_on(status):
-        stamp_ns = next(later_ns)
+    def only_the_parent_goes_on(each):
+        stamp_ns, child = next(later_ns), each.inputs["child"]
         publishers[0].publish(message(publishers[0].msg_type, stamp_ns, Ts_pw_p[-1], "lidar"))
-        return status.level == DiagnosticStatus.WARN and "silent for" in status.message
+        return child.level is Level.WARN and "silent for" in child.text
 
-    wait(peer, heard, "child input", only_the_parent_goes_on)
+    state(only_the_parent_goes_on)
     for stamp_ns in stamps_ns[:8]:  # enough to be believed after the pause
         publishers[1].publish(
             message(publishers[1].msg_type, int(stamp_ns) + 12 * 10**9, Ts_cw_c[0], "other_camera")
         )
-    status = wait(peer, heard, "child input", lambda status: status.level == DiagnosticStatus.ERROR)
+    child = state(lambda each: each.inputs["child"].level is Level.ERROR).inputs["child"]
     assert (
         "/child_odom: the child stream's sensor frame changed from 'camera' to 'other_camera'"
-        in status.message
+        in child.text
     )
-    assert values(status)["refused: unusable"] == "8"
+    assert child.refused["unusable"] == 8
     publishers[0].publish(message(publishers[0].msg_type, 0, Ts_pw_p[0], "lidar"))
-    status = wait(
-        peer,
-        heard,
-        "parent input",
-        lambda status: values(status).get("refused: corrupt stamp") == "1",
-    )
-    assert status.level == DiagnosticStatus.ERROR
+    found = state(lambda each: each.inputs["parent"].refused.get("corrupt stamp") == 1)
+    assert found.inputs["parent"].level is Level.ERROR
 
 
-def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_node, peer, heard):
+def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_node, peer, state):
     start_node(*RELIABLE_INPUTS, "-p max_gap:=0.3")
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
     kept = np.r_[0:20, 30:60, 60:60]
     peer.feed(publishers, stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept])
     peer.feed(publishers, stamps_ns[55:60], Ts_pw_p[55:60], Ts_cw_c[55:60])
-    found = values(
-        wait(
-            peer,
-            heard,
-            "parent input",
-            lambda status: values(status)["refused: repeated stamp"] == "5",
-        )
-    )
-    assert (found["messages"], found["poses taken"]) == ("55", "50")
-    assert (found["longest gap (s)"], found["gaps above max_gap"]) == ("1.100", "1")
-    assert float(found["rate (Hz)"]) > 0
+    parent = state(lambda each: each.inputs["parent"].refused["repeated stamp"] == 5)
+    parent = parent.inputs["parent"]
+    assert (parent.messages, parent.poses_taken) == (55, 50)
+    assert (parent.longest_gap_s, parent.gaps_above_max_gap) == (pytest.approx(1.1), 1)
+    assert parent.rate_hz > 0
     assert peer.set_enabled(False).success
     disabled = "not accepting poses: call ~/set_enabled"
-    wait(peer, heard, "extrinsic", lambda status: disabled in status.message)
+    state(lambda each: disabled in each.extrinsic.text)
 
 
-def test_simulated_time_that_does_not_run_is_said(start_node, peer, heard):
+def test_simulated_time_that_does_not_run_is_no_age(start_node, peer, state):
     start_node("-p use_sim_time:=true", "-p solve_period:=0.2", *RELIABLE_INPUTS)
     peer.feed(peer.publishers(), *drive())
-    status = wait(peer, heard, "extrinsic", lambda status: "status" in values(status))
-    assert (
-        values(status)["age of its newest pose (s)"] == "the clock does not run: nothing on /clock"
-    )
+    found = state(lambda each: each.extrinsic.result)
+    assert found.extrinsic.result.newest_pose_age_s is None
 
 
-def test_a_journal_that_cannot_be_written_is_an_error(start_node, peer, heard, tmp_path):
+def test_a_journal_that_cannot_be_written_is_an_error(start_node, state, tmp_path):
     (tmp_path / "a_file").write_text("")
     start_node(f"-p output_directory:={tmp_path / 'a_file' / 'out'}")
-    status = wait(peer, heard, "journal", lambda status: status.level == DiagnosticStatus.ERROR)
-    assert "a crash would lose the session" in status.message
+    found = state(lambda each: each.journal.level is Level.ERROR)
+    assert "a crash would lose the session" in found.journal.text
 
 
 class TestStreamChecks:
@@ -237,49 +196,38 @@ class TestStreamChecks:
             (inverted, "the child stream seems to hold inverse poses"),
         ],
     )
-    def test_faulty_streams_are_named(self, start_node, peer, heard, damage, said):
+    def test_faulty_streams_are_named(self, start_node, peer, state, damage, said):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
-        peer.feed(
-            peer.publishers(), stamps_ns, Ts_pw_p, damage(Trajectory(stamps_ns, Ts_cw_c)).poses
-        )
-        status = wait(peer, heard, "stream checks", lambda status: said in status.message)
-        assert status.level == DiagnosticStatus.WARN
-        verdict = wait(peer, heard, "extrinsic", lambda status: said in status.message)
-        assert verdict.level == DiagnosticStatus.WARN
-        assert verdict.message.startswith("DO NOT USE: ")
+        child = damage(Trajectory(stamps_ns, Ts_cw_c)).poses
+        peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, child)
+        found = state(lambda each: said in each.checks.text and said in each.extrinsic.text)
+        assert (found.checks.level, found.extrinsic.level) == (Level.WARN, Level.WARN)
+        assert found.extrinsic.text.startswith("DO NOT USE: ")
         node.wait_for_log(said)
 
     def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(
-        self, start_node, peer, heard, tmp_path
+        self, start_node, peer, state, tmp_path
     ):
         node = start_node(
-            "-p solve_period:=0.5",
-            "-p scale:=0.002",
-            f"-p output_directory:={tmp_path}",
+            "-p solve_period:=0.5", "-p scale:=0.002", f"-p output_directory:={tmp_path}",
             *RELIABLE_INPUTS,
-        )
+        )  # fmt: skip
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
         Ts_cw_c[:, :3, 3] *= 1000.0
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
-        wait(
-            peer,
-            heard,
-            "stream checks",
-            lambda status: status.message.endswith(": set scale to 0.001"),
-        )
+        state(lambda each: each.checks.text.endswith(": set scale to 0.001"))
         assert peer.trigger("save").success
         assert load_result(tmp_path).headline.startswith("DO NOT USE: the child's lengths must be")
         assert peer.set_parameter("scale", 0.001).successful
-        status = wait(
-            peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK
+        found = state(
+            lambda each: each.checks.level is Level.OK and each.extrinsic.level is Level.OK
         )
-        assert status.message == "both streams can be of one rigid body"
-        wait(peer, heard, "extrinsic", lambda status: status.level == DiagnosticStatus.OK)
+        assert found.checks.text == "both streams can be of one rigid body"
         log = node.wait_for_log("no longer found: the child's lengths must be")
         assert log.count("set scale to 0.001") == 1
 
-    def test_a_unit_that_is_certain_is_used_and_said(self, start_node, peer, heard, tmp_path):
+    def test_a_unit_that_is_certain_is_used_and_said(self, start_node, peer, state, tmp_path):
         node = start_node(
             "-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS
         )
@@ -288,28 +236,20 @@ class TestStreamChecks:
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
         said = "solved with scale 0.001"
         node.wait_for_log(said)
-        wait(peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK)
-        wait(peer, heard, "extrinsic", lambda status: status.level == DiagnosticStatus.OK)
+        state(lambda each: each.checks.level is Level.OK and each.extrinsic.level is Level.OK)
         assert peer.trigger("save").success
         result = load_result(tmp_path)
         assert result.scale == 0.001
         assert any(said in text for text in result.warnings)
 
-    def test_sound_streams_raise_nothing(self, start_node, peer, heard):
+    def test_sound_streams_raise_nothing(self, start_node, peer, state):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
-        peer.feed(peer.publishers(), *drive(250))
-        status = wait(
-            peer, heard, "stream checks", lambda status: status.level == DiagnosticStatus.OK
-        )
-        assert not [key for key in values(status) if key.startswith(("warning", "error"))]
-        assert "[WARN]" not in node.log
-
-    def test_too_little_driving_is_said(self, start_node, peer, heard):
-        start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
         peer.feed(peer.publishers(), *drive(60))
-        wait(peer, heard, "extrinsic", lambda status: "status" in values(status))
-        status = wait(peer, heard, "stream checks", lambda status: True)
-        assert status.level == DiagnosticStatus.WARN
-        assert (
-            status.message == "not checked yet: that takes 20 s of motion with rotations of 30 deg"
-        )
+        early = state(lambda each: each.extrinsic.result)
+        assert (early.checks.level, early.checks.age_s) == (Level.WARN, None)
+        said = "not checked yet: that takes 20 s of motion with rotations of 30 deg"
+        assert early.checks.text == said
+        peer.feed(peer.publishers(), *(part[60:] for part in drive(250)))
+        found = state(lambda each: each.checks.level is Level.OK)
+        assert not [each for each in found.checks.findings if not each.startswith("note")]
+        assert "[WARN]" not in node.log

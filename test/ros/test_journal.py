@@ -13,7 +13,7 @@ from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
 from hand_eye_calib.io.journal import count_poses, has_session, read_journal
 from hand_eye_calib.io.results import load_result
-from hand_eye_calib.ros.session_journal import DirectoryLock
+from hand_eye_calib.live.journal import DirectoryLock
 
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 

@@ -1,7 +1,9 @@
 """However it is told to end, the node ends soon, with code 0 and without a traceback."""
 
+import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,3 +76,20 @@ def test_a_full_temporary_directory_costs_the_report_and_not_the_result(start_no
     code, _ = node.stop(signal.SIGTERM)
     assert (code, "Traceback" in node.log) == (0, False), node.log
     assert load_result(tmp_path).n_poses == 120
+
+
+def test_a_solving_process_that_hangs_is_noticed_and_the_node_goes_on(start_node, peer):
+    node = start_node(
+        "-p solve_period:=1000.0",
+        *RELIABLE_INPUTS,
+        before="from hand_eye_calib.live import processes as p; p.HANGS_AFTER_S = 5.0",
+    )
+    assert peer.trigger("reset").success
+    pid = node.process.pid
+    os.kill(int(Path(f"/proc/{pid}/task/{pid}/children").read_text()), signal.SIGSTOP)
+    answer = peer.trigger("solve")
+    what = "the solving process had no answer after 5 s and was killed"
+    assert (answer.success, what in answer.message) == (False, True)
+    node.wait_for_log(f"{what}; it was started again")
+    answer, _ = peer.solve(peer.publishers(), *drive())
+    assert answer.success

@@ -14,9 +14,9 @@ from ros_harness import LATCHED, RELIABLE_INPUTS, drive, matrix
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.ros import tf
-from hand_eye_calib.ros.log import NodeLog
 from hand_eye_calib.ros.tf import FrameTree
 
 

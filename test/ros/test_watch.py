@@ -9,27 +9,22 @@ import sys
 import time
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
 from ros_harness import PATIENCE_S, RELIABLE_INPUTS, drive
 
-from hand_eye_calib.ros.watcher import by_node
+from hand_eye_calib.live.state import JournalState, Level, NodeState
+from hand_eye_calib.plain import json_text
+from hand_eye_calib.ros.watcher import state_of
 
 QUICK = ("-p solve_period:=0.2", *RELIABLE_INPUTS)
 
 
-def test_statuses_of_others_and_impossible_names_are_left_out():
-    def status(name, hardware_id="hand_eye_calib"):
-        return DiagnosticStatus(name=name, hardware_id=hardware_id, message="a\x1bb")
-
-    names = ("/r/calibrator: progress", "/b: mount", "/r/calibrator: journal")
-    ours = [status(name) for name in names]
-    others = [status("/c: progress", "motor"), status("a b: x"), status("x"), status("//: x")]
-    found = by_node([*ours, *others])
-    assert {node: [each.part for each in parts] for node, parts in found.items()} == {
-        "/r/calibrator": ["progress", "journal"],
-        "/b": ["mount"],
-    }
-    assert found["/b"][0].text == r"a\x1bb"
+def test_what_is_no_state_is_left_out_and_control_characters_are_escaped():
+    state = NodeState(
+        node="/r/calibrator", journal=JournalState(level=Level.OK, text="a\x1bb", directory="")
+    )
+    assert state_of(json_text(state)).journal.text == r"a\x1bb"
+    for text in ("", "[]", "{", "[" * 100_000, '{"node": "/x"}', "7"):
+        assert state_of(text) is None
 
 
 class Watch:

@@ -41,9 +41,10 @@ ALLOWED = ENGINE | {
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
     "root": GROUND | {"geometry", "results", "engine", "rig", "session", "io", "report"},
-    "watch": {"errors", "text"},
-    "ros": {"io", "watch", *ENGINE},
-    "cli": {"io", "report", "simulation", "watch", "ros", *ENGINE},
+    "live": {"io", *ENGINE},
+    "watch": {"errors", "text", "live"},
+    "ros": {"io", "live", "watch", *ENGINE},
+    "cli": {"io", "report", "simulation", "live", "watch", "ros", *ENGINE},
     "__main__": {"cli"},
 }
 

@@ -8,7 +8,7 @@ from result_making import calibration as made
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import AXES
-from hand_eye_calib.assessment.excitation import Excitation, excitation
+from hand_eye_calib.assessment.excitation import Excitation, excitation, helpful_motion
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.cli.present import as_text
 from hand_eye_calib.config import CalibratorConfig
@@ -18,7 +18,7 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.records import CorrelatedError, Noise, Progress
-from hand_eye_calib.session.goal import Goal, helpful_motion
+from hand_eye_calib.session.goal import Goal
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
 
@@ -101,7 +101,7 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
     assert progress.limiting_axis == "y"
     np.testing.assert_allclose(progress.seconds_left, [0, 120, 0, 0, 0, 0])
     assert progress.sentence == (
-        "Go on for about 2 min: the offset in y takes longest, rotations about x help most."
+        "Go on for about 2 min: y takes longest, rotations about x help most."
     )
 
 
@@ -180,7 +180,7 @@ class TestNotGettingThere:
         stuck = goal.add(hidden, seen(40.0, self.FLAT))
         assert (stuck.will_not_get_there, stuck.limiting_axis) == (True, "z")
         assert stuck.sentence == (
-            "This motion will not determine the offset in z well enough: tilt the sensors over a "
+            "This motion will not determine z well enough: tilt the sensors over a "
             "ramp or a kerb, or measure it by hand."
         )
 
@@ -213,7 +213,7 @@ class TestNotGettingThere:
     ],
 )
 def test_motion_that_helps_is_about_another_axis(axis, rotation_deg, words):
-    assert helpful_motion(axis, seen(40.0, rotation_deg)) == words
+    assert helpful_motion([axis], seen(40.0, rotation_deg)) == words
 
 
 @pytest.mark.parametrize(
@@ -226,7 +226,7 @@ def test_motion_that_helps_is_about_another_axis(axis, rotation_deg, words):
 )
 def test_nobody_tells_a_robot_arm_to_drive(axis, rotation_deg, words):
     arm = dataclasses.replace(seen(40.0, rotation_deg), drives=False)
-    assert helpful_motion(axis, arm) == words
+    assert helpful_motion([axis], arm) == words
 
 
 def test_only_motion_counts_as_time():

@@ -15,7 +15,7 @@ from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
-from hand_eye_calib.ros.session_journal import give, poses_so_far, takers
+from hand_eye_calib.live.journal import give, poses_so_far, takers
 
 CONFIG = CalibratorConfig(reference="B3")
 BOTH = {"parent": {}, "child": {}}
@@ -47,7 +47,7 @@ def record(writer, calibrator, sequence, flush_every=25):
 
 def resumed(directory, limits=None):
     calibrator, journal = Calibrator(CONFIG, limits), read_journal(directory)
-    give(journal, directory, calibrator)
+    give(journal, directory, {"child": calibrator})
     return calibrator, journal
 
 
@@ -119,7 +119,7 @@ def test_a_journal_that_begins_late_has_the_poses_so_far(tmp_path):
     calibrator, sequence = Calibrator(CONFIG), list(messages())
     for message in sequence[:60]:
         calibrator.add_pose(*message)
-    writer = JournalWriter(tmp_path, BOTH, poses_so_far(calibrator, {}))
+    writer = JournalWriter(tmp_path, BOTH, poses_so_far({"child": calibrator}))
     record(writer, calibrator, sequence[60:])
     writer.close()
     again, _ = resumed(tmp_path)
@@ -252,17 +252,17 @@ def test_kill_at_any_moment_costs_only_what_was_not_flushed(tmp_path):
 
 
 def test_further_child_sensors_are_resumed_too(tmp_path):
-    calibrator, others = Calibrator(CONFIG), {"child2": Calibrator(CONFIG)}
+    engines = {"child": Calibrator(CONFIG), "child2": Calibrator(CONFIG)}
     writer = JournalWriter(tmp_path, BOTH | {"child2": {}})
     for stream, *pose in messages():
         for name in [stream, "child2"] if stream == "child" else [stream]:
             writer.add_pose(name, *pose)
-            for own_stream, each in takers(name, calibrator, others):
+            for own_stream, each in takers(name, engines):
                 each.add_pose(own_stream, *pose)
     writer.close()
-    again, others = Calibrator(CONFIG), {"child2": Calibrator(CONFIG)}
-    give(read_journal(tmp_path), tmp_path, again, others)
-    assert others["child2"].statistics("child").received == 60
-    T = calibrator.estimate().T_parent_child
-    assert np.array_equal(others["child2"].estimate().T_parent_child, T)
-    assert np.array_equal(again.estimate().T_parent_child, T)
+    again = {"child": Calibrator(CONFIG), "child2": Calibrator(CONFIG)}
+    give(read_journal(tmp_path), tmp_path, again)
+    assert again["child2"].statistics("child").received == 60
+    T = engines["child"].estimate().T_parent_child
+    for each in again.values():
+        assert np.array_equal(each.estimate().T_parent_child, T)

@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.live.monitor import LEARNING_S, MEMORY_S, MountMonitor
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.session.monitor import LEARNING_S, MEMORY_S, MountMonitor
 
 X = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 EXACT = np.zeros((6, 6))

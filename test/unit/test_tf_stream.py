@@ -7,7 +7,7 @@ from motions import wandering_poses
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.transforms import TfSource, TransformTree
-from hand_eye_calib.ros.tf_stream import StampedTransform, TfStream
+from hand_eye_calib.live.tf_stream import StampedTransform, TfStream
 
 MOUNT = se3.exp(np.array([1.2, 0.1, 0.8, 0.2, -0.1, 1.5]))
 MS = 1_000_000

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.watch import web
 from hand_eye_calib.watch.board import Board
 from hand_eye_calib.watch.html import fragment
@@ -78,7 +79,7 @@ class Found(HTMLParser):
 def shown(*names):
     board = Board()
     for name in names:
-        board.take(name, [], 0.0)
+        board.take(NodeState(node=name), 0.0)
     return Found(fragment(board.view("", 0.0)))
 
 

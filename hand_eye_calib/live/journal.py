@@ -1,5 +1,5 @@
-"""The journal of the node's session, written by a thread of its own: a slow or full disk never
-holds up a message.
+"""The journal of the live session, written by a thread of its own: a slow or full disk never holds
+up a message.
 """
 
 import fcntl
@@ -8,8 +8,8 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -37,28 +37,29 @@ _LOCK_NAME = ".calibrator.lock"
 # Batches that may wait for a disk that does not answer: a minute.
 _MOST_WAITING = 240
 
-
-# The poses so far by stream, and what the thread is told to do with what.
+# The engines by the child sensor of each; all of them have the same parent.
+Engines = Mapping[str, Calibrator]
+# The poses so far by stream.
 Poses = dict[str, Trajectory]
-_Work = Callable[[Any], None]
 
 
-def poses_so_far(calibrator: Calibrator, others: Mapping[str, Calibrator]) -> Poses:
-    """What an engine, and those of further child sensors, have of each stream: as it came in, or
-    at the stamps of pairs where some were made.
+def takers(stream: str, engines: Engines) -> list[tuple[str, Calibrator]]:
+    """Who takes a message of a stream, and as which: the parent's counts for all child sensors."""
+    if stream == "parent":
+        return [(stream, each) for each in engines.values()]
+    return [("child", engines[stream])] if stream in engines else []
+
+
+def poses_so_far(engines: Engines) -> Poses:
+    """What the engines have of each stream: as it came in, or at the stamps of pairs where some
+    were made.
     """
-    parent, child = calibrator.snapshot().streams
-    found = {"parent": parent, "child": child}
-    return found | {name: other.snapshot().streams[1] for name, other in others.items()}
+    streams = {name: engine.snapshot().streams for name, engine in engines.items()}
+    return {"parent": streams["child"][0]} | {name: child for name, (_, child) in streams.items()}
 
 
-def give(
-    journal: Journal,
-    directory: Path,
-    calibrator: Calibrator,
-    others: Mapping[str, Calibrator] | None = None,
-) -> None:
-    """Give a calibrator, and those of further child sensors, the session of a directory.
+def give(journal: Journal, directory: Path, engines: Engines) -> None:
+    """Give engines the session of a directory.
 
     Raises
     ------
@@ -66,27 +67,16 @@ def give(
         If they do not take it.
     """
     try:
-        for name, each in {"child": calibrator, **(others or {})}.items():
+        for name, engine in engines.items():
             for stream, own_stream in (("parent", "parent"), (name, "child")):
                 if frame := journal.about.get(stream, {}).get("frame"):
-                    each.set_frame(own_stream, frame)
+                    engine.set_frame(own_stream, frame)
             rows = np.isin(journal.streams, ["parent", name])
-            streams, poses = journal.streams[rows], journal.poses[rows]
-            own_streams = np.where(streams == "parent", "parent", "child")
-            each.add_poses(own_streams, journal.stamps_ns[rows], poses[:, :3], poses[:, 3:])
+            poses = journal.poses[rows]
+            own_streams = np.where(journal.streams[rows] == "parent", "parent", "child")
+            engine.add_poses(own_streams, journal.stamps_ns[rows], poses[:, :3], poses[:, 3:])
     except InputError as error:
         raise InputError(f"cannot use the session journal {directory}: {error}") from None
-
-
-def takers(
-    stream: str, calibrator: Calibrator, others: Mapping[str, Calibrator]
-) -> list[tuple[str, Calibrator]]:
-    """Who takes a message of a stream, and as which: the parent's counts for all child sensors."""
-    if stream == "parent":
-        return [(stream, each) for each in (calibrator, *others.values())]
-    if stream == "child":
-        return [(stream, calibrator)]
-    return [("child", others[stream])] if stream in others else []
 
 
 class DirectoryLock:
@@ -144,6 +134,11 @@ class SessionJournal:
         Of the session so far.
     resumed : Journal, optional
         The session in the directory goes on; otherwise it is kept aside.
+
+    Attributes
+    ----------
+    error : str
+        Why it cannot be written; empty if it can.
     """
 
     def __init__(
@@ -152,14 +147,13 @@ class SessionJournal:
         self.directory = Path(directory)
         self.error = ""
         self._notes: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
-        self._events: list[tuple[Any, ...]] = []
-        self._jobs: queue.Queue[tuple[_Work, Any] | None] = queue.Queue()
-        self._failed_at: float | None = None
-        self._broken = False  # in the thread: the files must not be written to any more
-        self._is_ours = resumed is not None
-        self._writer: JournalWriter | None = None
+        self._events: list[tuple[str, int, Sequence[float], Sequence[float]]] = []
+        self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
+        self._failed_at_s: float | None = None
         self._about = {stream: dict(known) for stream, known in about.items()}
-        self._jobs.put((self._go_on, resumed) if resumed else (self._open, poses))
+        self._is_ours = resumed is not None
+        self._writer: JournalWriter | None = None  # in the thread; None while it cannot be written
+        self._jobs.put(partial(self._open, poses, resumed))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
@@ -171,7 +165,7 @@ class SessionJournal:
 
     def describe(self, about: About) -> None:
         """Note what is known of the streams."""
-        self._jobs.put((self._describe, about))
+        self._jobs.put(partial(self._describe, about))
 
     def flush(self, make_poses: Callable[[], Poses]) -> None:
         """Hand what was noted to the thread; to be called often.
@@ -182,110 +176,95 @@ class SessionJournal:
             Gives the poses so far, for a journal that is begun again after an error.
         """
         events, self._events = self._events, []
-        if self._failed_at is not None:
-            if time.monotonic() - self._failed_at >= _RETRY_S:
-                self._failed_at = None
-                self._jobs.put((self._open, make_poses()))
+        if self._failed_at_s is not None:
+            if time.monotonic() - self._failed_at_s >= _RETRY_S:
+                self._failed_at_s = None
+                self._jobs.put(partial(self._open, make_poses()))
         elif self._jobs.qsize() > _MOST_WAITING:
-            self._failed_at = time.monotonic()
-            self._fail("the disk does not answer")
+            self._give_up("the disk does not answer")
         elif events:
-            self._jobs.put((self._write, events))
+            self._jobs.put(partial(self._write, events))
 
     def begin(self) -> None:
         """Start a new session without poses; the one so far is kept aside."""
-        self._jobs.put((self._write, self._events))
+        self._jobs.put(partial(self._write, self._events))
         self._events = []
-        self._jobs.put((self._begin, {}))
+        self._jobs.put(self._begin)
 
     def notes(self) -> Iterator[tuple[bool, str]]:
         """Lines for the log since the last call, each with whether it is a warning."""
         while not self._notes.empty():
             yield self._notes.get()
 
-    def stop(self, make_poses: Callable[[], Poses], timeout_s: float) -> bool:
-        """Write what is left and end the thread; False if the disk keeps it busy."""
+    def stop(self, make_poses: Callable[[], Poses], timeout_s: float) -> None:
+        """Write what is left and end the thread, unless the disk keeps it busy."""
         self.flush(make_poses)
+        self._jobs.put(self._close)
         self._jobs.put(None)
         self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+
+    def _give_up(self, reason: str) -> None:
+        """Leave the files as they are; they are begun again later."""
+        self.error, self._failed_at_s = reason, time.monotonic()
+        text = f"cannot write the session journal in {self.directory}: {reason}; "
+        self._notes.put((True, text + "going on without it: a crash would lose this session"))
 
     # ------------------------------------------------------------ in the thread
 
     def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            work, argument = job
+        while (work := self._jobs.get()) is not None:
             try:
-                work(argument)
+                work()
             except OSError as error:
+                self._writer = None
                 self._give_up(error.strerror or str(error))
             except Exception as error:  # a defect: the node must say so and go on
+                self._writer = None
                 self._give_up(f"{type(error).__name__}: {error}")
-        if self._writer is not None and not self._broken:
-            try:
-                self._writer.close()
-            except OSError as error:
-                self._fail(error.strerror or str(error))
 
-    def _give_up(self, reason: str) -> None:
-        """Leave the files as they are; they are begun again later."""
-        self._broken = True
-        self._failed_at = time.monotonic()
-        self._fail(reason)
-
-    def _fail(self, reason: str) -> None:
-        self.error = reason
-        text = f"cannot write the session journal in {self.directory}: {reason}; "
-        self._notes.put((True, text + "going on without it: a crash would lose this session"))
-
-    def _go_on(self, resumed: Journal) -> None:
-        self._writer = JournalWriter(self.directory, self._about, resumed=resumed)
-
-    def _open(self, poses: Poses) -> None:
+    def _open(self, poses: Poses, resumed: Journal | None = None) -> None:
         if not self._is_ours:
             self._keep_aside()
         self._is_ours = True
-        self._writer = JournalWriter(self.directory, self._about, poses)
-        self._broken = False
+        self._writer = JournalWriter(self.directory, self._about, poses, resumed)
         if self.error:
             self.error = ""
             text = f"the session journal in {self.directory} is being written again"
             self._notes.put((False, text))
 
-    def _begin(self, poses: Poses) -> None:
-        if self._writer is not None and not self._broken:
-            self._writer.close()
-        self._writer, self._is_ours = None, False
-        self._open(poses)
+    def _begin(self) -> None:
+        self._close()
+        self._is_ours = False
+        self._open({})
 
     def _keep_aside(self) -> None:
         """Keep an earlier session, unless there is nothing in it."""
-        if not has_session(self.directory):
-            return
-        poses = count_poses(self.directory)
+        poses = count_poses(self.directory) if has_session(self.directory) else 0
         if poses == 0:
             return
         aside = keep_aside(self.directory)
-        size = (
-            "a session that cannot be read"
-            if poses is None
-            else f"the session before this one ({poses} poses)"
+        size = f"the session before this one ({poses} poses)"
+        if poses is None:
+            size = "a session that cannot be read"
+        text = (
+            f"{size} is kept in {aside}; to go on with it, stop the node, rename that folder to "
+            f"{self.directory.name} and start with the parameter journal at resume"
         )
-        how = (
-            f"stop the node, rename that folder to {self.directory.name} and start with the "
-            "parameter journal at resume"
-        )
-        self._notes.put((False, f"{size} is kept in {aside}; to go on with it, {how}"))
+        self._notes.put((False, text))
 
-    def _write(self, events: list[tuple[Any, ...]]) -> None:
-        if self._broken or self._writer is None:
-            return
-        for event in events:
-            self._writer.add_pose(*event)
-        self._writer.flush()
+    def _write(self, events: list[tuple[str, int, Sequence[float], Sequence[float]]]) -> None:
+        if self._writer is not None:
+            for event in events:
+                self._writer.add_pose(*event)
+            self._writer.flush()
 
     def _describe(self, about: About) -> None:
         for stream, known in about.items():
             self._about.setdefault(stream, {}).update(known)
-        if not self._broken and self._writer is not None:
+        if self._writer is not None:
             self._writer.describe(self._about)
+
+    def _close(self) -> None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()

@@ -1,0 +1,255 @@
+"""The processes beside the node's: one solves, one writes the report of a session.
+
+A thread that solves would share the interpreter with the callbacks: on a slow machine their latency
+rises to a second. The thread here only waits for the pipes.
+"""
+
+import contextlib
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.live.solving import Answer, Failure, FailureKind, Job
+from hand_eye_calib.results.calibration import Calibration
+
+# Not `-m`: its classes would belong to the module __main__, which the node does not have.
+_SOLVE = "from hand_eye_calib.live.solving import main; main()"
+_REPORT = "from hand_eye_calib.cli.reporting import write_session; write_session()"
+
+# A job is sent so many times before it is given up.
+_ATTEMPTS = 2
+
+# A job hangs that has taken this long (s), and so many times the longest before it: solves grow
+# with their data, but not by that from one to the next, and a slow computer needs seconds for each.
+HANGS_AFTER_S, _HANGS_TIMES = 120.0, 20.0
+
+# A process that has closed its pipes is killed after so long.
+_LAST_BREATH_S = 1.0
+
+_NOT_AN_ANSWER = (EOFError, OSError, pickle.UnpicklingError)
+
+
+def _start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Popen[bytes]":
+    """Run Python code with the same modules as here, in a group of its own, which Ctrl-C in the
+    terminal leaves alone.
+    """
+    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        stdin=stdin,
+        stdout=stdout,
+        env=os.environ | {"PYTHONPATH": path},
+        process_group=0,
+    )
+
+
+class SolvingProcess:
+    """Answers jobs in another process, in the order they were submitted.
+
+    The process is started at once and again when it has died; the job in hand is sent again then.
+    One that hangs is killed and started again; the job in hand has failed then. It ends with this
+    one, however this one ends.
+
+    Parameters
+    ----------
+    on_answer : callable
+        Called in another thread when an answer or a note is ready; one call may stand for two.
+    command : str
+        Python code that the process runs.
+    """
+
+    def __init__(self, on_answer: Callable[[], None], command: str = _SOLVE) -> None:
+        self._on_answer, self._command = on_answer, command
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._stopping = threading.Event()
+        self._hangs_after_s = HANGS_AFTER_S
+        self._process = self._started()
+        # A daemon: a disk or a pipe that hangs must not keep the node alive.
+        self._thread = threading.Thread(target=self._run, name="solving", daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int:
+        """Id of the process that solves."""
+        return self._process.pid
+
+    def submit(self, job: Job) -> None:
+        """Queue a job."""
+        self._jobs.put(job)
+
+    def answers(self) -> Iterator[Answer]:
+        """Each answer that nobody has taken, in order."""
+        while not self._answers.empty():
+            yield self._answers.get()
+
+    def notes(self) -> Iterator[str]:
+        """Lines for the log: the process died and was started again."""
+        while not self._notes.empty():
+            yield self._notes.get()
+
+    def stop(self, timeout_s: float) -> None:
+        """Wait for the job in hand, then end the process whatever it does."""
+        self._stopping.set()
+        self._jobs.put(None)
+        self._thread.join(timeout_s)
+        self._process.kill()
+        self._thread.join(_LAST_BREATH_S)  # its pipe has ended
+        _end(self._process)
+
+    def _started(self) -> "subprocess.Popen[bytes]":
+        return _start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            found = self._answer(job)
+            if found is not None:
+                self._answers.put(found)
+                if not self._stopping.is_set():
+                    self._on_answer()
+
+    def _answer(self, job: Job) -> Answer | None:
+        """The job's answer, a failure if the process dies again and again; None at the end."""
+        cause = ""
+        for _ in range(_ATTEMPTS):
+            began_s, timer = time.monotonic(), self._killer()
+            try:
+                found = self._exchange(job)
+                longest_s = _HANGS_TIMES * (time.monotonic() - began_s)
+                self._hangs_after_s = max(self._hangs_after_s, longest_s)
+                return found
+            except _NOT_AN_ANSWER:
+                if self._stopping.is_set():
+                    return None
+                hangs = time.monotonic() - began_s >= self._hangs_after_s
+                cause = self._restart(hangs)
+            finally:
+                timer.cancel()
+            if hangs:
+                self._hangs_after_s *= 2.0  # it may have been a long solve
+                break
+        failure = Failure(FailureKind.UNEXPECTED, f"the solving process {cause}")
+        return Answer(job.session, 0.0, failure=failure)
+
+    def _killer(self) -> threading.Timer:
+        """Kills a process that hangs, unless it is cancelled."""
+        timer = threading.Timer(self._hangs_after_s, self._process.kill)
+        timer.daemon = True
+        timer.start()
+        return timer
+
+    def _exchange(self, job: Job) -> Answer:
+        to, back = self._process.stdin, self._process.stdout
+        assert to is not None
+        assert back is not None
+        pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
+        to.flush()
+        found: Answer = pickle.load(back)
+        return found
+
+    def _restart(self, hangs: bool) -> str:
+        """Start the process again; returns how it ended."""
+        code = _end(self._process)
+        self._process = self._started()
+        if self._stopping.is_set():
+            self._process.kill()
+        if hangs:
+            cause = f"had no answer after {self._hangs_after_s:.3g} s and was killed"
+        elif code < 0:
+            cause = f"was ended by {signal.Signals(-code).name}"
+        else:
+            cause = f"ended with code {code}"
+        self._notes.put(f"the solving process {cause}; it was started again")
+        return cause
+
+
+def _end(process: "subprocess.Popen[bytes]") -> int:
+    """Exit code of a process that has died, or is made to."""
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with contextlib.suppress(OSError):
+                pipe.close()
+    try:
+        return process.wait(_LAST_BREATH_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+@dataclass(frozen=True)
+class SessionResult:
+    """A result of the node, the poses that gave it, and where these came from; whether a report is
+    wanted, and the poses of further child sensors, each with those of the parent.
+    """
+
+    calibration: Calibration
+    snapshot: Snapshot
+    inputs: Mapping[str, Any]
+    with_report: bool = True
+    others: Mapping[str, Snapshot] = field(default_factory=dict)
+
+    @property
+    def files(self) -> str:
+        """What is written, in words."""
+        return " and ".join(["report.html"] * self.with_report + ["rig/"] * bool(self.others))
+
+
+class ReportProcess:
+    """Writes reports in a process that outlives the node, one at a time: the newest counts."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._answer: IO[bytes] | None = None
+
+    def write(self, directory: Path, result: SessionResult) -> str:
+        """Start to write the files into a directory, which takes milliseconds; returns a sentence
+        about that.
+
+        The result is handed over in a file that has no name: nobody else can change it, and no
+        pipe has to be waited for at the end of the node.
+        """
+        try:
+            self._write(directory, result)
+        except OSError as error:  # a full temporary directory, or no process can be started
+            return f"{result.files} cannot be written: {error.strerror}"
+        return f"{result.files} follow" + "s" * (" and " not in result.files)
+
+    def _write(self, directory: Path, result: SessionResult) -> None:
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.kill()
+            self._process.wait()
+        self._process = self._answer = None
+        answer = tempfile.TemporaryFile() if result.others else None  # noqa: SIM115
+        with tempfile.TemporaryFile() as file:
+            pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
+            file.seek(0)
+            out = answer or subprocess.DEVNULL
+            self._process = _start(_REPORT, str(directory.resolve()), stdin=file, stdout=out)
+        self._answer = answer
+
+    def take_others(self) -> list[Calibration]:
+        """Results of further child sensors in their order, once, when they are there."""
+        if self._answer is None or self._process is None or self._process.poll() is None:
+            return []
+        with self._answer as answer:
+            self._answer = None
+            answer.seek(0)
+            found: list[Calibration] = pickle.load(answer) if self._process.returncode == 0 else []
+            return found
+
+    def forget(self) -> None:
+        """A new session has begun: results of the one before are of no use."""
+        self._answer = None

@@ -1,0 +1,202 @@
+"""The parts of the session as the node's state has them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.live.cycle import SolveCycle
+from hand_eye_calib.live.input import PoseInput, with_clock_offset
+from hand_eye_calib.live.solving import FailureKind
+from hand_eye_calib.live.state import (
+    AxisValues,
+    Broadcast,
+    ComparisonState,
+    ExtrinsicState,
+    InputState,
+    Level,
+    ProgressState,
+    ResultState,
+)
+from hand_eye_calib.plain import plain
+from hand_eye_calib.results.calibration import Calibration, Verdict
+
+# If poses wait that no result contains, the result is stale when it is older than this many solve
+# periods, and than so many seconds.
+_STALE_PERIODS, _STALE_S = 5, 10.0
+
+
+def extrinsic_state(
+    cycle: SolveCycle,
+    *,
+    accepts_poses: bool,
+    tf_static: tuple[Broadcast, str],
+    stale_after_s: float,
+    steady_s: float,
+    clock_ns: int,
+) -> ExtrinsicState:
+    """The result: what is missing, how good it is, how it was found.
+
+    Parameters
+    ----------
+    cycle : SolveCycle
+    accepts_poses : bool
+    tf_static : (Broadcast, str)
+        What is done about ``/tf_static``, and the reason.
+    stale_after_s : float
+        Age from which on the result should have been followed by another.
+    steady_s : float
+        Steady time.
+    clock_ns : int
+        The node's clock; 0 if it does not run yet.
+    """
+    seen, result = cycle.seen, cycle.result
+    level, text = _judged(cycle, accepts_poses, tf_static, stale_after_s, steady_s)
+    rotation = np.degrees(seen.rotation).tolist() if seen else []
+    return ExtrinsicState(
+        level=level,
+        text=text,
+        accepts_poses=accepts_poses,
+        is_solving=cycle.is_solving,
+        solves=cycle.solves,
+        last_solve_s=cycle.seconds,
+        last_failure=cycle.failure.what if cycle.failure else "",
+        n_poses=seen.n_poses if seen else 0,
+        path_m=seen.distance if seen else 0.0,
+        rotation_deg=dict(zip("xyz", rotation, strict=False)),
+        tf_static=tf_static[0],
+        tf_static_reason=tf_static[1],
+        result=_result_state(result, _age_s(cycle, steady_s), clock_ns) if result else None,
+    )
+
+
+def stale_after_s(has_new_poses: bool, solve_period_s: float) -> float:
+    """Age from which on a result is stale; on a parked robot none is, as no poses wait."""
+    return max(_STALE_S, _STALE_PERIODS * solve_period_s) if has_new_poses else np.inf
+
+
+def _age_s(cycle: SolveCycle, steady_s: float) -> float:
+    return 0.0 if cycle.solved_at_s is None else steady_s - cycle.solved_at_s
+
+
+def _judged(
+    cycle: SolveCycle,
+    accepts_poses: bool,
+    tf_static: tuple[Broadcast, str],
+    stale_s: float,
+    steady_s: float,
+) -> tuple[Level, str]:
+    """Level and message: the gravest that applies."""
+    result, failure, age_s = cycle.result, cycle.failure, _age_s(cycle, steady_s)
+    if failure is not None and failure.kind is FailureKind.UNEXPECTED:
+        return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
+    if not accepts_poses:
+        return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
+    said = failure.what if failure else ""
+    if result is None:
+        faults = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in cycle.checks.faults()[:1]]
+        return Level.WARN, "; ".join(filter(None, (*faults, said))) or "no result yet"
+    if result.verdict is Verdict.DO_NOT_USE:
+        return Level.WARN, result.headline
+    if tf_static[0] in (Broadcast.REFUSED, Broadcast.ON) and tf_static[1]:
+        return Level.WARN, f"publish_tf is refused: {tf_static[1]}"
+    if age_s > stale_s:
+        return Level.WARN, ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
+    return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
+
+
+def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultState:
+    T = result.T_parent_child
+    pose = np.concatenate([T[:3, 3], se3.rotation_to_rpy(T[:3, :3])])
+    sigmas = np.concatenate([result.sigmas[:3], result.sigmas_rpy])
+    return ResultState(
+        parent_frame=result.parent_frame,
+        child_frame=result.child_frame,
+        verdict=result.verdict.value,
+        status=result.status.value,
+        reasons=[f"{each.sentence}: {each.what_to_do}" for each in result.reasons],
+        warnings=list(result.warnings),
+        pose=_by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
+        pose_sigma=_by_axis(sigmas),
+        axis_verdict={dof.name: dof.verdict.value for dof in result.observability},
+        method=f"{result.method} {result.reference} {result.backend}",
+        n_poses=result.n_poses,
+        n_pairs=result.n_pairs,
+        inlier_share=result.n_inliers / max(result.n_pairs, 1),
+        time_offset_s=result.time_offset_s,
+        time_offset_sigma_s=result.time_offset_sigma_s,
+        scale=result.scale,
+        scale_sigma=result.scale_sigma,
+        age_s=age_s,
+        newest_pose_age_s=(clock_ns - result.stamp_ns) * 1e-9 if clock_ns else None,
+    )
+
+
+def _by_axis(values: Any) -> AxisValues:
+    return dict(zip(AXES, plain(values), strict=True))
+
+
+def progress_state(cycle: SolveCycle, why_not_compared: str) -> ProgressState:
+    """Each axis against its target, the seconds left, and what to do now.
+
+    WARN before the first result, and while the motion is of no use for an axis that lacks.
+
+    Parameters
+    ----------
+    cycle : SolveCycle
+    why_not_compared : str
+        Why there is no comparison with what is installed; empty if none was asked for.
+    """
+    progress, result = cycle.goal.progress, cycle.result
+    comparison = None
+    if result is not None and result.comparison:
+        comparison = _comparison_state(result.comparison)
+    elif why_not_compared:
+        sentence = f"not compared yet: {why_not_compared}"
+        comparison = ComparisonState(verdict="not yet", sentence=sentence)
+    return ProgressState(
+        level=Level.WARN if result is None or progress.will_not_get_there else Level.OK,
+        text=progress.sentence,
+        has_result=result is not None,
+        is_done=progress.is_done,
+        is_faulty=progress.is_faulty,
+        limiting_axis=progress.limiting_axis,
+        sigma=_by_axis(progress.sigmas),
+        target=_by_axis(progress.targets),
+        seconds_left=_by_axis(progress.seconds_left),
+        comparison=comparison,
+    )
+
+
+def _comparison_state(comparison: Mapping[str, Any]) -> ComparisonState:
+    rows = comparison["differences"][0]["axes"]
+    return ComparisonState(
+        verdict=comparison["verdict"],
+        sentence=comparison["sentence"],
+        installed_from=comparison["installed"],
+        installed={axis: comparison["values"][axis] for axis in rows},
+        difference={axis: row["difference"] for axis, row in rows.items()},
+        difference_sigma={axis: row["sigma"] for axis, row in rows.items()},
+    )
+
+
+def input_states(
+    inputs: Sequence[PoseInput], has_result: bool, time_offset: float | str, steady_s: float
+) -> dict[str, InputState]:
+    """The states of the inputs by their names: parent, child, and those of further child sensors.
+
+    Parameters
+    ----------
+    inputs : sequence of PoseInput
+    has_result : bool
+        Whether a robot that rests has nothing more to show.
+    time_offset : float or str
+        What is added to the child's stamps, s.
+    steady_s : float
+    """
+    may_rest = has_result and all(each.is_silent(steady_s) for each in inputs[:2])
+    states = {each.name: each.state(steady_s, may_rest) for each in inputs}
+    pair = with_clock_offset(states["parent"], states["child"], time_offset)
+    return states | dict(zip(("parent", "child"), pair, strict=True))

@@ -1,0 +1,114 @@
+"""What the node publishes: its results, and its state."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from std_msgs.msg import String
+
+from hand_eye_calib.live.state import NodeState
+from hand_eye_calib.plain import json_text, plain
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.status import ROTATIONS
+from hand_eye_calib.ros.conversions import (
+    LATCHED,
+    to_pose_with_covariance,
+    to_time,
+    to_transform,
+)
+from hand_eye_calib.text import in_words
+
+PROGRESS_TOPIC = "progress"
+HARDWARE_ID = "hand_eye_calib"
+
+
+class ResultTopics:
+    """Publishes results on ``~/extrinsic`` and ``~/extrinsic_with_covariance``, latched; those of
+    further child sensors on ``~/extrinsic_child2`` and so on.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publishers: dict[str, Publisher] = {}
+        self._open()
+
+    def _open(self) -> None:
+        kinds = {"extrinsic": TransformStamped}
+        kinds |= {"extrinsic_with_covariance": PoseWithCovarianceStamped}
+        for name, kind in kinds.items():
+            self._publishers[name] = self._node.create_publisher(kind, f"~/{name}", LATCHED)
+
+    def publish(self, calibration: Calibration) -> None:
+        """Publish a result, if there is one that says enough to be used."""
+        if _is_known(calibration):
+            self._publishers["extrinsic"].publish(to_transform(calibration))
+            pose = to_pose_with_covariance(calibration)
+            self._publishers["extrinsic_with_covariance"].publish(pose)
+
+    def publish_other(self, input_name: str, calibration: Calibration) -> None:
+        """Publish a result of a further child sensor, by the name of its input."""
+        name = f"extrinsic_{input_name}"
+        if name not in self._publishers:
+            publisher = self._node.create_publisher(TransformStamped, f"~/{name}", LATCHED)
+            self._publishers[name] = publisher
+        self._publishers[name].publish(to_transform(calibration))
+
+    def clear(self) -> None:
+        """Withdraw the results: who subscribes from now on gets none."""
+        for publisher in self._publishers.values():
+            self._node.destroy_publisher(publisher)
+        self._publishers.clear()
+        self._open()
+
+
+def _is_known(calibration: Calibration) -> bool:
+    """Whether the rotation and two axes of the translation are determined: the others are zeros."""
+    hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
+    return hidden.isdisjoint(ROTATIONS) and len(hidden) <= 1
+
+
+class StateTopics:
+    """Publishes the node's state: as JSON on ``~/progress``, latched, and on ``/diagnostics``."""
+
+    def __init__(self, node: Node) -> None:
+        self._progress = node.create_publisher(String, f"~/{PROGRESS_TOPIC}", LATCHED)
+        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+
+    def publish(self, state: NodeState, clock_ns: int) -> None:
+        """Publish the state; ``clock_ns`` is the node's clock, 0 if it does not run."""
+        self._progress.publish(String(data=json_text(state)))
+        self._diagnostics.publish(diagnostics(state, clock_ns))
+
+
+def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
+    """The message for ``/diagnostics``: a status for each part of the node, by its fully qualified
+    name: two nodes must be told apart.
+    """
+    message = DiagnosticArray(
+        status=[
+            DiagnosticStatus(
+                level=bytes([part.level]),
+                name=f"{state.node}: {name}",
+                message=part.text,
+                hardware_id=HARDWARE_ID,
+                values=[KeyValue(key=key, value=text) for key, text in _values(plain(part))],
+            )
+            for name, part in state.parts()
+        ]
+    )
+    message.header.stamp = to_time(clock_ns)
+    return message
+
+
+def _values(part: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Names and texts of the values of a part, those of a part of it as ``name.name``."""
+    for name, value in part.items():
+        if isinstance(value, dict):
+            yield from _values(value, f"{before}{name}.")
+        elif isinstance(value, bool):
+            yield f"{before}{name}", "true" if value else "false"
+        elif before or name not in ("level", "text"):
+            yield f"{before}{name}", "unknown" if value is None else in_words(value)

@@ -1,0 +1,223 @@
+"""The process that solves, without a node."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from motions import as_trajectory, child_of, disturbed, feed, wandering_poses
+
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.checked import checked
+from hand_eye_calib.engine.pose_buffer import BufferLimits
+from hand_eye_calib.live import processes
+from hand_eye_calib.live.processes import SolvingProcess
+from hand_eye_calib.live.solving import Answer, Checked, Failure, FailureKind, Job, answer
+
+PATIENCE_S = 120.0
+
+# Solvers of the test's own.
+SLOW = """
+import time
+from hand_eye_calib.live import solving
+solving.answer = lambda job: time.sleep(3600.0)
+solving.main()
+"""
+BROKEN = "raise SystemExit(3)"
+NOISY = """
+import os
+from hand_eye_calib.live import solving
+excitation = solving.excitation
+def noisy(pose_pairs):
+    print("a library that prints", flush=True)
+    os.system("echo a program that prints")
+    return excitation(pose_pairs)
+solving.excitation = noisy
+solving.main()
+"""
+
+
+def snapshot(**options):
+    calibrator = Calibrator(CalibratorConfig(**{"reference": "B3", **options}))
+    parent = wandering_poses(250)
+    for stream, poses in (("parent", parent), ("child", child_of(parent))):
+        feed(calibrator, stream, as_trajectory(poses))
+    return calibrator.snapshot()
+
+
+class Started(SolvingProcess):
+    """A process whose answers can be waited for."""
+
+    def __init__(self, *command):
+        self.announced = threading.Semaphore(0)
+        super().__init__(self.announced.release, *command)
+
+    def next(self):
+        assert self.announced.acquire(timeout=PATIENCE_S)
+        (found,) = self.answers()
+        return found
+
+
+@pytest.fixture
+def start():
+    running = []
+
+    def made(*command):
+        running.append(Started(*command))
+        return running[-1]
+
+    yield made
+    for process in running:
+        process.stop(timeout_s=0.0)
+
+
+def status(pid):
+    try:
+        return Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    except FileNotFoundError:
+        return "(zombie)"
+
+
+def wait_gone(pid):
+    end = time.monotonic() + PATIENCE_S
+    while "(zombie)" not in status(pid):
+        assert time.monotonic() < end, f"process {pid} goes on"
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"method": "adaptive", "time_offset": "estimate"}, {"method": "dnlo", "backend": "ipopt"}],
+)
+def test_gives_the_same_bits_as_here_whatever_libraries_print(start, options):
+    process, work = start(NOISY), snapshot(**options)
+    process.submit(Job(5, work, check=True))
+    there, here = process.next(), answer(Job(5, snapshot(**options), check=True))
+    assert there.session == 5
+    for name in ("T_parent_child", "covariance", "objective", "sigmas"):
+        values = [getattr(each.calibration, name) for each in (there, here)]
+        np.testing.assert_array_equal(*values)
+    assert there.check.result.findings == here.check.result.findings
+    assert there.seen.n_poses == here.seen.n_poses == 250
+    assert (there.time_offset is None) == ("time_offset" not in options)
+    if there.time_offset is not None:
+        assert there.time_offset.seconds == work.resolved().time_offset.seconds
+
+
+def test_what_is_missing_and_defects_are_told_apart():
+    missing = answer(Job(0, Calibrator().snapshot(), check=True))
+    assert missing.failure.kind is FailureKind.NOT_ENOUGH_DATA
+    assert "no poses on the parent stream" in missing.failure.what
+    assert missing.check == Checked()  # streams that tell too little are not checked
+    unusable = answer(Job(0, snapshot(parent_frame="one", child_frame="one")))
+    assert unusable.failure.kind is FailureKind.UNUSABLE
+    defect = answer(Job(0, dataclasses.replace(snapshot(), config=None)))
+    assert defect.failure.kind is FailureKind.UNEXPECTED
+    assert "AttributeError" in defect.failure.what
+    assert "Traceback" in defect.failure.details
+
+
+def test_killed_it_is_started_again_says_so_and_the_job_in_hand_is_answered(start):
+    process = start()
+    for kill in range(3):
+        old = process.pid
+        process.submit(Job(kill, snapshot()))
+        os.kill(old, signal.SIGKILL)
+        found = process.next()
+        assert (found.session, found.failure) == (kill, None)
+        assert process.pid != old
+    note = "the solving process was ended by SIGKILL; it was started again"
+    assert list(process.notes()) == [note] * 3
+
+
+def test_one_that_cannot_run_is_a_failure_and_not_for_ever(start):
+    process = start(BROKEN)
+    process.submit(Job(0, snapshot(), check=True))
+    failure = Failure(FailureKind.UNEXPECTED, "the solving process ended with code 3")
+    assert process.next() == Answer(0, 0.0, failure=failure)
+
+
+def test_one_that_hangs_is_killed_started_again_and_the_job_has_failed(start, monkeypatch):
+    monkeypatch.setattr(processes, "HANGS_AFTER_S", 0.5)
+    process = start(SLOW)
+    old = process.pid
+    process.submit(Job(7, snapshot(), check=True))
+    what = "the solving process had no answer after 0.5 s and was killed"
+    assert process.next() == Answer(7, 0.0, failure=Failure(FailureKind.UNEXPECTED, what))
+    assert list(process.notes()) == [f"{what}; it was started again"]
+    assert process.pid != old
+    wait_gone(old)
+
+
+def test_stop_does_not_wait_for_a_long_solve(start):
+    for wait_s in (0.0, 0.2, 1.0):  # while it starts, reads, solves
+        process = start(SLOW)
+        process.submit(Job(0, snapshot()))
+        time.sleep(wait_s)
+        process.stop(timeout_s=0.1)
+        wait_gone(process.pid)
+        assert not list(process.answers())
+
+
+@pytest.mark.parametrize("command", ["idle", "busy"])
+def test_it_ends_with_the_node_however_that_ends(command):
+    """In a program that is killed: nothing there can clean up."""
+    program = f"""
+import time
+from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.live.solving import Job
+from hand_eye_calib.live.processes import SolvingProcess
+process = SolvingProcess(lambda: None, {SLOW!r})
+if {command == "busy"}:
+    process.submit(Job(0, Calibrator().snapshot()))
+print(process.pid, flush=True)
+time.sleep(3600.0)
+"""
+    node = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    pid = int(node.stdout.readline())
+    node.kill()
+    node.wait()
+    node.stdout.close()
+    wait_gone(pid)
+
+
+def test_it_imports_neither_ros_nor_plots_nor_bags():
+    program = "import sys, hand_eye_calib.live.solving; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    unwanted = {"rclpy", "matplotlib", "rosbags", "casadi", "jinja2", "yaml", "rich"}
+    assert not unwanted & set(done.stdout.split())
+
+
+@pytest.mark.parametrize("pairing_starts", [2000, 100])
+def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts):
+    limits = BufferLimits(pairing_starts=pairing_starts, batch=64)
+    calibrator = Calibrator(CalibratorConfig(reference="B3"), limits)
+    parent = wandering_poses(400)
+    child = disturbed(child_of(parent), 1, 0.001, 0.001)
+    # Turn by turn, as live: the oldest are made into pairs on the way.
+    streams = as_trajectory(parent), as_trajectory(child).shifted(-0.3)
+    for start in range(0, 400, 50):
+        for stream, poses in zip(("parent", "child"), streams, strict=True):
+            feed(calibrator, stream, poses[start : start + 50])
+    live = calibrator.snapshot()
+    assert (len(live.kept) > 0) == (pairing_starts < 400)
+    replayed, _ = checked(live.estimate(), live)
+    found = answer(Job(1, live, check=True))
+    assert found.check.options == {"time_offset": "estimate"}
+    assert "solved with time_offset estimate" in found.check.told[0]
+    again = answer(Job(1, live, check=True, options=found.check.options))
+    assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
+    for each in (found, again):
+        np.testing.assert_array_equal(each.calibration.T_parent_child, replayed.T_parent_child)
+        np.testing.assert_array_equal(each.calibration.covariance, replayed.covariance)
+    assert (again.check.options, again.check.told) == ({}, ())
+    assert "time_offset" not in {finding.code for finding in again.check.result.findings}
