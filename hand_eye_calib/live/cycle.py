@@ -17,7 +17,8 @@ from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.solving import Answer, Checked, Failure, FailureKind, Job
 from hand_eye_calib.live.stream_checks import StreamChecks
 from hand_eye_calib.results.calibration import Calibration, SolveStatus
-from hand_eye_calib.session.goal import Goal, Progress
+from hand_eye_calib.results.records import Progress
+from hand_eye_calib.session.goal import Goal
 
 # Takes whether a solve was good, and a line about it.
 OnSolved = Callable[[bool, str], None]
@@ -208,7 +209,7 @@ class SolveCycle:
 
     def _tell(self, progress: Progress) -> None:
         """Log the progress unless only its figures differ from what was said last."""
-        said = progress.limiting_axis, progress.is_done, progress.will_not_get_there
+        said = progress.limiting_axis, progress.done, progress.will_not_get_there
         if said == self._said or progress.is_faulty or not progress.sentence:
             return
         self._said = said
@@ -218,8 +219,7 @@ class SolveCycle:
     def _with_findings(self, calibration: Calibration) -> Calibration:
         if calibration.measured != "poses":
             return calibration  # which has its own
-        findings = tuple(finding.to_dict() for finding in self.checks.findings)
-        return replace(calibration, findings=findings)
+        return replace(calibration, findings=self.checks.findings)
 
     def _report_failure(self, failure: Failure) -> str:
         if failure.kind is FailureKind.NOT_ENOUGH_DATA:

@@ -1,6 +1,6 @@
 """The parts of the session as the node's state has them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from hand_eye_calib.live.solving import FailureKind
 from hand_eye_calib.live.state import (
     AxisValues,
     Broadcast,
-    ComparisonState,
     ExtrinsicState,
     InputState,
     Level,
@@ -22,6 +21,7 @@ from hand_eye_calib.live.state import (
 )
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.results.records import Comparison
 
 # If poses wait that no result contains, the result is stale when it is older than this many solve
 # periods, and than so many seconds.
@@ -116,8 +116,8 @@ def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultSta
         child_frame=result.child_frame,
         verdict=result.verdict.value,
         status=result.status.value,
-        reasons=[f"{each.sentence}: {each.what_to_do}" for each in result.reasons],
-        warnings=list(result.warnings),
+        reasons=tuple(f"{each.sentence}: {each.what_to_do}" for each in result.reasons),
+        warnings=result.warnings,
         pose=_by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
         pose_sigma=_by_axis(sigmas),
         axis_verdict={dof.name: dof.verdict.value for dof in result.observability},
@@ -150,35 +150,15 @@ def progress_state(cycle: SolveCycle, why_not_compared: str) -> ProgressState:
         Why there is no comparison with what is installed; empty if none was asked for.
     """
     progress, result = cycle.goal.progress, cycle.result
-    comparison = None
-    if result is not None and result.comparison:
-        comparison = _comparison_state(result.comparison)
-    elif why_not_compared:
-        sentence = f"not compared yet: {why_not_compared}"
-        comparison = ComparisonState(verdict="not yet", sentence=sentence)
+    comparison = result.comparison if result is not None else None
+    if comparison is None and why_not_compared:
+        comparison = Comparison(sentence=f"not compared yet: {why_not_compared}")
     return ProgressState(
         level=Level.WARN if result is None or progress.will_not_get_there else Level.OK,
         text=progress.sentence,
         has_result=result is not None,
-        is_done=progress.is_done,
-        is_faulty=progress.is_faulty,
-        limiting_axis=progress.limiting_axis,
-        sigma=_by_axis(progress.sigmas),
-        target=_by_axis(progress.targets),
-        seconds_left=_by_axis(progress.seconds_left),
+        progress=progress,
         comparison=comparison,
-    )
-
-
-def _comparison_state(comparison: Mapping[str, Any]) -> ComparisonState:
-    rows = comparison["differences"][0]["axes"]
-    return ComparisonState(
-        verdict=comparison["verdict"],
-        sentence=comparison["sentence"],
-        installed_from=comparison["installed"],
-        installed={axis: comparison["values"][axis] for axis in rows},
-        difference={axis: row["difference"] for axis, row in rows.items()},
-        difference_sigma={axis: row["sigma"] for axis, row in rows.items()},
     )
 
 

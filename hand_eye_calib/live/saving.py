@@ -51,7 +51,7 @@ class Saver:
             return False, "nothing to save: there is no result yet"
         # A check may have been certain of other options.
         inputs = self._session.inputs() | {"options": snapshot.config.to_options()}
-        result = replace(result, goal=self._cycle.goal.progress.to_dict())
+        result = replace(result, goal=self._cycle.goal.progress)
         try:
             path = output_path(directory)
             if self._earlier_kept_in != directory:

@@ -124,9 +124,7 @@ def answer(job: Job) -> Answer:
     if calibration is not None:  # the node has no use for the noise model's whole solution
         calibration = replace(calibration, model=None)
     seconds = time.monotonic() - start_s
-    return Answer(
-        job.session, seconds, seen, calibration, snapshot.time_offset, failure, checked
-    )
+    return Answer(job.session, seconds, seen, calibration, snapshot.time_offset, failure, checked)
 
 
 def _check(job: Job, calibration: Calibration | None) -> tuple[Calibration | None, Checked]:

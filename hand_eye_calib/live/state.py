@@ -5,11 +5,13 @@ All values are in SI units. Mappings by axis have x, y, z, roll, pitch and yaw; 
 is not known.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
-AxisValues = dict[str, float | None]
+from hand_eye_calib.results.records import Comparison, Progress
+
+AxisValues = Mapping[str, float | None]
 
 
 class Level(IntEnum):
@@ -56,11 +58,11 @@ class ResultState:
     child_frame: str
     verdict: str
     status: str
-    reasons: list[str]
-    warnings: list[str]
+    reasons: tuple[str, ...]
+    warnings: tuple[str, ...]
     pose: AxisValues
     pose_sigma: AxisValues
-    axis_verdict: dict[str, str]
+    axis_verdict: Mapping[str, str]
     method: str
     n_poses: int
     n_pairs: int
@@ -84,39 +86,28 @@ class ExtrinsicState(Part):
     last_failure: str
     n_poses: int
     path_m: float
-    rotation_deg: dict[str, float]
+    rotation_deg: Mapping[str, float]
     tf_static: Broadcast
     tf_static_reason: str
     result: ResultState | None
 
 
 @dataclass(frozen=True, kw_only=True)
-class ComparisonState:
-    """The result against what is installed: same, moved, cannot tell or not yet."""
-
-    verdict: str
-    sentence: str
-    installed_from: str = ""
-    installed: AxisValues = field(default_factory=dict)
-    difference: AxisValues = field(default_factory=dict)
-    difference_sigma: AxisValues = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
 class ProgressState(Part):
     """How far the session is from its goal; the text says what to do now.
 
-    Standard deviations are along (m) and about (rad) the axes of the parent sensor's frame.
+    Attributes
+    ----------
+    has_result : bool
+    progress : Progress
+        Standard deviations are along (m) and about (rad) the axes of the parent sensor's frame.
+    comparison : Comparison or None
+        Of the result with what is installed; only a sentence while it cannot be made.
     """
 
     has_result: bool
-    is_done: bool
-    is_faulty: bool
-    limiting_axis: str
-    sigma: AxisValues
-    target: AxisValues
-    seconds_left: AxisValues
-    comparison: ComparisonState | None
+    progress: Progress
+    comparison: Comparison | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +128,7 @@ class InputState(Part):
     rate_hz: float
     messages: int
     poses_taken: int
-    refused: dict[str, int]
+    refused: Mapping[str, int]
     dropped_unpaired: int
     ignored_while_disabled: int
     lost: int | None
@@ -158,7 +149,7 @@ class ChecksState(Part):
 
     age_s: float | None
     correlation: float | None
-    findings: list[str]
+    findings: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +201,7 @@ class NodeState:
     extrinsic: ExtrinsicState | None = None
     progress: ProgressState | None = None
     mount: MountState | None = None
-    inputs: dict[str, InputState] = field(default_factory=dict)
+    inputs: Mapping[str, InputState] = field(default_factory=dict)
     checks: ChecksState | None = None
     journal: JournalState | None = None
 

@@ -82,7 +82,7 @@ class StreamChecks:
                 f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
             )
             return ChecksState(
-                level=Level.WARN, text=text, age_s=None, correlation=None, findings=[]
+                level=Level.WARN, text=text, age_s=None, correlation=None, findings=()
             )
         faults = self.faults()
         return ChecksState(
@@ -90,9 +90,9 @@ class StreamChecks:
             text="; ".join(faults) or "both streams can be of one rigid body",
             age_s=steady_s - self._checked_at_s,
             correlation=self._result.correlation.correlation,
-            findings=[
+            findings=tuple(
                 f"{each.severity.value}: {in_parameters(each)}" for each in self._result.findings
-            ],
+            ),
         )
 
 

@@ -179,7 +179,7 @@ class CalibratorNode(Node):
     def _publish_result(self, calibration: Calibration) -> None:
         self._results.publish(calibration)
         if not self._robot.lacks_base(calibration):
-            self._tf.add(calibration, self._cycle.goal.progress.is_done)
+            self._tf.add(calibration, self._cycle.goal.progress.done)
 
     def _publish_others(self, calibrations: Sequence[Calibration]) -> None:
         """Publish new results of the further child sensors, in their order."""

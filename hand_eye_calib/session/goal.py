@@ -9,15 +9,14 @@ docs/session.md.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import Excitation, helpful_motion
-from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.results.records import AxisProgress, Progress
 from hand_eye_calib.text import amount, angle, axes_in_words, duration, length
 
 # An axis is known if its standard deviation is below this share of its target ...
@@ -36,59 +35,6 @@ _TOO_LONG_S = 1200.0
 # ... or if, over so many seconds of motion, the information on the worst axis has grown by less
 # than this share of what the motion before would have brought.
 _STALL_S, _STALL_GROWTH = 60.0, 0.25
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a session is from its goal.
-
-    Attributes
-    ----------
-    sigmas : (6,) array
-        Standard deviations along (m) and about (rad) the axes of the parent sensor's frame;
-        infinite if unobservable.
-    targets : (6,) array
-        What they are to fall below, m and rad.
-    seconds_left : (6,) array
-        Seconds of motion like that so far until each axis is known; infinite if unobservable.
-    limiting_axis : str
-        The axis that is farthest from its target; empty if there is none, or no result.
-    is_done : bool
-    will_not_get_there : bool
-        More of this motion is of no use for the limiting axis.
-    sentence : str
-        What to do now, for a person next to the robot.
-    is_faulty : bool
-        The streams cannot be calibrated with.
-    """
-
-    sigmas: FloatArray
-    targets: FloatArray
-    seconds_left: FloatArray
-    limiting_axis: str
-    is_done: bool
-    will_not_get_there: bool
-    sentence: str
-    is_faulty: bool = False
-
-    def by_axis(self) -> dict[str, dict[str, float]]:
-        """Standard deviation, target and seconds left of each axis."""
-        columns = {"sigma": self.sigmas, "target": self.targets, "seconds_left": self.seconds_left}
-        return {
-            axis: {name: float(values[index]) for name, values in columns.items()}
-            for index, axis in enumerate(AXES)
-        }
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values; None for what is unknown."""
-        found: dict[str, Any] = {
-            "sentence": self.sentence,
-            "done": self.is_done,
-            "limiting_axis": self.limiting_axis,
-            "will_not_get_there": self.will_not_get_there,
-            "axes": plain(self.by_axis()),
-        }
-        return found
 
 
 @dataclass(frozen=True)
@@ -128,11 +74,10 @@ class Goal:
         """The best result that reaches the goal; None before that."""
         return self._best
 
-    def wait(self, sentence: str) -> Progress:
-        """Take note that there is no result yet, and why; returns the progress."""
+    def wait(self, sentence: str) -> None:
+        """Take note that there is no result yet, and why."""
         if not self._points:
             self.progress = self._nothing_yet(sentence)
-        return self.progress
 
     def add(
         self, calibration: Calibration, seen: Excitation, faults: Sequence[str] = ()
@@ -171,15 +116,14 @@ class Goal:
         left_s = np.maximum(left_s, max(_least_motion_s(calibration) - motion_s, 0.0))
         is_done = self._best is not None
         stuck = not is_done and self._is_stuck(float(left_s[worst]))
+        sentence = self._sentence(calibration, seen, faults, AXES[worst], left_s[worst], stuck)
         self.progress = Progress(
-            sigmas=calibration.sigmas,
-            targets=self._targets,
-            seconds_left=np.zeros(6) if is_done else left_s,
-            limiting_axis="" if is_done else AXES[worst],
-            is_done=is_done,
-            will_not_get_there=stuck,
-            sentence=self._sentence(calibration, seen, faults, AXES[worst], left_s[worst], stuck),
+            sentence=sentence,
+            done=is_done,
             is_faulty=bool(faults),
+            limiting_axis="" if is_done else AXES[worst],
+            will_not_get_there=stuck,
+            axes=self._by_axis(calibration.sigmas, np.zeros(6) if is_done else left_s),
         )
         return self.progress
 
@@ -208,7 +152,14 @@ class Goal:
 
     def _nothing_yet(self, sentence: str) -> Progress:
         unknown = np.full(6, np.inf)
-        return Progress(unknown, self._targets, unknown, "", False, False, sentence)
+        return Progress(sentence=sentence, axes=self._by_axis(unknown, unknown))
+
+    def _by_axis(self, sigmas: FloatArray, left_s: FloatArray) -> dict[str, AxisProgress]:
+        columns = zip(AXES, sigmas.tolist(), self._targets.tolist(), left_s.tolist(), strict=True)
+        return {
+            axis: AxisProgress(sigma=sigma, target=target, seconds_left=seconds)
+            for axis, sigma, target, seconds in columns
+        }
 
     def _sentence(
         self,

@@ -20,6 +20,7 @@ from hand_eye_calib.live.state import (
     ProgressState,
     ResultState,
 )
+from hand_eye_calib.results.records import AxisProgress, Comparison
 from hand_eye_calib.text import amount, duration, two_digits
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -219,7 +220,7 @@ def _view(state: NodeState, names: tuple[str, ...], silent_s: float, answer: Lin
         values=tuple(_values(result)) if result else (),
         bars=tuple(_bar(axis, state.progress) for axis in AXES) if state.progress else (),
         result=tuple(_result(state)),
-        reasons=tuple(result.reasons) if result else (),
+        reasons=result.reasons if result else (),
         health=health,
         answer=answer,
     )
@@ -255,9 +256,9 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
 
 def _of_progress(progress: ProgressState) -> tuple[Tone, str, str]:
     sentence = _sentence(progress.text)
-    if progress.is_faulty:  # the result was good, the streams no longer are
+    if progress.progress.is_faulty:  # the result was good, the streams no longer are
         return Tone.ACT, "CHECK THE STREAMS", sentence
-    if progress.is_done:
+    if progress.progress.done:
         return Tone.GOOD, "DONE", sentence
     if not progress.has_result:
         return Tone.BUSY, "START", sentence
@@ -284,46 +285,42 @@ def _sentence(text: str) -> str:
 # ------------------------------------------------------------------------ bars
 
 
-def _bar(axis: str, progress: ProgressState) -> Bar:
-    sigma, target, left_s = (
-        math.inf if (value := values.get(axis)) is None else value
-        for values in (progress.sigma, progress.target, progress.seconds_left)
-    )
-    share = min(1.0, (target / sigma) ** 2) if sigma > 0 else 1.0
-    tone, word = _state(sigma, target, left_s, is_behind=progress.limiting_axis == axis)
-    return Bar(axis, share, tone, word, _against(axis, sigma, target), _difference(axis, progress))
+def _bar(axis: str, part: ProgressState) -> Bar:
+    known = part.progress.axes[axis]
+    share = min(1.0, (known.target / known.sigma) ** 2) if known.sigma > 0 else 1.0
+    tone, word = _state(known, is_behind=part.progress.limiting_axis == axis)
+    return Bar(axis, share, tone, word, _against(axis, known), _difference(axis, part.comparison))
 
 
-def _state(sigma: float, target: float, left_s: float, is_behind: bool) -> tuple[Tone, str]:
-    if not math.isfinite(sigma):
+def _state(known: AxisProgress, is_behind: bool) -> tuple[Tone, str]:
+    left_s = known.seconds_left
+    if not math.isfinite(known.sigma):
         return Tone.UNKNOWN, "not seen yet"
     if left_s == 0:
         return Tone.GOOD, "enough"
     left = f"{duration(left_s)} left" if math.isfinite(left_s) else "not with this motion"
-    if sigma <= target:
+    if known.sigma <= known.target:
         return Tone.BUSY, f"nearly: {left}"
     return (Tone.ACT if is_behind else Tone.BUSY), left
 
 
-def _against(axis: str, sigma: float, target: float) -> str:
-    wanted = amount(axis, target)
-    if not math.isfinite(sigma):
+def _against(axis: str, known: AxisProgress) -> str:
+    wanted = amount(axis, known.target)
+    if not math.isfinite(known.sigma):
         return f"wanted: {wanted}"
-    number, _, unit = amount(axis, sigma).rpartition(" ")
-    same = wanted.endswith(f" {unit}")
-    return f"± {number if same else f'{number} {unit}'} of {wanted}"
+    number, _, unit = amount(axis, known.sigma).rpartition(" ")
+    return f"± {number if wanted.endswith(f' {unit}') else f'{number} {unit}'} of {wanted}"
 
 
-def _difference(axis: str, progress: ProgressState) -> str:
+def _difference(axis: str, comparison: Comparison | None) -> str:
     """Result minus what is installed, with its standard deviation; unknown without one."""
-    comparison = progress.comparison
-    difference = comparison.difference.get(axis) if comparison else None
-    if comparison is None or difference is None:
+    if comparison is None or not comparison.differences:
         return ""
-    sigma = comparison.difference_sigma.get(axis)
-    if sigma is None:
+    row = comparison.differences[0].axes[axis]
+    if not math.isfinite(row.sigma):
         return "unknown"
-    return f"{'+' * (difference >= 0)}{amount(axis, difference)} ± {amount(axis, sigma)}"
+    sign = "+" * (row.difference >= 0)
+    return f"{sign}{amount(axis, row.difference)} ± {amount(axis, row.sigma)}"
 
 
 # ------------------------------------------------------------------------ pose

@@ -160,7 +160,7 @@ def _stopped(recorded: Recorded, steps: Sequence[Step], factor: float) -> Stop:
         progress = goal.add(step.calibration, step.seen)
         is_stuck |= progress.will_not_get_there
         worst.append(_worst(step.error, recorded.truth_sigmas, factor))
-        if progress.is_done:
+        if progress.done:
             # From here on all errors stay within their targets.
             first = max((i + 1 for i, each in enumerate(worst) if each > 1.0), default=0)
             earliest_s = steps[first].end_s if first < len(worst) else np.nan

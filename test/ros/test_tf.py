@@ -15,6 +15,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.state import Broadcast
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.ros import tf
 from hand_eye_calib.ros.tf import FrameTree
@@ -159,15 +160,15 @@ class TestNode:
         def edges(found):
             return [each for each in found if each.child_frame_id == "camera"]
 
-        def state(part="extrinsic", key="broadcast on /tf_static"):
+        def state(part="extrinsic", key="tf_static"):
             return {pair.key: pair.value for pair in said[part].values}[key]
 
         publishers, poses = peer.publishers(), drive(450)
         peer.solve(publishers, *(part[:400] for part in poses))
-        waiting = "not yet: the goal is not reached"
-        peer.spin_until(lambda: said and state() == waiting, "the state")
+        peer.spin_until(lambda: said and state() == "not yet", "the state")
+        assert state(key="tf_static_reason") == "the goal is not reached"
         peer.solve(publishers, *(part[400:] for part in poses))
-        peer.spin_until(lambda: state("progress", "done") == "true", "the goal")
+        peer.spin_until(lambda: state("progress", "progress.done") == "true", "the goal")
         # Nothing comes in any more: the two results that reached the goal suffice.
         peer.spin_until(lambda: edges(heard), "the edge")
         peer.spin_until(lambda: state() == "broadcast", "the state")
@@ -227,7 +228,7 @@ class TestNode:
         )
         rough = TestWhatIsUnknown.with_z(side, DofVerdict.WEAK, 0.06)
         broadcaster.add_others([rear, rough])
-        assert broadcaster.state == "not yet: no result yet"
+        assert broadcaster.state == (Broadcast.WAITING, "no result yet")
         self.settle(broadcaster, calibration)
         child = calibration.child_frame
         assert self.frames_of_new_listener(peer, listen, "rear") == {child, "rear"}
@@ -246,7 +247,7 @@ class TestNode:
         self.settle(broadcaster, calibration)
         broadcaster.add_others(others)
         assert broadcaster.refused.startswith("rear has the parent base_link on /tf_static")
-        assert broadcaster.state.startswith("broadcast; rear has the parent")
+        assert broadcaster.state == (Broadcast.ON, broadcaster.refused)
         heard = listen()
         peer.spin_until(lambda: {each.child_frame_id for each in heard} >= {child, "side"}, "both")
         robot(("base_link", "side"))

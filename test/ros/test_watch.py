@@ -19,9 +19,8 @@ QUICK = ("-p solve_period:=0.2", *RELIABLE_INPUTS)
 
 
 def test_what_is_no_state_is_left_out_and_control_characters_are_escaped():
-    state = NodeState(
-        node="/r/calibrator", journal=JournalState(level=Level.OK, text="a\x1bb", directory="")
-    )
+    journal = JournalState(level=Level.OK, text="a\x1bb", directory="")
+    state = NodeState(node="/r/calibrator", journal=journal)
     assert state_of(json_text(state)).journal.text == r"a\x1bb"
     for text in ("", "[]", "{", "[" * 100_000, '{"node": "/x"}', "7"):
         assert state_of(text) is None

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hand_eye_calib.engine.checked import checked
 from motions import as_trajectory, child_of, disturbed, feed, wandering_poses
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.checked import checked
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.live import processes
 from hand_eye_calib.live.processes import SolvingProcess

@@ -17,7 +17,6 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.live.state import (
     Broadcast,
     ChecksState,
-    ComparisonState,
     ExtrinsicState,
     InputState,
     Level,
@@ -27,17 +26,25 @@ from hand_eye_calib.live.state import (
     ResultState,
 )
 from hand_eye_calib.plain import from_plain, plain
+from hand_eye_calib.results.records import (
+    AxisDifference,
+    AxisProgress,
+    Comparison,
+    Difference,
+    Progress,
+)
 from hand_eye_calib.watch import terminal, web
 from hand_eye_calib.watch.board import AXES, Board, Tone
 from hand_eye_calib.watch.html import fragment
 from hand_eye_calib.watch.web import WebServer
 
 NODE = "/calibrator"
+INF = float("inf")
 PATIENCE_S = 120.0  # how long a hang takes to fail a test, on a busy machine
 
 RESULT = ResultState(
     parent_frame="lidar", child_frame="camera", verdict="USE WITH CARE", status="ok",
-    reasons=["a: b", "c: d"], warnings=[], method="adaptive", n_poses=9, n_pairs=9,
+    reasons=("a: b", "c: d"), warnings=(), method="adaptive", n_poses=9, n_pairs=9,
     inlier_share=1.0, time_offset_s=0.0, time_offset_sigma_s=0.0, scale=1.0, scale_sigma=0.0,
     age_s=1.0, newest_pose_age_s=None, axis_verdict={},
     pose={"x": 0.42, "y": -0.13, "z": None, "roll": 0.01, "pitch": -0.02, "yaw": 1.5},
@@ -48,14 +55,15 @@ EXTRINSIC = ExtrinsicState(
     last_failure="", n_poses=9, path_m=3.0, rotation_deg={}, tf_static=Broadcast.OFF,
     tf_static_reason="", result=RESULT,
 )  # fmt: skip
-PROGRESS = ProgressState(
-    level=Level.OK, text="Go on for about 25 s: z is behind.", has_result=True, is_done=False,
-    is_faulty=False, limiting_axis="z", comparison=None,
-    sigma={axis: 0.04 if axis == "z" else 0.004 if axis in "xy" else 0.001 for axis in AXES},
-    target={axis: 0.02 if axis in "xyz" else 0.00524 for axis in AXES},
-    seconds_left={axis: 25.0 * (axis == "z") for axis in AXES},
-)  # fmt: skip
-CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, correlation=0.9, findings=[])
+ROTATION = AxisProgress(sigma=0.001, target=0.00524, seconds_left=0.0)
+KNOWN = AxisProgress(sigma=0.004, target=0.02, seconds_left=0.0)
+BEHIND = AxisProgress(sigma=0.04, target=0.02, seconds_left=25.0)
+AT = Progress(
+    sentence="Go on for about 25 s: z is behind.",
+    limiting_axis="z",
+    axes=dict.fromkeys(AXES, ROTATION) | {"x": KNOWN, "y": KNOWN, "z": BEHIND},
+)
+CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, correlation=0.9, findings=())
 MOUNT = MountState(
     level=Level.OK, text="it has not", is_learning=False, seconds_of_motion=200, alarms=0,
     long_run=2.0, shift={}, shift_sigma={}, visible_1min={}, visible_10min={}, since_ns=None,
@@ -79,9 +87,13 @@ def inputs(parent=Level.OK, child=Level.OK):
     }
 
 
-def state(node=NODE, progress=None, **parts):
-    """The state of a node that goes on, with other values of its progress, or other parts."""
-    made = {"extrinsic": EXTRINSIC, "progress": replace(PROGRESS, **progress or {})}
+def state(node=NODE, at=None, axes=None, **parts):
+    """The state of a node that goes on, with another progress, or other parts."""
+    at = replace(AT, **{"axes": AT.axes | (axes or {}), **(at or {})})
+    fields = {"level": Level.OK, "has_result": True, "comparison": None}
+    fields |= {name: parts.pop(name) for name in fields if name in parts}
+    progress = ProgressState(text=at.sentence, progress=at, **fields)
+    made = {"extrinsic": EXTRINSIC, "progress": progress}
     return NodeState(node=node, **{"inputs": inputs(), "checks": CHECKS, **made, **parts})
 
 
@@ -113,13 +125,13 @@ ERROR = {"level": Level.ERROR}
         (None, 0.5, Tone.UNKNOWN, "NO NODE", "Nothing heard of a calibrator yet."),
         (state(), 9.0, Tone.BAD, "SILENT", "The node has said nothing for 9 s."),
         (state(), 0.5, Tone.BUSY, "GO ON", "Go on for about 25 s"),
-        (state(progress={"level": Level.WARN}), 0.5, Tone.ACT, "CHANGE THE MOTION", "Go on"),
-        (state(progress={"has_result": False}), 0.5, Tone.BUSY, "START", "Go on"),
+        (state(level=Level.WARN), 0.5, Tone.ACT, "CHANGE THE MOTION", "Go on"),
+        (state(has_result=False), 0.5, Tone.BUSY, "START", "Go on"),
         (
-            state(progress={"is_done": True, "is_faulty": True, "text": "Stop: feet."}),
+            state(at={"done": True, "is_faulty": True, "sentence": "Stop: feet."}),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "Stop: "),
         ),
-        (state(progress={"is_done": True}), 0.5, Tone.GOOD, "DONE", "Go on"),
+        (state(at={"done": True}), 0.5, Tone.GOOD, "DONE", "Go on"),
         (state(inputs=inputs(child=Level.WARN)), 0.5, Tone.ACT, "CHECK INPUT", "/odom has been"),
         (state(inputs=inputs(Level.WARN, Level.ERROR)), 0.5, Tone.BAD, "BAD INPUT", "/odom: bad"),
         (
@@ -156,17 +168,16 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
 @pytest.mark.parametrize(
     ("sigma", "left", "tone", "word", "share"),
     [
-        (None, None, Tone.UNKNOWN, "not seen yet", 0.0),
-        (0.08, None, Tone.ACT, "not with this motion", 0.0625),
+        (INF, INF, Tone.UNKNOWN, "not seen yet", 0.0),
+        (0.08, INF, Tone.ACT, "not with this motion", 0.0625),
         (0.018, 12.0, Tone.BUSY, "nearly: 12 s left", 1.0),
         (0.0, 0.0, Tone.GOOD, "enough", 1.0),
         (0.08, 300.0, Tone.ACT, "5 min left", 0.0625),
     ],
 )
 def test_an_axis_in_words(sigma, left, tone, word, share):
-    progress = {"sigma": PROGRESS.sigma | {"z": sigma}}
-    progress |= {"seconds_left": PROGRESS.seconds_left | {"z": left}}
-    bar = view_of(state(progress=progress)).bars[2]
+    known = AxisProgress(sigma=sigma, target=0.02, seconds_left=left)
+    bar = view_of(state(axes={"z": known})).bars[2]
     assert (bar.tone, bar.word, bar.share) == (tone, word, pytest.approx(share))
 
 
@@ -181,11 +192,15 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
 
 
 def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
-    comparison = ComparisonState(
-        verdict="moved", sentence="z has moved by 3 cm",
-        difference={"z": 0.031, "yaw": -0.02}, difference_sigma={"z": 0.004, "yaw": None},
-    )  # fmt: skip
-    view = view_of(state(progress={"comparison": comparison}))
+    differs = AxisDifference(difference=0.031, sigma=0.004, visible=0.01, verdict="moved")
+    axes = dict.fromkeys(AXES, differs) | {"yaw": replace(differs, sigma=INF)}
+    difference = Difference(
+        first="a", second="b", verdict="moved", sentence="", chi2=1.0, axes=axes
+    )
+    comparison = Comparison(
+        sentence="z has moved by 3 cm", verdict="moved", differences=(difference,)
+    )
+    view = view_of(state(comparison=comparison))
     assert (view.result[0].tone, view.result[0].text) == (Tone.ACT, "USE WITH CARE")
     assert view.reasons == ("a: b", "c: d")
     assert (view.result[1].tone, view.result[1].text) == (Tone.ACT, "z has moved by 3 cm")
@@ -195,7 +210,7 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     assert len(view_of(state()).result) == 2
     for verdict, tone in (("same", Tone.GOOD), ("cannot tell", Tone.UNKNOWN)):
         other = replace(comparison, verdict=verdict)
-        assert view_of(state(progress={"comparison": other})).result[1].tone is tone
+        assert view_of(state(comparison=other)).result[1].tone is tone
     for broadcast, tone in ((Broadcast.ON, Tone.GOOD), (Broadcast.REFUSED, Tone.ACT)):
         extrinsic = replace(EXTRINSIC, tf_static=broadcast, tf_static_reason="why")
         line = view_of(state(extrinsic=extrinsic)).result[2]
@@ -273,8 +288,8 @@ def test_lines_are_printed_when_something_new_is_said():
     first = lines(state(), 1.0)
     assert first[0] == "   1.0 s  ▶ GO ON: Go on for about 25 s: z is behind."
     assert "z 25 %" in first[1]
-    assert lines(state(progress={"sigma": PROGRESS.sigma | {"x": 0.003}}), 2.0) == []
-    assert lines(state(progress={"is_done": True}), 3.0)
+    assert lines(state(axes={"x": replace(KNOWN, sigma=0.003)}), 2.0) == []
+    assert lines(state(at={"done": True}), 3.0)
     assert log.lines(board.view("", 9.0), 9.0)
     assert log.lines(board.view("", 10.0), 10.0) == []  # still silent
     learning = [mount(is_learning=True, text=f"{second} of 120 s") for second in (1, 2)]
@@ -335,8 +350,8 @@ def test_wrong_usage_is_one_line(arguments, text, capsys):
 
 def test_the_fragment_is_well_formed_and_escapes_what_nodes_say():
     hostile = '<script>alert("1")</script>'
-    result = replace(RESULT, reasons=[hostile], parent_frame="<", child_frame="&")
-    each = state(progress={"text": hostile}, extrinsic=replace(EXTRINSIC, result=result))
+    result = replace(RESULT, reasons=(hostile,), parent_frame="<", child_frame="&")
+    each = state(at={"sentence": hostile}, extrinsic=replace(EXTRINSIC, result=result))
     text = fragment(view_of(each))
     assert "<script" not in text
     root = ElementTree.fromstring(f"<main>{text}</main>")
@@ -387,7 +402,7 @@ def test_events_bring_the_view_at_once_and_again_when_it_changes(server):
     first = events.readline().decode()
     assert first.startswith("data: <p")
     assert "GO ON" in first
-    server.board.take(state(progress={"is_done": True}), time.monotonic())
+    server.board.take(state(at={"done": True}), time.monotonic())
     changed = next(line for line in iter(events.readline, b"") if b"<" in line)
     assert "DONE" in changed.decode()
 
