@@ -66,18 +66,20 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.watch.board import Board
 
     board, requests = Board(), queue.SimpleQueue[tuple[str, str]]()
-    stopped = _stop_signals()
+    came: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda signum, _: came.append(signum))
     with (
         Watcher(board) as watcher,
         _web(arguments, board, requests) as server,
-        _display(server) as display,
+        _display(server) as show,
     ):
-        session = Session(board, arguments.node, requests, display.keys)
-        while not stopped() and not session.is_over:
+        session = Session(board, arguments.node, requests, _keys)
+        while not came and not session.is_over:
             watcher.spin(_LISTEN_S)
             while not requests.empty():
                 watcher.ask(*requests.get())
-            display.show(session.view())
+            show(session.view())
     return 0
 
 
@@ -126,75 +128,49 @@ class Session:
             self._requests.put((node, _KEYS[key]))
 
 
-# --------------------------------------------------------------------- display
-
-
-class _Screen:
-    """Draws the view in place, and reads single keys."""
-
-    def __init__(self, footer: str) -> None:
-        from rich.console import Console
-        from rich.live import Live
-
-        self._console = Console()
-        self._live = Live(console=self._console, screen=True, auto_refresh=False)
-        self._footer = footer
-        self._shown: tuple[object, ...] = ()
-
-    def __enter__(self) -> "_Screen":
-        self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
-
-    def show(self, view: "View") -> None:
-        """Draw a view, unless it is there already."""
-        from hand_eye_calib.watch.terminal import screen
-
-        width, height = self._console.size
-        if (view, width, height) != self._shown:
-            self._live.update(screen(view, width, height, self._footer), refresh=True)
-            self._shown = view, width, height
-
-    def keys(self) -> str:
-        """The keys pressed since the last call."""
-        pressed = ""
-        while sys.stdin.isatty() and select.select([sys.stdin], [], [], 0)[0]:
-            read = os.read(sys.stdin.fileno(), 64).decode(errors="replace")
-            if not read:
-                break
-            pressed += read
-        return pressed
-
-
-class _Lines:
-    """Prints what is new, for a file or a pipe."""
-
-    def __init__(self) -> None:
-        from hand_eye_calib.watch.terminal import LineLog
-
-        self._log, self._started_s = LineLog(), time.monotonic()
-
-    def show(self, view: "View") -> None:
-        """Print what is new."""
-        for line in self._log.lines(view, time.monotonic() - self._started_s):
-            print(line, flush=True)
-
-    def keys(self) -> str:
-        """None: nobody is there to press them."""
-        return ""
-
-
 @contextlib.contextmanager
-def _display(server: "WebServer | None") -> "Iterator[_Screen | _Lines]":
-    """The screen of a terminal, or lines."""
+def _display(server: "WebServer | None") -> "Iterator[Callable[[View], None]]":
+    """Function that shows a view: on the screen of a terminal, or in lines for a file or a pipe."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from hand_eye_calib.watch.terminal import LineLog, screen
+
     if not sys.stdout.isatty():
-        yield _Lines()
+        log, started_s = LineLog(), time.monotonic()
+
+        def write(view: "View") -> None:
+            for line in log.lines(view, time.monotonic() - started_s):
+                print(line, flush=True)
+
+        yield write
         return
     footer = f"phone: {server.addresses()[0]}" if server is not None else ""
-    with _single_keys(), _Screen(footer) as screen:
-        yield screen
+    console, shown = Console(), list[tuple[object, ...]]()
+    with _single_keys(), Live(console=console, screen=True, auto_refresh=False) as live:
+
+        def show(view: "View") -> None:
+            width, height = console.size
+            if shown != [(view, width, height)]:
+                live.update(screen(view, width, height, footer), refresh=True)
+                shown[:] = [(view, width, height)]
+
+        yield show
+
+
+def _is_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def _keys() -> str:
+    """The keys pressed since the last call."""
+    pressed = ""
+    while _is_terminal() and select.select([sys.stdin], [], [], 0)[0]:
+        read = os.read(sys.stdin.fileno(), 64).decode(errors="replace")
+        if not read:
+            break
+        pressed += read
+    return pressed
 
 
 @contextlib.contextmanager
@@ -226,24 +202,16 @@ def _web(
         return
     from hand_eye_calib.watch.web import WebServer
 
-    def request(node: str, what: str) -> None:
-        requests.put((node, what))
+    def ask(node: str, request: str) -> None:
+        requests.put((node, request))
 
-    server = WebServer(board, request, arguments.web, wanted=arguments.node, key=arguments.key)
+    server = WebServer(board, ask, arguments.web, wanted=arguments.node, key=arguments.key)
     try:
         for address in server.addresses():
             note(f"open {address} in a browser")
         yield server
     finally:
         server.stop()
-
-
-def _stop_signals() -> Callable[[], bool]:
-    """Function that tells whether SIGINT or SIGTERM has come."""
-    came: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda signum, _: came.append(signum))
-    return lambda: bool(came)
 
 
 @argument_type

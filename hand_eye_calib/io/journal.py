@@ -17,7 +17,7 @@ from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from hand_eye_calib.io.trajectory_files.writing import tum_line, tum_lines
 _FORMAT, _VERSION = "hand_eye_calib/journal", 2
 _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
-_SEGMENTS = "session-*.journal"  # of version 1
 _NS_PER_S = 1_000_000_000
 _LARGEST_STAMP_NS = int(np.iinfo(np.int64).max)
 
@@ -200,11 +199,6 @@ def read_journal(directory: str | Path) -> Journal:
         If there is no journal, or it cannot be read.
     """
     directory = Path(directory)
-    if _is_old(directory):
-        raise InputError(
-            f"the session journal in {directory} is of version 0.1, whose binary format is not "
-            "read any more: use that version for it, or move it away to start anew"
-        )
     if not has_session(directory):
         raise InputError(f"no session journal in {directory}")
     found = {
@@ -225,8 +219,7 @@ def read_journal(directory: str | Path) -> Journal:
     )
 
 
-@dataclass(frozen=True)
-class _File:
+class _File(NamedTuple):
     """One stream: about, poses, and of each the time of its arrival in poses of the parent."""
 
     about: dict[str, Any]
@@ -322,17 +315,8 @@ def _pose(line: bytes) -> tuple[int, list[float]]:
 
 
 def has_session(directory: str | Path) -> bool:
-    """Whether a directory holds a journal, of this or an earlier version."""
-    directory = Path(directory)
-    try:
-        # A reset may rename the directory meanwhile.
-        return (directory / "parent.tum").is_file() or _is_old(directory)
-    except OSError:
-        return False
-
-
-def _is_old(directory: Path) -> bool:
-    return any(directory.glob(_SEGMENTS)) and not (directory / "parent.tum").exists()
+    """Whether a directory holds a journal."""
+    return os.path.isfile(Path(directory) / "parent.tum")
 
 
 def keep_aside(directory: str | Path) -> Path:

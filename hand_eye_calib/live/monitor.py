@@ -93,60 +93,55 @@ class Alarm:
 
 
 class _Seconds:
-    """Information of the newest seconds of motion, as running sums; at most MEMORY_S of them."""
+    """Information of the newest seconds of motion, the newest first; at most MEMORY_S of them."""
 
     def __init__(self) -> None:
-        self._stamps_ns = np.zeros(2 * MEMORY_S, dtype=np.int64)
-        self._H = np.zeros((2 * MEMORY_S + 1, 6, 6))
-        self._S = np.zeros((2 * MEMORY_S + 1, 6))
-        self._end = self._count = 0
+        self._stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self._H, self._S = np.zeros((0, 6, 6)), np.zeros((0, 6))
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._S)
 
     def add(self, stamp_ns: int, H: FloatArray, S: FloatArray) -> None:
-        """Append a second; the oldest goes if there are too many."""
-        if self._end == 2 * MEMORY_S:
-            self._make_room()
-        self._stamps_ns[self._end] = stamp_ns
-        self._end += 1
-        self._H[self._end] = self._H[self._end - 1] + H
-        self._S[self._end] = self._S[self._end - 1] + S
-        self._count = min(self._count + 1, MEMORY_S)
-
-    def _make_room(self) -> None:
-        start = self._end - self._count
-        self._stamps_ns[: self._count] = self._stamps_ns[start : self._end]
-        for sums in (self._H, self._S):
-            sums[: self._count + 1] = sums[start : self._end + 1] - sums[start]
-        self._end = self._count
+        """Add a second; the oldest goes if there are too many."""
+        self._stamps_ns = np.append(np.int64(stamp_ns), self._stamps_ns)[:MEMORY_S]
+        self._H = np.concatenate([H[None], self._H])[:MEMORY_S]
+        self._S = np.concatenate([S[None], self._S])[:MEMORY_S]
 
     def forget_all_but(self, newest: int) -> None:
         """Keep so many of the newest seconds."""
-        self._count = newest
+        self._stamps_ns = self._stamps_ns[:newest]
+        self._H, self._S = self._H[:newest], self._S[:newest]
 
     def newest(self, lags: IntArray | int) -> tuple[FloatArray, FloatArray]:
         """H (..., 6, 6) and S (..., 6) of so many of the newest seconds."""
-        start = self._end - lags
-        return self._H[self._end] - self._H[start], self._S[self._end] - self._S[start]
+        last = np.asarray(lags) - 1
+        return np.cumsum(self._H, axis=0)[last], np.cumsum(self._S, axis=0)[last]
+
+    def all(self) -> tuple[FloatArray, FloatArray]:
+        """H (6, 6) and S (6,) of all of them."""
+        return self._H.sum(axis=0), self._S.sum(axis=0)
 
     def oldest(self) -> tuple[FloatArray, FloatArray]:
         """H (6, 6) and S (6,) of the oldest second."""
-        start = self._end - self._count
-        return self._H[start + 1] - self._H[start], self._S[start + 1] - self._S[start]
+        return self._H[-1], self._S[-1]
 
     def windows(self, length: int) -> tuple[FloatArray, FloatArray]:
         """H (w, 6, 6) and S (w, 6) of windows of so many seconds, back from the newest."""
-        edges = self._end - length * np.arange(self._count // length, -1, -1)
-        return np.diff(self._H[edges], axis=0), np.diff(self._S[edges], axis=0)
+        n_windows = len(self) // length
+        H, S = self._H[: n_windows * length], self._S[: n_windows * length]
+        return (
+            H.reshape(n_windows, length, 6, 6).sum(axis=1),
+            S.reshape(n_windows, length, 6).sum(axis=1),
+        )
 
     def stamp_ns(self, lag: int) -> int:
         """When the newest so many seconds began."""
-        return int(self._stamps_ns[self._end - min(lag, self._count)])
+        return int(self._stamps_ns[min(lag, len(self)) - 1])
 
     def answer(self) -> FloatArray:
         """Shift (6,) that all of them together show."""
-        return _shift_shown(*self.newest(self._count))
+        return _shift_shown(*self.all())
 
 
 class _Scale:
@@ -375,8 +370,7 @@ class MountMonitor:
         lags = _LAGS[: np.searchsorted(_LAGS, len(self._memory), side="right")]
         newest_H, newest_S = self._memory.newest(lags)
         all_H, all_S = (
-            old + newer
-            for old, newer in zip(self._old, self._memory.newest(len(self._memory)), strict=True)
+            old + newer for old, newer in zip(self._old, self._memory.all(), strict=True)
         )
         H = np.concatenate([newest_H, all_H[None]]) / self.long_run
         S = np.concatenate([newest_S, all_S[None]]) / self.long_run
@@ -411,7 +405,7 @@ class MountMonitor:
         if self.is_learning:
             return np.full(6, np.inf)
         H_old, _ = self._old
-        H, _ = self._memory.newest(len(self._memory))
+        H, _ = self._memory.all()
         known = (H_old + H) / self.long_run
         before = np.linalg.inv(np.linalg.inv(self._covariance) + known) + self._wander
         H /= len(self._memory)

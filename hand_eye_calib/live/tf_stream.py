@@ -1,6 +1,5 @@
 """Poses of one frame in another from live transforms, as a replay takes them from a bag."""
 
-import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator
@@ -11,11 +10,8 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import (
-    FARTHEST_M,
-    QUATERNION_NORM_TOLERANCE,
-    far_position,
-)
+from hand_eye_calib.geometry.frames import checked_pose
+from hand_eye_calib.io.plausibility import check_positions
 from hand_eye_calib.io.transforms import TfSource, TransformTree
 
 # An edge's stamps that jump back by more begin a new session (ns).
@@ -65,7 +61,6 @@ class TfStream:
         self.source, self.max_gap_s = source, max_gap_s
         self.left_out = 0
         self._tree = TransformTree()
-        self._shape: dict[str, bool] = {}  # frame to whether its edge is static
         self._static: dict[str, StampedTransform] = {}
         self._up: list[str] = []
         self._down: list[str] = []
@@ -80,13 +75,12 @@ class TfStream:
         InputError
             If it is no pose, or its frame has another parent already.
         """
-        frame = transform.sensor_frame or ""
+        frame, edges = transform.sensor_frame, self._tree.edges
+        before = edges[frame].is_static if frame in edges else None
         self._tree.note(transform, is_static)
-        edge = self._tree.edges[frame]
-        if is_static and edge.is_static:
+        if edges[frame].is_static:
             self._static[frame] = transform
-        if self._shape.get(frame) != edge.is_static:
-            self._shape[frame] = edge.is_static
+        if before != edges[frame].is_static:
             self._find_chain()
         if frame in self._moving and not is_static:
             yield from self._move(frame, transform)
@@ -106,23 +100,25 @@ class TfStream:
             edge.clear()
 
     def _find_chain(self) -> None:
+        self._slowest = ""
         try:
             self._up, self._down = self._tree.chain(self.source)
         except InputError:
             self._moving = {}
             return
-        frames = [frame for frame in self._up + self._down if not self._shape[frame]]
-        self._moving = {frame: self._moving.get(frame, _MovingEdge()) for frame in frames}
-        self._slowest = ""
+        moving = [each for each in self._up + self._down if not self._tree.edges[each].is_static]
+        self._moving = {frame: self._moving.get(frame, _MovingEdge()) for frame in moving}
 
     def _move(self, frame: str, transform: StampedTransform) -> Iterator[StampedPose]:
         if len(self._moving) == 1:  # the usual case, for which nothing is kept
             yield self._composed(transform.stamp_ns, {frame: _matrix(transform)})
             return
         edge = self._moving[frame]
-        if edge.is_far_before(transform.stamp_ns):
+        if edge and transform.stamp_ns < edge[-1][0] - _JUMP_BACK_NS:
             self.restart()
-        edge.add(transform)
+        # Of repeated ones the first counts, and late ones are left out.
+        if not edge or transform.stamp_ns > edge[-1][0]:
+            edge.append((transform.stamp_ns, _matrix(transform)))
         if not self._slowest and all(len(each) >= _RATE_FROM for each in self._moving.values()):
             self._slowest = max(self._moving, key=lambda name: self._moving[name].interval_ns())
         if self._slowest:
@@ -132,10 +128,8 @@ class TfStream:
         """The poses at the waiting stamps of the slowest edge that no other edge keeps waiting."""
         base = self._moving[self._slowest]
         others = {name: edge for name, edge in self._moving.items() if edge is not base}
-        while base.stamps_ns and all(
-            edge.stamps_ns and edge.stamps_ns[-1] >= base.stamps_ns[0] for edge in others.values()
-        ):
-            stamp_ns, T_base = base.take_first()
+        while base and all(edge and edge[-1][0] >= base[0][0] for edge in others.values()):
+            stamp_ns, T_base = base.popleft()
             Ts = {name: edge.at(stamp_ns, self.max_gap_s) for name, edge in others.items()}
             known = {name: T for name, T in Ts.items() if T is not None}
             if len(known) == len(Ts):
@@ -145,64 +139,37 @@ class TfStream:
 
     def _composed(self, stamp_ns: int, moving: dict[str, FloatArray]) -> StampedPose:
         T_world_sensor = np.eye(4)
-        for frame in self._up:
-            T_world_sensor = T_world_sensor @ se3.inverse(self._at(frame, moving))
-        for frame in self._down:
-            T_world_sensor = T_world_sensor @ self._at(frame, moving)
+        for frame in self._up + self._down:
+            T = moving[frame] if frame in moving else _matrix(self._static[frame])
+            T_world_sensor = T_world_sensor @ (se3.inverse(T) if frame in self._up else T)
         x, y, z = T_world_sensor[:3, 3].tolist()
         qx, qy, qz, qw = se3.to_quat_xyzw(T_world_sensor).tolist()
         return StampedPose(stamp_ns, (x, y, z), (qx, qy, qz, qw))
 
-    def _at(self, frame: str, moving: dict[str, FloatArray]) -> FloatArray:
-        return moving[frame] if frame in moving else _matrix(self._static[frame])
 
-
-class _MovingEdge:
-    """The newest transforms of a moving edge, by stamp."""
+class _MovingEdge(deque[tuple[int, FloatArray]]):
+    """The newest stamps and poses of a moving edge, in order."""
 
     def __init__(self) -> None:
-        self.stamps_ns: deque[int] = deque(maxlen=_MOST_KEPT)
-        self._matrices: deque[FloatArray] = deque(maxlen=_MOST_KEPT)
-
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
-
-    def clear(self) -> None:
-        self.stamps_ns.clear()
-        self._matrices.clear()
-
-    def is_far_before(self, stamp_ns: int) -> bool:
-        """Whether a stamp has jumped back."""
-        return bool(self.stamps_ns) and stamp_ns < self.stamps_ns[-1] - _JUMP_BACK_NS
+        super().__init__(maxlen=_MOST_KEPT)
 
     def interval_ns(self) -> float:
         """Median time between transforms."""
-        return float(np.median(np.diff(self.stamps_ns)))
-
-    def add(self, transform: StampedTransform) -> None:
-        """Keep a transform; of repeated ones the first counts, and late ones are left out."""
-        if not self.stamps_ns or transform.stamp_ns > self.stamps_ns[-1]:
-            matrix = _matrix(transform)
-            self.stamps_ns.append(transform.stamp_ns)
-            self._matrices.append(matrix)
-
-    def take_first(self) -> tuple[int, FloatArray]:
-        return self.stamps_ns.popleft(), self._matrices.popleft()
+        return float(np.median(np.diff([stamp_ns for stamp_ns, _ in self])))
 
     def at(self, stamp_ns: int, max_gap_s: float) -> FloatArray | None:
         """The pose at a stamp that is not after the last one; None if it is not known."""
-        after = bisect_left(self.stamps_ns, stamp_ns)
+        after = bisect_left(self, stamp_ns, key=lambda each: each[0])
         for _ in range(after - 1):  # what is asked for next is later
-            self.take_first()
-        after = min(after, 1)
-        if self.stamps_ns[after] == stamp_ns:
-            return self._matrices[after]
-        if after == 0 or self.stamps_ns[1] - self.stamps_ns[0] > max_gap_s * 1e9:
+            self.popleft()
+        (end_ns, T_end) = self[min(after, 1)]
+        if end_ns == stamp_ns:
+            return T_end
+        start_ns, T_start = self[0]
+        if after == 0 or end_ns - start_ns > max_gap_s * 1e9:
             return None
-        span_ns = float(self.stamps_ns[1] - self.stamps_ns[0])
-        fraction = np.array([float(stamp_ns - self.stamps_ns[0]) / span_ns])
-        first, second = self._matrices[0][None], self._matrices[1][None]
-        matrix: FloatArray = se3.interpolate(first, second, fraction)[0]
+        fraction = np.array([float(stamp_ns - start_ns) / float(end_ns - start_ns)])
+        matrix: FloatArray = se3.interpolate(T_start[None], T_end[None], fraction)[0]
         return matrix
 
 
@@ -214,12 +181,9 @@ def _matrix(transform: StampedTransform) -> FloatArray:
     InputError
         If it is not a pose.
     """
-    edge = f"transform {transform.world_frame}:{transform.sensor_frame}"
-    if not all(map(math.isfinite, (*transform.position, *transform.quat_xyzw))):
-        raise InputError(f"{edge} has a value that is not finite")
-    length = math.hypot(*transform.quat_xyzw)
-    if abs(length - 1.0) > QUATERNION_NORM_TOLERANCE:
-        raise InputError(f"{edge} has a quaternion of length {length:.4g}, expected 1")
-    if max(map(abs, transform.position)) > FARTHEST_M:
-        raise InputError(f"{edge}: {far_position(*transform.position)}")
-    return se3.from_quat_xyzw(transform.position, transform.quat_xyzw)
+    try:
+        check_positions(np.array([transform.position]))
+        return checked_pose(transform.position, transform.quat_xyzw)
+    except InputError as error:
+        edge = f"transform {transform.world_frame}:{transform.sensor_frame}"
+        raise InputError(f"{edge}: {error}") from None

@@ -1,6 +1,6 @@
 """What the node publishes: its results, and its state."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -9,6 +9,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
+from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.plain import json_text, plain
 from hand_eye_calib.results.calibration import Calibration
@@ -23,6 +24,9 @@ from hand_eye_calib.text import in_words
 
 PROGRESS_TOPIC = "progress"
 HARDWARE_ID = "hand_eye_calib"
+
+# Parts of the state that the names of values on /diagnostics leave out.
+_UNNAMED = ("progress", "axes", "result", "differences")
 
 
 class ResultTopics:
@@ -87,28 +91,33 @@ def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
     """The message for ``/diagnostics``: a status for each part of the node, by its fully qualified
     name: two nodes must be told apart.
     """
-    message = DiagnosticArray(
-        status=[
-            DiagnosticStatus(
-                level=bytes([part.level]),
-                name=f"{state.node}: {name}",
-                message=part.text,
-                hardware_id=HARDWARE_ID,
-                values=[KeyValue(key=key, value=text) for key, text in _values(plain(part))],
-            )
-            for name, part in state.parts()
-        ]
-    )
+    message = DiagnosticArray()
     message.header.stamp = to_time(clock_ns)
+    for name, part in state.parts():
+        values = dict(_values(plain(part)))
+        status = DiagnosticStatus(
+            level=bytes([part.level]),
+            name=f"{state.node}: {name}",
+            message=part.text,
+            hardware_id=HARDWARE_ID,
+            values=[KeyValue(key=key, value=text) for key, text in values.items()],
+        )
+        message.status.append(status)
     return message
 
 
-def _values(part: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    """Names and texts of the values of a part, those of a part of it as ``name.name``."""
-    for name, value in part.items():
-        if isinstance(value, dict):
-            yield from _values(value, f"{before}{name}.")
-        elif isinstance(value, bool):
-            yield f"{before}{name}", "true" if value else "false"
-        elif before or name not in ("level", "text"):
-            yield f"{before}{name}", "unknown" if value is None else in_words(value)
+def _values(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
+    """Names and texts of the values of a part: those of a mapping have its name before theirs, and
+    the axis is last, as in ``sigma.x``.
+    """
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        value = value[0]  # of comparisons, that with what is installed
+    if isinstance(value, dict):
+        for name, each in value.items():
+            yield from _values(each, (*path, name))
+    elif path not in (("level",), ("text",)):
+        axes = [name for name in path if name in AXES]
+        name = ".".join([each for each in path if each not in (*_UNNAMED, *axes)] + axes)
+        if isinstance(value, bool):
+            value = str(value).lower()
+        yield name, "unknown" if value is None else in_words(value)

@@ -17,25 +17,21 @@ from rclpy.parameter import Parameter
 from hand_eye_calib.config import (
     CalibratorConfig,
     NodeConfig,
-    OptionSet,
+    OptionField,
     check_value,
     option_name,
 )
 from hand_eye_calib.errors import ConfigError
 
-_Field = dataclasses.Field[Any]
 _Values = dict[str, Any]
 
-
-def _fields(config: type[Any]) -> tuple[_Field, ...]:
-    return dataclasses.fields(config)
-
-
-FIELDS: dict[str, _Field] = {
-    option_name(field): field
-    for config in (CalibratorConfig, NodeConfig)
-    for field in _fields(config)
+_OF_CALIBRATOR: dict[str, OptionField] = {
+    option_name(field): field for field in dataclasses.fields(CalibratorConfig)
 }
+_OF_NODE: dict[str, OptionField] = {
+    option_name(field): field for field in dataclasses.fields(NodeConfig)
+}
+FIELDS = _OF_CALIBRATOR | _OF_NODE
 
 # Declared by rclpy itself.
 _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
@@ -122,14 +118,9 @@ class Parameters:
 
 
 def _configs(values: _Values) -> tuple[CalibratorConfig, NodeConfig]:
-    def part(config: type[OptionSet]) -> dict[str, Any]:
-        names = map(option_name, _fields(config))
-        return {name: values[name] for name in names if name in values}
-
-    return (
-        CalibratorConfig.from_options(part(CalibratorConfig)),
-        NodeConfig.from_options(part(NodeConfig)),
-    )
+    of_calibrator = {name: value for name, value in values.items() if name in _OF_CALIBRATOR}
+    of_node = {name: value for name, value in values.items() if name in _OF_NODE}
+    return CalibratorConfig.from_options(of_calibrator), NodeConfig.from_options(of_node)
 
 
 def _take_overrides(node: Node) -> _Values:
@@ -152,7 +143,7 @@ def _unknown(name: str) -> str:
     )
 
 
-def _start_value(field: _Field, value: Any) -> Any:
+def _start_value(field: OptionField, value: Any) -> Any:
     # ROS parameters have fixed types: rclpy refuses an integer for a double, and so does `ros2
     # param set`.
     if isinstance(field.default, float) and type(value) is int and not _dynamic(field):
@@ -164,33 +155,27 @@ def _start_value(field: _Field, value: Any) -> Any:
     return check_value(field, value)
 
 
-def _dynamic(field: _Field) -> bool:
+def _dynamic(field: OptionField) -> bool:
     """Whether a parameter takes a word as well as a number, and so has no single type."""
     return bool(field.metadata["words"])
 
 
-def _descriptor(field: _Field) -> ParameterDescriptor:
+def _descriptor(field: OptionField) -> ParameterDescriptor:
     meta = field.metadata
     words = meta["choices"] or (f"{' or '.join(meta['words'])}, or a number",) * _dynamic(field)
-    description = (
-        meta["doc"]
-        + (f" Unit: {meta['unit']}." if meta["unit"] else "")
-        + (f" Values: {', '.join(words)}." if words else "")
-    )
+    unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
+    values = f" Values: {', '.join(words)}." if words else ""
     descriptor = ParameterDescriptor(
-        description=description,
+        description=f"{meta['doc']}{unit}{values}",
         additional_constraints=f"must be {meta['form']}" if meta["form"] else "",
         read_only=meta["read_only"],
         dynamic_typing=_dynamic(field),
     )
-    if meta["minimum"] is not None and meta["maximum"] is not None and not _dynamic(field):
-        kind = float if isinstance(field.default, float) else int
-        bounds = dict(
-            from_value=kind(meta["minimum"]),
-            to_value=kind(meta["maximum"]),
-        )
-        if kind is float:
-            descriptor.floating_point_range = [FloatingPointRange(**bounds)]
+    bounds = meta["minimum"], meta["maximum"]
+    if None not in bounds and not _dynamic(field):
+        low, high = map(type(field.default), bounds)
+        if isinstance(field.default, float):
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
         else:
-            descriptor.integer_range = [IntegerRange(**bounds)]
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
     return descriptor

@@ -72,8 +72,8 @@ def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
     assert said.message == document["progress"]["text"]
     values = {pair.key: pair.value for pair in said.values}
     assert (said.level, said.hardware_id) == (DiagnosticStatus.WARN, "hand_eye_calib")
-    z = [values[f"progress.axes.z.{name}"] for name in ("sigma", "target")]
-    assert (values["progress.done"], *z) == ("false", "unknown", "0.03")
+    z = [values[f"{name}.z"] for name in ("sigma", "target")]
+    assert (values["done"], *z) == ("false", "unknown", "0.03")
 
 
 def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_path):

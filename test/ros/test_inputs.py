@@ -304,9 +304,9 @@ class TestLoss:
                 publisher.publish(pose)
             for name in ("parent input", "child input"):
                 values = counted.get(name, {})
-                if values.get("lost messages", "unknown") == "unknown":
+                if values.get("lost", "unknown") == "unknown":
                     return False
-                received, lost = (int(values[key]) for key in ("messages", "lost messages"))
+                received, lost = (int(values[key]) for key in ("messages", "lost"))
                 if lost < 500 or abs(received + lost - index) > 0.02 * lost:
                     return False
             return True

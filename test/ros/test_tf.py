@@ -168,7 +168,7 @@ class TestNode:
         peer.spin_until(lambda: said and state() == "not yet", "the state")
         assert state(key="tf_static_reason") == "the goal is not reached"
         peer.solve(publishers, *(part[400:] for part in poses))
-        peer.spin_until(lambda: state("progress", "progress.done") == "true", "the goal")
+        peer.spin_until(lambda: state("progress", "done") == "true", "the goal")
         # Nothing comes in any more: the two results that reached the goal suffice.
         peer.spin_until(lambda: edges(heard), "the edge")
         peer.spin_until(lambda: state() == "broadcast", "the state")

@@ -172,10 +172,6 @@ def test_what_is_no_journal_is_said(tmp_path):
     assert not has_session(tmp_path)
     with pytest.raises(InputError, match="no session journal in"):
         read_journal(tmp_path)
-    (tmp_path / "session-000001.journal").write_bytes(b"hand_eye_calib journal 1\n")
-    assert has_session(tmp_path)
-    with pytest.raises(InputError, match="is of version 0.1, whose binary format is not read any"):
-        read_journal(tmp_path)
     for text, what in (("something else\n", "damaged from its first byte"),
                        ('# {"format": "hand_eye_calib/journal", "version": 3}\n',
                         "is of format version 3, this program reads 2")):  # fmt: skip
