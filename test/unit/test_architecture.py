@@ -42,7 +42,7 @@ ALLOWED = ENGINE | {
     "simulation": GROUND | {"geometry", "io"},
     "root": GROUND | {"geometry", "results", "engine", "rig", "session", "io", "report"},
     "live": {"io", *ENGINE},
-    "watch": {"errors", "text", "live"},
+    "watch": {"errors", "text", "results", "live"},
     "ros": {"io", "live", "watch", *ENGINE},
     "cli": {"io", "report", "simulation", "live", "watch", "ros", *ENGINE},
     "__main__": {"cli"},

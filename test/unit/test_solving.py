@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_eye_calib.engine.checked import checked
 from motions import as_trajectory, child_of, disturbed, feed, wandering_poses
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits
+from hand_eye_calib.engine.run import review
 from hand_eye_calib.live import processes
 from hand_eye_calib.live.processes import SolvingProcess
 from hand_eye_calib.live.solving import Answer, Checked, Failure, FailureKind, Job, answer
@@ -210,7 +210,7 @@ def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts
             feed(calibrator, stream, poses[start : start + 50])
     live = calibrator.snapshot()
     assert (len(live.kept) > 0) == (pairing_starts < 400)
-    replayed, _ = checked(live.estimate(), live)
+    replayed = review(live.estimate(), live).calibration
     found = answer(Job(1, live, check=True))
     assert found.check.options == {"time_offset": "estimate"}
     assert "solved with time_offset estimate" in found.check.told[0]
