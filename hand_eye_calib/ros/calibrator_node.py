@@ -5,6 +5,7 @@ nothing here needs a lock.
 """
 
 import time
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -41,6 +42,10 @@ from hand_eye_calib.ros.tf import TfBroadcaster, message_type
 
 _DISCOVERY_PERIOD_S = 0.2
 _STATE_PERIOD_S = 1.0
+
+# Answers to many calls are sent a few at a time: a client keeps ten that it has not taken yet, and
+# loses the others.
+_ANSWERS_AT_ONCE, _ANSWER_PERIOD_S = 4, 0.02
 
 # Requests that come while the node is busy wait here.
 _SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -96,6 +101,7 @@ class CalibratorNode(Node):
             self._mount = MountWatch(
                 self._session, self._robot.installed, lambda: why.problem, self._log
             )
+        self._due_answers: deque[tuple[Future, tuple[bool, str]]] = deque()
         self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
         self._cycle = SolveCycle(
             self._session,
@@ -160,6 +166,7 @@ class CalibratorNode(Node):
         self._solve_timer = self.create_timer(period_s, self._on_solve_timer, clock=steady)
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=steady)
         self.create_timer(_STATE_PERIOD_S, self._publish_state, clock=steady)
+        self._answer_timer = self.create_timer(_ANSWER_PERIOD_S, self._answer_some, clock=steady)
         self.create_timer(FLUSH_PERIOD_S, self._session.flush_journal, clock=steady)
 
     # ---------------------------------------------------------------- timers
@@ -175,6 +182,13 @@ class CalibratorNode(Node):
             text = "; ".join(each.describe_silence() for each in silent)
             self._log.info(text, "silent", 2 * LOG_PERIOD_S)
         self._cycle.start_if_due()
+
+    def _answer_some(self) -> None:
+        for _ in range(min(_ANSWERS_AT_ONCE, len(self._due_answers))):
+            future, answer = self._due_answers.popleft()
+            future.set_result(answer)
+        if not self._due_answers:
+            self._answer_timer.cancel()
 
     def _publish_result(self, calibration: Calibration) -> None:
         self._results.publish(calibration)
@@ -238,7 +252,12 @@ class CalibratorNode(Node):
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         solved = Future()
-        self._cycle.ask(lambda good, text: solved.set_result((good, text)))
+
+        def on_solved(good: bool, text: str) -> None:
+            self._due_answers.append((solved, (good, text)))
+            self._answer_timer.reset()
+
+        self._cycle.ask(on_solved)
         response.success, response.message = await solved
         return response
 
