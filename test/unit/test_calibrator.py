@@ -12,12 +12,13 @@ from motions import (
     wandering_poses,
 )
 
-import hand_eye_calib as hec
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator, UnusablePose
 from hand_eye_calib.engine.offline import calibrate, offline_config, whole_snapshot
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import SolveStatus
 
@@ -26,18 +27,9 @@ IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 def drive(n_poses=200, seed=0):
     """Parent at 10 Hz, child at 50 Hz, 13 ms apart; smooth, so that interpolation costs little."""
-    from hand_eye_calib.geometry import se3
-
-    coarse = wandering_poses(n_poses, seed)
-    fine = as_trajectory(coarse, 10).at(
-        np.sort(
-            np.r_[as_trajectory(coarse, 10).stamps_ns[:-1, None] + np.arange(5) * 2 * 10**7].ravel()
-        )
-    )
-    parent = as_trajectory(coarse, 10)
-    child = as_trajectory(child_of(fine), 50)
-    assert np.allclose(se3.inverse(coarse[0]) @ coarse[0], np.eye(4))
-    return parent, child
+    parent = as_trajectory(wandering_poses(n_poses, seed), 10)
+    fine = parent.at((parent.stamps_ns[:-1, None] + np.arange(5) * 2 * 10**7).ravel())
+    return parent, as_trajectory(child_of(fine), 50)
 
 
 def test_python_function_finds_the_truth_at_different_rates():
@@ -56,9 +48,6 @@ def test_the_engine_and_the_function_agree_to_the_last_bit():
     feed(calibrator, "child", child)
     feed(calibrator, "parent", parent)
     fed = calibrator.estimate()
-    from hand_eye_calib.geometry import se3
-    from hand_eye_calib.geometry.trajectory import Trajectory
-
     through_quaternions = [
         Trajectory.from_quat_xyzw(t.stamps_ns, t.poses[:, :3, 3], se3.to_quat_xyzw(t.poses))
         for t in (parent, child)
@@ -85,14 +74,6 @@ def test_adaptive_describes_the_noise():
     assert result.noise.translation_white_m == pytest.approx(0.002, rel=0.3)
     assert result.to_dict()["noise"] == plain(result.noise)
     assert all(dof.sigma < 0.02 for dof in result.observability)
-
-
-def test_adaptive_reports_a_wrong_scale():
-    parent, child = drive()
-    small = dataclasses.replace(child, poses=child.scaled(0.95).poses)
-    result = calibrate(parent, disturb(small), method="adaptive")
-    assert result.noise.systematic == "scale"
-    assert result.scale == pytest.approx(1 / 0.95, abs=5e-3)
 
 
 def disturb(trajectory):
@@ -127,13 +108,6 @@ def test_flat_ground_is_a_status_not_a_number():
     assert result.unobservable() == ["z"]
     assert result.headline == "USE WITH CARE: all but z; measure z by hand"
     assert result.to_dict()["observability"][2]["sigma"] is None
-
-
-@pytest.mark.parametrize("method", ["park", "taylor", "zhuang", "ali", "dnl"])
-def test_every_method_is_available(method):
-    parent, child = drive(60)
-    result = calibrate(parent, child, method=method, reference="B5")
-    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -213,47 +187,29 @@ class TestRefusals:
         calibrator.set_frame("child", "lidar")
         with pytest.raises(InputError, match="both streams name 'lidar'"):
             calibrator.estimate()
-
-    def test_named_frames_win_over_the_messages(self):
-        calibrator = Calibrator(CalibratorConfig(child_frame="camera"))
-        calibrator.set_frame("child", "")
-        calibrator.set_frame("child", "base_link")
-        assert calibrator.snapshot().child_frame == "camera"
-
-    def test_unnamed_frames_are_said(self):
-        snapshot = Calibrator().snapshot()
-        assert (snapshot.parent_frame, snapshot.child_frame) == ("parent_sensor", "child_sensor")
+        named = Calibrator(CalibratorConfig(child_frame="camera"))
+        named.set_frame("child", "")
+        named.set_frame("child", "base_link")
+        snapshot = named.snapshot()
+        assert (snapshot.parent_frame, snapshot.child_frame) == ("parent_sensor", "camera")
         assert "parent stream does not name" in snapshot.warnings[0]
 
 
-class TestMissingData:
-    def test_nothing(self):
-        with pytest.raises(NotEnoughDataError, match="no poses on the parent stream"):
-            Calibrator().estimate()
-
-    def test_no_overlap(self):
-        parent, child = drive(30)
-        with pytest.raises(NotEnoughDataError, match=r"do not overlap in time .* 97\.\d+ s apart"):
-            calibrate(parent, child.shifted(100))
-
-    def test_too_few(self):
-        parent, child = drive(8)
-        with pytest.raises(
-            NotEnoughDataError, match="10 synchronised pose pairs are needed, found 7"
-        ):
-            calibrate(parent, child)
-
-    def test_too_few_for_the_reference(self):
-        parent, child = drive(12)
-        with pytest.raises(
-            NotEnoughDataError, match="too few common poses for the chosen reference"
-        ):
-            calibrate(parent, child, reference="B50")
-
-    def test_gaps(self):
-        parent, child = drive(40)
-        with pytest.raises(NotEnoughDataError, match="raise max_gap"):
-            calibrate(parent.shifted(0.005), child, max_gap=0.01)
+@pytest.mark.parametrize(
+    ("n_poses", "parent_s", "child_s", "options", "message"),
+    [
+        (30, 0.0, 100.0, {}, r"do not overlap in time .* 97\.\d+ s apart"),
+        (8, 0.0, 0.0, {}, "10 synchronised pose pairs are needed, found 7"),
+        (12, 0.0, 0.0, {"reference": "B50"}, "too few common poses for the chosen reference"),
+        (40, 0.005, 0.0, {"max_gap": 0.01}, "raise max_gap"),
+    ],
+)
+def test_missing_data_is_named(n_poses, parent_s, child_s, options, message):
+    parent, child = drive(n_poses)
+    with pytest.raises(NotEnoughDataError, match=message):
+        calibrate(parent.shifted(parent_s), child.shifted(child_s), **options)
+    with pytest.raises(NotEnoughDataError, match="no poses on the parent stream"):
+        Calibrator().estimate()
 
 
 class TestLongSessions:
@@ -263,8 +219,6 @@ class TestLongSessions:
 
     @staticmethod
     def interleaved(calibrator, parent, child):
-        from hand_eye_calib.geometry import se3
-
         messages = [
             (stamp_ns, stream, pose[:3, 3], quat)
             for stream, trajectory in (("parent", parent), ("child", child))
@@ -278,32 +232,22 @@ class TestLongSessions:
         for stamp_ns, stream, position, quat in sorted(messages, key=lambda message: message[:2]):
             calibrator.add_pose(stream, stamp_ns, position, quat)
 
-    def test_every_pose_is_paired_once_however_often_the_buffers_were_full(self):
+    @pytest.mark.parametrize("max_pairs", [500, 100])
+    def test_every_pose_is_paired_once_and_the_pairs_are_bounded(self, max_pairs):
         parent, child = drive(400)
-        calibrator = Calibrator(CalibratorConfig(reference="B3"), self.LIMITS)
+        config = CalibratorConfig(max_pairs=max_pairs, reference="B3")
+        calibrator = Calibrator(config, self.LIMITS)
         self.interleaved(calibrator, parent, child)
-        pairs = calibrator.snapshot().pose_pairs()
-        inside = parent.stamps_ns <= child.stamps_ns[-1]
-        assert np.array_equal(pairs.stamps_ns, parent.stamps_ns[inside])
+        stamps_ns = calibrator.snapshot().pose_pairs().stamps_ns
+        inside = parent.stamps_ns[parent.stamps_ns <= child.stamps_ns[-1]]
+        if max_pairs > len(inside):
+            assert np.array_equal(stamps_ns, inside)
+        else:
+            assert 50 <= len(stamps_ns) <= max_pairs
+            assert np.ptp(stamps_ns) > 0.9 * np.ptp(parent.stamps_ns)
         np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
-
-    def test_late_arrivals_are_counted(self):
-        parent, child = drive(400)
-        calibrator = Calibrator(limits=self.LIMITS)
-        self.interleaved(calibrator, parent, child)
         assert not calibrator.add_pose("parent", int(parent.stamps_ns[0]) + 1, *IDENTITY)
         assert calibrator.statistics("parent").refused_late == 1
-
-    def test_pairs_are_bounded_and_curves_survive(self):
-        parent, child = drive(400)
-        calibrator = Calibrator(CalibratorConfig(max_pairs=100, reference="B3"), self.LIMITS)
-        self.interleaved(calibrator, parent, child)
-        pairs = calibrator.snapshot().pose_pairs()
-        assert 50 <= len(pairs) <= 100
-        assert pairs.stamps_ns[-1] - pairs.stamps_ns[0] > 0.9 * (
-            parent.stamps_ns[-1] - parent.stamps_ns[0]
-        )
-        np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
     def test_a_stream_on_its_own_does_not_fill_the_memory(self):
         parent, child = drive(400)
@@ -339,10 +283,3 @@ def test_a_snapshot_does_not_change_when_poses_come_in():
     feed(calibrator, "parent", parent[40:])
     assert np.array_equal(snapshot.estimate().T_parent_child, before.T_parent_child)
     assert calibrator.estimate().n_poses > before.n_poses
-
-
-def test_public_names_exist():
-    for name in hec.__all__:
-        assert callable(getattr(hec, name))
-    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
-        hec.calibrat  # noqa: B018

@@ -42,12 +42,10 @@ class TestOptionsOfCalibrate:
         assert set(fields) >= PRIOR_FIELDS
         keywords = self.keywords()
         assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior", "progress", "checks"}
+        assert {each.default for each in keywords.values()} == {None}
         for name, field in fields.items():
             if name not in PRIOR_FIELDS:
                 assert keywords[name].annotation == field.type | None, name
-
-    def test_defaults_are_the_config_s(self):
-        assert {p.default for p in self.keywords().values()} == {None}
 
     def test_each_has_the_effect_of_its_option(self, monkeypatch):
         """Every keyword reaches the configuration that is solved with."""
@@ -108,10 +106,6 @@ class TestOptionsOfCalibrate:
         with pytest.raises(InputError, match="child must be a Trajectory; found ndarray: build"):
             hec.calibrate(parent, child.poses)
 
-    def test_a_typing_error_is_an_error(self):
-        with pytest.raises(TypeError, match="unexpected keyword argument 'metod'"):
-            hec.calibrate(*streams(), metod="dnlo")
-
     def test_progress_is_told_and_changes_nothing(self):
         parent, child = streams()
         told = []
@@ -168,22 +162,6 @@ class TestMethods:
                 Method(name)
 
     @pytest.mark.parametrize("name", METHODS)
-    def test_outliers_are_rejected_where_the_record_says_so(self, name):
-        """A jump in the child's stream leaves the answers of those methods alone."""
-        parent, child = streams(120)
-        poses = child.poses.copy()
-        poses[60:, :3, 3] += [1.0, -0.7, 0.4]
-        jumped = hec.Trajectory(child.stamps_ns, poses)
-        result = hec.calibrate(parent, jumped, method=name, reference="B1")
-        error_m = np.linalg.norm((result.T_parent_child - T_PARENT_CHILD)[:3, 3])
-        if METHODS[name].rejects_outliers:
-            assert error_m < 1e-4
-            assert result.n_inliers < result.n_pairs
-        else:
-            assert error_m > 1e-3
-            assert result.n_inliers == result.n_pairs
-
-    @pytest.mark.parametrize("name", METHODS)
     def test_backends_are_those_of_the_record(self, name):
         parent, child = streams(30)
         for backend in BACKENDS:
@@ -210,6 +188,9 @@ class TestResiduals:
         crosses = (residuals.start_ns < parent.stamps_ns[40]) & (
             residuals.end_ns >= parent.stamps_ns[40]
         )
+        error_m = np.linalg.norm((result.T_parent_child - T_PARENT_CHILD)[:3, 3])
+        assert METHODS[name].rejects_outliers == (error_m < 1e-4)
+        assert METHODS[name].rejects_outliers == (result.n_inliers < result.n_pairs)
         if METHODS[name].rejects_outliers:
             np.testing.assert_array_equal(residuals.is_inlier, ~crosses)
             assert residuals.translation_m[~crosses].max() < 1e-6
@@ -252,12 +233,9 @@ class TestAnswerOfTheMethod:
         assert pair_costs(pairs, result.T_parent_child).sum() > result.objective
         assert abs(result.T_method[2, 3] - result.T_parent_child[2, 3]) > 1e-3
 
-    def test_it_is_the_result_if_all_is_observable(self):
+    def test_it_comes_back_from_files_that_have_it(self):
         result = hec.calibrate(*streams(100), reference="B5")
         np.testing.assert_allclose(result.T_method, result.T_parent_child, atol=1e-12)
-
-    def test_it_comes_back_from_files_that_have_it(self):
-        result = hec.calibrate(*streams(), reference="B1")
         document = result.to_dict()
         loaded = hec.Calibration.from_dict(document)
         np.testing.assert_array_equal(loaded.T_method, result.T_method)
@@ -267,13 +245,13 @@ class TestAnswerOfTheMethod:
 
 @pytest.mark.parametrize(
     ("option", "guess"),
-    [({"method": "dlno"}, "dnlo"), ({"backend": "ipotp"}, "ipopt"), ({"scale": "atuo"}, "auto")],
+    [
+        ({"method": "dlno"}, "dnlo"),
+        ({"backend": "ipotp"}, "ipopt"),
+        ({"scale": "atuo"}, "auto"),
+        ({"max_gp": 1.0}, "max_gap"),
+    ],
 )
-def test_a_misspelt_value_is_answered_with_a_guess(option, guess):
+def test_a_misspelt_option_or_value_is_answered_with_a_guess(option, guess):
     with pytest.raises(ConfigError, match=rf"did you mean {guess}\?"):
         CalibratorConfig.from_options(option)
-
-
-def test_a_misspelt_option_is_answered_with_a_guess():
-    with pytest.raises(ConfigError, match=r"unknown option 'max_gp'; did you mean max_gap\?"):
-        CalibratorConfig.from_options({"max_gp": 1.0})
