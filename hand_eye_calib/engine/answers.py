@@ -10,7 +10,7 @@ seconds.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -88,13 +88,6 @@ class Answer:
     stride: int = 1
 
 
-@dataclass(frozen=True)
-class _Question:
-    label: str
-    part: slice
-    config: CalibratorConfig
-
-
 class OtherAnswers:
     """Solves the same question again. Answers with too few data are left out.
 
@@ -126,108 +119,89 @@ class OtherAnswers:
         """From the first part of the recording, the first two ... to all of it, with the prior."""
         method = METHODS[self._config.method]
         ends = np.linspace(0, len(self._poses), method.parts + 1).astype(int)[1:-1]
-        questions = [_Question(str(end), slice(0, end), self._config) for end in ends]
-        last_s = self._seconds(self._poses)
-        return (
-            *self._same_method(questions, method.most_poses_of_many),
-            Answer("all", last_s, self._calibration),
-        )
+        parts = {str(end): slice(0, end) for end in ends}
+        found = self._of_parts(parts, self._config, method.most_poses_of_many)
+        return (*found, Answer("all", self._seconds(self._poses), self._calibration))
 
     def halves(self) -> tuple[Answer, ...]:
         """From each half alone, without priors."""
-        return self._same_method(
-            self._halves_with(self._without_prior), METHODS[self._config.method].most_poses_of_few
-        )
-
-    def _halves_with(self, config: CalibratorConfig) -> list[_Question]:
-        half = len(self._poses) // 2
-        return [
-            _Question("first half", slice(0, half), config),
-            _Question("second half", slice(half, None), config),
-        ]
+        most = METHODS[self._config.method].most_poses_of_few
+        return self._of_parts(self._halves(), self._without_prior, most)
 
     def other_methods(self) -> tuple[Answer, ...]:
         """From other methods and references, without priors: of poses."""
         if self._calibration.measured != "poses":
             return ()
-        questions = [
-            question
+        found: list[Answer | None] = [
+            answer
             for method in _COMPARED_METHODS
-            for question in self._at_baselines(method, _COMPARED_BASELINES)
+            for answer in self._at_baselines(method, _COMPARED_BASELINES, estimate_extrinsic)
         ]
-        if self._calibration.method != _COMPARED_ESTIMATOR:
-            questions.append(self._estimator_question())
-        return self._answers(questions)
+        label = _COMPARED_ESTIMATOR
+        if self._calibration.method != label:
+            config = replace(self._without_prior, method=label, reference="auto")
+            stride = _stride(len(self._poses), METHODS[label].most_poses_of_few)
+            label += f" (1 in {stride})" if stride > 1 else ""
+            found.append(self._answer(label, slice(None, None, stride), config))
+        return tuple(filter(None, found))
 
     def quick(self) -> tuple[tuple[Answer, ...], tuple[Answer, ...]]:
         """From other references, and from each half, with the quickest method: without priors."""
-        others = self._at_baselines(_QUICK_METHOD, _QUICK_BASELINES)
+        others = self._at_baselines(_QUICK_METHOD, _QUICK_BASELINES, estimate_beside)
         own = self._calibration.reference
         if not METHODS[self._calibration.method].uses_reference or own[0] not in "BC":
             own = f"B{_QUICK_BASELINES[2]}"
         config = replace(self._without_prior, method=_QUICK_METHOD, reference=own)
-        halves = [
-            self._downsampled(half, _MAX_POSES_OF_OTHERS, own) for half in self._halves_with(config)
-        ]
-        return self._answers(others, estimate_beside), self._answers(halves, estimate_beside)
+        return others, self._of_parts(self._halves(), config, _MAX_POSES_OF_OTHERS, estimate_beside)
 
-    def _at_baselines(self, method: str, baselines: Sequence[int]) -> list[_Question]:
+    def _halves(self) -> dict[str, slice]:
+        half = len(self._poses) // 2
+        return {"first half": slice(0, half), "second half": slice(half, None)}
+
+    def _at_baselines(
+        self, method: str, baselines: Sequence[int], estimate: Estimator
+    ) -> tuple[Answer, ...]:
         """A method at these baselines, with at most so many poses; without the result itself."""
         stride = _stride(len(self._poses), _MAX_POSES_OF_OTHERS)
         own_label = f"{self._calibration.method} {self._calibration.reference}"
-        questions = [
-            _Question(
-                f"{method} B{n * stride}",
-                slice(None, None, stride),
-                replace(self._without_prior, method=method, reference=f"B{n}"),
-            )
-            for n in baselines
-            if n * stride * 4 < len(self._poses)
-        ]
-        return [question for question in questions if question.label != own_label]
-
-    def _estimator_question(self) -> _Question:
-        label = _COMPARED_ESTIMATOR
-        stride = _stride(len(self._poses), METHODS[label].most_poses_of_few)
-        config = replace(self._without_prior, method=label, reference="auto")
-        if stride > 1:
-            label = f"{label} (1 in {stride})"
-        return _Question(label, slice(None, None, stride), config)
-
-    def _same_method(self, questions: Iterable[_Question], max_poses: int) -> tuple[Answer, ...]:
-        """Answers of the result's own method, with its reference, from at most so many poses."""
-        return self._answers(
-            self._downsampled(question, max_poses, self._calibration.reference)
-            for question in questions
-        )
-
-    def _downsampled(self, question: _Question, max_poses: int, own_reference: str) -> _Question:
-        start, end, _ = question.part.indices(len(self._poses))
-        stride = _stride(end - start, max_poses)
-        reference = "auto"
-        if METHODS[question.config.method].uses_reference:
-            reference = _coarser(own_reference, stride)
-        config = replace(question.config, reference=reference)
-        return replace(question, part=slice(start, end, stride), config=config)
-
-    def _answers(
-        self, questions: Iterable[_Question], estimate: Estimator | None = None
-    ) -> tuple[Answer, ...]:
-        """Answers by an estimator: by default the one that gave the result."""
-        estimate = estimate or ESTIMATORS[self._calibration.measured]
-        found = (self._answer(question, estimate) for question in questions)
+        found = []
+        for n in baselines:
+            label = f"{method} B{n * stride}"
+            if n * stride * 4 < len(self._poses) and label != own_label:
+                config = replace(self._without_prior, method=method, reference=f"B{n}")
+                found.append(self._answer(label, slice(None, None, stride), config, estimate))
         return tuple(filter(None, found))
 
-    def _answer(self, question: _Question, estimate: Estimator) -> Answer | None:
-        poses = self._poses[question.part]
+    def _of_parts(
+        self,
+        parts: Mapping[str, slice],
+        config: CalibratorConfig,
+        max_poses: int,
+        estimate: Estimator | None = None,
+    ) -> tuple[Answer, ...]:
+        """Answers from parts of the recording, from at most so many poses of each."""
+        own = self._calibration.reference if estimate is None else config.reference
+        found = []
+        for label, part in parts.items():
+            start, end, _ = part.indices(len(self._poses))
+            stride = _stride(end - start, max_poses)
+            uses_reference = METHODS[config.method].uses_reference
+            on = replace(config, reference=_coarser(own, stride) if uses_reference else "auto")
+            found.append(self._answer(label, slice(start, end, stride), on, estimate))
+        return tuple(filter(None, found))
+
+    def _answer(
+        self, label: str, part: slice, config: CalibratorConfig, estimate: Estimator | None = None
+    ) -> Answer | None:
+        """The answer of an estimator: by default of the one that gave the result."""
+        poses = self._poses[part]
         if len(poses) < _MIN_POSES:
             return None
         try:
-            calibration = estimate(poses, question.config)
+            found = (estimate or ESTIMATORS[self._calibration.measured])(poses, config)
         except HandEyeCalibError:
             return None
-        stride = question.part.step or 1
-        return Answer(question.label, self._seconds(poses), calibration, stride)
+        return Answer(label, self._seconds(poses), found, part.step or 1)
 
     def _seconds(self, poses: PosePairs) -> float:
         """Seconds from the first pose of the recording to the last of these."""
@@ -315,7 +289,11 @@ def compare_answers(
         # The whole is the mean of both halves: its standard deviation is half of that of their
         # difference.
         of_halves = apart / 2
-        excess_of_halves = of_halves / np.hypot(allowed / 2, _beside_halves(calibration, halves[0]))
+        # The halves do not state the floor and, of another method, errors that last.
+        beside = calibration.sigmas_of_floor
+        if halves[0].method != calibration.method:
+            beside = calibration.sigmas_with_floor
+        excess_of_halves = of_halves / np.hypot(allowed / 2, beside)
     of_model, excess_of_model = _from_other_model(calibration)
     columns = {
         "sigma": calibration.sigmas,
@@ -334,15 +312,6 @@ def compare_answers(
         )
         for k, axis in enumerate(AXES)
     }
-
-
-def _beside_halves(calibration: Calibration, half: Calibration) -> FloatArray:
-    """Standard deviations (6,) that the halves do not state: the floor, and those of a result of
-    another method, which may know of errors that last.
-    """
-    if half.method == calibration.method:
-        return calibration.sigmas_of_floor
-    return np.hypot(calibration.sigmas, calibration.sigmas_of_floor)
 
 
 def _scatter(

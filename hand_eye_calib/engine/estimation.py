@@ -170,9 +170,14 @@ def solve_poses(
     """
     scale = settle_scale(pose_pairs, config.scale)
     METHODS[config.method].require_backend(config.backend)
-    solve = _SOLVE.get(config.method, _solve_only_pairs)
     scaled = child_scaled(pose_pairs, scale.value)
-    evaluation = solve(scaled, config, is_clock_free=time_offset is not None)
+    is_clock_free = time_offset is not None
+    if config.method == "auto":
+        evaluation = _solve_auto(scaled, config, is_clock_free)
+    elif config.method == "adaptive":
+        evaluation = _evaluated(scaled, _adaptive_solution(scaled, config, is_clock_free))
+    else:
+        evaluation = _solve_pairs(scaled, config)
     T_method, found = evaluation.solution.T_parent_child, evaluation.adaptive
     # A model with a time offset knows how uncertain that is.
     spread = _spread_by_alignment(
@@ -376,20 +381,6 @@ def _solve_reference(
     )
 
 
-def _solve_only_pairs(
-    pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
-) -> _Evaluation:
-    """A method of the paper, which takes the clock as it is."""
-    return _solve_pairs(pose_pairs, config)
-
-
-def _solve_adaptive(
-    pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
-) -> _Evaluation:
-    """The adaptive estimator, which uses no reference."""
-    return _evaluated(pose_pairs, _adaptive_solution(pose_pairs, config, is_clock_free))
-
-
 def _adaptive_solution(
     pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
 ) -> AdaptiveSolution:
@@ -458,10 +449,6 @@ def _spans(
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{baseline}")
     before = np.concatenate([[0], np.cumsum(left_out)])
     return pairs, (before[pairs.i] == before[pairs.j]).astype(float)
-
-
-# Methods that do not only solve the motion pairs of a reference.
-_SOLVE = {"auto": _solve_auto, "adaptive": _solve_adaptive}
 
 
 def _spread_by_alignment(scale: Scale | None, time_offset: TimeOffset | None) -> FloatArray:

@@ -88,8 +88,8 @@ def calibrate(
     for name in ("parent", "child", "prior", "checks", "progress"):
         del options[name]
     options = {name: value for name, value in options.items() if value is not None}
-    of_streams = _most_pairs(parent, child) | _measures(parent, child)
-    config = CalibratorConfig(**(of_streams | options | prior_fields(prior or {})))
+    options = _of_streams(parent, child) | options | prior_fields(prior or {})
+    config = CalibratorConfig(**options)
     snapshot = whole_snapshot(config, parent, child)
     return run(snapshot, checks=checks, progress=progress).calibration
 
@@ -133,8 +133,7 @@ def offline_config(
     """The CalibratorConfig for two whole trajectories, from options by their public names: all
     pairs up to 100,000 unless they set another limit.
     """
-    of_streams = _most_pairs(parent, child) | _measures(parent, child)
-    return CalibratorConfig.from_options(of_streams | dict(options))
+    return CalibratorConfig.from_options(_of_streams(parent, child) | dict(options))
 
 
 def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajectory) -> Snapshot:
@@ -156,14 +155,15 @@ def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajecto
     )
 
 
-def _most_pairs(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
-    """Options under which all poses of both trajectories are used, unless there are too many."""
-    return {"max_pairs": min(max(len(parent), len(child), 10), _MOST_PAIRS)}
-
-
-def _measures(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
-    """Options that say what the streams measure, as they themselves do."""
-    return {"parent_measures": parent.measures, "child_measures": child.measures}
+def _of_streams(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
+    """Options that follow from the streams: what they measure, and that all their poses are used
+    unless there are too many.
+    """
+    return {
+        "max_pairs": min(max(len(parent), len(child), 10), _MOST_PAIRS),
+        "parent_measures": parent.measures,
+        "child_measures": child.measures,
+    }
 
 
 def cross_check(
