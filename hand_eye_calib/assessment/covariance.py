@@ -25,10 +25,9 @@ from hand_eye_calib.assessment.lever_arm import (
     weighted_products,
 )
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.normal import NormalEquations, answers_without
 from hand_eye_calib.gls.positions import LeverArmSolution
-from hand_eye_calib.gls.resampling import answers_without
 from hand_eye_calib.gls.solution import AdaptiveSolution
-from hand_eye_calib.gls.state_space import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict
@@ -395,7 +394,7 @@ def widened_by_halves(
     ----------
     model : (6, 6) array
     products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.resampling`.
+        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.parts`.
     misfit : float
         Factor of the covariances of the halves.
     part : slice

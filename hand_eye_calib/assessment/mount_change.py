@@ -31,7 +31,7 @@ from hand_eye_calib.assessment.moved import (
     solve,
 )
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.state_space import NormalEquations
+from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.stats import median, robust_sigma, student_weights
@@ -306,7 +306,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     Parameters
     ----------
     products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.resampling`.
+        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.parts`.
     misfit : float
         Factor of the covariances.
     """

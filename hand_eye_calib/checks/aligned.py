@@ -16,7 +16,7 @@ from hand_eye_calib.checks.response import MAX_ROTATION, Smoothing, find_smoothi
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator
-from hand_eye_calib.gls.part_delays import PartDelay
+from hand_eye_calib.gls.extras import PartDelay
 from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -148,7 +148,7 @@ def solved(pose_pairs: PosePairs) -> AdaptiveSolution | None:
     if len(poses) < _FEWEST_POSES:
         return None
     return estimator.solve(
-        poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c, is_clock_free=True, with_delays=True
+        poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c, is_clock_free=True, with_extras=True
     )
 
 
@@ -223,10 +223,10 @@ def _check_gains(aligned: Aligned) -> tuple[FloatArray, list[Finding]]:
 
 def _check_delays(aligned: Aligned) -> list[Finding]:
     """Finding about positions that are late, or early, against orientations of their stream."""
-    if aligned.solution is None or aligned.solution.delays is None:
+    if aligned.solution is None or aligned.solution.extras is None:
         return []
     delays: dict[str, PartDelay] = dict(
-        zip(("child", "parent"), aligned.solution.delays, strict=True)
+        zip(("child", "parent"), aligned.solution.extras.delays, strict=True)
     )
     stream = max(delays, key=lambda name: delays[name].sigmas)
     delay = delays[stream]
@@ -249,9 +249,10 @@ def _check_delays(aligned: Aligned) -> list[Finding]:
 
 def _check_world(aligned: Aligned) -> list[Finding]:
     """Finding about a world that moves against the other."""
-    drift = aligned.solution.world_drift if aligned.solution else None
-    if drift is None or not drift.is_significant:
+    found = aligned.solution.extras if aligned.solution else None
+    if found is None or not found.world_drift.is_significant:
         return []
+    drift = found.world_drift
     share = drift.speed_at(aligned.pose_pairs.Ts_cw_c[:, :3, 3]) / max(aligned.rms_speed, 1e-9)
     if share < _MOVING:
         return []

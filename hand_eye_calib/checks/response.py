@@ -7,7 +7,7 @@ Two sensors on one rigid body feel the same motion at the same time, so that wit
 
 for rotations w and displacements v over a short span. A gain of the rotations and smoothing break
 this and are easily taken for a part of X. So is a delay of one part, which
-:mod:`~hand_eye_calib.gls.part_delays` finds.
+:mod:`~hand_eye_calib.gls.extras` finds.
 
 A filter changes a motion of angular frequency f by the factor 1 - i f d - f^2 c + ...: it adds -d
 times the velocity and c times the acceleration. Both are columns of a linear regression.

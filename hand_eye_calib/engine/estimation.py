@@ -21,7 +21,6 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
 from hand_eye_calib.gls.increments import SYSTEMATIC, Streams, course_of
-from hand_eye_calib.gls.part_delays import spread_by_delays
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -79,22 +78,6 @@ class _Evaluation:
     def adaptive(self) -> AdaptiveSolution | None:
         """The solution, if it is the adaptive estimator's."""
         return self.model if self.method == "adaptive" else None
-
-    def spread(self, clock_offset_s: float) -> FloatArray:
-        """Covariance (6, 6) of xi by what is not in the model.
-
-        Parameters
-        ----------
-        clock_offset_s : float
-            As estimated before; zero if it was given.
-        """
-        found, spread = self.adaptive, np.zeros((6, 6))
-        if found:
-            spread = spread_by_delays(found.delays or (), clock_offset_s, found.clock)
-            drift = found.world_drift
-            if drift is not None and drift.is_significant:
-                spread = spread + np.outer(drift.shift, drift.shift)
-        return spread if self.shift is None else spread + self.shift.spread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +166,8 @@ def solve_poses(
     spread = _spread_by_alignment(
         scale.estimate, None if found and found.time_offset_s else time_offset
     )
-    spread += evaluation.spread(time_offset.seconds if time_offset else 0.0)
+    if evaluation.shift is not None:
+        spread += evaluation.shift.spread
     return Solved(
         evaluation=evaluation,
         assessment=widened(evaluation.assessment, T_method[:3, :3], spread),
@@ -300,7 +284,7 @@ def _solve_auto(
         return replace(dnlo, method_reason=reason, other_answer=_beside(by_model), model=solution)
     # DNLO does not know of systematic errors: it is compared on poses without them.
     if solution.systematic != "none":
-        pose_pairs = _without_biases(_corrected(pose_pairs, solution), solution)
+        pose_pairs = _without_bias(_corrected(pose_pairs, solution), solution)
     dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
     reason = f"auto: adaptive, compared with dnlo on reference {dnlo.reference}"
     return replace(by_model, method_reason=reason, other_answer=_beside(dnlo))
@@ -393,7 +377,7 @@ def _adaptive_solution(
         pose_pairs.Ts_cw_c,
         [name for name in SYSTEMATIC if known.isdisjoint(name.split("+"))],
         is_clock_free=is_clock_free,
-        with_delays=True,
+        with_extras=True,
     )
 
 
@@ -405,15 +389,13 @@ def _corrected(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
     return PosePairs(stamps_ns, pose_pairs.Ts_pw_p, Ts_cw_c)
 
 
-def _without_biases(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
-    """The poses without the biases per metre of path that the solution found."""
+def _without_bias(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
+    """The poses without the bias per metre of path that the solution found."""
     stamps_ns = pose_pairs.stamps_ns
-    Ts_pw_p, Ts_cw_c = pose_pairs.Ts_pw_p.copy(), pose_pairs.Ts_cw_c.copy()
+    Ts_pw_p, Ts_cw_c = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c.copy()
     streams = Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c)
     course = course_of(streams, solution.T_parent_child)
-    of_child, of_parent = solution.biases
-    Ts_cw_c[:, :3, 3] -= course.along_c @ of_child
-    Ts_pw_p[:, :3, 3] -= course.along_p @ of_parent
+    Ts_cw_c[:, :3, 3] -= course.along @ solution.bias
     return PosePairs(stamps_ns, Ts_pw_p, Ts_cw_c)
 
 

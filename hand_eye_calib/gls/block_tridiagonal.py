@@ -4,8 +4,7 @@ memory linear in their size.
 Cyclic reduction (Golub; Heller, SIAM J. Numer. Anal. 13, 1976): every other block is eliminated,
 all of them at once, and what is left is block tridiagonal again, half as long. It is a Cholesky
 factorisation in another order. Each level is a few products of stacked matrices, so that numpy's
-overhead grows with the logarithm of the number of blocks. The order of time is kept only where it
-matters, see :class:`InOrder`.
+overhead grows with the logarithm of the number of blocks.
 """
 
 from __future__ import annotations
@@ -15,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.gls import lapack
-from hand_eye_calib.gls.chunks import chunks
 
 # Matrices that are fewer than so many times their size are inverted faster by LAPACK, one by one,
 # than by stacked rows. So many small ones are factored faster entry by entry, all at once.
@@ -46,11 +43,9 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     lower = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
     pivots = np.diagonal(lower, axis1=1, axis2=2)
     log_determinants = 2.0 * np.log(pivots).sum(axis=1)
-    inverse: FloatArray = np.zeros_like(lower)
     if len(lower) < _FEW * lower.shape[1]:
-        for one, of_one in zip(lower, inverse, strict=True):
-            of_one[:] = lapack.dtrtri(one.T)[0].T
-        return inverse, log_determinants
+        return np.asarray(np.linalg.inv(lower), dtype=np.float64), log_determinants
+    inverse: FloatArray = np.zeros_like(lower)
     inverse[:, 0, 0] = 1.0 / pivots[:, 0]
     for row in range(1, lower.shape[1]):
         scaled = lower[:, row : row + 1, :row] / -pivots[:, row, None, None]
@@ -113,53 +108,40 @@ class _Level:
     before: FloatArray
     behind: FloatArray
 
-    def _behind(self, part: slice) -> tuple[FloatArray, slice]:
-        """``behind`` of a part of the eliminated blocks, and which of those that stay that is."""
-        behind = self.behind[part]
-        return behind, slice(part.start + 1, part.start + 1 + len(behind))
-
     def whiten(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened columns of the eliminated blocks, and the columns of the blocks that stay."""
-        odd, rest = right[1::2], right[::2].copy()
-        whitened = np.empty(odd.shape)
-        for part in chunks(len(odd)):
-            np.matmul(self.inverse[part], odd[part], out=whitened[part])
-            rest[part] -= transposed(self.before[part]) @ whitened[part]
-            behind, after = self._behind(part)
-            rest[after] -= transposed(behind) @ whitened[part][: len(behind)]
+        whitened, rest = self.inverse @ right[1::2], right[::2].copy()
+        rest[: len(whitened)] -= transposed(self.before) @ whitened
+        n_behind = len(self.behind)
+        rest[1 : 1 + n_behind] -= transposed(self.behind) @ whitened[:n_behind]
         return whitened, rest
 
     def restore(self, whitened: FloatArray, rest: FloatArray) -> FloatArray:
         """Solution of all blocks from that of those that stay."""
+        n_behind = len(self.behind)
+        own = whitened - self.before @ rest[: len(whitened)]
+        own[:n_behind] -= self.behind @ rest[1 : 1 + n_behind]
         solved = np.empty((len(whitened) + len(rest), *rest.shape[1:]))
         solved[::2] = rest
-        for part in chunks(len(whitened)):
-            own = whitened[part] - self.before[part] @ rest[part]
-            behind, after = self._behind(part)
-            own[: len(behind)] -= behind @ rest[after]
-            solved[1::2][part] = transposed(self.inverse[part]) @ own
+        np.matmul(transposed(self.inverse), own, out=solved[1::2])
         return solved
 
     def extend(self, diagonal: FloatArray, below: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Blocks of the inverse on the diagonal and below it from those of the blocks that stay."""
-        n_blocks = len(diagonal) + len(self.inverse)
-        all_diagonal = np.empty((n_blocks, *diagonal.shape[1:]))
-        all_below = np.empty((n_blocks - 1, *diagonal.shape[1:]))
-        all_diagonal[::2] = diagonal
-        for part in chunks(len(self.inverse)):
-            (behind, after), root = self._behind(part), transposed(self.inverse[part])
-            n_behind = len(behind)
-            to_before, to_behind = -root @ self.before[part], -root[:n_behind] @ behind
-            beside = below[part][:n_behind]
-            with_before = to_before @ diagonal[part]
-            with_before[:n_behind] += to_behind @ beside
-            with_behind = diagonal[after] @ transposed(to_behind)
-            with_behind += beside @ transposed(to_before[:n_behind])
-            own = squared(self.inverse[part])
-            own += with_before @ transposed(to_before)
-            own[:n_behind] += transposed(to_behind @ with_behind)
-            all_diagonal[1::2][part] = own
-            all_below[::2][part], all_below[1::2][part] = with_before, with_behind
+        n_own, n_behind = len(self.inverse), len(self.behind)
+        root = transposed(self.inverse)
+        to_before, to_behind = -root @ self.before, -root[:n_behind] @ self.behind
+        with_before = to_before @ diagonal[:n_own]
+        with_before[:n_behind] += to_behind @ below[:n_behind]
+        with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
+        with_behind += below[:n_behind] @ transposed(to_before[:n_behind])
+        own = squared(self.inverse)
+        own += with_before @ transposed(to_before)
+        own[:n_behind] += transposed(to_behind @ with_behind)
+        all_diagonal = np.empty((len(diagonal) + n_own, *diagonal.shape[1:]))
+        all_below = np.empty((len(all_diagonal) - 1, *diagonal.shape[1:]))
+        all_diagonal[::2], all_diagonal[1::2] = diagonal, own
+        all_below[::2], all_below[1::2] = with_before, with_behind
         return all_diagonal, all_below
 
     @classmethod
@@ -170,13 +152,10 @@ class _Level:
 
     def rest(self, diagonal: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The diagonal, and the blocks below it, of the matrix that stays."""
-        diagonal, below = diagonal[::2].copy(), np.empty_like(self.behind)
-        for part in chunks(len(self.before)):
-            before, (behind, after) = self.before[part], self._behind(part)
-            diagonal[part] -= squared(before)
-            diagonal[after] -= squared(behind)
-            np.negative(transposed(behind) @ before[: len(behind)], out=below[part])
-        return diagonal, below
+        n_behind, diagonal = len(self.behind), diagonal[::2].copy()
+        diagonal[: len(self.before)] -= squared(self.before)
+        diagonal[1 : 1 + n_behind] -= squared(self.behind)
+        return diagonal, -transposed(self.behind) @ self.before[:n_behind]
 
 
 def _whole(diagonal: FloatArray, below: FloatArray) -> FloatArray:
@@ -190,7 +169,8 @@ def _whole(diagonal: FloatArray, below: FloatArray) -> FloatArray:
 
 
 class Factor:
-    """Cholesky factor L of a positive definite matrix with permuted rows and columns.
+    """Cholesky factor L of a positive definite matrix with permuted rows and columns;
+    ``log_determinant`` is that of the matrix.
 
     Parameters
     ----------
@@ -206,7 +186,7 @@ class Factor:
 
     def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
         self._levels: list[_Level] = []
-        self._log_determinant = 0.0
+        self.log_determinant = 0.0
         while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _DENSE:
             level = _Level.of(diagonal, below, self._inverse_root(diagonal[1::2]))
             diagonal, below = level.rest(diagonal)
@@ -216,12 +196,8 @@ class Factor:
 
     def _inverse_root(self, blocks: FloatArray) -> FloatArray:
         inverse, log_determinants = inverse_roots(blocks)
-        self._log_determinant += float(log_determinants.sum())
+        self.log_determinant += float(log_determinants.sum())
         return inverse
-
-    def log_determinant(self) -> float:
-        """Logarithm of the matrix's determinant."""
-        return self._log_determinant
 
     def whiten(self, right: FloatArray) -> FloatArray:
         """``L^-1`` times columns (n, d, k), in the order of the elimination."""
@@ -254,47 +230,3 @@ class Factor:
         for level in reversed(self._levels):
             diagonal, below = level.extend(diagonal, below)
         return diagonal, below
-
-
-class InOrder:
-    """Cholesky factor L of the same matrices in the order of their blocks: what is whitened up to a
-    block does not depend on the blocks behind it.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the matrix is not positive definite.
-    """
-
-    def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
-        self._n_blocks, self._size, _ = diagonal.shape
-        size = self._size
-        bands = np.zeros((self._n_blocks, size, 2 * size))
-        for column in range(size):
-            bands[:, column, : size - column] = diagonal[:, column:, column]
-            bands[:-1, column, size - column : 2 * size - column] = below[:, :, column]
-        self._bands, info = lapack.dpbtrf(bands.reshape(-1, 2 * size).T, lower=1, overwrite_ab=1)
-        if info != 0:
-            raise np.linalg.LinAlgError(f"not positive definite at row {info}")
-
-    def whiten(
-        self, right: FloatArray, start: int = 0, before: FloatArray | None = None
-    ) -> FloatArray:
-        """``L^-1`` times columns (n, d, k); or a part of that from a block on, from that part of
-        the columns and what is whitened (d, k) of the block before.
-        """
-        n_blocks, size, n_columns = right.shape
-        columns = right.reshape(n_blocks * size, n_columns).copy(order="F")
-        del right  # as large as the answer
-        if before is not None:
-            columns[:size] -= self.below(start - 1) @ before
-        bands = self._bands[:, start * size : (start + n_blocks) * size]
-        whitened, _ = lapack.dtbtrs(bands, columns, uplo="L", overwrite_b=1)
-        # A view: rows of one column follow each other in memory.
-        return whitened.T.reshape(n_columns, n_blocks, size).transpose(1, 2, 0)
-
-    def below(self, block: int) -> FloatArray:
-        """Block (d, d) of L below its diagonal block of this number."""
-        size = self._size
-        rows = self._bands.T.reshape(self._n_blocks, size, 2 * size)[block]
-        return np.stack([rows[c, size - c : 2 * size - c] for c in range(size)], axis=1)

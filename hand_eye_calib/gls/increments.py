@@ -6,8 +6,12 @@ child's frame, with ``c = Ad(X^-1) a - b``,
     e_i = Log(B_i^-1 X^-1 A_i X) = c_{i+1} - Ad(B_i^-1) c_i + w_i + (I - Ad(B_i^-1)) xi
 
 for motions A, B between poses i and i + 1, errors w of the motions themselves, and ``X Exp(-xi)``
-in place of X. Systematic errors add their own columns: a scale, a bias per metre of either path, a
+in place of X. Systematic errors add their own columns: a scale, a bias per metre of the path, a
 time offset.
+
+Errors known so far are taken out of the poses before derivatives are taken there, and put back into
+the residuals: where noise is not small beside the motion from pose to pose, derivatives of noisy
+poses are noise themselves, and draw the answer (errors in variables).
 
 The columns rest on steps free of each increment's own noise: the mean of the steps two before and
 two after. Steps that share the noise of the residuals would be drawn towards it, and a child whose
@@ -26,44 +30,30 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import chained
-from hand_eye_calib.gls.chunks import chunks
 from hand_eye_calib.stats import median
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
-# of the child's or of the parent's path along the axes of that sensor (m/m), by how much the
-# child's stamps are late (s), the bias of the child's rates minus that of the parent's, along the
-# axes of the child (rad/s).
+# of the child's path along its axes (m/m), by how much the child's stamps are late (s), the bias of
+# the child's rates minus that of the parent's, along the axes of the child (rad/s).
 _PARAMETERS: dict[str, list[int]] = {
     "none": [],
     "scale": [0],
     "bias": [1, 2, 3],
-    "parent bias": [4, 5, 6],
-    "time": [7],
-    "rate": [8, 9, 10],
+    "time": [4],
+    "rate": [5, 6, 7],
 }
-SYSTEMATIC = (
-    "none",
-    "scale",
-    "bias",
-    "parent bias",
-    "time",
-    "scale+time",
-    "bias+time",
-    "parent bias+time",
-)
+SYSTEMATIC = ("none", "scale", "bias", "time", "scale+time", "bias+time")
 # Of streams without positions, and of those whose rotations are integrated rates.
 SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("rate+time",)
-N_SYSTEMATIC = 11
-
-# Steps count as noise until they differ from their neighbours by so many times its variance.
-_CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
+N_SYSTEMATIC = 8
 
 # Steps that vary by less than this share are alike.
 _EVEN = 0.2
 
-SCALE, TIME, RATE = 0, 7, slice(8, 11)
-_CHILD_BIASES, _PARENT_BIASES, _RATES = {1, 2, 3}, {4, 5, 6}, {8, 9, 10}
-DRIFT = sorted(_CHILD_BIASES | _PARENT_BIASES)
+# Steps count as noise until they differ from their neighbours by so many times its variance.
+_CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
+
+SCALE, BIAS, TIME, RATE = 0, slice(1, 4), 4, slice(5, 8)
 
 
 def parameters_of(systematic: str) -> list[int]:
@@ -164,14 +154,13 @@ class Course:
         Velocity (m/s, rad/s) of the child in its own frame.
     path : (N, 3) array
         Of the child, in its world, m.
-    along_c, along_p : (N, 3, 3) arrays
-        Metres travelled by child and parent times the axes in which they were travelled.
+    along : (N, 3, 3) array
+        Metres travelled by the child times the axes in which they were travelled.
     """
 
     twists: FloatArray
     path: FloatArray
-    along_c: FloatArray
-    along_p: FloatArray
+    along: FloatArray
 
     @property
     def is_uneven(self) -> bool:
@@ -180,9 +169,7 @@ class Course:
         return bool(np.std(metres) > _EVEN * np.mean(metres))
 
     def __getitem__(self, index: IntArray | slice) -> Course:
-        return Course(
-            self.twists[index], self.path[index], self.along_c[index], self.along_p[index]
-        )
+        return Course(self.twists[index], self.path[index], self.along[index])
 
 
 def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.inf) -> Course:
@@ -202,13 +189,11 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
     as_child = (chords + of_parent.raw) @ rotation
     step = Steps.of(0.5 * (of_child.raw + as_child), np.diff(streams.stamps_s)).cleaned(noise_m)
     metres_c = np.linalg.norm(of_child.cleaned(noise_m), axis=1)
-    metres_p = np.linalg.norm(of_parent.cleaned(noise_m), axis=1)
-    axes_c, axes_p = streams.Ts_cw_c[:-1, :3, :3], streams.Ts_pw_p[:-1, :3, :3]
+    axes_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
         streams.twists,
         summed(turned(axes_c, step)),
         summed(axes_c * metres_c[:, None, None]),
-        summed(axes_p * metres_p[:, None, None]),
     )
 
 
@@ -220,7 +205,7 @@ def motions(Ts_world_sensor: FloatArray) -> FloatArray:
     return moved
 
 
-def between(Ts: FloatArray, T_parent_child: FloatArray) -> FloatArray:
+def _as_child(Ts: FloatArray, T_parent_child: FloatArray) -> FloatArray:
     """Motions (n, 4, 4) of the parent as the child makes them, ``X^-1 A X``."""
     moved = (Ts.reshape(-1, 4) @ T_parent_child).reshape(Ts.shape)
     return se3.inverse(T_parent_child) @ moved
@@ -280,11 +265,6 @@ class Linearisation:
         """(n, 6) array: e."""
         return self.columns[:, :, -1]
 
-    def __getitem__(self, part: slice) -> Linearisation:
-        return Linearisation(
-            self.columns[part], self.adjoints[part], self.by_scale[part], self.metres[part]
-        )
-
     def with_columns(self, columns: FloatArray) -> Linearisation:
         """With more derivatives (n, 6, l)."""
         parts = [self.jacobian, columns, self.columns[:, :, -1:]]
@@ -297,6 +277,7 @@ def linearise(
     T_parent_child: FloatArray,
     parameters: FloatArray,
     columns: Sequence[int] = range(N_SYSTEMATIC),
+    error: FloatArray | None = None,
 ) -> Linearisation:
     """Residuals and derivatives.
 
@@ -306,81 +287,46 @@ def linearise(
     course : Course
         At the same poses.
     T_parent_child : (4, 4) array
-    parameters : (11,) array
+    parameters : (8,) array
         Of all systematic errors, see the module.
     columns : sequence of int
         Those whose derivatives are asked for.
+    error : (N, 6) array, optional
+        Errors that the poses were freed of.
     """
-    n = len(streams) - 1
-    found = Linearisation(
-        columns=np.zeros((n, 6, 6 + len(columns) + 1)),
-        adjoints=np.empty((n, 6, 6)),
-        by_scale=np.zeros((n, 6, 1)),
-        metres=np.empty(n),
-    )
-    for part in chunks(n):
-        poses = slice(part.start, part.stop + 1)
-        _linearise(streams[poses], course[poses], T_parent_child, parameters, columns, found[part])
-    return found
-
-
-def _linearise(
-    streams: Streams,
-    course: Course,
-    T_parent_child: FloatArray,
-    parameters: FloatArray,
-    columns: Sequence[int],
-    found: Linearisation,
-) -> None:
-    """Fill in the arrays of a part of the increments, whose columns and ``by_scale`` are zero."""
-    used, asked = {*columns, *np.flatnonzero(parameters).tolist()}, {*columns}
-
-    def of(kind: set[int]) -> tuple[list[int], list[int]]:
-        """Columns of the parameters of a kind that are asked for, and their axes."""
-        chosen = sorted(kind & asked)
-        return [6 + columns.index(index) for index in chosen], [i - min(kind) for i in chosen]
-
+    used = {*columns, *np.flatnonzero(parameters).tolist()}
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
-    back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
     step = turned(back_c, np.diff(course.path, axis=0))
-
     Ts_cw_c = streams.Ts_cw_c
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
-    by_child, by_parent = motions(Ts_cw_c), motions(streams.Ts_pw_p)
-    if used & _RATES:
+    by_child = motions(Ts_cw_c)
+    if used & {*_PARAMETERS["rate"]}:
         by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
         by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
     by_child[:, :3, 3] *= 1.0 + parameters[SCALE]
-    if used & _CHILD_BIASES:
-        metres_c = back_c @ np.diff(course.along_c, axis=0)
-        by_child[:, :3, 3] -= metres_c @ parameters[1:4]
-    if used & _PARENT_BIASES:
-        metres_p = back_p @ np.diff(course.along_p, axis=0)
-        by_parent[:, :3, 3] -= metres_p @ parameters[4:7]
+    if used & {*_PARAMETERS["bias"]}:
+        metres = back_c @ np.diff(course.along, axis=0)
+        by_child[:, :3, 3] -= metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
-
-    by = found.columns
+    by = np.zeros((len(step), 6, 6 + len(columns) + 1))
     np.subtract(np.eye(6), adjoints, out=by[:, :, :6])
-    found.by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
-    if SCALE in asked:
-        by[:, :, 6 + columns.index(SCALE)] = found.by_scale[:, :, 0]
-    if asked & _CHILD_BIASES:
-        at, along = of(_CHILD_BIASES)
-        by[:, :3, at] = (back[:, :3, :3] @ metres_c)[:, :, along]
-    if asked & _PARENT_BIASES:
-        at, along = of(_PARENT_BIASES)
-        axes = T_parent_child[:3, :3].T @ np.swapaxes(by_parent[:, :3, :3], 1, 2)
-        by[:, :3, at] = (-axes @ metres_p)[:, :, along]
-    if TIME in asked:
-        late = turned(adjoints, course.twists[:-1]) - course.twists[1:]
-        by[:, :, 6 + columns.index(TIME)] = late
-    if asked & _RATES:
-        at, along = of(_RATES)
-        by[:, 3:, at] = by_rate[:, :, along]
-    by[:, :, -1] = se3.log(back @ between(by_parent, T_parent_child))
-    found.adjoints[:], found.metres[:] = adjoints, np.linalg.norm(step, axis=1)
+    by_scale = np.zeros((len(step), 6, 1))
+    by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
+    for at, index in enumerate(columns, start=6):
+        if index == SCALE:
+            by[:, :, at] = by_scale[:, :, 0]
+        elif index in _PARAMETERS["bias"]:
+            by[:, :3, at] = turned(back[:, :3, :3], metres[:, :, index - BIAS.start])
+        elif index == TIME:
+            by[:, :, at] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+        else:
+            by[:, 3:, at] = by_rate[:, :, index - RATE.start]
+    by[:, :, -1] = se3.log(back @ _as_child(streams.motions_p, T_parent_child))
+    if error is not None:
+        by[:, :, -1] += error[1:] - turned(adjoints, error[:-1])
+    return Linearisation(by, adjoints, by_scale, np.linalg.norm(step, axis=1))
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
@@ -397,3 +343,38 @@ def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray
     by_rate = _by_rate_bias(rotations, np.diff(stamps_ns) * 1e-9)
     freed = chained(rotations @ se3.rotation_exp(-by_rate @ bias))
     return se3.from_rotation_translation(freed, np.zeros((len(freed), 3)))
+
+
+def freed(
+    streams: Streams,
+    white_error: FloatArray,
+    other_error: FloatArray,
+    T_parent_child: FloatArray,
+    white: tuple[FloatArray, FloatArray],
+) -> Streams:
+    """Streams without the errors c (N, 6), split between the sensors.
+
+    White errors are split by ``Ad(X^-1) a = S' (S' + S)^-1 c`` and ``b = -S (S' + S)^-1 c`` with
+    the white covariances S' of the parent and S of the child, in the child's frame: with a lever
+    arm, a translation says which of the sensors rotated. This holds for errors of these covariances
+    only. A lasting error of some centimetres beside white noise of a millimetre would be taken for
+    large and opposite rotations, so other errors are split in halves.
+
+    Parameters
+    ----------
+    streams : Streams
+    white_error, other_error : (N, 6) arrays
+    T_parent_child : (4, 4) array
+    white : ((1 or N, 6, 6) array, (1 or N, 6, 6) array)
+        Of parent and child.
+    """
+    of_parent, of_child = white
+    share = np.swapaxes(np.linalg.solve(of_parent + of_child, of_parent), 1, 2)
+    of_white = turned(share, white_error)
+    by_parent, by_child = of_white + 0.5 * other_error, of_white - white_error - 0.5 * other_error
+    to_parent = se3.adjoint(T_parent_child).T
+    return Streams(
+        streams.stamps_s,
+        streams.Ts_pw_p @ se3.exp(-by_parent @ to_parent),
+        streams.Ts_cw_c @ se3.exp(-by_child),
+    )

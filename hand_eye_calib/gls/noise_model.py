@@ -16,9 +16,8 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.increments import Linearisation, Streams
-from hand_eye_calib.gls.relinearise import SensorWhite
-from hand_eye_calib.gls.reml import Fit, Prior
-from hand_eye_calib.gls.state_space import WHITE, Group, Posterior, StateSpace
+from hand_eye_calib.gls.reml import Levels, Prior
+from hand_eye_calib.gls.state_space import WHITE, Group, StateSpace
 
 # What white rotation noise turns a trajectory about: either sensor itself, or the origin of the
 # child's or of the parent's world, as of a camera that sees a target.
@@ -48,7 +47,7 @@ _SLOWEST_SCALE = 0.02
 
 # A walk's variance over an increment, in units of a typical one: bounded, so that neither a gap nor
 # twin stamps nor a halt dominate.
-_LEAST_INTERVAL, _MOST_INTERVAL, _LEAST_METRES, _MOST_METRES = 0.1, 100.0, 0.05, 1e3
+_RELATIVE = {"time": (0.1, 100.0), "distance": (0.05, 1e3)}
 
 # Processes that last are looked for at so many time constants, from a few intervals to a share of
 # the recording, where they have this share of the white and walking noise; one is tried if a step
@@ -61,9 +60,6 @@ _AUDIBLE_WHITE, _AUDIBLE_WALK = 0.1, 1e-3
 
 # A process whose variance the data say less about than this is left out: it makes no difference.
 _LEAST_INFORMATION = 0.3
-
-# No axis has less than this share of the mean variance of white errors.
-_LEAST_SHARE = 1e-3
 
 _TRANSLATIONS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 _ROTATIONS = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
@@ -112,17 +108,12 @@ class NoiseModel:
     walk_by : {"time", "distance"}
     centre : {"sensors", "child", "parent"}
     extent : Extent
-    white : ((6, 6) array, (6, 6) array) or None
-        Covariance of white errors of translation, and of rotation with the translation that comes
-        with it, of unit variance per axis in the mean. None: the same about all axes, of both
-        sensors.
     """
 
     slow: tuple[Slow, ...]
     walk_by: str
     centre: str
     extent: Extent
-    white: tuple[FloatArray, FloatArray] | None = None
 
     def state_space(
         self,
@@ -145,15 +136,16 @@ class NoiseModel:
         weights : (N,) array
         cut : (n,) bool array
         """
-        to_child = se3.adjoint(se3.inverse(T_parent_child))
+        to_child, intervals_s = se3.adjoint(se3.inverse(T_parent_child)), np.diff(streams.stamps_s)
+        steps = intervals_s / self.extent.interval_s
+        if self.walk_by == "distance":
+            steps = linearisation.metres / self.extent.metres
         ahead, behind = self._entries(streams, linearisation, to_child)
         walk = (_TRANSLATIONS, _both_rotations(to_child))
         white = (_TRANSLATIONS[None], self._white_rotation(streams, to_child))
-        if self.white is not None:
-            white = (self.white[0][None], self.white[1][None])
         return StateSpace(
-            intervals_s=np.diff(streams.stamps_s),
-            relative=self._relative(streams, linearisation),
+            intervals_s=intervals_s,
+            relative=np.clip(steps, *_RELATIVE[self.walk_by]),
             columns=linearisation.columns,
             ahead=ahead,
             behind=behind,
@@ -164,13 +156,6 @@ class NoiseModel:
             weights=weights,
             cut=cut,
         )
-
-    def _relative(self, streams: Streams, linearisation: Linearisation) -> FloatArray:
-        if self.walk_by == "time":
-            intervals = np.diff(streams.stamps_s) / self.extent.interval_s
-            return np.clip(intervals, _LEAST_INTERVAL, _MOST_INTERVAL)
-        steps = linearisation.metres / self.extent.metres
-        return np.clip(steps, _LEAST_METRES, _MOST_METRES)
 
     def _groups(self) -> tuple[Group, ...]:
         groups, state, level = [], WHITE, N_FAST
@@ -206,9 +191,10 @@ class NoiseModel:
 
     def sensor_white(
         self, levels: FloatArray, streams: Streams, T_parent_child: FloatArray
-    ) -> SensorWhite:
-        """White errors of either sensor: half of both sensors', or all of the rotation noise of the
-        one that it turns about a world's origin.
+    ) -> tuple[FloatArray, FloatArray]:
+        """Covariances (1 or N, 6, 6) of the white errors of parent and child, in the child's frame:
+        half of both sensors', or all of the rotation noise of the one that it turns about a world's
+        origin.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         translation, rotation = np.exp(levels[[TRANSLATION, ROTATION]])
@@ -216,27 +202,11 @@ class NoiseModel:
         of_child, of_parent = half[None], (to_child @ half @ to_child.T)[None]
         if self.centre == "sensors":
             turning = 0.5 * rotation * _ROTATIONS
-            return SensorWhite(of_parent + to_child @ turning @ to_child.T, of_child + turning)
+            return of_parent + to_child @ turning @ to_child.T, of_child + turning
         turning = rotation * self._white_rotation(streams, to_child)
         if self.centre == "child":
-            return SensorWhite(of_parent, of_child + turning)
-        return SensorWhite(of_parent + turning, of_child)
-
-    def shaped(self, moments: FloatArray, levels: FloatArray) -> tuple[NoiseModel, FloatArray]:
-        """The model and log levels with white errors of these second moments (6, 6)."""
-        both, turning = moments[:3, 3:], moments[3:, 3:]
-        follows = both @ np.linalg.inv(turning)
-        of_rotation, of_translation = moments.copy(), np.zeros((6, 6))
-        of_rotation[:3, :3] = follows @ both.T
-        of_translation[:3, :3] = moments[:3, :3] - of_rotation[:3, :3]
-        variances = np.trace(of_translation) / 3.0, np.trace(turning) / 3.0
-        levels = levels.copy()
-        levels[[TRANSLATION, ROTATION]] = np.log(variances)
-        white = (
-            of_translation / variances[0] + _LEAST_SHARE * _TRANSLATIONS,
-            of_rotation / variances[1] + _LEAST_SHARE * _ROTATIONS,
-        )
-        return dataclasses.replace(self, white=white), levels
+            return of_parent, of_child + turning
+        return of_parent + turning, of_child
 
     def richer(self, slow: tuple[Slow, ...]) -> NoiseModel:
         """The same with other slow processes."""
@@ -345,7 +315,7 @@ class NoiseModel:
         start = np.concatenate([levels[:N_FAST], starts, levels[N_FAST:]])
         return tuple(chosen), start, total
 
-    def reduced(self, fit: Fit[Posterior]) -> tuple[NoiseModel, FloatArray]:
+    def reduced(self, fit: Levels) -> tuple[NoiseModel, FloatArray]:
         """The model and log levels without the slow processes that make no difference."""
         keep = [
             bool(fit.information[group.variance, group.variance] > _LEAST_INFORMATION)

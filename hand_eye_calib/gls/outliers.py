@@ -15,7 +15,6 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.block_tridiagonal import inverse_products, transposed
-from hand_eye_calib.gls.chunks import chunks
 from hand_eye_calib.gls.increments import Streams
 from hand_eye_calib.gls.reml import walk_covariance
 from hand_eye_calib.gls.state_space import WHITE, Posterior
@@ -41,9 +40,6 @@ _MOST_SPIKES = 0.3
 # Tails are heavy if the fourth moment of the white errors exceeds the square of the second by this
 # factor (4/3 for normal ones).
 _HEAVY_KURTOSIS = 1.7
-
-# If tails are heavy, a spike exceeds the level of false alarms by this factor.
-_BEYOND_TAILS = 3.0
 
 # Share of a covariance that keeps differences of covariances away from zero.
 _ROUNDING, _LEAST_VARIANCE = 1e-9, 1e-18
@@ -130,49 +126,22 @@ def _standing_out(residuals: FloatArray, limits: list[float]) -> BoolArray:
 
 def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Chi-squares of all increments (n,) and of all poses' white errors (N,)."""
-    states = posterior.restricted()
-    of_walk, of_white = np.empty(len(spikes) - 1), np.empty(len(spikes))
-    for part in chunks(len(spikes)):
-        of_walk[part] = _of_walk(posterior, states, part)
-        of_white[part] = _of_white(posterior, states, spikes, part)
+    space, levels, states = posterior.space, posterior.levels, posterior.restricted()
+    walk = posterior.restricted_walk(states)
+    of_walk = _chi_squares(
+        walk[:, :, 0],
+        space.walk_covariance(levels) * space.relative[:, None, None],
+        walk_covariance(posterior) + _squared(walk[:, :, 1:]),
+        space.cut,
+    )
+    white, weights = states[:, :WHITE], np.where(spikes, 1.0, space.weights)
+    of_white = _chi_squares(
+        white[:, :, 0],
+        space.white_covariance(levels) / weights[:, None, None],
+        posterior.precision.selected_inverse[0][:, :WHITE, :WHITE] + _squared(white[:, :, 1:]),
+        spikes,
+    )
     return of_walk, of_white
-
-
-def _of_walk(posterior: Posterior, states: FloatArray, part: slice) -> FloatArray:
-    space, walk = posterior.space, posterior.restricted_walk(states, part)
-    prior = space.walk_covariance(posterior.levels) * space.relative[part, None, None]
-    known = walk_covariance(posterior, part) + _squared(walk[:, :, 1:])
-    return _chi_squares(walk[:, :, 0], prior, known, space.cut[part])
-
-
-def spikes_beyond_tails(posterior: Posterior, spikes: BoolArray, errors: FloatArray) -> BoolArray:
-    """Spikes (N,) that stand out of heavy tails, too.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    spikes : (N,) bool array
-        Poses that are left out, and bridged.
-    errors : (N, 6) array
-        What bridging took away from them, in the child's frame.
-    """
-    states = posterior.restricted()[:, :WHITE]
-    states[:, :, 0] -= errors
-    gross = spikes.copy()
-    limit = _BEYOND_TAILS * chi_square_quantile(_FALSE_ALARMS / len(spikes))
-    for part in chunks(len(spikes)):
-        gross[part] &= _of_white(posterior, states, spikes, part) > limit
-    return gross
-
-
-def _of_white(
-    posterior: Posterior, states: FloatArray, spikes: BoolArray, part: slice
-) -> FloatArray:
-    own, spikes = states[part, :WHITE], spikes[part]
-    weights = np.where(spikes, 1.0, posterior.space.weights[part])
-    prior = posterior.space.white_covariance(posterior.levels, part) / weights[:, None, None]
-    known = posterior.selected_inverse[0][part, :WHITE, :WHITE] + _squared(own[:, :, 1:])
-    return _chi_squares(own[:, :, 0], prior, known, spikes)
 
 
 def _squared(columns: FloatArray) -> FloatArray:
@@ -254,7 +223,7 @@ def student_weights(posterior: Posterior) -> FloatArray:
     the white errors is spread over the poses in inverse proportion to their weights.
     """
     states = posterior.states_after(posterior.normal.step)[:, :WHITE]
-    pulled = (posterior.white_precision @ states[:, :, None])[:, :, 0]
+    pulled = (posterior.precision.white @ states[:, :, None])[:, :, 0]
     squares = (states * pulled).sum(axis=1)
     weights, free = posterior.space.weights, posterior.space.is_free
     kept = min(float(np.mean((weights * squares)[~free])) / 6.0, 1.0)

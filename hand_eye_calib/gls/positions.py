@@ -11,16 +11,13 @@ the axes of the other one by convention: ``X = (I, l)``.
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import noise_model, reml
-from hand_eye_calib.gls.estimator import rough_levels, sample
 from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,
     SCALE,
@@ -34,8 +31,10 @@ from hand_eye_calib.gls.increments import (
 )
 from hand_eye_calib.gls.noise_model import N_FAST, Extent, NoiseModel, Slow
 from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
-from hand_eye_calib.gls.resampling import part_products
-from hand_eye_calib.gls.state_space import Posterior, StateSpace, multiplied
+from hand_eye_calib.gls.parts import part_products
+from hand_eye_calib.gls.problem import sample
+from hand_eye_calib.gls.stages import rough_levels
+from hand_eye_calib.gls.state_space import Posterior, StateSpace
 from hand_eye_calib.results.records import Noise
 from hand_eye_calib.text import angle, length
 
@@ -82,10 +81,6 @@ _PARTS = 10
 # that of the best quarter of the recording by this factor are left out: they would hardly count,
 # and their errors last.
 _NEIGHBOURS, _USUAL, _WORSE = 11, 0.25, 16.0
-
-# Errors of odometry that are the same all the time: of the direction of travel (rad) and of the
-# scale, as in the common-mode floor.
-_PARENT_BIAS = [4, 5, 6]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -369,7 +364,7 @@ class _State:
         white[1], walk[1] = _ANY_ROTATION, _FIRST_WALK
         levels = state.model.first_levels(white, walk)[:N_FAST]
         streams = bridged(streams, state.X, worse)
-        return dataclasses.replace(state, streams=streams, levels=levels, worse=worse)
+        return replace(state, streams=streams, levels=levels, worse=worse)
 
     @property
     def X(self) -> FloatArray:
@@ -391,10 +386,10 @@ class _State:
         course = course_of(moved, self.X)
         back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
         worlds = streams.Ts_cw_c[:-1, :3, :3] @ back_p
-        return dataclasses.replace(
+        return replace(
             course,
             path=summed(turned(worlds, np.diff(course.path, axis=0))),
-            along_c=summed(worlds @ np.diff(course.along_c, axis=0)),
+            along=summed(worlds @ np.diff(course.along, axis=0)),
         )
 
     def space(
@@ -409,7 +404,7 @@ class _State:
         path = np.linalg.norm(np.diff(self.streams.Ts_pw_p[:, :3, 3], axis=0), axis=1)
         space = model.state_space(
             self.streams,
-            dataclasses.replace(linearisation, metres=path),
+            replace(linearisation, metres=path),
             course.twists,
             X,
             np.where(self.left_out, 0.0, 1.0),
@@ -423,7 +418,7 @@ class _State:
         if kept is None:
             return self.space(model)
         jumps = self.outliers.across(kept, LONGEST_GAP).jumps
-        return dataclasses.replace(
+        return replace(
             self,
             streams=self.streams[kept],
             outliers=Outliers(jumps, self.outliers.spikes[kept]),
@@ -431,9 +426,11 @@ class _State:
             worse=self.worse[kept],
         ).space(model)
 
-    def posterior(self) -> _Posterior:
+    def posterior(self) -> Posterior:
         """Of all poses."""
-        return _Posterior(self.space(), self.levels, self.lever_arm)
+        space = self.space()
+        known = _known(self.lever_arm, space.columns.shape[2])
+        return Posterior(replace(space, prior=known), self.levels)
 
     def fitted(self) -> _State:
         """With noise levels fitted, for a drift that grows with time or with the path, whichever is
@@ -442,10 +439,10 @@ class _State:
         prior = _prior(self.model, self.levels)
         fits = []
         for walk_by in ("time", "distance"):
-            model = dataclasses.replace(self.model, walk_by=walk_by)
+            model = replace(self.model, walk_by=walk_by)
             fits.append((model, reml.fit(self.sampled_space(model), self.levels, prior)))
         model, fit = min(fits, key=lambda each: each[1].loss)
-        return dataclasses.replace(self, model=model, levels=fit.levels)
+        return replace(self, model=model, levels=fit.levels)
 
     def with_lasting_error(self) -> _State:
         """With an error of the positions that lasts, if the data ask for it."""
@@ -464,37 +461,37 @@ class _State:
         before = Posterior(self.sampled_space(), levels).loss
         if before - best.loss < _LEAST_GAIN:
             return self
-        return dataclasses.replace(self, model=model, levels=best.levels)
+        return replace(self, model=model, levels=best.levels)
 
-    def with_outliers(self, posterior: _Posterior) -> _State:
+    def with_outliers(self, posterior: Posterior) -> _State:
         """With jumps, which are large steps of the walk, and positions wrong by themselves."""
         of_walk, of_white = surprises(posterior, self.left_out)
         found = judged(self.outliers, of_walk, of_white, with_spikes=True)
         boost = np.where(found.jumps, np.maximum(_JUMP_FACTOR * of_walk, self.boost), 1.0)
-        return dataclasses.replace(self, outliers=found, boost=boost)
+        return replace(self, outliers=found, boost=boost)
 
-    def with_quality(self, posterior: _Posterior) -> _State:
+    def with_quality(self, posterior: Posterior) -> _State:
         """With positions left out if those around are clearly worse than the rest."""
         states = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         path = Ts_cw_c[:, :3, 3] + turned(Ts_cw_c[:, :3, :3], states)
-        spread = posterior.selected_inverse[0][:, range(3), range(3)]
+        spread = posterior.precision.selected_inverse[0][:, range(3), range(3)]
         drift = 3.0 * float(np.exp(self.levels[noise_model.WALK_TRANSLATION]))
         worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
-        streams = dataclasses.replace(self.streams, Ts_cw_c=Ts_cw_c)
-        return dataclasses.replace(self, streams=streams, worse=worse)
+        streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
+        return replace(self, streams=streams, worse=worse)
 
-    def moved(self, posterior: _Posterior) -> _State:
+    def moved(self, posterior: Posterior) -> _State:
         """After a step, with the orientations that the positions ask for."""
         turns = posterior.states_after(posterior.normal.step)[:, _WHITE_ROTATION]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
         parameters = self.parameters.copy()
         parameters[self.columns] += posterior.normal.step[3:]
-        return dataclasses.replace(
+        return replace(
             self,
-            streams=dataclasses.replace(self.streams, Ts_cw_c=Ts_cw_c),
+            streams=replace(self.streams, Ts_cw_c=Ts_cw_c),
             lever_arm=self.lever_arm + posterior.normal.step[:3],
             parameters=parameters,
         )
@@ -512,26 +509,13 @@ def _worse(squares: FloatArray, least: float = noise_model.LOWEST_VARIANCE) -> B
     return np.asarray(around > _WORSE * usual * counts)
 
 
-class _Posterior(Posterior):
-    """A posterior that knows that no lever arm is kilometres long."""
-
-    def __init__(self, space: StateSpace, levels: FloatArray, lever_arm: FloatArray) -> None:
-        super().__init__(space, levels)
-        self._lever_arm = lever_arm
-
-    @cached_property
-    def products(self) -> FloatArray:
-        """Products of J and, last, e, weighed with V^-1, the prior among them."""
-        return super().products + self.of_prior
-
-    @property
-    def of_prior(self) -> FloatArray:
-        """What the prior adds to the products."""
-        added = np.zeros(2 * (self.space.columns.shape[2],))
-        added[:3, :3] = np.eye(3) / _LONG_M**2
-        added[:3, -1] = self._lever_arm / _LONG_M**2
-        added[-1, :3], added[-1, -1] = added[:3, -1], self._lever_arm @ added[:3, -1]
-        return added
+def _known(lever_arm: FloatArray, n_columns: int) -> FloatArray:
+    """Products (p + 1, p + 1) that say that no lever arm is kilometres long."""
+    added = np.zeros((n_columns, n_columns))
+    added[:3, :3] = np.eye(3) / _LONG_M**2
+    added[:3, -1] = added[-1, :3] = lever_arm / _LONG_M**2
+    added[-1, -1] = lever_arm @ added[:3, -1]
+    return added
 
 
 def _of_positions(space: StateSpace, X: FloatArray, boost: FloatArray) -> StateSpace:
@@ -540,7 +524,7 @@ def _of_positions(space: StateSpace, X: FloatArray, boost: FloatArray) -> StateS
     """
     to_child = se3.adjoint(se3.inverse(X))
     translation, rotation = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
-    return dataclasses.replace(
+    return replace(
         space,
         relative=space.relative * boost,
         columns=np.delete(space.columns, [3, 4, 5], axis=2),
@@ -561,11 +545,11 @@ def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
     lower[noise_model.ROTATION] = upper[noise_model.ROTATION] = _ANY_ROTATION
     lower[noise_model.WALK_ROTATION] = _LEAST_WALK
     upper[noise_model.WALK_ROTATION] = _MOST_WALK
-    return dataclasses.replace(prior, lower=lower, upper=upper)
+    return replace(prior, lower=lower, upper=upper)
 
 
 def _solution(
-    state: _State, posterior: _Posterior, converged: bool, first_scale: float
+    state: _State, posterior: Posterior, converged: bool, first_scale: float
 ) -> LeverArmSolution:
     normal = posterior.normal
     n_evidence = len(state.boost) - int(state.left_out.sum())
@@ -587,18 +571,21 @@ def _solution(
         worse=state.worse,
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
-        part_products=parts + posterior.of_prior / len(parts),
+        part_products=parts + _known(state.lever_arm, parts.shape[1]) / len(parts),
         misfit=misfit,
-        objective=0.5 * (posterior.log_determinant + normal.cost),
+        objective=0.5 * (posterior.precision.log_determinant + normal.cost),
         converged=converged,
     )
 
 
 def _by_common_errors(state: _State) -> dict[str, FloatArray]:
     """Derivatives of the lever arm by errors of the odometry that are the same all the time."""
-    space = state.space(columns=[SCALE, *_PARENT_BIAS])
-    posterior = Posterior(space, state.levels)
-    products = multiplied(space.columns, posterior.weighed(space.columns))
-    products -= multiplied(posterior.whitened, posterior.whitened)
+    motions, steps = state.streams.motions_p, state.streams.steps[0]
+    metres = np.linalg.norm(steps.cleaned(np.inf), axis=1)
+    sideways = np.zeros((len(metres), 6, 3))
+    sideways[:, :3] = -np.swapaxes(motions[:, :3, :3], 1, 2) * metres[:, None, None]
+    space = state.space(columns=[SCALE])
+    columns = np.insert(space.columns, [4], sideways, axis=2)
+    products = Posterior(replace(space, columns=columns), state.levels).products
     by: FloatArray = -np.linalg.pinv(products[:3, :3], hermitian=True) @ products[:3, 3:-1]
     return {"by_scale": by[:, 0], "by_direction": by[:, 1:]}

@@ -7,15 +7,14 @@ curvature is the average of observed and expected information (Gilmour, Thompson
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.gls.block_tridiagonal import transposed
-from hand_eye_calib.gls.state_space import WHITE, Markov, Posterior, StateSpace, multiplied
+from hand_eye_calib.gls.normal import multiplied
+from hand_eye_calib.gls.state_space import WHITE, Markov, Posterior, StateSpace
 
 # The search ends if a step promises to lower the loss by less: noise levels need no more than a few
 # per cent. Steps stay within a radius of the log levels.
@@ -45,25 +44,12 @@ class Prior:
         return self.precision * (levels - self.mean)
 
 
-class HasLoss(Protocol):
-    """What :func:`minimised` needs of a likelihood."""
-
-    levels: FloatArray
-
-    @property
-    def loss(self) -> float:
-        """Negative restricted log likelihood."""
-
-
-L = TypeVar("L", bound=HasLoss)
-
-
 @dataclass(frozen=True)
-class Fit(Generic[L]):
+class Levels:
     """Log levels, the posterior at them, and the average information (m, m)."""
 
     levels: FloatArray
-    posterior: L
+    posterior: Posterior
     information: FloatArray
     n_evaluations: int
 
@@ -73,30 +59,10 @@ class Fit(Generic[L]):
         return self.posterior.loss
 
 
-def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Fit[Posterior]:
-    """Levels of the least loss of a state space near a start."""
-    return minimised(lambda levels: Posterior(space, levels), derivatives, start, prior)
-
-
-def minimised(
-    at: Callable[[FloatArray], L],
-    derivatives: Callable[[L], tuple[FloatArray, FloatArray]],
-    start: FloatArray,
-    prior: Prior,
-) -> Fit[L]:
-    """Levels of the least loss near a start, by Newton steps within a radius.
-
-    Parameters
-    ----------
-    at : callable
-        The likelihood at log levels (m,).
-    derivatives : callable
-        Gradient (m,) and average information (m, m) of a likelihood.
-    start : (m,) array
-    prior : Prior
-    """
+def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Levels:
+    """Levels of the least loss of a state space near a start, by Newton steps within a radius."""
     levels = np.clip(start, prior.lower, prior.upper)
-    posterior, radius, n_evaluations = at(levels), _FIRST_RADIUS, 1
+    posterior, radius, n_evaluations = Posterior(space, levels), _FIRST_RADIUS, 1
     loss = posterior.loss + prior.loss(levels)
     for _ in range(_MAX_STEPS):
         gradient, information = derivatives(posterior)
@@ -108,7 +74,7 @@ def minimised(
             promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
             if np.abs(step).max() < _SETTLED_STEP or (is_newton and promised < _SETTLED_LOSS):
                 break
-            rival = _at_or_none(at, levels + step)
+            rival = _at_or_none(space, levels + step)
             n_evaluations += 1
             gain = loss - _total(rival, prior)
             if rival is not None and gain > 0.0:
@@ -123,17 +89,17 @@ def minimised(
             radius = 0.5 * float(np.abs(step).max())
         if gain < 0.5 * _SETTLED_LOSS:
             break
-    return Fit(levels, posterior, information, n_evaluations)
+    return Levels(levels, posterior, information, n_evaluations)
 
 
-def _at_or_none(at: Callable[[FloatArray], L], levels: FloatArray) -> L | None:
+def _at_or_none(space: StateSpace, levels: FloatArray) -> Posterior | None:
     try:
-        return at(levels)
+        return Posterior(space, levels)
     except np.linalg.LinAlgError:
         return None
 
 
-def _total(posterior: HasLoss | None, prior: Prior) -> float:
+def _total(posterior: Posterior | None, prior: Prior) -> float:
     if posterior is None or not np.isfinite(posterior.loss):
         return np.inf
     return posterior.loss + prior.loss(posterior.levels)
@@ -167,15 +133,18 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
         [
             _white_gradient(posterior, states[:, :WHITE]),
             _walk_gradient(posterior, walk),
-            *(_markov_gradient(posterior, process, states) for process in posterior.markov),
+            *(
+                _markov_gradient(posterior, process, states)
+                for process in posterior.precision.markov
+            ),
         ]
     )
     return gradient, _average_information(posterior, states[:, :, 0], walk[:, :, 0])
 
 
 def _white_gradient(posterior: Posterior, states: FloatArray) -> FloatArray:
-    space, precision = posterior.space, posterior.white_precision
-    covariance, _ = posterior.selected_inverse
+    space, precision = posterior.space, posterior.precision.white
+    covariance, _ = posterior.precision.selected_inverse
     moments = states @ transposed(states)
     moments += covariance[:, :WHITE, :WHITE]
     moments *= space.weights[:, None, None]
@@ -192,32 +161,22 @@ def _white_gradient(posterior: Posterior, states: FloatArray) -> FloatArray:
 
 
 def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
-    space, precision = posterior.space, posterior.walk_precision
+    space, precision = posterior.space, posterior.precision.walk
     moments = walk_covariance(posterior) + walk @ walk.transpose(0, 2, 1)
-    total = np.tensordot(posterior.evidence, moments, axes=1)
+    total = np.tensordot(posterior.precision.evidence, moments, axes=1)
     excess = (~space.cut).sum() * precision - precision @ total @ precision
     first = space.n_white
     traces = [float((excess * basis).sum()) for basis in space.walk]
     return 0.5 * np.exp(posterior.levels[first : first + len(traces)]) * traces
 
 
-def white_moments(posterior: Posterior) -> FloatArray:
-    """Mean second moments (6, 6) of the white errors, what is uncertain of them included."""
-    space, white = posterior.space, slice(0, WHITE)
-    states, counted = posterior.restricted()[:, white], ~space.is_free
-    second = posterior.selected_inverse[0][:, white, white] + states @ transposed(states)
-    weighed = second * space.weights[:, None, None]
-    return np.asarray(weighed[counted].mean(axis=0))
-
-
-def walk_covariance(posterior: Posterior, part: slice = slice(None)) -> FloatArray:
-    """Covariance (n, 6, 6) of the walk's increments, or of a part of them, for known parameters."""
-    covariance, below = posterior.selected_inverse
-    space, back = posterior.space, transposed(posterior.space.behind[part])
-    half = space.ahead_times(covariance[1:][part], part)
-    own = space.ahead_times(transposed(half), part)
-    own = own + transposed(back) @ covariance[:-1][part] @ back
-    mixed = space.ahead_times(below[part], part) @ back
+def walk_covariance(posterior: Posterior) -> FloatArray:
+    """Covariance (n, 6, 6) of the walk's increments for known parameters."""
+    covariance, below = posterior.precision.selected_inverse
+    space, back = posterior.space, transposed(posterior.space.behind)
+    half = space.ahead_times(covariance[1:])
+    own = space.ahead_times(transposed(half)) + transposed(back) @ covariance[:-1] @ back
+    mixed = space.ahead_times(below) @ back
     own -= mixed
     own -= transposed(mixed)
     return own
@@ -225,7 +184,7 @@ def walk_covariance(posterior: Posterior, part: slice = slice(None)) -> FloatArr
 
 def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) -> FloatArray:
     phi, rest, group = process.phi, process.rest, process.group.states
-    covariance, below = posterior.selected_inverse
+    covariance, below = posterior.precision.selected_inverse
     own = states[:, group]
     here = np.einsum("nii->n", covariance[:, group, group]) + np.einsum("nij,nij->n", own, own)
     ahead = np.einsum("nii->n", below[:, group, group])
@@ -249,19 +208,19 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     space = posterior.space
     variances = np.exp(posterior.levels)
     moved = np.zeros((*states.shape, len(variances)))
-    pulled = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
+    pulled = (posterior.precision.white @ states[:, :WHITE, None])[:, :, 0]
     pulled[space.is_free] = 0.0
     for index, basis in enumerate(space.white):
         moved[:, :WHITE, index] = variances[index] * (basis @ pulled[:, :, None])[:, :, 0]
     along = variances[len(space.white)] * (space.twists * pulled).sum(axis=1)
     moved[:, :WHITE, len(space.white)] = along[:, None] * space.twists
-    for process in posterior.markov:
+    for process in posterior.precision.markov:
         group = process.group
         values = states[:, group.states]
         moved[:, group.states, group.variance] = values
         moved[:, group.states, group.tau] = _by_tau(process, values)
     columns = space.observed(moved)
-    pushed = walk @ posterior.walk_precision
+    pushed = walk @ posterior.precision.walk
     for index, basis in enumerate(space.walk, start=space.n_white):
         columns[:, :, index] = variances[index] * pushed @ basis
     columns[space.cut] = 0.0

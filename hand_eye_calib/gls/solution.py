@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.gls.increments import RATE, SCALE, SYSTEMATIC, TIME
+from hand_eye_calib.gls.extras import Extras
+from hand_eye_calib.gls.increments import BIAS, RATE, SCALE, SYSTEMATIC, TIME
 from hand_eye_calib.gls.noise_model import (
     JITTER,
     N_FAST,
@@ -18,8 +19,6 @@ from hand_eye_calib.gls.noise_model import (
     WALK_TRANSLATION,
     NoiseModel,
 )
-from hand_eye_calib.gls.part_delays import PartDelay
-from hand_eye_calib.gls.world_drift import WorldDrift
 from hand_eye_calib.results.records import CorrelatedError, Noise
 from hand_eye_calib.text import angle, length
 
@@ -140,17 +139,18 @@ class AdaptiveSolution:
         Of the poses' white errors; other than 1 where tails are heavy.
     systematic : str
         Which systematic errors the data asks for, one of ``increments.SYSTEMATIC``.
-    parameters : (11,) array
+    parameters : (8,) array
         Parameters of all systematic errors, see :attr:`scale`, :attr:`biases` and
         :attr:`time_offset_s`; zero for those that are not assumed.
-    parameter_sigmas : (11,) array
+    parameter_sigmas : (8,) array
         Their standard deviations: for those not assumed, what they would be known to.
     jumps : (n,) bool array
         Increments (from pose i to i + 1) across which a trajectory jumped for good.
     spikes : (n + 1,) bool array
         Poses that are wrong by themselves, and left out.
     is_drowned : bool
-        Whether single poses are noisier than the rotation between them: only some were used.
+        Whether single poses of a camera that sees a target are noisier than the rotation between
+        them.
     heavy_tails : bool
         Whether white errors are weighed as of Student's t distribution.
     misfit : float
@@ -158,14 +158,9 @@ class AdaptiveSolution:
     metres_per_pose : float
         Path of the parent from pose to pose.
     part_products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.resampling`.
-    delays : (PartDelay, PartDelay) or None
-        Of the child's and of the parent's positions against their orientations, if they were
-        estimated.
-    clock : PartDelay or None
-        Of the child's clock, if delays were estimated and the model has none.
-    world_drift : WorldDrift or None
-        How one world moves against the other, if delays were estimated.
+        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.parts`.
+    extras : Extras or None
+        Delays and how a world moves, if they were estimated.
     objective : float
         Negative log likelihood.
     converged : bool
@@ -192,9 +187,7 @@ class AdaptiveSolution:
     converged: bool
     iterations: int
     is_drowned: bool = False
-    delays: tuple[PartDelay, PartDelay] | None = None
-    clock: PartDelay | None = None
-    world_drift: WorldDrift | None = None
+    extras: Extras | None = None
 
     @cached_property
     def noise(self) -> NoiseLevels:
@@ -212,11 +205,9 @@ class AdaptiveSolution:
         return float(self.parameter_sigmas[SCALE])
 
     @property
-    def biases(self) -> FloatArray:
-        """(2, 3) array: error of the child's and of the parent's path per metre travelled, each
-        along the axes of its sensor.
-        """
-        return self.parameters[1:7].reshape(2, 3)
+    def bias(self) -> FloatArray:
+        """(3,) array: error of the child's path per metre travelled, along its axes."""
+        return self.parameters[BIAS]
 
     @property
     def rate_bias(self) -> FloatArray:
@@ -324,16 +315,13 @@ class AdaptiveSolution:
                 f"the child's lengths are {abs(off):.2f} +/- {100 * self.scale_sigma:.2g} % "
                 f"{than} than the parent's"
             )
-        sensors = (("bias", "child"), ("parent bias", "parent"))
-        for (name, sensor), bias in zip(sensors, self.biases, strict=True):
-            if name in systematic:
-                along = ", ".join(
-                    f"{axis} {1000 * value:.2g}" for axis, value in zip("xyz", bias, strict=True)
-                )
-                said.append(
-                    f"the {sensor}'s path is off by {along} mm per metre travelled, "
-                    "along its own axes"
-                )
+        if "bias" in systematic:
+            along = ", ".join(
+                f"{axis} {1000 * value:.2g}" for axis, value in zip("xyz", self.bias, strict=True)
+            )
+            said.append(
+                f"the child's path is off by {along} mm per metre travelled, along its axes"
+            )
         if "rate" in systematic:
             bias, sigmas = np.degrees(self.rate_bias)
             told = ", ".join(

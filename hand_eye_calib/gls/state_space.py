@@ -17,17 +17,14 @@ whitened columns ``Y = L^-1 U' W Z``.
 
 from __future__ import annotations
 
-import copy
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.gls import lapack
 from hand_eye_calib.gls.block_tridiagonal import Factor, inverse_roots, squared, transposed
-from hand_eye_calib.gls.chunks import chunks
+from hand_eye_calib.gls.normal import NormalEquations, multiplied
 
 WHITE = 6
 
@@ -82,6 +79,8 @@ class StateSpace:
         Factors of the precision of each pose's white error; zero for poses that may be anywhere.
     cut : (n,) bool array
         Increments that are no evidence.
+    prior : (p + 1, p + 1) array or None
+        Products that what is known of the parameters beforehand adds.
     """
 
     intervals_s: FloatArray
@@ -95,6 +94,7 @@ class StateSpace:
     groups: tuple[Group, ...]
     weights: FloatArray
     cut: BoolArray
+    prior: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -120,14 +120,10 @@ class StateSpace:
         """Number of levels of the white errors, the first ones."""
         return len(self.white) + 1
 
-    def white_covariance(self, levels: FloatArray, part: slice = slice(None)) -> FloatArray:
-        """Covariances (N, 6, 6) of the white errors, or of a part of them, at log levels, weights
-        left out.
-        """
-        bases = tuple(basis if len(basis) == 1 else basis[part] for basis in self.white)
-        twists = self.twists[part]
-        along = np.exp(levels[len(bases)]) * twists
-        return _combined(levels, bases) + along[:, :, None] * twists[:, None, :]
+    def white_covariance(self, levels: FloatArray) -> FloatArray:
+        """Covariances (N, 6, 6) of the white errors at log levels, weights left out."""
+        along = np.exp(levels[len(self.white)]) * self.twists
+        return _combined(levels, self.white) + along[:, :, None] * self.twists[:, None, :]
 
     def white_precision(self, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Inverses (N, 6, 6) of :meth:`white_covariance`, logarithms (N,) of its determinants.
@@ -148,31 +144,24 @@ class StateSpace:
         """Covariance (6, 6) of the walk over a typical increment."""
         return _combined(levels[self.n_white :], self.walk)
 
-    def observed(self, states: FloatArray, part: slice = slice(None)) -> FloatArray:
-        """What states (N, d, k) contribute to the increments, or to a part of them, (n, 6, k)."""
-        observed = self.behind[part] @ states[:-1][part]
-        return np.subtract(self.ahead_times(states[1:][part], part), observed, out=observed)
+    def observed(self, states: FloatArray) -> FloatArray:
+        """What states (N, d, k) contribute to the increments, (n, 6, k)."""
+        observed = self.behind @ states[:-1]
+        return np.subtract(self.ahead_times(states[1:]), observed, out=observed)
 
-    def ahead_times(self, blocks: FloatArray, part: slice = slice(None)) -> FloatArray:
-        """H1 of the increments, or of a part of them, times blocks (n, d, k): (n, 6, k)."""
+    def ahead_times(self, blocks: FloatArray) -> FloatArray:
+        """H1 of the increments times blocks (n, d, k): (n, 6, k)."""
         if self.slow_ahead is None:
             return blocks[:, :WHITE]
-        return blocks[:, :WHITE] + self.slow_ahead[part] @ blocks[:, WHITE:]
+        return blocks[:, :WHITE] + self.slow_ahead @ blocks[:, WHITE:]
 
-    def gathered(self, columns: FloatArray, start: int = 0) -> FloatArray:
-        """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k); or of those of n
-        increments from one on.
-        """
-        states = np.empty((len(columns) + 1, self.n_states, columns.shape[2]))
-        states[0] = 0.0
-        for part in chunks(len(columns)):
-            own = slice(start + part.start, start + part.stop)
-            ahead = states[1:][part]
-            ahead[:, :WHITE], ahead[:, WHITE:] = columns[part], 0.0
-            if self.slow_ahead is not None:
-                slow = transposed(self.slow_ahead[own])
-                np.matmul(slow, columns[part], out=ahead[:, WHITE:])
-            states[:-1][part] -= transposed(self.behind[own]) @ columns[part]
+    def gathered(self, columns: FloatArray) -> FloatArray:
+        """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
+        states = np.zeros((len(columns) + 1, self.n_states, columns.shape[2]))
+        states[1:, :WHITE] = columns
+        if self.slow_ahead is not None:
+            states[1:, WHITE:] = transposed(self.slow_ahead) @ columns
+        states[:-1] -= transposed(self.behind) @ columns
         return states
 
 
@@ -211,19 +200,19 @@ class Markov:
     phi: FloatArray
     rest: FloatArray
 
-    def tridiagonal(self) -> tuple[FloatArray, FloatArray]:
-        """Diagonal (N,) and element beside it (n,) of the precision for unit variance."""
+    def transitions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What each increment (n,) adds to the precision for unit variance: beside the diagonal, to
+        the state before and to that behind. The first state has 1 of its own.
+        """
         inverse = 1.0 / self.rest
-        diagonal = np.empty(len(inverse) + 1)
-        diagonal[0] = 1.0
-        diagonal[1:] = inverse
-        diagonal[:-1] += self.phi**2 * inverse
-        return diagonal, -self.phi * inverse
+        return -self.phi * inverse, self.phi**2 * inverse, inverse
 
     def covariance_times(self, columns: FloatArray) -> FloatArray:
         """The covariance for unit variance times columns (N, k)."""
-        pivots, multipliers, _ = lapack.dpttrf(*self.tridiagonal())
-        return lapack.dpttrs(pivots, multipliers, columns)[0]
+        here, before, after = self.transitions()
+        diagonal = np.r_[1.0, after] + np.r_[before, 0.0]
+        factor = Factor(diagonal[:, None, None], here[:, None, None])
+        return factor.restore(factor.whiten(columns[:, None]))[:, 0]
 
 
 def markov(group: Group, levels: FloatArray, intervals_s: FloatArray) -> Markov:
@@ -233,8 +222,9 @@ def markov(group: Group, levels: FloatArray, intervals_s: FloatArray) -> Markov:
     return Markov(group, variance, ratio, np.exp(-ratio), -np.expm1(-2.0 * ratio))
 
 
-class Posterior:
-    """States and likelihood of a state space at given log levels.
+class Precision:
+    """What is known of the states of a space at log levels: all that does not depend on the columns
+    of its increments.
 
     Parameters
     ----------
@@ -250,58 +240,72 @@ class Posterior:
     """
 
     def __init__(self, space: StateSpace, levels: FloatArray) -> None:
-        self.space, self.levels = space, levels
-        self.white_precision, self._white_log_determinants = space.white_precision(levels)
+        self._space = space
+        self.white, self._white_log_determinants = space.white_precision(levels)
         walk = space.walk_covariance(levels)
-        self.walk_precision = np.linalg.inv(walk)
+        self.walk = np.linalg.inv(walk)
         self._walk_log_determinant = np.linalg.slogdet(walk)[1]
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
-        self._weights = self.evidence[:, None, None] * self.walk_precision
+        self.weights = self.evidence[:, None, None] * self.walk
         self.markov = [markov(group, levels, space.intervals_s) for group in space.groups]
-        self.factor = Factor(*self.precision())
+        diagonal, below = self.blocks()
+        diagonal[0] += self.prior_block()
+        states = range(space.n_states)
+        diagonal[:, states, states] *= 1.0 + _ROUNDING
+        self.factor = Factor(diagonal, below)
+        self.log_determinant = self._log_determinant()
 
-    def precision(self) -> tuple[FloatArray, FloatArray]:
-        """Blocks of P on the diagonal (N, d, d) and below it (n, d, d)."""
-        space, size = self.space, self.space.n_states
-        diagonal = np.zeros((len(space) + 1, size, size))
-        below = np.zeros((len(space), size, size))
-        diagonal[1:, :WHITE, :WHITE] = self._weights
-        for part in chunks(len(space)):
-            behind = space.behind[part]
-            weighed = self._weights[part] @ behind
-            np.negative(weighed, out=below[part, :WHITE])
-            self._add_slow(diagonal[1:][part], below[part], weighed, part)
-            diagonal[:-1][part] += transposed(behind) @ weighed
-        white = space.weights[:, None, None] * self.white_precision
-        white[space.is_free] = FREE * np.eye(WHITE)
-        diagonal[:, :WHITE, :WHITE] += white
+    def blocks(self, start: int = 0, end: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Blocks of P on the diagonal (m + 1, d, d) and below it (m, d, d), of the m increments
+        from pose to pose; without what is known of the first pose by itself.
+        """
+        space, size = self._space, self._space.n_states
+        part = slice(start, len(space) if end is None else end)
+        behind, weights, here = space.behind[part], self.weights[part], slice(1, None)
+        n = len(behind)
+        diagonal, below = np.zeros((n + 1, size, size)), np.zeros((n, size, size))
+        diagonal[here, :WHITE, :WHITE] = weights
+        weighed = weights @ behind
+        np.negative(weighed, out=below[:, :WHITE])
+        if space.slow_ahead is not None:
+            slow = space.slow_ahead[part]
+            beside = weights @ slow
+            diagonal[here, :WHITE, WHITE:], diagonal[here, WHITE:, :WHITE] = (
+                beside,
+                transposed(beside),
+            )
+            diagonal[here, WHITE:, WHITE:] = transposed(slow) @ beside
+            below[:, WHITE:] = transposed(slow) @ below[:, :WHITE]
+        diagonal[:-1] += transposed(behind) @ weighed
+        diagonal[here, :WHITE, :WHITE] += self._of_poses(slice(part.start + 1, part.stop + 1))
         for process in self.markov:
-            own, beside = process.tridiagonal()
             states = range(process.group.states.start, process.group.states.stop)
-            diagonal[:, states, states] += (own / process.variance)[:, None]
-            below[:, states, states] += (beside / process.variance)[:, None]
-        diagonal[:, range(size), range(size)] *= 1.0 + _ROUNDING
+            beside, before, after = (
+                each[part, None] / process.variance for each in process.transitions()
+            )
+            below[:, states, states] += beside
+            diagonal[:-1, states, states] += before
+            diagonal[1:, states, states] += after
         return diagonal, below
 
-    def _add_slow(
-        self, diagonal: FloatArray, below: FloatArray, weighed: FloatArray, part: slice
-    ) -> None:
-        """Fill in the blocks of the slow states of the poses ahead; ``weighed`` is W H0."""
-        if (slow := self.space.slow_ahead) is None:
-            return
-        beside = self._weights[part] @ slow[part]
-        diagonal[:, :WHITE, WHITE:], diagonal[:, WHITE:, :WHITE] = beside, transposed(beside)
-        diagonal[:, WHITE:, WHITE:] = transposed(slow[part]) @ beside
-        below[:, WHITE:] = transposed(slow[part]) @ np.negative(weighed)
+    def _of_poses(self, part: slice) -> FloatArray:
+        """Precisions (m, 6, 6) of the white errors of some poses."""
+        weights = self._space.weights[part, None, None]
+        white = self.white if len(self.white) == 1 else self.white[part]
+        return np.where(weights > 0.0, weights * white, FREE * np.eye(WHITE))
 
-    def weighed(self, columns: FloatArray, part: slice = slice(None)) -> FloatArray:
-        """W times columns (n, 6, k) of the increments, or of a part of them."""
-        return self._weights[part] @ columns
+    def prior_block(self) -> FloatArray:
+        """What is known of the state (d, d) of the first pose by itself."""
+        block = np.zeros((self._space.n_states,) * 2)
+        block[:WHITE, :WHITE] = self._of_poses(slice(0, 1))[0]
+        for process in self.markov:
+            states = range(process.group.states.start, process.group.states.stop)
+            block[states, states] = 1.0 / process.variance
+        return block
 
-    @cached_property
-    def log_determinant(self) -> float:
+    def _log_determinant(self) -> float:
         """log|V|, increments that are no evidence left out."""
-        space = self.space
+        space = self._space
         n_poses, kept, given = len(space) + 1, ~space.cut, ~space.is_free
         white = WHITE * np.log(np.where(given, space.weights, 1.0)) - self._white_log_determinants
         prior = float(white[given].sum()) + WHITE * np.log(FREE) * int((~given).sum())
@@ -309,12 +313,56 @@ class Posterior:
             of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
             prior -= process.group.size * of_one
         walk = kept.sum() * self._walk_log_determinant + 6 * np.log(space.relative[kept]).sum()
-        return float(walk + self.factor.log_determinant() - prior)
+        return float(walk + self.factor.log_determinant - prior)
+
+    @cached_property
+    def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
+        """Covariances of the states for known parameters: of each pose's (N, d, d), and between
+        each pose's and the one's before (n, d, d).
+        """
+        return self.factor.selected_inverse()
+
+
+class Posterior:
+    """States, parameters and likelihood of a state space at given log levels.
+
+    Parameters
+    ----------
+    space : StateSpace
+    levels : (m,) array
+        See :class:`Precision`.
+    precision : Precision, optional
+        Of the same increments with other columns.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the levels make a matrix that is not positive definite to rounding.
+    """
+
+    def __init__(
+        self, space: StateSpace, levels: FloatArray, precision: Precision | None = None
+    ) -> None:
+        self.space, self.levels = space, levels
+        self.precision = precision or Precision(space, levels)
 
     def halves(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """W Z and Y, (n, 6, k) and (N, d, k), of columns Z (n, 6, k)."""
-        weighed = self.weighed(columns)
-        return weighed, self.factor.whiten(self.space.gathered(weighed))
+        weighed = self.precision.weights @ columns
+        return weighed, self.precision.factor.whiten(self.space.gathered(weighed))
+
+    def part(self, start: int, end: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Blocks of :meth:`Precision.blocks`, forces (m + 1, d, k) of the columns and products (k,
+        k) of the increments from pose to pose.
+        """
+        here = slice(start, end)
+        space = self.space
+        columns = space.columns[here]
+        weighed = self.precision.weights[here] @ columns
+        forces = replace(space, ahead=space.ahead[here], behind=space.behind[here]).gathered(
+            weighed
+        )
+        return *self.precision.blocks(start, end), forces, multiplied(columns, weighed)
 
     @cached_property
     def _halves(self) -> tuple[FloatArray, FloatArray]:
@@ -331,7 +379,8 @@ class Posterior:
     def products(self) -> FloatArray:
         """(p + 1, p + 1) array: products of J and, last, e, weighed with V^-1."""
         products = self._halves[0] - multiplied(self.whitened, self.whitened)
-        return 0.5 * (products + products.T)
+        products = 0.5 * (products + products.T)
+        return products if self.space.prior is None else products + self.space.prior
 
     @cached_property
     def normal(self) -> NormalEquations:
@@ -343,125 +392,33 @@ class Posterior:
         """Negative restricted log likelihood, constants left out (Patterson, Thompson, Biometrika
         58, 1971).
         """
-        return 0.5 * (self.log_determinant + self.normal.cost + self.normal.log_determinant)
-
-    @cached_property
-    def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
-        """Covariances of the states for known parameters: of each pose's (N, d, d), and between
-        each pose's and the one's before (n, d, d).
-        """
-        return self.factor.selected_inverse()
+        determinants = self.precision.log_determinant + self.normal.log_determinant
+        return 0.5 * (determinants + self.normal.cost)
 
     def with_columns(self, columns: FloatArray) -> Posterior:
         """The posterior of the same increments with other columns (n, 6, k)."""
-        return self._with(dataclasses.replace(self.space, columns=columns))
+        return Posterior(replace(self.space, columns=columns), self.levels, self.precision)
 
     def with_weights(self, weights: FloatArray) -> Posterior:
         """The posterior at other weights (N,) of the white errors."""
-        other = self._with(dataclasses.replace(self.space, weights=weights))
-        other.__dict__.pop("log_determinant", None)
-        other.factor = Factor(*other.precision())
-        return other
-
-    def _with(self, space: StateSpace) -> Posterior:
-        """A copy for another space, without what depends on its columns or is large."""
-        other = copy.copy(self)
-        other.space = space
-        for name in ("_halves", "products", "normal", "loss", "selected_inverse"):
-            other.__dict__.pop(name, None)
-        return other
+        return Posterior(replace(self.space, weights=weights), self.levels)
 
     def states_after(self, step: FloatArray, columns: list[int] | None = None) -> FloatArray:
         """States (N, d) expected after a step of the parameters, or of some of them."""
         mixing = np.zeros((self.whitened.shape[2], 1))
         mixing[slice(-1) if columns is None else columns, 0] = step
         mixing[-1] = 1.0
-        return self.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
+        return self.precision.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
 
     def restricted(self) -> FloatArray:
         """States (N, d, 1 + q): expected values and, behind them, what the parameters' uncertainty
         adds, as columns whose squares sum to it.
         """
-        return self.factor.restore(_mixed(self.whitened, self.normal.mixing))
+        return self.precision.factor.restore(_mixed(self.whitened, self.normal.mixing))
 
-    def restricted_walk(self, states: FloatArray, part: slice = slice(None)) -> FloatArray:
-        """The same of the walk, or of a part of it, (n, 6, 1 + q), from all states."""
-        mixed = _mixed(self.space.columns[part], self.normal.mixing)
-        mixed -= self.space.observed(states, part)
-        return mixed
-
-
-# Information below this share of what a parameter's own diagonal promises is rounding; no diagonal
-# counts as smaller than the latter.
-_RANK_TOLERANCE, _LEAST_INFORMATION = 1e-12, float(np.finfo(float).tiny)
-
-
-class NormalEquations:
-    """Generalised least squares from products (..., p + 1, p + 1) of derivatives and, last,
-    residuals: of one system, or of several at once.
-
-    Attributes
-    ----------
-    step : (..., p) array
-        Change of the parameters; zero along directions without any evidence.
-    covariance : (..., p, p) array
-        Zero along these directions, too.
-    is_complete : (...) bool array
-        Whether there are none.
-    """
-
-    def __init__(self, products: FloatArray) -> None:
-        information, gradient = products[..., :-1, :-1], products[..., :-1, -1]
-        diagonal = np.einsum("...ii->...i", information)
-        scale = 1.0 / np.sqrt(np.maximum(diagonal, _LEAST_INFORMATION))
-        values, vectors = np.linalg.eigh(scale[..., :, None] * information * scale[..., None, :])
-        self._seen = values > _RANK_TOLERANCE
-        values = np.where(self._seen, values, 1.0)
-        self._axes = scale[..., :, None] * vectors
-        self._root = self._axes * (self._seen / np.sqrt(values))[..., None, :]
-        self.covariance = self._root @ transposed(self._root)
-        self.is_complete = self._seen.all(axis=-1)
-        self.step = -(self.covariance @ gradient[..., None])[..., 0]
-        self._costs = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
-        self._log_determinants = np.log(values).sum(axis=-1) - 2.0 * np.log(scale).sum(axis=-1)
-
-    @property
-    def cost(self) -> float:
-        """Weighted squared residual of one system after the step."""
-        return float(self._costs)
-
-    @property
-    def log_determinant(self) -> float:
-        """Of the information of one system."""
-        return float(self._log_determinants)
-
-    @property
-    def unseen(self) -> FloatArray:
-        """(p, U) array: the directions without evidence of one system, of unit length."""
-        axes = self._axes[:, ~self._seen]
-        return np.asarray(axes / np.linalg.norm(axes, axis=0))
-
-    @property
-    def mixing(self) -> FloatArray:
-        """(p + 1, 1 + p) array of one system: residuals after the step, then the columns of a root
-        of the covariance.
-        """
-        size = len(self.step)
-        mixing = np.zeros((size + 1, size + 1))
-        mixing[:-1, 0], mixing[-1, 0] = self.step, 1.0
-        mixing[:-1, 1:] = self._root
-        return mixing
-
-
-def selected(products: FloatArray, columns: list[int]) -> FloatArray:
-    """The products (..., p + 1, p + 1) of some parameters."""
-    rows = [*columns, products.shape[-1] - 1]
-    return products[..., rows, :][..., rows]
-
-
-def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Products (k, l) of columns (n, d, k) with columns (n, d, l)."""
-    return first.reshape(-1, first.shape[2]).T @ second.reshape(-1, second.shape[2])
+    def restricted_walk(self, states: FloatArray) -> FloatArray:
+        """The same of the walk, (n, 6, 1 + q), from all states."""
+        return _mixed(self.space.columns, self.normal.mixing) - self.space.observed(states)
 
 
 def _mixed(columns: FloatArray, mixing: FloatArray) -> FloatArray:

@@ -1,6 +1,5 @@
 import itertools
 import re
-import sys
 
 import numpy as np
 import pytest
@@ -8,12 +7,13 @@ from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering
 
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls import estimator, lapack
+from hand_eye_calib.gls import estimator, noise_model
 from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,
     SYSTEMATIC,
     Streams,
     course_of,
+    freed,
     linearise,
     parameters_of,
 )
@@ -25,7 +25,6 @@ from hand_eye_calib.gls.noise_model import (
     NoiseModel,
 )
 from hand_eye_calib.gls.outliers import Outliers, judged
-from hand_eye_calib.gls.relinearise import SensorWhite, corrected
 from hand_eye_calib.gls.state_space import Covariance
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofVerdict
@@ -35,11 +34,9 @@ PARAMETERS = {
     "none": np.zeros(0),
     "scale": np.array([0.03]),
     "bias": np.array([0.02, -0.01, 0.03]),
-    "parent bias": np.array([-0.02, 0.03, 0.01]),
     "time": np.array([0.02]),
     "scale+time": np.array([0.03, 0.02]),
     "bias+time": np.array([0.02, -0.01, 0.03, 0.02]),
-    "parent bias+time": np.array([-0.02, 0.03, 0.01, 0.02]),
 }
 
 
@@ -75,18 +72,7 @@ def systematic(parent, nuisance, parameters):
         child[:, :3, 3] /= 1 + parameters[0]
     elif kind == "bias":
         child = biased(child, parameters)
-    elif kind == "parent bias":
-        parent = biased(parent, parameters)
     return parent, child
-
-
-def test_lapack_is_that_of_scipy(monkeypatch):
-    from scipy.linalg import lapack as public
-
-    assert lapack.dpbtrf is public.dpbtrf
-    monkeypatch.delitem(sys.modules, "scipy.linalg._flapack")
-    monkeypatch.setattr(lapack.PathFinder, "find_spec", lambda *_: None)
-    assert lapack._load_wrapper() is public  # where the wrapper is not where it used to be
 
 
 def linearised(streams, T_parent_child=T_PARENT_CHILD, parameters=None):
@@ -141,7 +127,7 @@ def test_the_derivative_by_time_is_what_a_lag_does():
         child = child_of(smooth_poses(times_s - late_s))
         return linearised(streams_of(parent, child)).residuals
 
-    derivative = linearised(streams_of(parent, child_of(parent))).jacobian[2:-2, :, 6 + 7]
+    derivative = linearised(streams_of(parent, child_of(parent))).jacobian[2:-2, :, 6 + 4]
     # What is assumed of the stamps' lateness undoes it.
     undone = (residuals(-lag_s) - residuals(lag_s))[2:-2] / (2 * lag_s)
     # Velocities are medians: they cut the peaks, and agree everywhere else.
@@ -294,7 +280,7 @@ def test_flicker_is_stated_beyond_what_was_found(monkeypatch):
     error = sum(lasting(seed, 500, [0.004, 0.004], tau) for seed, tau in enumerate((3, 30, 300)))
     child = child_of(parent) @ se3.exp(error)
     stated = estimator.solve(stamps(500), parent, child).cov_parent_child_in_child
-    monkeypatch.setattr(estimator, "LONGEST_IN_THE_MEAN", 0.0)
+    monkeypatch.setattr(noise_model, "LONGEST_IN_THE_MEAN", 0.0)
     found = estimator.solve(stamps(500), parent, child).cov_parent_child_in_child
     longer = np.sqrt(np.diag(stated - found))
     assert (longer > 0.2e-3).all()
@@ -381,27 +367,13 @@ def test_a_lag_is_not_taken_for_a_lever():
     assert with_lag < 0.3 * without
 
 
-@pytest.mark.parametrize("slipping", ["bias", "parent bias"])
-def test_on_flat_ground_no_sideways_slip_is_assumed(slipping):
+def test_on_flat_ground_no_sideways_slip_is_assumed():
     # It could not be told from a child that is mounted askew; forwards and upwards it can.
-    parent, child = systematic(planar_poses(400), slipping, [0.0, 0.05, 0.0])
+    parent, child = systematic(planar_poses(400), "bias", [0.0, 0.05, 0.0])
     solution = estimator.solve(
         stamps(400), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3)
     )
-    np.testing.assert_array_equal(solution.parameters[[1, 2, 3, 5]], 0.0)
-
-
-def test_the_sensor_whose_path_is_off_is_named():
-    for nuisance, sensor in (("bias", "child"), ("parent bias", "parent")):
-        parent, child = systematic(wandering_poses(300), nuisance, PARAMETERS[nuisance])
-        solution = estimator.solve(
-            stamps(300), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3)
-        )
-        said = [
-            line for line in solution.describe(stamps(300))["in_words"] if "mm per metre" in line
-        ]
-        assert len(said) == 1
-        assert said[0].startswith(f"the {sensor}'s path is off by x {'-' * (sensor == 'parent')}")
+    assert solution.bias[1] == 0.0
 
 
 def test_poses_wrong_by_themselves_are_bridged():
@@ -432,33 +404,19 @@ def test_heavy_tails_leave_the_answer_near():
     assert np.median(errors) < 10.0
 
 
-def test_poses_that_heavy_tails_make_probable_are_not_left_out():
-    random, shares, errors = np.random.default_rng(6), [], []
-    for seed in range(4):
-        parent = wandering_poses(200, seed)
-        tails = np.sqrt(1.3 / random.chisquare(1.3, (2, 200, 1)))
-        noise = se3.exp(random.normal(size=(2, 200, 6)) * tails * np.repeat([0.003, 0.004], 3))
-        solution = estimator.solve(stamps(200), parent @ noise[0], child_of(parent) @ noise[1])
-        xi = se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD)
-        shares.append(np.mean(solution.spikes))
-        errors.append(xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi))
-    assert np.mean(shares) < 0.1, shares
-    assert np.median(errors) < 12.0, errors
-
-
 def test_lasting_errors_are_no_rotations():
     parent = wandering_poses(5, 1)
     streams = streams_of(parent, child_of(parent))
     to_child = se3.adjoint(se3.inverse(T_PARENT_CHILD))
     of_child = np.diag(np.repeat([1e-6, 1e-4], 3))
-    white = SensorWhite((to_child @ of_child @ to_child.T)[None], of_child[None])
+    white = (to_child @ of_child @ to_child.T)[None], of_child[None]
     error = np.tile([0.05, -0.02, 0.03, 0.0, 0.0, 0.0], (5, 1))
     none = np.zeros((5, 6))
-    freed = corrected(streams, none, error, T_PARENT_CHILD, white)
-    as_white = corrected(streams, error, none, T_PARENT_CHILD, white)
+    halved = freed(streams, none, error, T_PARENT_CHILD, white)
+    as_white = freed(streams, error, none, T_PARENT_CHILD, white)
     for given, lasting, split in zip(
         (streams.Ts_pw_p, streams.Ts_cw_c),
-        (freed.Ts_pw_p, freed.Ts_cw_c),
+        (halved.Ts_pw_p, halved.Ts_cw_c),
         (as_white.Ts_pw_p, as_white.Ts_cw_c),
         strict=True,
     ):
@@ -467,7 +425,7 @@ def test_lasting_errors_are_no_rotations():
         assert (
             se3.rotation_angle(np.swapaxes(given, 1, 2)[:, :3, :3] @ split[:, :3, :3]).min() > 0.002
         )
-    for each in (freed, as_white):
+    for each in (halved, as_white):
         moved = se3.inverse(each.Ts_pw_p) @ streams.Ts_pw_p
         by_child = se3.inverse(each.Ts_cw_c) @ streams.Ts_cw_c
         removed = se3.log(moved) @ to_child.T - se3.log(by_child)
@@ -489,15 +447,6 @@ def test_a_camera_that_sees_a_target_swings_about_it(centre):
         assert solution.noise.centre == centre
         distances.append(squared_distance(solution))
     assert 2.0 < np.median(distances) < 11.0
-
-
-def test_white_errors_get_a_covariance_of_their_own_if_they_differ_from_axis_to_axis():
-    parent, child = noisy_drive(5, n_poses=400, white=(0.002, 0.002))
-    assert estimator.solve(stamps(400), parent, child).model.white is None
-    depth = np.random.default_rng(6).normal(0.0, 0.02, 400)
-    child[:, :3, 3] += child[:, :3, 2] * depth[:, None]
-    of_translation, _ = estimator.solve(stamps(400), parent, child).model.white
-    np.testing.assert_allclose(np.diag(of_translation)[:3], [0.05, 0.05, 2.9], atol=0.1)
 
 
 @pytest.mark.parametrize(("heavy_tails", "found"), [(False, True), (True, False)])

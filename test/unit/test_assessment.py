@@ -14,7 +14,7 @@ from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
-from hand_eye_calib.gls.resampling import answers_without
+from hand_eye_calib.gls.normal import answers_without
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofVerdict

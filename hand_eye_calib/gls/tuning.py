@@ -1,0 +1,69 @@
+"""Every number that decides something in the search, with its unit and its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Numbers of the search. ``python -m reproduction.ablation`` shows what each stage gains."""
+
+    # Robust start: DNLO over this reference sees through jumps, and needs no noise levels.
+    start_reference: str = "B3"
+    # Rotation noise turns about the origin of a world if residuals seen from there are so much
+    # smaller than at the sensors.
+    decisive_centre: float = 0.7
+    # No lever arm is that long (m).
+    longest_step_m: float = 1000.0
+    # Noise levels need no more poses than this, in bursts that are spread evenly: bursts show the
+    # fast errors, the time between them the slow ones. Slow errors take more time and need fewer.
+    most_poses: int = 300
+    most_poses_lasting: int = 200
+    burst: tuple[int, ...] = (0, 1, 2, 3, 5, 8, 13, 21, 34, 55)
+    # Rounds of looking for jumps; of weighing heavy tails.
+    outlier_rounds: int = 4
+    tail_rounds: int = 3
+    # No more than this share of the poses are wrong by themselves.
+    most_spikes: float = 0.2
+    # The noise levels are fitted again only if more than this share of poses changed status.
+    negligible: float = 0.005
+    # Rotation noise this large beside the rotation between poses is not small.
+    noisy: float = 0.2
+    # Errors that last are looked for if a first step promises to lower the loss by so much, and
+    # part of the model if it is so much lower in the end: two levels each, by Akaike and more.
+    least_promise: float = 2.0
+    least_gain: float = 4.0
+    # Size of errors that last longer than those found, as a share of their variance, if there are
+    # any: flicker. A loss larger by so much leaves no chance.
+    longer_share: float = 0.5
+    no_chance: float = 100.0
+    # X is followed until it moves by less than this share of its sigma, or by so little (m, rad).
+    max_rounds: int = 6
+    settled_sigmas: float = 0.1
+    settled_step: float = 1e-9
+    # A translation whose variance is this many times that of the next one need not settle.
+    most_uneven: float = 9.0
+    # What chi-square with the degrees of freedom of the jackknife, nine, exceeds per degree once in
+    # ten times.
+    chance_of_jackknife: float = 1.63
+
+    # Systematic errors larger than this are none: a wrong unit, a clock that was not aligned, or
+    # noise. Of lengths, of a bias (m/m), s, rad/s.
+    largest: tuple[float, ...] = (0.5, 0.2, 0.2, 0.2, 0.5, 1.0, 1.0, 1.0)
+    # Nor is one assumed that can hardly be told from X, whose standard deviations would grow by
+    # this factor: on a road a child that slips sideways looks like one that is mounted askew.
+    # There such biases grow them by 4 or more, biases of the published simulations by 2 or less.
+    most_growth: float = 3.0
+    # Each parameter of a systematic error must lower the weighted squared residual by so much: one
+    # that is not there is chosen once in forty to five hundred recordings. Schwarz's criterion
+    # would ask for 7 to 10, as if every increment were evidence of errors that add up over all.
+    penalty: float = 5.0
+    # A bias along each of the three axes of the child is there, at these odds, or not: on platforms
+    # that nobody chose a likely one does harm, and drifts of 1 % and more are found all the same.
+    # Its size is Cauchy's, with the scale (m/m) that odometry has.
+    bias_scale: float = 0.01
+    bias_odds: float = 0.01
+
+
+TUNING = Tuning()
