@@ -355,7 +355,7 @@ def test_a_lag_is_not_taken_for_a_lever():
             for models in (("none",), SYSTEMATIC)
         ]
         assert answers[1].time_offset_s == pytest.approx(-0.02, abs=1e-3)
-        said = " ".join(answers[1].describe(stamps(300))["in_words"])
+        said = " ".join(answers[1].describe(stamps(300)).in_words)
         assert re.search(r"the child's stamps are (19|20|21)\.\d \+/- 0\.\d+ ms late", said)
         errors.append(
             [
@@ -386,7 +386,7 @@ def test_poses_wrong_by_themselves_are_bridged():
     np.testing.assert_array_equal(np.flatnonzero(solution.jumps), [99])
     undisturbed = estimator.solve(stamps(150), *noisy_drive(4, white=(0.002, 0.002)))
     np.testing.assert_allclose(solution.T_parent_child, undisturbed.T_parent_child, atol=2e-3)
-    said = " ".join(solution.describe(stamps(150))["in_words"])
+    said = " ".join(solution.describe(stamps(150)).in_words)
     assert (
         "5 poses wrong by themselves and left out, at 2.000, 4.100, 4.200, 8.000, 12.000 s" in said
     )

@@ -160,7 +160,7 @@ class TestWhichAnswerStands:
                 .T_parent_child[:3, 3]
                 - T_PARENT_CHILD[:3, 3]
             )
-            for poses in (given, estimation._without_biases(given, solution))
+            for poses in (given, estimation._without_bias(given, solution))
         ]
         assert off[1] < 0.2 * off[0]
 
