@@ -1,11 +1,10 @@
 """Load, soak and crashes of the node, measured.
 
-    OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [ipopt] [slow] [share] [busy] [watch]
+    OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [slow] [share] [busy] [watch]
     [monitor] [solver] [soak] [kill] [--seconds 60] [--hours 10] [--kills 20]
 
 load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages
        lost, latency of the callbacks, CPU
-ipopt  the same while CasADi + Ipopt solves
 slow   the same while every solve takes two seconds of pure Python
 share  the same with a share of a core for the node and for its solving process (cgroups v1)
 busy   the same while other programs load all cores: messages lost against messages reported lost
@@ -53,7 +52,7 @@ from hand_eye_calib.geometry import se3  # noqa: E402
 from hand_eye_calib.io.journal import read_journal  # noqa: E402
 from hand_eye_calib.io.results import load_result, save_result  # noqa: E402
 
-PARTS = ("load", "ipopt", "slow", "share", "busy", "watch", "monitor", "solver", "soak", "kill")
+PARTS = ("load", "slow", "share", "busy", "watch", "monitor", "solver", "soak", "kill")
 STREAMS = ("parent", "child")
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 START_NS = 1_700_000_000_000_000_000
@@ -381,7 +380,7 @@ def watched(folder, name, seconds, options=()):
     return [*rows, ("watch: CPU (cores), views", f"{cost:.3f}, {views}", "views > 5", views > 5)]
 
 
-def loaded_node(folder, name, seconds, backend="fast", disturb=None, more=(), **environment):
+def loaded_node(folder, name, seconds, disturb=None, more=(), **environment):
     """What the node saw of two streams at 400 Hz.
 
     Parameters
@@ -397,7 +396,6 @@ def loaded_node(folder, name, seconds, backend="fast", disturb=None, more=(), **
     options = {
         "method": "dnlo",
         "reference": "B5",
-        "backend": backend,
         "solve_period": 1.0,
         "max_pairs": 5005,
         "output_directory": folder / name,
@@ -688,7 +686,7 @@ def main(arguments):
         return publish(int(os.environ["ROS_DOMAIN_ID"]), int(arguments[1]), int(arguments[2]))
     parser = argparse.ArgumentParser(description="Load, soak and crashes of the node, measured.")
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="all by default")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of load and ipopt")
+    parser.add_argument("--seconds", type=float, default=60.0, help="length of a load")
     parser.add_argument("--hours", type=int, default=10, help="length of soak, simulated")
     parser.add_argument("--kills", type=int, default=20, help="how often to kill the node")
     parser.add_argument("--share", type=float, default=0.4, help="of a core, for share")
@@ -698,7 +696,6 @@ def main(arguments):
         folder = Path(name)
         run = {
             "load": lambda: load(loaded_node(folder, "load", options.seconds)),
-            "ipopt": lambda: load(loaded_node(folder, "ipopt", options.seconds, "ipopt")),
             "slow": lambda: load(loaded_node(folder, "slow", options.seconds, **{SLOW: "1"})),
             "share": lambda: load(
                 loaded_node(

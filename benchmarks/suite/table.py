@@ -7,7 +7,7 @@ import numpy as np
 from rich import box, table
 from rich.console import Console
 
-from suite.baseline import FLOOR, aims, ratios
+from suite.baseline import FLOOR, aims
 from suite.data import LONG, REFERENCE, SHORT
 
 _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"))
@@ -38,14 +38,6 @@ def tables(source, rows, memory):
             )
         )
     found.append(_others([row for row in rows if row.size not in sizes], memory))
-    compared = ratios(rows, memory).items()
-    found.append(
-        Table(
-            "Times faster",
-            ["ratio"],
-            [[name, f"{ratio:.3g}"] for name, ratio in compared if not name.startswith(FLOOR)],
-        )
-    )
     aimed_at = [
         [what, aim, measured, "yes" if is_met else "no"]
         for what, aim, measured, is_met in aims(rows, memory)
