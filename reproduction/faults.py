@@ -42,6 +42,7 @@ _LIMIT_Z = 3.0
 _MAX_PAIRS = 400
 
 _NO_ANSWER = "no answer"
+_SHORT = {"DO NOT USE": "no", "USE WITH CARE": "care", "USE": "use"}
 
 # Fault of a case without one, in a recording that the faults are put into, and in a clean one.
 _SOUND, _CLEAN = "none", "clean"
@@ -238,7 +239,8 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
             "drives of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), "
             "whose answer without the fault counts as the truth. z is the largest error of an axis "
             "in its stated standard deviations; z and the error are the largest of all. Findings "
-            "and verdicts are counted, the verdicts for each severity in turn.",
+            "and verdicts are counted, the verdicts for each severity in turn: `no` is DO NOT USE, "
+            "`care` USE WITH CARE.",
             _unsafe_text(faulty),
             f"Without a fault, these recordings end in {counted(f.verdict for f in sound)}; z is "
             f"at most {max((f.z for f in sound), default=0.0):.1f}.",
@@ -272,7 +274,11 @@ def _row(fault: Fault, found: Sequence[Outcome]) -> dict[str, str]:
         if not code.endswith(("gaps", "one_axis"))
     )
     verdicts = (
-        counted(one.verdict for one in found if one.key.split()[1] == str(index))
+        counted(
+            _SHORT.get(one.verdict, one.verdict)
+            for one in found
+            if one.key.split()[1] == str(index)
+        )
         for index in range(len(fault.severities))
     )
     answered = [one for one in found if math.isfinite(one.z)]

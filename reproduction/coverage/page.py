@@ -6,14 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from reproduction.coverage.classes import CLASSES
 from reproduction.coverage.measures import KINDS, POOLED, Row
 from reproduction.writing import markdown_table
 
 _COLUMNS = {
-    "simulated": ("bound", "bound_t", "bound_r", "nees", "covers", "answered", "refused"),
-    "mixed": ("bound", "bound_t", "bound_r", "nees", "covers", "answered"),
-    "levels": ("mm", "deg", "covers", "answered"),
+    "simulated": ("bound", "bound_t", "bound_r", "nees", "covers"),
+    "mixed": ("bound", "bound_t", "bound_r", "nees", "covers"),
+    "levels": ("mm", "deg", "covers"),
     "known answer": ("mm", "deg", "z", "covers", "covers_floor", "covers_truth"),
     "rig": ("scatter",),
     "parts": ("scatter",),
@@ -113,10 +112,11 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: int) -> str:
             and (row.method == methods[0] or row.name in (POOLED.get(table), "tango"))
         ]
         if chosen:
-            shown = (_shown(row, columns) for row in chosen)
+            shown = (_shown(row, columns, methods[0]) for row in chosen)
             blocks += [f"## {_TITLES[table]}", _ABOUT[table], markdown_table(shown)]
-    about = f"{seeds} recordings each; motions and noise in `reproduction/coverage/`."
-    return "\n\n".join(filter(None, [*blocks, "## The classes", about, _class_table()])) + "\n"
+    others = f" Of {', '.join(methods[1:])} the pooled rows are shown." if methods[1:] else ""
+    about = f"{seeds} recordings of each class, as `reproduction/coverage/` makes them.{others}"
+    return "\n\n".join(filter(None, [*blocks, about])) + "\n"
 
 
 def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:
@@ -134,13 +134,9 @@ def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:
     return said if goal.low <= found[name] <= goal.high else f"**{said}**"
 
 
-def _shown(row: Row, columns: Sequence[str]) -> dict[str, str]:
-    return {
-        "": row.name,
-        "method": row.method,
-        **{KINDS[kind].title: cell(row, kind) for kind in columns},
-        "CPU (s)": f"{row.seconds:.2f}",
-    }
+def _shown(row: Row, columns: Sequence[str], first: str) -> dict[str, str]:
+    name = row.name if row.method == first else f"{row.name}, {row.method}"
+    return {"": name, **{KINDS[kind].title: cell(row, kind) for kind in columns}}
 
 
 def cell(row: Row, kind: str) -> str:
@@ -151,16 +147,3 @@ def cell(row: Row, kind: str) -> str:
     if kind in _PERCENT:
         return f"{100.0 * value:.0f} %"
     return f"{value:.3f}" if kind == "deg" else f"{value:.2f}" if value < 100 else f"{value:.0f}"
-
-
-def _class_table() -> str:
-    return markdown_table(
-        {
-            "class": name,
-            "duration (s)": f"{kind.duration_s:g}",
-            "rate (Hz)": f"{kind.rate_hz:g}",
-            "lever arm (m)": f"{kind.lever_m:g}",
-            "bound": kind.bound_from,
-        }
-        for name, kind in CLASSES.items()
-    )
