@@ -4,6 +4,7 @@ The node's parameters, the options of the command line, ``config/calibrator.yaml
 the documentation are made from these dataclasses or tested against them.
 """
 
+import contextlib
 import dataclasses
 import math
 import re
@@ -44,8 +45,7 @@ def option(
     doc: str,
     *,
     unit: str = "",
-    minimum: float | None = None,
-    maximum: float | None = None,
+    within: tuple[float, float] | None = None,
     choices: tuple[str, ...] | None = None,
     pattern: str | None = None,
     form: str = "",
@@ -64,14 +64,12 @@ def option(
         One line for a person who is about to set it.
     unit
         Unit of the value, empty for none.
-    minimum, maximum
-        Bounds, both allowed values.
+    within
+        Smallest and largest allowed value.
     choices
         The allowed values.
-    pattern
-        Regular expression that the whole value must match.
-    form
-        The same in words, for messages.
+    pattern, form
+        Regular expression that the whole value must match, and the same in words.
     words
         Words that may stand for a number, such as "none".
     name
@@ -82,6 +80,7 @@ def option(
         For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
     """
     metadata = dict(locals())
+    metadata["minimum"], metadata["maximum"] = metadata.pop("within") or (None, None)
     del metadata["default"]
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -115,36 +114,21 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         If the value has the wrong type, is out of range or is not among the choices; one line that
         says what is allowed.
     """
-    meta, name = field.metadata, option_name(field)
-    if isinstance(value, str) and value in meta["words"]:
-        return value
-    kind: type = float if meta["words"] else type(field.default)
-    if meta["words"]:
-        value = _number(name, value, meta)
-    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        number = float(value)
-        if not math.isfinite(number):
-            raise ConfigError(f"{name} must be a finite number; got {number}")
-        return _in_range(name, number, meta)
-    if type(value) is not kind or not isinstance(value, bool | int | float | str):
-        raise ConfigError(f"{name} must be {_TYPE_NAMES[kind]}; got {_shown(value)}")
-    return _allowed(name, value, meta) if isinstance(value, str) else _in_range(name, value, meta)
-
-
-def _number(name: str, value: Any, meta: Mapping[str, Any]) -> float:
-    """The number that may stand in place of the words of an option."""
-    try:
-        if not isinstance(value, bool):
-            return float(value)
-    except (TypeError, ValueError):
-        pass
-    raise ConfigError(
-        f"{name} must be {' or '.join(meta['words'])} or a number; got {_shown(value)}"
-        f"{did_you_mean(str(value), meta['words'])}"
-    )
-
-
-def _in_range(name: str, value: float, meta: Mapping[str, Any]) -> float:
+    meta, name, words = field.metadata, option_name(field), field.metadata["words"]
+    kind: type = float if words else type(field.default)
+    if isinstance(value, str) and (value in words or kind is str):
+        return _checked_text(name, value, meta)
+    if words and isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            value = float(value)
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind or not isinstance(value, bool | int | float):
+        expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[kind]
+        hint = did_you_mean(str(value), words) if words else ""
+        raise ConfigError(f"{name} must be {expected}; got {_shown(value)}{hint}")
+    if not math.isfinite(value):
+        raise ConfigError(f"{name} must be a finite number; got {value}")
     unit = f" {meta['unit']}" if meta["unit"] else ""
     if meta["minimum"] is not None and value < meta["minimum"]:
         raise ConfigError(f"{name} must be at least {meta['minimum']}{unit}; got {value}")
@@ -153,7 +137,7 @@ def _in_range(name: str, value: float, meta: Mapping[str, Any]) -> float:
     return value
 
 
-def _allowed(name: str, value: str, meta: Mapping[str, Any]) -> str:
+def _checked_text(name: str, value: str, meta: Mapping[str, Any]) -> str:
     if meta["choices"] is not None and value not in meta["choices"]:
         raise ConfigError(
             f"{name} must be one of {', '.join(meta['choices'])}; got {_shown(value)}"
@@ -216,7 +200,8 @@ Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
 
 
 def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
-    """Values and standard deviations of the axes that a prior option gives.
+    """Values and standard deviations of the axes that a prior option gives: axis name to
+    (value, sigma), in m or rad; empty for an empty text.
 
     Parameters
     ----------
@@ -224,13 +209,7 @@ def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
         prior.x ... prior.yaw or prior.transform.
     text : str
         ``VALUE+/-SIGMA`` for an axis; ``X Y Z ROLL PITCH YAW +/- SIGMA_TRANSLATION SIGMA_ROTATION``
-        for the transform. Metres and radians, or with units (m, cm, mm, rad, deg). Empty for
-        none.
-
-    Returns
-    -------
-    dict
-        Axis name to (value, sigma), in m or rad.
+        for the transform. Metres and radians, or with units (m, cm, mm, rad, deg).
 
     Raises
     ------
@@ -241,7 +220,7 @@ def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
         return {}
     axis = name.removeprefix("prior.")
     axes = tuple(AXIS_UNITS) if axis == "transform" else (axis,)
-    before, plus_minus, after = text.replace("±", "+/-").partition("+/-")
+    before, plus_minus, after = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
     values, sigmas, expected = before.split(), after.split(), "VALUE+/-SIGMA"
     if axis == "transform":
         expected = "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
@@ -321,12 +300,8 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:
-    """Targets of single axes: ``z=10cm yaw=0.5deg``, metres and radians without a unit.
-
-    Returns
-    -------
-    dict
-        Axis name to standard deviation, in m or rad; empty for an empty text.
+    """Targets of single axes: ``z=10cm yaw=0.5deg``, metres and radians without a unit, as axis
+    name to standard deviation in m or rad.
 
     Raises
     ------
@@ -420,34 +395,27 @@ class CalibratorConfig(OptionSet):
         0.01,
         "DNLO: pairs with a larger cost are outliers (c of eq. 5).",
         unit="m^2",
-        minimum=1e-12,
-        maximum=1e6,
+        within=(1e-12, 1e6),
     )
     min_inlier_fraction: float = option(
         0.5,
         "DNLO: at least this share of the pairs counts as inliers (d of eq. 5 over the pairs).",
-        minimum=0.0,
-        maximum=1.0,
+        within=(0.0, 1.0),
     )
     min_pairs: int = option(
-        10,
-        "Smallest number of synchronised pose pairs to solve with.",
-        minimum=3,
-        maximum=1_000_000,
+        10, "Smallest number of synchronised pose pairs to solve with.", within=(3, 1_000_000)
     )
     max_pairs: int = option(
         5000,
         "Largest number of synchronised pose pairs kept; more are downsampled.",
-        minimum=10,
-        maximum=100_000_000,
+        within=(10, 100_000_000),
     )
     keyframe_min_translation: float = option(
         0.0,
         "Keep a pose pair if the parent sensor has moved this far since the last one kept, or "
         "rotated by keyframe.min_rotation. 0 switches this off.",
         unit="m",
-        minimum=0.0,
-        maximum=100.0,
+        within=(0.0, 100.0),
         name="keyframe.min_translation",
     )
     keyframe_min_rotation: float = option(
@@ -455,24 +423,21 @@ class CalibratorConfig(OptionSet):
         "Keep a pose pair if the parent sensor has rotated by this angle since the last one kept, "
         "or moved keyframe.min_translation. 0 switches this off.",
         unit="rad",
-        minimum=0.0,
-        maximum=math.pi,
+        within=(0.0, math.pi),
         name="keyframe.min_rotation",
     )
     keyframe_min_interval: float = option(
         0.0,
         "Smallest time between pose pairs that are kept.",
         unit="s",
-        minimum=0.0,
-        maximum=60.0,
+        within=(0.0, 60.0),
         name="keyframe.min_interval",
     )
     max_gap: float = option(
         0.5,
         "Longest time between two poses of a stream across which it is interpolated.",
         unit="s",
-        minimum=1e-3,
-        maximum=60.0,
+        within=(1e-3, 60.0),
     )
     time_offset: float | str = option(
         0.0,
@@ -480,16 +445,14 @@ class CalibratorConfig(OptionSet):
         "rates of both streams.",
         unit="s",
         words=("estimate",),
-        minimum=-1e9,
-        maximum=1e9,
+        within=(-1e9, 1e9),
     )
     scale: float | str = option(
         "none",
         "Factor from the child's lengths to metres; estimate finds it; auto finds it and uses it "
         "only if it clearly differs from 1.",
         words=("none", "auto", "estimate"),
-        minimum=1e-6,
-        maximum=1e6,
+        within=(1e-6, 1e6),
     )
     parent_measures: str = _measures("parent")
     child_measures: str = _measures("child")
@@ -511,8 +474,7 @@ class CalibratorConfig(OptionSet):
         "Standard deviation along each axis that is good enough; the verdict and the stop rule use "
         "it.",
         unit="m",
-        minimum=1e-6,
-        maximum=100.0,
+        within=(1e-6, 100.0),
         name="target.translation",
     )
     target_rotation: float = option(
@@ -520,8 +482,7 @@ class CalibratorConfig(OptionSet):
         "Standard deviation about each axis that is good enough, 0.3 deg unless set; the verdict "
         "and the stop rule use it.",
         unit="rad",
-        minimum=1e-6,
-        maximum=math.pi,
+        within=(1e-6, math.pi),
         name="target.rotation",
     )
     target_axes: str = option(
@@ -615,9 +576,7 @@ def other_names(count: int = MOST_OTHERS) -> list[str]:
 class NodeConfig(OptionSet):
     """Options that only the node has."""
 
-    solve_period: float = option(
-        2.0, "Time between solves.", unit="s", minimum=0.05, maximum=3600.0
-    )
+    solve_period: float = option(2.0, "Time between solves.", unit="s", within=(0.05, 3600.0))
     parent_type: str = option(
         "auto",
         "Message type of parent_odom; auto takes it from the publisher.",
@@ -635,8 +594,7 @@ class NodeConfig(OptionSet):
         "Number of further child sensors, with poses on child2_odom, child3_odom and so on. "
         "Whenever the result is saved, all sensors are also solved together, into rig/ of "
         "output_directory, in a process of its own.",
-        minimum=0,
-        maximum=MOST_OTHERS,
+        within=(0, MOST_OTHERS),
         read_only=True,
     )
     parent_tf: str = _tf_source("parent")

@@ -54,41 +54,36 @@ class MethodRecord:
             )
 
 
+def _of_stream(name: str) -> MethodRecord:
+    """The record of a method that uses the pose stream as a whole."""
+    return MethodRecord(
+        name=name,
+        uses_reference=False,
+        rejects_outliers=True,
+        most_poses_of_many=600,
+        most_poses_of_few=600,
+        parts=4,
+    )
+
+
+def _of_quadratic_form(name: str, rejects_outliers: bool) -> MethodRecord:
+    """The record of a method whose time hardly depends on the number of poses."""
+    return MethodRecord(
+        name=name,
+        rejects_outliers=rejects_outliers,
+        backends=BACKENDS,
+        most_poses_of_many=20_000,
+        most_poses_of_few=50_000,
+    )
+
+
 METHODS = {
     record.name: record
     for record in (
-        MethodRecord(
-            name="auto",
-            uses_reference=False,
-            rejects_outliers=True,
-            most_poses_of_many=600,
-            most_poses_of_few=600,
-            parts=4,
-        ),
-        MethodRecord(
-            name="dnlo",
-            rejects_outliers=True,
-            backends=BACKENDS,
-            most_poses_of_many=20_000,
-            most_poses_of_few=50_000,
-        ),
-        MethodRecord(
-            name="dnl",
-            backends=BACKENDS,
-            most_poses_of_many=20_000,
-            most_poses_of_few=50_000,
-        ),
-        MethodRecord(name="park"),
-        MethodRecord(name="taylor"),
-        MethodRecord(name="zhuang"),
-        MethodRecord(name="ali"),
-        MethodRecord(
-            name="adaptive",
-            uses_reference=False,
-            rejects_outliers=True,
-            most_poses_of_many=600,
-            most_poses_of_few=600,
-            parts=4,
-        ),
+        _of_stream("auto"),
+        _of_quadratic_form("dnlo", rejects_outliers=True),
+        _of_quadratic_form("dnl", rejects_outliers=False),
+        *(MethodRecord(name=name) for name in ("park", "taylor", "zhuang", "ali")),
+        _of_stream("adaptive"),
     )
 }

@@ -9,7 +9,7 @@ from hand_eye_calib.config import OptionSet, option
 def _number(
     default: float, doc: str, unit: str = "", least: float = 0.0, most: float = 10_000.0
 ) -> Any:
-    return option(default, doc, unit=unit, minimum=least, maximum=most)
+    return option(default, doc, unit=unit, within=(least, most))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +18,7 @@ class DriveConfig(OptionSet):
     trajectories.
     """
 
-    poses: int = option(100, "Number of poses of the parent sensor.", minimum=2, maximum=10_000_000)
+    poses: int = option(100, "Number of poses of the parent sensor.", within=(2, 10_000_000))
     parent_rate: float = _number(10.0, "Poses of the parent sensor per second.", "Hz", 0.01)
     child_rate: float = _number(10.0, "Poses of the child sensor per second.", "Hz", 0.01)
     child_delay: float = _number(
