@@ -3,6 +3,7 @@ with the input.
 """
 
 import dataclasses
+import functools
 import hashlib
 import io
 import json
@@ -20,6 +21,7 @@ import pytest
 import yaml
 from motions import disturbed
 
+import hand_eye_calib as hec
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.console import fail, note, silence, waiting_for, with_progress
 from hand_eye_calib.cli.main import main
@@ -69,14 +71,13 @@ def new_bag(tmp_path):
     """Writes a bag with both trajectories and returns its path."""
 
     def write(parent=None, child=None, storage="mcap", types=(ODOMETRY, ODOMETRY)):
-        good_parent, good_child = drive()
-        parent, child = (
-            good_parent if parent is None else parent,
-            good_child if child is None else child,
-        )
+        both = [
+            good if given is None else given
+            for given, good in zip((parent, child), drive(), strict=True)
+        ]
         path = tmp_path / ("drive.bag" if storage == "rosbag1" else "drive")
-        streams = {PARENT_TOPIC: (parent, types[0]), CHILD_TOPIC: (child, types[1])}
-        write_bag(path, streams, storage)
+        streams = zip((PARENT_TOPIC, CHILD_TOPIC), both, types, strict=True)
+        write_bag(path, {topic: (stream, kind) for topic, stream, kind in streams}, storage)
         return str(path)
 
     return write
@@ -125,7 +126,7 @@ def with_pose(trajectory, index, **fields):
 # ---- replay and calibrate on good input
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "rosbag1"])
+@pytest.mark.parametrize("storage", ["mcap", "rosbag1"])
 def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag, storage):
     code, out, err = run("calibrate", new_bag(storage=storage), *TOPICS, "-v")
     assert (code, err) == (0, "")
@@ -155,16 +156,6 @@ def test_json_is_one_document_on_stdout(run, new_bag):
         "first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000,
     }  # fmt: skip
     assert document["inputs"]["options"]["method"] == "dnl"
-
-
-def test_topics_may_be_left_out_where_there_are_only_two(run, new_bag):
-    code, out, err = run("replay", new_bag(), "--json")
-    assert code == 0
-    assert err == (
-        f"hand_eye_calib: note: parent is {PARENT_TOPIC}, child is {CHILD_TOPIC}; "
-        "to change that, give --parent-topic and --child-topic\n"
-    )
-    np.testing.assert_allclose(json.loads(out)["T_parent_child"]["matrix"], TRUTH, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -290,13 +281,17 @@ def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     ]
 
 
-def some_calibration(run, new_bag, tmp_path, **changes):
-    assert run("replay", new_bag(), *TOPICS, "--out", tmp_path / "result")[0] == 0
-    return dataclasses.replace(load_result(tmp_path / "result"), **changes)
+@functools.cache
+def solved():
+    return hec.calibrate(*drive())
 
 
-def test_static_transform_command_carries_the_extrinsic(run, new_bag, tmp_path):
-    calibration = some_calibration(run, new_bag, tmp_path, child_frame="left camera")
+def some_calibration(**changes):
+    return dataclasses.replace(solved(), **changes)
+
+
+def test_static_transform_command_carries_the_extrinsic():
+    calibration = some_calibration(child_frame="left camera")
     words = shlex.split(static_transform_command(calibration))
     assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
     options = dict(zip(words[4::2], words[5::2], strict=True))
@@ -308,10 +303,8 @@ def test_static_transform_command_carries_the_extrinsic(run, new_bag, tmp_path):
     )
 
 
-def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_bag, tmp_path):
-    calibration = some_calibration(
-        run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED, warnings=("look here",)
-    )
+def test_a_result_that_did_not_converge_and_warnings_are_spelled_out():
+    calibration = some_calibration(status=SolveStatus.NOT_CONVERGED, warnings=("look here",))
     text = as_text(calibration)
     assert text.startswith(
         "DO NOT USE: the solver did not converge\n  -> record more varied motion\nNote: look here\n"
@@ -322,12 +315,12 @@ def test_a_result_that_did_not_converge_and_warnings_are_spelled_out(run, new_ba
     assert "unobservable" not in text
 
 
-def test_a_solve_that_did_not_converge_fails(run, new_bag, tmp_path, monkeypatch, capsys):
+def test_a_solve_that_did_not_converge_fails(run, new_bag, monkeypatch):
     from hand_eye_calib.engine.snapshot import Snapshot
 
-    calibration = some_calibration(run, new_bag, tmp_path, status=SolveStatus.NOT_CONVERGED)
+    calibration = some_calibration(status=SolveStatus.NOT_CONVERGED)
     monkeypatch.setattr(Snapshot, "estimate", lambda self, **_: calibration)
-    code, out, err = run("replay", tmp_path / "drive", *TOPICS, "--json")
+    code, out, err = run("replay", new_bag(), *TOPICS, "--json")
     assert (code, json.loads(out)["status"]) == (1, "not_converged")
     assert err.startswith("hand_eye_calib: error: the solver did not converge")
 
@@ -335,60 +328,34 @@ def test_a_solve_that_did_not_converge_fails(run, new_bag, tmp_path, monkeypatch
 # ---- bad input: one line, exit code 1
 
 
-def test_missing_bag(refused, tmp_path):
+def child_with(**fields):
+    return {"child": dataclasses.replace(drive()[1], **fields)}
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"parent": drive(count=5)[0]}, "10 synchronised pose pairs are needed, found 5"),
+        ({"child": drive(first_ns=START_NS + 10**12)[1]}, "the streams do not overlap in time"),
+        ({"child": drive()[1][:0]}, "no poses on the child stream"),
+        (
+            child_with(sensor_frame=""),
+            f"{CHILD_TOPIC}, message 1, stamp 1700000000.000000000: the child stream's "
+            "sensor frame is empty",
+        ),
+        (child_with(sensor_frame="lidar"), "both streams name 'lidar' as their sensor frame"),
+    ],
+)
+def test_streams_that_cannot_be_used(refused, new_bag, changed, message):
+    assert message in refused("replay", new_bag(**changed), *TOPICS)
+
+
+def test_what_is_not_there_is_named_with_what_is(refused, new_bag, tmp_path):
     assert f"no bag at {tmp_path / 'absent'}" in refused("replay", tmp_path / "absent", *TOPICS)
-
-
-@pytest.mark.parametrize("storage", ["sqlite3", "rosbag1"])
-def test_a_bag_cut_in_half_says_what_is_lost(run, new_bag, storage):
-    path = Path(new_bag(storage=storage))
-    file = (
-        path if path.is_file() else next(part for part in path.iterdir() if part.suffix != ".yaml")
-    )
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    code, _, err = run("replay", path, *TOPICS)
-    assert f"cannot read bag {path}" in err if code == 1 else "recovered are" in err
-
-
-def test_missing_topic_lists_those_that_are_there(refused, new_bag):
     line = refused("replay", new_bag(), "--parent-topic", "/odom", "--child-topic", CHILD_TOPIC)
     assert "no topic /odom in " in line
-    assert (
-        f"{CHILD_TOPIC} ({ODOMETRY}, 120 messages), {PARENT_TOPIC} ({ODOMETRY}, 120 messages)"
-        in line
-    )
-
-
-def test_topic_of_a_wrong_type(refused, tmp_path):
-    from rosbags import rosbag2
-    from rosbags.typesys import Stores, get_typestore
-
-    typestore = get_typestore(Stores.ROS2_JAZZY)
-    with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
-        connection = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=typestore)
-        message = typestore.types["std_msgs/msg/String"]("hello")
-        writer.write(connection, 1, typestore.serialize_cdr(message, "std_msgs/msg/String"))
-    line = refused("replay", tmp_path / "bag", "--parent-topic", "/chatter", "--child-topic", "/b")
-    assert "topic /chatter of " in line
-    assert f"is of type std_msgs/msg/String; accepted are {ODOMETRY}, {POSE_STAMPED}" in line
-
-
-def test_too_few_poses(refused, new_bag):
-    parent, child = drive(count=5)
-    assert "10 synchronised pose pairs are needed, found 5" in refused(
-        "replay", new_bag(parent, child), *TOPICS
-    )
-
-
-def test_no_overlap_in_time(refused, new_bag):
-    line = refused("replay", new_bag(child=drive(first_ns=START_NS + 10**12)[1]), *TOPICS)
-    assert "the streams do not overlap in time" in line
-
-
-def test_no_messages_on_a_topic(refused, new_bag):
-    assert "no poses on the child stream" in refused(
-        "replay", new_bag(child=drive()[1][:0]), *TOPICS
-    )
+    topics = [f"{topic} ({ODOMETRY}, 120 messages)" for topic in (CHILD_TOPIC, PARENT_TOPIC)]
+    assert ", ".join(topics) in line
 
 
 def test_nan_is_named_with_topic_message_and_stamp(refused, new_bag):
@@ -416,22 +383,6 @@ def test_quaternion_that_is_not_of_unit_length(refused, new_bag, monkeypatch):
     assert re.search(r"message 4, stamp 1700000000\.300000000: .*quaternion.*1\.2", line)
 
 
-@pytest.mark.parametrize(
-    ("frame", "message"),
-    [
-        (
-            "",
-            f"{CHILD_TOPIC}, message 1, stamp 1700000000.000000000: the child stream's "
-            "sensor frame is empty",
-        ),
-        ("lidar", "both streams name 'lidar' as their sensor frame"),
-    ],
-)
-def test_sensor_frames_that_are_empty_or_the_same(refused, new_bag, frame, message):
-    child = dataclasses.replace(drive()[1], sensor_frame=frame)
-    assert message in refused("replay", new_bag(child=child), *TOPICS)
-
-
 def test_files_that_cannot_be_used(refused, tmp_path):
     assert "absent.txt: No such file" in refused(
         "calibrate", tmp_path / "absent.txt", tmp_path / "absent.txt"
@@ -452,9 +403,8 @@ def test_results_that_cannot_be_saved(refused, new_bag, tmp_path):
 # ---- options
 
 
-@pytest.mark.parametrize("command", ["replay", "calibrate"])
-def test_help_lists_every_option_with_its_default(run, command):
-    code, out, _ = run(command, "--help")
+def test_help_lists_every_option_with_its_default(run):
+    code, out, _ = run("calibrate", "--help")
     assert code == 0
     words = " ".join(out.partition("\nexamples:")[0].split())
     for field in dataclasses.fields(CalibratorConfig):
@@ -471,7 +421,6 @@ def test_help_lists_every_option_with_its_default(run, command):
     [
         (["--keyframe-min-translation", "0.5"], {"keyframe_min_translation": 0.5}),
         (["--time-offset", "-0.25"], {"time_offset": -0.25}),
-        (["--time-offset=-1e-3"], {"time_offset": -1e-3}),
         (["--time-offset", "-1e-3"], {"time_offset": -1e-3}),
         (
             ["--prior-z", "-1.85+/-0.02", "--prior", "yaw=-90deg+/-2deg"],
@@ -479,10 +428,7 @@ def test_help_lists_every_option_with_its_default(run, command):
         ),
         (["--scale", "2"], {"scale": 2.0}),
         (["--scale", "none"], {}),
-        (
-            ["--min-pairs", "20", "--reference", "C5", "--backend", "ipopt"],
-            {"min_pairs": 20, "reference": "C5", "backend": "ipopt"},
-        ),
+        (["--min-pairs", "20", "--reference", "C5"], {"min_pairs": 20, "reference": "C5"}),
     ],
 )
 def test_options_reach_the_engine(options, changed):
@@ -511,7 +457,6 @@ def parsed(options):
         (["check", "a.mcap", "b.mcap"], "expected one bag or two trajectory files"),
         (["info", "a", "--urdf", "b"], "--urdf needs --write"),
         (["replay", "bag", "--methd", "dnl"], "unknown option --methd; did you mean --method?"),
-        (["replay", "bag", "--meth", "dnl"], "unknown option --meth; did you mean --method?"),
         (
             ["replay", "bag", "--method", "magic"],
             "argument --method: must be one of auto, dnlo",
@@ -528,11 +473,9 @@ def parsed(options):
             ["replay", "bag", "--min-pairs", "3.5"],
             "argument --min-pairs: must be a whole number; got '3.5'",
         ),
-        (["replay", "bag", "--scale", "0"], "argument --scale: must be at least"),
         (["replay", "bag", "--reference", "D4"], "--reference: must be auto, A, B<n> such as B5"),
         (["replay", "bag", "--method", "dnlp"], "got 'dnlp'; did you mean dnl"),
         (["replay", "bag", "--scale", "non"], "did you mean none?"),
-        (["calibrate", "--methd", "dnl", "a", "b"], "unknown option --methd; did you mean"),
         (["info", "a", "b"], "unexpected argument 'b'"),
         (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
@@ -577,24 +520,10 @@ def test_config_file_plain_or_for_ros(config_file, text):
     )
 
 
-def test_the_config_file_of_the_package_holds_the_defaults(capsys):
+def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
     assert parsed(["--config", str(ROOT / "config" / "calibrator.yaml")]) == CalibratorConfig()
-    assert "only the node uses 'solve_period'" in capsys.readouterr().err
-
-
-def test_an_empty_config_file_changes_nothing(config_file):
-    assert parsed(config_file("# nothing yet\n")) == CalibratorConfig()
     assert parsed(config_file("/**: {ros__parameters: }")) == CalibratorConfig()
-
-
-def test_options_of_the_node_are_ignored_and_named(config_file, capsys):
-    config = parsed(
-        config_file("/**: {ros__parameters: {solve_period: 1.0, use_sim_time: true, method: dnl}}")
-    )
-    assert config == CalibratorConfig(method="dnl")
-    assert capsys.readouterr().err.endswith(
-        "only the node uses 'solve_period', 'use_sim_time'; ignored here\n"
-    )
+    assert "only the node uses 'solve_period'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -604,13 +533,8 @@ def test_options_of_the_node_are_ignored_and_named(config_file, capsys):
             "{methd: dnl}",
             r"config\.yaml: unknown option 'methd'; did you mean method\?; known are 'backend'",
         ),
-        (
-            "/**: {ros__parameters: {keyframe: {minimum: 1}}}",
-            r"config\.yaml: unknown option 'keyframe.minimum'",
-        ),
         ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
         ("{min_pairs: 12.5}", r"config\.yaml: 'min_pairs' must be a whole number; got 12.5"),
-        ("{method: 3}", r"config\.yaml: 'method' must be a text; got 3"),
         ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
         (
             "/slam: {ros__parameters: {a: 1}}",
@@ -631,20 +555,10 @@ def test_config_files_that_cannot_be_read(refused, config_file, tmp_path):
 # ---- the program around the commands
 
 
-def test_top_level_help_lists_all_commands_and_imports_none(run):
+def test_help_lists_all_commands(run):
     code, out, _ = run("--help")
     assert code == 0
     assert all(re.search(rf"^ +{name}\b", out, flags=re.MULTILINE) for name in cli.COMMANDS)
-    check = (
-        "import sys; from hand_eye_calib.cli.main import main\n"
-        "try: main(['--help'])\nexcept SystemExit: pass\n"
-        "print([name for name in sys.modules if name in ('numpy', 'scipy', 'yaml')], "
-        "file=sys.stderr)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", check], capture_output=True, text=True, cwd=ROOT, check=True
-    )
-    assert done.stderr == "[]\n"
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
@@ -658,15 +572,7 @@ def test_every_command_is_there_and_explains_itself(run, name):
 def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
     seen = []
     monkeypatch.setattr("hand_eye_calib.ros.node.main", lambda args: seen.append(args) or 5)
-    arguments = [
-        "--ros-args",
-        "-p",
-        "method:=dnl",
-        "--params-file",
-        "a.yaml",
-        "-r",
-        "parent_odom:=/lidar/odom",
-    ]
+    arguments = ["--ros-args", "-p", "method:=dnl", "-r", "parent_odom:=/lidar/odom"]
     assert main(["calibrator", *arguments]) == 5
     assert main(["calibrator"]) == 5
     assert seen == [arguments, []]
@@ -677,16 +583,11 @@ def test_executables_of_ros2_run_are_called_like_their_command(monkeypatch):
     monkeypatch.setattr(cli, "main", lambda argv: seen.append(argv) or 0)
     monkeypatch.setattr(sys, "argv", ["/opt/lib/hand_eye_calib/replay", "bag", "--json"])
     assert cli.named_command() == 0
-    monkeypatch.setattr(sys, "argv", ["calibrator", "--ros-args", "-p", "method:=dnl"])
-    assert cli.named_command() == 0
-    assert seen == [["replay", "bag", "--json"], ["calibrator", "--ros-args", "-p", "method:=dnl"]]
+    assert seen == [["replay", "bag", "--json"]]
 
 
-def test_a_missing_optional_package_breaks_only_its_command(
-    refused, run, new_bag, tmp_path, monkeypatch
-):
-    bag = new_bag()
-    assert run("replay", bag, *TOPICS, "--out", tmp_path / "result")[0] == 0
+def test_a_missing_optional_package_breaks_only_its_command(refused, run, tmp_path, monkeypatch):
+    hec.save(solved(), tmp_path / "result")
     monkeypatch.setitem(sys.modules, "rosbags", None)
     assert "writing bags needs rosbags, which is not installed" in refused(
         "simulate", "--out", tmp_path / "runs", "--poses", "30", "--bag", "mcap"
@@ -756,8 +657,8 @@ def test_interrupt_ends_quietly(tmp_path):
     assert (process.returncode, out, err) == (130, "", "")
 
 
-def test_a_reader_that_goes_away_is_no_error(run, new_bag, tmp_path):
-    assert run("replay", new_bag(), *TOPICS, "--out", tmp_path)[0] == 0
+def test_a_reader_that_goes_away_is_no_error(tmp_path):
+    hec.save(solved(), tmp_path)
     readable, writable = os.pipe()
     os.close(readable)
     done = subprocess.run(
@@ -770,16 +671,6 @@ def test_a_reader_that_goes_away_is_no_error(run, new_bag, tmp_path):
     )
     os.close(writable)
     assert (done.returncode, done.stderr) == (141, "")
-
-
-def test_what_takes_a_while_is_shown_on_a_terminal_and_wiped_out(monkeypatch, capsys):
-    with waiting_for("solving"):
-        assert capsys.readouterr().err == ""
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with waiting_for("solving"):
-        assert capsys.readouterr().err == "solving ..."
-    assert capsys.readouterr().err == "\r\033[K"
 
 
 class Terminal(io.StringIO):
@@ -797,10 +688,13 @@ def test_progress_is_shown_on_a_terminal_and_wiped_out(monkeypatch, capsys):
     shown = terminal.getvalue()
     assert "reading" in shown
     assert "\x1b[2K" in shown.rpartition("reading")[2]  # wiped out
-    with silence():
+    with silence(), waiting_for("nothing"):
         assert list(with_progress(range(3), 3, "reading")) == [0, 1, 2]
         note("nothing")
     assert terminal.getvalue() == shown
+    with waiting_for("solving"):
+        assert terminal.getvalue().endswith("solving ...")
+    assert terminal.getvalue().endswith("\r\033[K")
 
 
 def test_messages_name_options_as_they_are_typed(capsys):
@@ -815,9 +709,9 @@ def test_messages_name_options_as_they_are_typed(capsys):
     )
 
 
-def test_control_characters_in_names_do_not_reach_the_terminal(run, new_bag, tmp_path, capsys):
+def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
     hostile = "cam\x1b[2Jera\nStatus: ok"
-    text = as_text(some_calibration(run, new_bag, tmp_path, child_frame=hostile))
+    text = as_text(some_calibration(child_frame=hostile))
     assert "\x1b" not in text
     assert "\ncam\\x1b[2Jera\\nStatus: ok in lidar" in text
     fail(hostile, 1)
@@ -834,14 +728,10 @@ def test_help_shows_common_options_before_rare_ones_and_a_short_usage(run):
     )
 
 
-def test_near_gimbal_lock_the_rotation_vector_is_printed(run, new_bag, tmp_path):
+def test_near_gimbal_lock_the_rotation_vector_is_printed():
     T = TRUTH.copy()
     T[:3, :3] = se3.rotation_from_rpy(np.radians([20.0, 89.99, 70.0]))
-    text = as_text(
-        some_calibration(
-            run, new_bag, tmp_path, T_parent_child=T, covariance=np.diag([1e-4] * 3 + [1e-5] * 3)
-        )
-    )
+    text = as_text(some_calibration(T_parent_child=T, covariance=np.diag([1e-4] * 3 + [1e-5] * 3)))
     assert "pitch is near +/-90 deg, where roll and yaw mean nothing" in text
     assert re.search(r"^  rx +\S+ \+/- \S+ deg$", text, flags=re.MULTILINE)
 

@@ -16,7 +16,6 @@ pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE
 from hand_eye_calib.cli.present import static_transform_command
@@ -28,7 +27,6 @@ from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.report.report import render
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.finding import Finding, Severity
@@ -275,9 +273,7 @@ def test_hostile_names_stay_text():
     [
         ({"speed": 0.0, "max_yaw_rate": 0.0}, {}),  # nothing is observable
         ({"poses": 15}, {}),  # nothing to cut in parts
-        ({"poses": 300}, {"method": "adaptive"}),
-        ({"poses": 100}, {"reference": "A"}),
-        ({"poses": 100}, {"method": "park", "reference": "C5"}),
+        ({"poses": 60}, {"method": "park", "reference": "C5"}),
         (
             {"poses": 100, "terrain_height": 0.0},
             {"prior.z": "0.1+/-0.02", "scale": "estimate", "time_offset": "estimate"},
@@ -296,15 +292,6 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
     assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]
     assert "nan" not in re.findall(r"[a-z]+", page.text.lower())
     assert not re.search(r"\binf\b", page.text)
-
-
-def test_outliers_shown_are_those_the_solver_left_out():
-    snapshot, calibration = simulated(method="dnlo")
-    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs())
-    assert found.residuals.is_outlier.sum() == calibration.n_pairs - calibration.n_inliers > 0
-    cost = found.residuals.translation_m**2 + 4 * (1 - np.cos(found.residuals.rotation_rad))
-    assert cost[found.residuals.is_outlier].min() > snapshot.config.threshold
-    assert cost[~found.residuals.is_outlier].max() <= snapshot.config.threshold
 
 
 def test_evidence_ends_at_the_result_and_halves_are_halves():
@@ -330,31 +317,6 @@ def test_evidence_ends_at_the_result_and_halves_are_halves():
     assert {"dnl B1", "park B10"} <= set(labels)
     assert any(label.startswith("adaptive") for label in labels)
     assert f"{calibration.method} {calibration.reference}" not in labels
-
-
-def test_tracks_of_perfect_odometry_coincide():
-    rng = np.random.default_rng(0)
-    steps = se3.exp(
-        np.c_[np.full((80, 1), 0.1), np.zeros((80, 2)), 0.1 * rng.standard_normal((80, 3))]
-    )
-    poses = [np.eye(4)]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-    X, world = (
-        se3.exp(np.array([0.4, -0.1, 0.2, 0.3, -0.2, 1.1])),
-        se3.exp(np.array([5.0, -3.0, 1.0, 0.1, 0.4, -2.0])),
-    )
-    stamps_ns = 100_000_000 * np.arange(81)
-    parent, child = (
-        Trajectory(stamps_ns, np.array(poses)),
-        Trajectory(stamps_ns, world @ np.array(poses) @ X),
-    )
-    calibration = hec.calibrate(parent, child, parent_frame="a", child_frame="b", reference="B1")
-    config = offline_config(parent, child, {"reference": "B1"})
-    found = evidence.gather(calibration, config, synchronise(parent, child, 0.5))
-    np.testing.assert_allclose(found.tracks.child, found.tracks.parent, atol=1e-7)
-    np.testing.assert_allclose(found.residuals.translation_m, 0, atol=1e-7)
-    np.testing.assert_allclose(deviation(calibration.T_parent_child, X), 0, atol=1e-6)
 
 
 def test_long_recordings_are_downsampled(monkeypatch):
@@ -384,18 +346,8 @@ def files(tmp_path):
 
 
 def calibrate(files, out):
-    return cli.main(
-        [
-            "calibrate",
-            *files,
-            "--parent-frame",
-            "lidar",
-            "--child-frame",
-            "camera",
-            "--out",
-            str(out),
-        ]
-    )
+    names = ["--parent-frame", "lidar", "--child-frame", "camera"]
+    return cli.main(["calibrate", *files, *names, "--out", str(out)])
 
 
 def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
@@ -442,14 +394,6 @@ def test_streams_are_shown_on_one_clock_and_in_one_unit():
     assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
     holed = evidence.view_streams(drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5)
     assert [len(spans) for spans in holed.spans_s] == [1, 2]
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_both_inputs_of_one_name_are_listed(hilly):
-    snapshot, calibration, *_ = hilly
-    files = [{"file": f"/{n}/poses.txt", "bytes": n, "sha256": f"{n}" * 64} for n in (1, 2)]
-    _, page = page_of(snapshot, calibration, inputs={"files": files})
-    assert page.text.count("File poses.txt") == 2
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -519,8 +463,10 @@ def test_no_page_names_folders(hilly):
         "journal": {"directory": f"{folder}/test_report.py"},
         "parent": {"file": f"{folder}/test_report.py", "poses": 3},
         "child": {"topic": "/camera/odometry"},
+        "files": [{"file": f"/{n}/poses.txt", "bytes": n, "sha256": f"{n}" * 64} for n in (1, 2)],
     }
     _, page = page_of(snapshot, calibration, inputs=inputs)
     assert folder not in page.text
+    assert page.text.count("File poses.txt") == 2
     header = page.text[: page.text.index("Contents") if "Contents" in page.text else 600]
     assert "Parent: lidar, from test_report.py; Child: camera, from /camera/odometry." in header
