@@ -1,14 +1,17 @@
 """Parts of one recording, or several recordings? They look alike on the command line."""
 
-from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags.topics import Source
 
 # Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
 _LONGEST_PAUSE_S = 60.0
@@ -19,7 +22,7 @@ _FASTER = 2.0
 class _Part(NamedTuple):
     """The poses of one source in one of the bags."""
 
-    path: Path | str
+    path: Path
     poses: Trajectory
     # Whether another bag has the same pose at a stamp, if it is of this recording. A path is
     # corrected as it grows; positions and rates begin anew in each bag.
@@ -30,16 +33,16 @@ class _Part(NamedTuple):
 
 
 def refuse_recordings(
-    paths: Sequence[Path | str], source: Any, max_gap_s: float, measures: str = "auto"
+    bag: "PoseBag", source: "Source", max_gap_s: float, measures: str = "auto"
 ) -> None:
-    """Refuse bags that are not parts of one recording.
+    """Refuse bags that are not parts of one recording, after they were read together.
 
     Parts continue each other, hold different topics, or repeat the same poses, as two recorders do
     that run side by side.
 
     Parameters
     ----------
-    paths : sequence of path-like
+    bag : PoseBag
     source : str or TfSource
         A topic or a pair of frames.
     max_gap_s : float
@@ -52,10 +55,15 @@ def refuse_recordings(
     InputError
         If two bags are recordings of their own; the message names them and says why.
     """
-    if len(paths) < 2:
+    if len(bag.paths) < 2:
         return
-    read = (_part(path, source, measures) for path in paths)
-    parts = sorted(filter(None, read), key=lambda part: int(part.poses.stamps_ns[0]))
+    if isinstance(source, str) and bag.expected(source) is not None:
+        is_fixed = bag.measured(source, measures) == "poses"
+        read = [_Part(*each, is_fixed) for each in bag.parts(source)]
+    else:  # a path or transforms, which are put together from all bags
+        alone = (_part(path, source, measures) for path in bag.paths)
+        read = [part for part in alone if part is not None]
+    parts = sorted(read, key=lambda part: int(part.poses.stamps_ns[0]))
     differences = [
         (first, second, _overlap(first, second, max_gap_s))
         for first, second in combinations(parts, 2)
@@ -72,16 +80,14 @@ def refuse_recordings(
             )
 
 
-def _part(path: Path | str, source: Any, measures: str) -> _Part | None:
+def _part(path: Path, source: "Source", measures: str) -> _Part | None:
     """The poses of a source in one bag; None without any."""
     from hand_eye_calib.io.bags import PoseBag, trajectory_of
-    from hand_eye_calib.io.bags.messages import PATH_TYPE
 
     with PoseBag(path) as bag:
-        paths = {topic.name for topic in bag.topics() if topic.type == PATH_TYPE}
         try:
             poses, _ = trajectory_of(bag, source, measures)
-            return _Part(path, poses, poses.measures == "poses" and source not in paths)
+            return _Part(path, poses, not isinstance(source, str))
         except InputError:
             # It is no recording of its own: without the topic, or without the static transforms
             # that only a first part has. What is damaged is said when all parts are read.

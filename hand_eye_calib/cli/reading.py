@@ -302,15 +302,15 @@ def read_bags(
         measures = measures_of(bag, sources, config)
         of_streams: dict[str, Any] = {f"{stream}_measures": measures[stream] for stream in STREAMS}
         calibrator = Calibrator(dataclasses.replace(config, **of_streams))
-        with waiting_for("comparing the bags"):
-            for stream, source in sources.items():
-                refuse_recordings(paths, source, config.max_gap, measures[stream])
         blocks = bag.blocks(parent, child, config.max_gap, measures)
         with waiting_for(f"opening {bag}"):
             first = list(islice(blocks, 1))
         expected = bag.expected(parent, child)
         shown = with_progress(chain(first, blocks), expected, f"reading {bag}", len)
         found = feed(calibrator, shown, sources) + bag.n_left_out
+        with waiting_for("comparing the bags"):
+            for stream, source in sources.items():
+                refuse_recordings(bag, source, config.max_gap, measures[stream])
         warnings = list(bag.warnings)
         files = bag.files()
     if expected is not None and found != expected:

@@ -38,9 +38,9 @@ def calibrate_bag(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     with PoseBag(*arguments.paths) as bag:
         for topic in arguments.topics:
             source = TfSource.parse(topic) if ":" in topic else topic
-            refuse_recordings(arguments.paths, source, CalibratorConfig.max_gap)
             with waiting_for(f"reading {topic}"):
                 trajectory, notes = trajectory_of(bag, source)
+            refuse_recordings(bag, source, CalibratorConfig.max_gap)
             for text in notes:
                 note(text)
             add_sensor(found, trajectory.sensor_frame or topic, trajectory)

@@ -1,7 +1,6 @@
 """Text files: read within limits, and written in one step."""
 
 import os
-import secrets
 import stat
 from collections.abc import Mapping
 from pathlib import Path
@@ -94,7 +93,7 @@ def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
         If one cannot be written, with its name; what was there stays.
     """
     temporaries = {
-        path: path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}") for path in contents
+        path: path.with_name(f".{path.name[:100]}.{os.urandom(8).hex()}") for path in contents
     }
     path = Path()
     try:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.geometry.trajectory import Trajectory
 
 ObjectArray = NDArray[np.object_]
 
@@ -122,3 +123,11 @@ class PoseBlock:
         for *fields, pose, bag_ns in zip(*columns, strict=True):
             row: Any = (*fields, tuple(pose[:3]), tuple(pose[3:]), bag_ns)
             yield StampedPose(*row)
+
+    def trajectory(self) -> Trajectory:
+        """Poses of one stream in the order of stamps; of those with equal stamps the first."""
+        stamps_ns, first = np.unique(self.stamps_ns, return_index=True)
+        poses = self[first]
+        positions, quats_xyzw = poses.poses[:, :3], poses.poses[:, 3:]
+        frames = poses.sensor_frames[0] or "", poses.world_frames[0]
+        return Trajectory.from_quat_xyzw(stamps_ns, positions, quats_xyzw, *frames)

@@ -3,7 +3,6 @@
 import heapq
 from collections import defaultdict
 from collections.abc import Collection, Container, Iterator, Mapping
-from dataclasses import replace
 from itertools import chain, compress, pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -75,9 +74,10 @@ class PoseBag:
         self._watches: dict[str, PoseWatch] = {}
         self._readers: dict[str, MessageReader] = {}
         self._gaps: list[str] = []
+        self._parts: dict[tuple[str, int], list[PoseBlock]] = {}
         try:
-            for path in self.paths:
-                self._files.open(path)
+            for number, path in enumerate(self.paths):
+                self._files.open(path, number)
         except BaseException:
             self.close()
             raise
@@ -259,7 +259,7 @@ class PoseBag:
         """
         sources = {"parent": parent, "child": child}
         self._watches = {str(source): PoseWatch() for source in sources.values()}
-        self._readers = {}
+        self._readers, self._parts = {}, {}
         direct: dict[str, str] = {}
         paths, transforms = {}, {}
         for stream, source in sources.items():
@@ -299,8 +299,16 @@ class PoseBag:
                 keep &= self._watches[name].believable(first, columns.stamps_ns, part.bag_ns)
                 block = PoseBlock.of_columns(streams[name], part.numbers, columns, part.bag_ns)
                 blocks.append(self._watched(name, block[keep]))
+                if len(self.paths) > 1:
+                    self._parts.setdefault((name, part.kind.bag), []).append(blocks[-1])
                 kept_rows.append(part.rows[keep])
             yield PoseBlock.concatenate(blocks)[np.argsort(np.concatenate(kept_rows))]
+
+    def parts(self, topic: str) -> list[tuple[Path, Trajectory]]:
+        """The poses of a topic in each of several bags, after they were read."""
+        numbers = [number for name, number in sorted(self._parts) if name == topic]
+        found = [(number, PoseBlock.concatenate(self._parts[topic, number])) for number in numbers]
+        return [(self.paths[number], poses.trajectory()) for number, poses in found if len(poses)]
 
     def _watched(self, name: str, block: PoseBlock) -> PoseBlock:
         """Look at poses of a source."""
@@ -448,62 +456,3 @@ def _first_seen(
         is_known = stamps_ns[index] == new_stamps_ns
         first_ns[is_known] = bag_ns[index[is_known]]
     return first_ns
-
-
-def read_bag_trajectory(
-    path: str | Path, topic: str | None = None, tf: str | None = None, measures: str = "auto"
-) -> tuple[Trajectory, list[str]]:
-    """Read one trajectory of a bag.
-
-    Parameters
-    ----------
-    path : str or path-like
-    topic : str, optional
-    tf : str, optional
-        ``world:sensor``, instead of a topic.
-    measures : str
-        What to read of the poses, see :meth:`PoseBag.measured`.
-
-    Returns
-    -------
-    Trajectory
-        In the order of stamps; of those with equal stamps the first.
-    notes : list of str
-        What a person should know.
-
-    Raises
-    ------
-    InputError
-        If the bag or a pose cannot be read.
-    """
-    with PoseBag(path) as bag:
-        trajectory, notes = trajectory_of(bag, TfSource.parse(tf) if tf else topic or "", measures)
-        return trajectory, [*bag.warnings, *notes]
-
-
-def trajectory_of(
-    bag: PoseBag, source: Source, measures: str = "auto"
-) -> tuple[Trajectory, list[str]]:
-    """The trajectory of one source of an open bag, as :func:`read_bag_trajectory` gives it, and
-    what a person should know of it.
-    """
-    bag.check(source)
-    kind = bag.measured(source, measures)
-    notes: list[str] = []
-    blocks = list(bag.blocks(source, None, measures={"parent": measures}))
-    if not blocks:
-        raise InputError(f"no poses on {source} of {bag}")
-    poses = PoseBlock.concatenate(blocks)
-    stamps_ns, first = np.unique(poses.stamps_ns, return_index=True)
-    if len(first) < len(poses):
-        notes.append(
-            f"{source}: {len(poses) - len(first)} of {len(poses)} poses had a stamp that was there "
-            "already and were dropped"
-        )
-    if (np.diff(first) < 0).any():
-        notes.append(f"{source}: stamps were not in the order of the bag and were sorted")
-    poses = poses[first]
-    positions, quats_xyzw = poses.poses[:, :3], poses.poses[:, 3:]
-    frames = poses.sensor_frames[0] or "", poses.world_frames[0]
-    trajectory = Trajectory.from_quat_xyzw(stamps_ns, positions, quats_xyzw, *frames)
-    return replace(trajectory, measures=kind) if kind != "poses" else trajectory, notes

@@ -26,12 +26,13 @@ from hand_eye_calib.io.limits import (
 
 class MessageKind(NamedTuple):
     """What the messages of one connection have in common; encoding is "cdr" or "ros1" of what can
-    be read.
+    be read, and bag counts those that are read together.
     """
 
     topic: str
     type: str
     encoding: str
+    bag: int = 0
 
     @classmethod
     def of(cls, topic: str, message_type: str, encoding: str) -> "MessageKind":

@@ -60,6 +60,8 @@ class Storage:
         Where it is, unpacked.
     memory : ReadingMemory
         Of the whole bag.
+    number : int
+        Of the bag, of those that are read together.
 
     Attributes
     ----------
@@ -76,8 +78,8 @@ class Storage:
         If nothing in it can be read.
     """
 
-    def __init__(self, path: Path, file: Path, memory: ReadingMemory) -> None:
-        self.path, self._file, self._memory = path, file, memory
+    def __init__(self, path: Path, file: Path, memory: ReadingMemory, number: int) -> None:
+        self.path, self._file, self._memory, self._number = path, file, memory, number
         self._reader: Any = None
         self.losses: list[str] = []
         self._clear()
@@ -183,7 +185,11 @@ class Storage:
                 if _is_out_of_memory(error):
                     raise
                 self._lose(f"it is damaged ({reason_of(error)}), and was read record by record")
-        found = recovered_messages(self._file, lose)
+        own: dict[MessageKind, MessageKind] = {}
+        found = (
+            (own.setdefault(kind, kind._replace(bag=self._number)), bag_ns, data)
+            for kind, bag_ns, data in recovered_messages(self._file, lose)
+        )
         ordered = in_order(each for each in found if self._is_wanted(each[0], topics))
         if last:  # those before, and these at the last time, were given already
             end_ns = last[-1][1]
@@ -193,10 +199,9 @@ class Storage:
 
     def _indexed(self, topics: Collection[str]) -> Iterator[Message]:
         """Messages of some topics as rosbags has them."""
-        kinds = {each.id: _kind_of(each) for each in self._reader.connections}
-        wanted = [
-            each for each in self._reader.connections if self._is_wanted(kinds[each.id], topics)
-        ]
+        connections = self._reader.connections
+        kinds = {each.id: _kind_of(each)._replace(bag=self._number) for each in connections}
+        wanted = [each for each in connections if self._is_wanted(kinds[each.id], topics)]
         if not wanted:
             return
         n_missing = sum(each.msgcount for each in wanted)
@@ -338,8 +343,8 @@ class BagFiles:
         self._memory = ReadingMemory()
         self._temporary: tempfile.TemporaryDirectory[str] | None = None
 
-    def open(self, path: Path) -> None:
-        """Open the files of a bag.
+    def open(self, path: Path, number: int = 0) -> None:
+        """Open the files of a bag, the one of this number.
 
         Raises
         ------
@@ -348,7 +353,7 @@ class BagFiles:
         """
         _check_path(path)
         for file in [path] if path.is_file() else self._files_in(path):
-            self.storages.append(Storage(file, self._readable(file), self._memory))
+            self.storages.append(Storage(file, self._readable(file), self._memory, number))
             if len(self.storages) > MOST_BAG_FILES:
                 raise InputError(f"{path} has more than {MOST_BAG_FILES} files; read it in parts")
         self.storages.sort(key=lambda storage: (storage.start_ns is None, storage.start_ns or 0))

@@ -100,6 +100,12 @@ def stamped_messages(
     types: Mapping[str, Any], trajectory: Trajectory, message_type: str, is_ros1: bool
 ) -> Iterator[tuple[int, Any]]:
     """Iterate over stamps in ns and messages of a trajectory; ``types`` are rosbags' classes."""
+
+    def make(name: str, *values: Any, **more: Any) -> Any:
+        return types[f"geometry_msgs/msg/{name}"](*values, **more)
+
+    zero, no_covariance = make("Vector3", 0.0, 0.0, 0.0), np.zeros(36)
+    twist = make("TwistWithCovariance", make("Twist", zero, zero), no_covariance)
     positions = trajectory.poses[:, :3, 3].tolist()
     quats_xyzw = se3.to_quat_xyzw(trajectory.poses).tolist()
     for number, stamp_ns in enumerate(trajectory.stamps_ns.tolist()):
@@ -108,30 +114,16 @@ def stamped_messages(
             frame_id=trajectory.world_frame,
             **({"seq": number} if is_ros1 else {}),
         )
-        pose = types["geometry_msgs/msg/Pose"](
-            types["geometry_msgs/msg/Point"](*positions[number]),
-            types["geometry_msgs/msg/Quaternion"](*quats_xyzw[number]),
-        )
-        yield stamp_ns, _message(types, message_type, header, pose, trajectory.sensor_frame)
-
-
-def _message(
-    types: Mapping[str, Any], message_type: str, header: Any, pose: Any, sensor_frame: str
-) -> Any:
-    """A message of one of POSE_TYPES."""
-    make = types[message_type]
-    if message_type == "geometry_msgs/msg/PoseStamped":
-        return make(header, pose)
-    if message_type == "geometry_msgs/msg/TransformStamped":
-        position = pose.position
-        translation = types["geometry_msgs/msg/Vector3"](position.x, position.y, position.z)
-        transform = types["geometry_msgs/msg/Transform"](translation, pose.orientation)
-        return make(header, sensor_frame, transform)
-    no_covariance = np.zeros(36)
-    with_covariance = types["geometry_msgs/msg/PoseWithCovariance"](pose, no_covariance)
-    if message_type == "geometry_msgs/msg/PoseWithCovarianceStamped":
-        return make(header, with_covariance)
-    zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    twist = types["geometry_msgs/msg/Twist"](zero, zero)
-    with_twist = types["geometry_msgs/msg/TwistWithCovariance"](twist, no_covariance)
-    return make(header, sensor_frame, with_covariance, with_twist)
+        position, rotation = positions[number], make("Quaternion", *quats_xyzw[number])
+        pose: Any = make("Pose", make("Point", *position), rotation)
+        with_covariance = make("PoseWithCovariance", pose, no_covariance)
+        parts = {
+            "nav_msgs/msg/Odometry": (trajectory.sensor_frame, with_covariance, twist),
+            "geometry_msgs/msg/PoseStamped": (pose,),
+            "geometry_msgs/msg/PoseWithCovarianceStamped": (with_covariance,),
+            "geometry_msgs/msg/TransformStamped": (
+                trajectory.sensor_frame,
+                make("Transform", make("Vector3", *position), rotation),
+            ),
+        }[message_type]
+        yield stamp_ns, types[message_type](header, *parts)
