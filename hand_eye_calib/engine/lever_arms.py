@@ -18,7 +18,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import positions as lever_arm
-from hand_eye_calib.gls.positions import LeverArmSolution
+from hand_eye_calib.gls.solution import LeverArmSolution
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
 

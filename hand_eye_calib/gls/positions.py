@@ -33,10 +33,9 @@ from hand_eye_calib.gls.noise_model import N_FAST, Extent, NoiseModel, Slow
 from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
 from hand_eye_calib.gls.parts import part_products
 from hand_eye_calib.gls.problem import sample
+from hand_eye_calib.gls.solution import LeverArmSolution
 from hand_eye_calib.gls.stages import rough_levels
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
-from hand_eye_calib.results.records import Noise
-from hand_eye_calib.text import angle, length
 
 # Of the latent states.
 _WHITE_ROTATION = slice(3, 6)
@@ -81,88 +80,6 @@ _PARTS = 10
 # that of the best quarter of the recording by this factor are left out: they would hardly count,
 # and their errors last.
 _NEIGHBOURS, _USUAL, _WORSE = 11, 0.25, 16.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class LeverArmSolution:
-    """A lever arm and what it rests on.
-
-    Attributes
-    ----------
-    lever_arm : (3,) array
-        m, in the axes of the sensor with poses.
-    covariance : (3, 3) array
-        Under the model, misfit accounted for.
-    by_scale, by_direction : (3,) and (3, 3) arrays
-        Derivatives of the lever arm by the scale of the odometry, and by a sideways error of it
-        per metre travelled.
-    time_offset_s, time_offset_sigma_s, scale, scale_sigma : float
-        As of an AdaptiveSolution.
-    model, levels
-        Noise model and its log levels.
-    worse : (N,) bool array
-        Positions that are left out, for those around are far less precise than the best.
-    jumps : (n,) bool array
-    spikes : (N,) bool array
-    part_products : (K, p + 1, p + 1) array
-    misfit, objective : float
-    converged : bool
-    """
-
-    lever_arm: FloatArray
-    covariance: FloatArray
-    by_scale: FloatArray
-    by_direction: FloatArray
-    time_offset_s: float
-    time_offset_sigma_s: float
-    scale: float
-    scale_sigma: float
-    model: NoiseModel
-    levels: FloatArray
-    worse: BoolArray
-    jumps: BoolArray
-    spikes: BoolArray
-    part_products: FloatArray
-    misfit: float
-    objective: float
-    converged: bool
-
-    @property
-    def rotation_walk(self) -> float:
-        """Variance (rad^2) per axis that the drift of the odometry's rotation grows by from pose to
-        pose.
-        """
-        return float(np.exp(self.levels[noise_model.WALK_ROTATION]))
-
-    def describe(self, stamps_ns: IntArray) -> Noise:
-        """The noise in plain values and in words, as of an AdaptiveSolution."""
-        sigmas = np.exp(0.5 * self.levels)
-        white, walk = (
-            float(sigmas[level])
-            for level in (noise_model.TRANSLATION, noise_model.WALK_TRANSLATION)
-        )
-        turned = float(sigmas[noise_model.WALK_ROTATION])
-        worse = float(np.mean(self.worse))
-        said = [
-            f"each position is off by {length(white)} per axis, and the odometry drifts by "
-            f"{length(walk)} and {angle(turned)} from one to the next"
-        ]
-        if worse:
-            said.append(f"{worse:.0%} of the positions are far less precise, and are left out")
-        for what, found in (("jumps", self.jumps), ("positions wrong by themselves", self.spikes)):
-            if found.any():
-                said.append(f"{int(found.sum())} {what}")
-        return Noise(
-            translation_white_m=white,
-            translation_drift_m_per_pose=walk,
-            rotation_drift_rad_per_pose=float(np.radians(turned)),
-            drift_grows_with=self.model.walk_by,
-            share_of_worse_positions=worse,
-            jumps_before_stamp_ns=tuple(stamps_ns[1:][self.jumps].tolist()),
-            spikes_at_stamp_ns=tuple(stamps_ns[self.spikes].tolist()),
-            misfit=self.misfit,
-            in_words=tuple(said),
-        )
 
 
 def solve(

@@ -1,4 +1,6 @@
-"""The adaptive estimator's answer, and what it says in words about the noise it found."""
+"""The answers of the core, for poses and for positions, and what they say in words about the noise
+found.
+"""
 
 from __future__ import annotations
 
@@ -336,6 +338,85 @@ class AdaptiveSolution:
                 f"{1000 * self.time_offset_sigma_s:.2g} ms {'early' if offset_ms > 0 else 'late'}"
             )
         return said
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeverArmSolution:
+    """A lever arm and what it rests on.
+
+    Attributes
+    ----------
+    lever_arm : (3,) array
+        m, in the axes of the sensor with poses.
+    covariance : (3, 3) array
+        Under the model, misfit accounted for.
+    by_scale, by_direction : (3,) and (3, 3) arrays
+        Derivatives of the lever arm by the scale of the odometry, and by a sideways error of it
+        per metre travelled.
+    time_offset_s, time_offset_sigma_s, scale, scale_sigma : float
+        As of an AdaptiveSolution.
+    model, levels
+        Noise model and its log levels.
+    worse : (N,) bool array
+        Positions that are left out, for those around are far less precise than the best.
+    jumps : (n,) bool array
+    spikes : (N,) bool array
+    part_products : (K, p + 1, p + 1) array
+    misfit, objective : float
+    converged : bool
+    """
+
+    lever_arm: FloatArray
+    covariance: FloatArray
+    by_scale: FloatArray
+    by_direction: FloatArray
+    time_offset_s: float
+    time_offset_sigma_s: float
+    scale: float
+    scale_sigma: float
+    model: NoiseModel
+    levels: FloatArray
+    worse: BoolArray
+    jumps: BoolArray
+    spikes: BoolArray
+    part_products: FloatArray
+    misfit: float
+    objective: float
+    converged: bool
+
+    @property
+    def rotation_walk(self) -> float:
+        """Variance (rad^2) per axis that the drift of the odometry's rotation grows by from pose to
+        pose.
+        """
+        return float(np.exp(self.levels[WALK_ROTATION]))
+
+    def describe(self, stamps_ns: IntArray) -> Noise:
+        """The noise in plain values and in words, as of an AdaptiveSolution."""
+        sigmas = np.exp(0.5 * self.levels)
+        white, walk = (float(sigmas[level]) for level in (TRANSLATION, WALK_TRANSLATION))
+        turned = float(sigmas[WALK_ROTATION])
+        worse = float(np.mean(self.worse))
+        said = [
+            f"each position is off by {length(white)} per axis, and the odometry drifts by "
+            f"{length(walk)} and {angle(turned)} from one to the next"
+        ]
+        if worse:
+            said.append(f"{worse:.0%} of the positions are far less precise, and are left out")
+        for what, found in (("jumps", self.jumps), ("positions wrong by themselves", self.spikes)):
+            if found.any():
+                said.append(f"{int(found.sum())} {what}")
+        return Noise(
+            translation_white_m=white,
+            translation_drift_m_per_pose=walk,
+            rotation_drift_rad_per_pose=float(np.radians(turned)),
+            drift_grows_with=self.model.walk_by,
+            share_of_worse_positions=worse,
+            jumps_before_stamp_ns=tuple(stamps_ns[1:][self.jumps].tolist()),
+            spikes_at_stamp_ns=tuple(stamps_ns[self.spikes].tolist()),
+            misfit=self.misfit,
+            in_words=tuple(said),
+        )
 
 
 def _slow_in_words(slow: SlowNoise) -> str:

@@ -1,0 +1,201 @@
+"""``python -m reproduction.ablation``: what each part of the adaptive estimator gains, by families
+of recordings: with each part switched off in turn, the error over that of the whole estimator.
+
+The simulated platforms, their noise and their seeds are drawn anew at every run, so that nobody can
+tune to them. A part earns its place if families that it was not made for are better with it.
+"""
+
+import dataclasses
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.alignment.scale import child_scaled, settle_scale
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator
+from hand_eye_calib.gls.increments import SYSTEMATIC
+from hand_eye_calib.gls.tuning import TUNING
+from hand_eye_calib.pairing.synchronise import PosePairs
+from reproduction.coverage.classes import simulate
+from reproduction.coverage.mixed import MIXED, drawn_class
+from reproduction.recordings import Rig, real_rigs
+from reproduction.writing import markdown_table, show, study_parser
+
+# Families of rigs by the beginnings of their names; the others are families of their own.
+_FAMILIES = ("kitti", "euroc", "zxl19", "tango")
+
+# Errors (m, rad) below this are rounding: noise-free recordings tell nothing.
+_ROUNDING = 1e-6
+
+# A recording that a variant cannot solve counts as that many times as far off.
+_FAILED = 3.0
+
+
+def _only(*parts: str) -> dict[str, Any]:
+    """Models of systematic errors that have these parts alone."""
+    return {"systematic": [each for each in SYSTEMATIC if {*each.split("+")} <= {"none", *parts}]}
+
+
+def _with(**numbers: object) -> dict[str, Any]:
+    """Other numbers of the search."""
+    return {"tuning": dataclasses.replace(TUNING, **numbers)}  # type: ignore[arg-type]
+
+
+# Options of ``estimator.solve`` that switch one part off.
+VARIANTS: dict[str, dict[str, Any]] = {
+    "outliers": {"without": ("outliers", "tails")},
+    "heavy tails": {"without": ("tails",)},
+    "errors that last": {"without": ("lasting",)},
+    "turning about a world's origin": _with(decisive_centre=0.0),
+    "systematic errors": _only(),
+    "bias": _only("scale", "time"),
+    "scale": _only("bias", "time"),
+    "time": _only("scale", "bias"),
+    "biases that X can be told from": _with(most_growth=1e6),
+    "rarity of a bias": _with(bias_odds=1.0),
+    "following X": _with(max_rounds=1),
+    "all poses for the noise": _with(most_poses=10**6, most_poses_lasting=10**6),
+}
+
+
+class Case(NamedTuple):
+    """One recording, aligned: its truth and how well that is known (6,), infinite where not."""
+
+    family: str
+    poses: PosePairs
+    is_clock_free: bool
+    T_parent_child: FloatArray
+    sigmas: FloatArray
+
+
+def real_cases(folder: Path | None) -> Iterator[Case]:
+    """Recordings with a known answer."""
+    for rig in real_rigs(folder)[0] if folder else ():
+        if rig.truth is None or rig.is_refused:
+            continue
+        for recording in rig.recordings.values():
+            yield _real_case(rig, recording.parent, recording.child)
+
+
+def _real_case(rig: Rig, parent: Any, child: Any) -> Case:
+    assert rig.truth is not None
+    options = {name: value for name, value in rig.options.items() if name != "prior"}
+    snapshot = whole_snapshot(offline_config(parent, child, options), parent, child).resolved()
+    pairs = snapshot.pose_pairs()
+    pairs = child_scaled(pairs, settle_scale(pairs, snapshot.config.scale).value)
+    family = next((each for each in _FAMILIES if each in rig.name), rig.name)
+    is_clock_free = snapshot.time_offset is not None
+    return Case(family, pairs, is_clock_free, rig.truth.T_parent_child, rig.truth.sigmas)
+
+
+def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
+    """Random platforms: motion, rate, lever arm and noise drawn from the seed."""
+    for name in MIXED:
+        for number in range(repeats):
+            key = (seed, number, MIXED.index(name))
+            drive = simulate(drawn_class(name, np.random.default_rng(key)), key)
+            pairs = PosePairs(drive.parent.stamps_ns, drive.parent.poses, drive.child.poses)
+            yield Case(name, pairs, False, drive.T_parent_child, np.zeros(6))
+
+
+class Outcome(NamedTuple):
+    """Errors in m and rad, NaN where the truth is not known, and shares (6,) of sigma."""
+
+    errors: FloatArray
+    in_sigmas: FloatArray
+
+
+def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
+    """How far the estimator is off; None if it fails. Half of what the truth is not known to counts
+    as an error of all variants.
+    """
+    poses = case.poses
+    try:
+        found = estimator.solve(
+            poses.stamps_ns,
+            poses.Ts_pw_p,
+            poses.Ts_cw_c,
+            is_clock_free=case.is_clock_free,
+            **options,
+        )
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    T, rotation = found.T_parent_child, found.T_parent_child[:3, :3]
+    turn = se3.rotation_log(rotation @ case.T_parent_child[:3, :3].T)
+    off = np.r_[T[:3, 3] - case.T_parent_child[:3, 3], turn]
+    to_parent = np.kron(np.eye(2), rotation)
+    variances = np.diag(to_parent @ found.cov_parent_child_in_child @ to_parent.T)
+    known = np.isfinite(case.sigmas)
+    squares = np.where(known, off**2 + 0.25 * np.where(known, case.sigmas, 0.0) ** 2, 0.0)
+    sizes = [
+        np.sqrt(squares[part].sum()) if known[part].any() else np.nan
+        for part in (slice(0, 3), slice(3, 6))
+    ]
+    in_sigmas = np.abs(off) / np.sqrt(variances + np.where(known, case.sigmas, np.inf) ** 2)
+    return Outcome(np.array(sizes), in_sigmas[known])
+
+
+def table(cases: Sequence[Case]) -> str:
+    """A row for every variant: error over that of the whole estimator by family, translation and
+    rotation; geometric mean over all families, and over all but the one it gains most in.
+    """
+    whole = [outcome(case, {}) for case in cases]
+    rows = [_row("nothing", cases, whole, whole, 0.0)]
+    for name, options in VARIANTS.items():
+        started = time.process_time()
+        found = [outcome(case, options) for case in cases]
+        rows.append(_row(name, cases, found, whole, time.process_time() - started))
+    return markdown_table(rows)
+
+
+def _row(
+    name: str,
+    cases: Sequence[Case],
+    found: Sequence[Outcome | None],
+    whole: Sequence[Outcome | None],
+    seconds: float,
+) -> dict[str, str]:
+    logs: dict[str, list[FloatArray]] = {}
+    inside = []
+    for case, one, reference in zip(cases, found, whole, strict=True):
+        if reference is None or np.nanmax(reference.errors) < _ROUNDING:
+            continue
+        ratios = np.full(2, _FAILED) if one is None else one.errors / reference.errors
+        logs.setdefault(case.family, []).append(np.log(np.maximum(ratios, 1e-3)))
+        inside += [] if one is None else [*(one.in_sigmas < 1.645)]
+    means = {family: np.mean(each, axis=0) for family, each in logs.items()}
+    by_family = [float(np.nanmean(each)) for each in means.values()]
+    others = sorted(by_family)[:-1]
+    return {
+        "Without": name,
+        **{family: " ".join(f"{np.exp(x):.2f}" for x in each) for family, each in means.items()},
+        "All": f"{np.exp(np.mean(by_family)):.3f}",
+        "All but its best": f"{np.exp(np.mean(others)):.3f}",
+        "In 90 %": f"{100 * np.mean(inside):.0f} %",
+        "s": f"{seconds:.0f}",
+    }
+
+
+def main() -> None:
+    """Draw, solve and print."""
+    parser = study_parser("reproduction.ablation", __doc__)
+    parser.add_argument("--quick", action="store_true", help="two of each platform: five minutes")
+    parser.add_argument("--repeats", type=int, default=10, help="recordings of each platform")
+    parser.add_argument("--seed", type=int, help="default: another one at every run")
+    arguments = parser.parse_args()
+    seed = arguments.seed
+    if seed is None:
+        seed = int(np.random.SeedSequence().generate_state(1)[0])
+    repeats = 2 if arguments.quick else arguments.repeats
+    cases = [*real_cases(arguments.data_folder), *simulated_cases(seed, repeats)]
+    print(f"seed {seed}, {len(cases)} recordings", flush=True)
+    show(arguments.page, {"ablation": table(cases)})
+
+
+if __name__ == "__main__":
+    main()
