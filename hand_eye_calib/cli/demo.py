@@ -25,6 +25,7 @@ from hand_eye_calib.text import angle, length
 if TYPE_CHECKING:
     from hand_eye_calib.arrays import FloatArray
     from hand_eye_calib.results.calibration import Calibration
+    from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
@@ -66,6 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.cli.present import exit_code, show
     from hand_eye_calib.cli.reading import read_bags
     from hand_eye_calib.cli.reporting import with_cross_check, write_report
+    from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import simulate_drive
 
     with waiting_for("simulating"):
@@ -76,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     offline = recording.snapshot.estimate()
     note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
     with waiting_for("playing"):
-        live = _play(bag_path, arguments.out / "node.log", offline.stamp_ns)
+        live = _play(Player, bag_path, arguments.out / "node.log", offline.stamp_ns)
     note("3/4 calibrated live; cross-checks and report follow")
     document = _document(drive, bag_path, offline, live)
 
@@ -121,16 +123,15 @@ def _write_bag(out: Path, drive: "SimulatedDrive") -> Path:
     return path
 
 
-def _play(bag_path: Path, log_path: Path, stamp_ns: int) -> Any:
+def _play(player_type: "type[Player]", bag_path: Path, log_path: Path, stamp_ns: int) -> Any:
     """Play the bag to the node; returns its result for the stamp."""
     from hand_eye_calib.io.bags import PoseBag
-    from hand_eye_calib.ros.player import Player
 
     # Simulated odometry stays away from robots on the network.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     # From 102 on the ports overlap with those that Linux gives to clients.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    with _node(log_path) as check, Player(TOPICS, check) as player, PoseBag(bag_path) as bag:
+    with _node(log_path) as check, player_type(TOPICS, check) as player, PoseBag(bag_path) as bag:
         player.play(bag.poses(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
         return player.wait_for_extrinsic(stamp_ns)
 

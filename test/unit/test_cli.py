@@ -457,10 +457,7 @@ def parsed(options):
         (["check", "a.mcap", "b.mcap"], "expected one bag or two trajectory files"),
         (["info", "a", "--urdf", "b"], "--urdf needs --write"),
         (["replay", "bag", "--methd", "dnl"], "unknown option --methd; did you mean --method?"),
-        (
-            ["replay", "bag", "--method", "magic"],
-            "argument --method: must be one of auto, dnlo",
-        ),
+        (["replay", "bag", "--method", "magic"], "argument --method: must be one of auto, dnlo"),
         (
             ["replay", "bag", "--threshold", "-1"],
             "argument --threshold: must be at least 1e-12 m^2; got -1.0",

@@ -54,11 +54,7 @@ def run(capsys, *words):
     [
         (["first", "--with", NUMBERS], 0, "Mount of camera on lidar: same: a change of "),
         (["third", "--with", "robot.urdf"], 4, "moved: y by "),
-        (
-            ["flat", "--with", "first"],
-            3,
-            "cannot tell about x, y and z; roll, pitch",
-        ),
+        (["flat", "--with", "first"], 3, "cannot tell about x, y and z; roll, pitch"),
         (["first", "second"], 0, "same: none of 2 differs"),
         (["first", "second", "third"], 4, "moved: third differs, the others agree"),
         (["first", "third", "--with", "second"], 4, "moved: third of 2"),

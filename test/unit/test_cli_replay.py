@@ -164,10 +164,7 @@ def test_a_topic_and_frames_together(run, bag, tmp_path):
         ),
         (["bag", "--parent-tf", "a:b", "--parent-topic", "/a"], "not allowed with argument"),
         (["bag", "--jobs", "2"], "--jobs and --dask are for --batch"),
-        (
-            ["--batch", "fleet.yaml", "bag"],
-            "--batch cannot be combined with PATH or --list",
-        ),
+        (["--batch", "fleet.yaml", "bag"], "--batch cannot be combined with PATH or --list"),
         ([], "the following arguments are required: PATH, or --batch FILE"),
     ],
 )
