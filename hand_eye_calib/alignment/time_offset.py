@@ -93,7 +93,7 @@ def estimate_time_offset(
     """
     for name, stream in (("parent", parent), ("child", child)):
         if leap := find_leap(stream.stamps_ns):
-            raise InputError(f"the {name} stream's {leap.what()}; {leap.advice()}")
+            raise InputError(f"the {name} stream's {leap.what}; {leap.advice}")
     correlation = correlate_rates(parent, child, max_gap_s)
     if correlation.is_clear:
         return refine_time_offset(parent, child, correlation, max_gap_s)

@@ -228,7 +228,7 @@ def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> lis
     if len(trajectory) < 4:
         return [wording.finding("too_few_poses", stream, poses=len(trajectory))]
     if leap := find_leap(trajectory.stamps_ns):
-        return [wording.finding("leap", stream, text=leap.what(), remedy=leap.advice())]
+        return [wording.finding("leap", stream, text=leap.what, remedy=leap.advice)]
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     gaps = are_gaps(intervals_s, max_gap_s)
     if not gaps.any():

@@ -1,7 +1,7 @@
 """Synchronisation: poses of two streams at common instants, by interpolation."""
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,41 +176,26 @@ def _has_moved(
     return moved
 
 
-@dataclass(frozen=True)
-class Leap:
-    """The longest leap in a stream's stamps.
-
-    Attributes
-    ----------
-    seconds : float
-        Time between the two poses.
-    before, after : int
-        Number of poses before and after it.
+class Leap(NamedTuple):
+    """The longest leap in a stream's stamps: the finding, to follow "the parent stream's", and the
+    remedy.
     """
 
-    seconds: float
-    before: int
-    after: int
-
-    def what(self) -> str:
-        """The finding, to follow "the parent stream's"."""
-        return (
-            f"stamps leap by {self.seconds / _LEAP_S:,.0f} days after pose {self.before} "
-            f"of {self.before + self.after}"
-        )
-
-    def advice(self) -> str:
-        """The remedy."""
-        few = f"the first {self.before}" if self.before < self.after else f"the last {self.after}"
-        return f"repair the stamps, or remove {few} of its poses"
+    what: str
+    advice: str
 
 
 def find_leap(stamps_ns: IntArray) -> Leap | None:
     """The longest leap in stamps (N,), in rising order; None without one."""
     if len(stamps_ns) < 2:
         return None
-    intervals_s = np.diff(stamps_ns) * 1e-9
+    intervals_s, count = np.diff(stamps_ns) * 1e-9, len(stamps_ns)
     before = int(np.argmax(intervals_s)) + 1
-    if intervals_s[before - 1] <= _LEAP_S:
+    days = float(intervals_s[before - 1]) / _LEAP_S
+    if days <= 1.0:
         return None
-    return Leap(float(intervals_s[before - 1]), before, len(stamps_ns) - before)
+    few = f"the first {before}" if before < count - before else f"the last {count - before}"
+    return Leap(
+        f"stamps leap by {days:,.0f} days after pose {before} of {count}",
+        f"repair the stamps, or remove {few} of its poses",
+    )

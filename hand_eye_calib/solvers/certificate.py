@@ -101,20 +101,19 @@ def prove(
     Solution
         The given one, or a better one, with ``is_proved_global``.
     """
-    if _is_global(pairs, solution):
+    coefficients = quadratic_form.coefficients(pairs)
+
+    def form(of: Solution) -> FloatArray:
+        return quadratic_form.weighted_sum(coefficients, of.weights)
+
+    Q = form(solution)
+    if certify(Q, solution.T_parent_child).is_global:
         return replace(solution, is_proved_global=True)
-    found = solve_from(_best_of_many(_form(pairs, solution)))
+    found = solve_from(_best_of_many(Q))
     if not found.objective < solution.objective * (1 - _RELATIVE):
         return replace(solution, is_proved_global=False)
-    return replace(found, is_proved_global=_is_global(pairs, found))
-
-
-def _is_global(pairs: MotionPairs, solution: Solution) -> bool:
-    return certify(_form(pairs, solution), solution.T_parent_child).is_global
-
-
-def _form(pairs: MotionPairs, solution: Solution) -> FloatArray:
-    return quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), solution.weights)
+    is_global = certify(form(found), found.T_parent_child).is_global
+    return replace(found, is_proved_global=is_global)
 
 
 def _best_of_many(Q: FloatArray) -> FloatArray:
