@@ -6,7 +6,7 @@ from array import array
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,23 +41,26 @@ class TfSource(NamedTuple):
         return cls(*split_frames(text))
 
 
-class Transform(Protocol):
-    """A stamped transform: the pose of the sensor frame in the world frame."""
+class PoseFields(NamedTuple):
+    """What is unpacked of a message: a stamped pose or transform.
 
-    @property
-    def stamp_ns(self) -> int: ...
+    Attributes
+    ----------
+    stamp_ns : int
+    world_frame : str
+        Of a transform, the parent.
+    sensor_frame : str or None
+        Of a transform, the child; None if the type has no place for it.
+    position : sequence of 3 floats
+        m.
+    quat_xyzw : sequence of 4 floats
+    """
 
-    @property
-    def world_frame(self) -> str: ...
-
-    @property
-    def sensor_frame(self) -> str | None: ...
-
-    @property
-    def position(self) -> Sequence[float]: ...
-
-    @property
-    def quat_xyzw(self) -> Sequence[float]: ...
+    stamp_ns: int
+    world_frame: str
+    sensor_frame: str | None
+    position: Sequence[float]
+    quat_xyzw: Sequence[float]
 
 
 @dataclass
@@ -84,7 +87,7 @@ class TransformTree(FrameTree):
         super().__init__("the bag's transforms")
         self._kept: defaultdict[str, _Kept] = defaultdict(_Kept)
 
-    def note(self, transform: Transform, is_static: bool) -> None:
+    def note(self, transform: PoseFields, is_static: bool) -> None:
         """Add an edge, without its pose.
 
         Raises
@@ -96,7 +99,7 @@ class TransformTree(FrameTree):
         if len(self.edges) > MOST_FRAMES:
             raise InputError(f"the transforms have more than {MOST_FRAMES} frames")
 
-    def keep(self, transform: Transform, is_static: bool, log_ns: int) -> None:
+    def keep(self, transform: PoseFields, is_static: bool, log_ns: int) -> None:
         """Keep the pose of a transform that is needed; static ones of a moving edge are ignored."""
         frame = transform.sensor_frame or ""
         if self.edges[frame].is_static or not is_static:

@@ -9,7 +9,8 @@ import numpy as np
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
-from hand_eye_calib.io.bags.messages import PoseFields, measured_as
+from hand_eye_calib.io.bags.messages import measured_as
+from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.stamp_guard import Judgement, StampGuard

@@ -3,7 +3,6 @@
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,31 +11,13 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import checked_pose
 from hand_eye_calib.io.plausibility import check_positions
-from hand_eye_calib.io.transforms import TfSource, TransformTree
+from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
 
 # An edge's stamps that jump back by more begin a new session (ns).
 _JUMP_BACK_NS = 1_000_000_000
 
 # Transforms of each moving edge from which its rate is taken, and most that are kept.
 _RATE_FROM, _MOST_KEPT = 5, 2000
-
-
-class StampedTransform(NamedTuple):
-    """A transform of ``/tf`` or ``/tf_static``: the pose of a frame in its parent."""
-
-    stamp_ns: int
-    world_frame: str
-    sensor_frame: str
-    position: tuple[float, float, float]
-    quat_xyzw: tuple[float, float, float, float]
-
-
-class StampedPose(NamedTuple):
-    """A pose of the sensor's frame in the fixed frame."""
-
-    stamp_ns: int
-    position: tuple[float, float, float]
-    quat_xyzw: tuple[float, float, float, float]
 
 
 class TfStream:
@@ -61,13 +42,13 @@ class TfStream:
         self.source, self.max_gap_s = source, max_gap_s
         self.left_out = 0
         self._tree = TransformTree()
-        self._static: dict[str, StampedTransform] = {}
+        self._static: dict[str, PoseFields] = {}
         self._up: list[str] = []
         self._down: list[str] = []
         self._moving: dict[str, _MovingEdge] = {}
         self._slowest = ""
 
-    def add(self, transform: StampedTransform, is_static: bool) -> Iterator[StampedPose]:
+    def add(self, transform: PoseFields, is_static: bool) -> Iterator[PoseFields]:
         """Take a transform; yields the poses that are known with it.
 
         Raises
@@ -75,7 +56,7 @@ class TfStream:
         InputError
             If it is no pose, or its frame has another parent already.
         """
-        frame, edges = transform.sensor_frame, self._tree.edges
+        frame, edges = transform.sensor_frame or "", self._tree.edges
         before = edges[frame].is_static if frame in edges else None
         self._tree.note(transform, is_static)
         if edges[frame].is_static:
@@ -109,7 +90,7 @@ class TfStream:
         moving = [each for each in self._up + self._down if not self._tree.edges[each].is_static]
         self._moving = {frame: self._moving.get(frame, _MovingEdge()) for frame in moving}
 
-    def _move(self, frame: str, transform: StampedTransform) -> Iterator[StampedPose]:
+    def _move(self, frame: str, transform: PoseFields) -> Iterator[PoseFields]:
         if len(self._moving) == 1:  # the usual case, for which nothing is kept
             yield self._composed(transform.stamp_ns, {frame: _matrix(transform)})
             return
@@ -124,7 +105,7 @@ class TfStream:
         if self._slowest:
             yield from self._known()
 
-    def _known(self) -> Iterator[StampedPose]:
+    def _known(self) -> Iterator[PoseFields]:
         """The poses at the waiting stamps of the slowest edge that no other edge keeps waiting."""
         base = self._moving[self._slowest]
         others = {name: edge for name, edge in self._moving.items() if edge is not base}
@@ -137,14 +118,14 @@ class TfStream:
             else:
                 self.left_out += 1
 
-    def _composed(self, stamp_ns: int, moving: dict[str, FloatArray]) -> StampedPose:
+    def _composed(self, stamp_ns: int, moving: dict[str, FloatArray]) -> PoseFields:
         T_world_sensor = np.eye(4)
         for frame in self._up + self._down:
             T = moving[frame] if frame in moving else _matrix(self._static[frame])
             T_world_sensor = T_world_sensor @ (se3.inverse(T) if frame in self._up else T)
         x, y, z = T_world_sensor[:3, 3].tolist()
         qx, qy, qz, qw = se3.to_quat_xyzw(T_world_sensor).tolist()
-        return StampedPose(stamp_ns, (x, y, z), (qx, qy, qz, qw))
+        return PoseFields(stamp_ns, *self.source, (x, y, z), (qx, qy, qz, qw))
 
 
 class _MovingEdge(deque[tuple[int, FloatArray]]):
@@ -173,7 +154,7 @@ class _MovingEdge(deque[tuple[int, FloatArray]]):
         return matrix
 
 
-def _matrix(transform: StampedTransform) -> FloatArray:
+def _matrix(transform: PoseFields) -> FloatArray:
     """(4, 4) array of a transform.
 
     Raises

@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu, NavSatFix
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.live.tf_stream import StampedTransform
+from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.results.calibration import Calibration
 
 _Triple = TypeVar("_Triple", Point, Vector3)
@@ -59,10 +59,10 @@ def to_time(stamp_ns: int) -> Time:
     return Time(sec=sec, nanosec=nanosec)
 
 
-def from_transform(message: TransformStamped) -> StampedTransform:
+def from_transform(message: TransformStamped) -> PoseFields:
     """A transform as the engine takes it."""
     place, rotation = message.transform.translation, message.transform.rotation
-    return StampedTransform(
+    return PoseFields(
         to_ns(message.header.stamp),
         printable(message.header.frame_id).lstrip("/"),
         printable(message.child_frame_id).lstrip("/"),

@@ -16,14 +16,13 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.bags.messages import (
     MALFORMED,
     MessageReader,
-    PoseFields,
     unpack_stamp_ns,
 )
-from hand_eye_calib.io.transforms import TfSource
+from hand_eye_calib.io.transforms import PoseFields, TfSource
 from hand_eye_calib.live.input import PoseInput, with_stamp
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.tf_stream import StampedPose, TfStream
+from hand_eye_calib.live.tf_stream import TfStream
 from hand_eye_calib.ros.conversions import LISTENING, MESSAGES, from_transform
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
 
@@ -225,13 +224,9 @@ class TfInput(PoseInput):
         for transform in map(from_transform, message.transforms):
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):
-                    self.accept(pose.stamp_ns, partial(self._fields, pose))
+                    self.accept(pose.stamp_ns, partial(PoseFields, *pose))
             except InputError as error:
                 self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
-
-    def _fields(self, pose: StampedPose) -> PoseFields:
-        frames = self._source.world_frame, self._source.sensor_frame
-        return PoseFields(pose.stamp_ns, *frames, list(pose.position), list(pose.quat_xyzw))
 
 
 _MOVING_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.live.tf_stream import StampedTransform
+from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.ros.conversions import LATCHED, from_transform, to_time
 
 if TYPE_CHECKING:  # what reads bags is not needed to play poses
@@ -76,7 +76,7 @@ class Player:
             for stream, topic in topics.items()
         }
         self._solve = self._node.create_client(Trigger, "calibrator/solve")
-        self._heard: list[StampedTransform] = []
+        self._heard: list[PoseFields] = []
         self._node.create_subscription(
             TransformStamped,
             "calibrator/extrinsic",
@@ -126,7 +126,7 @@ class Player:
         self._wait(is_covered, "give a result with all poses")
         found = self._heard[-1]
         T = se3.from_quat_xyzw(found.position, found.quat_xyzw)
-        return LiveExtrinsic(T, found.world_frame, found.sensor_frame, found.stamp_ns)
+        return LiveExtrinsic(T, found.world_frame, found.sensor_frame or "", found.stamp_ns)
 
     def _wait(self, condition: Callable[[], object], purpose: str) -> None:
         end_s = time.monotonic() + self._patience_s

@@ -117,7 +117,7 @@ class Robot:
             edge = from_transform(each)
             try:
                 pose = checked_pose(edge.position, edge.quat_xyzw)
-                self._frames.add(edge.world_frame, edge.sensor_frame, pose)
+                self._frames.add(edge.world_frame, edge.sensor_frame or "", pose)
             except HandEyeCalibError as error:
                 frame = edge.sensor_frame
                 self._report(f"{STATIC_TOPIC} has an unusable transform of {frame}: {error}")

@@ -14,11 +14,11 @@ from hand_eye_calib.io.bags.messages import (
     MESSAGE_TYPES,
     POSE_TYPES,
     MalformedMessage,
-    PoseFields,
     unpack_path,
     unpack_poses,
     unpack_transforms,
 )
+from hand_eye_calib.io.transforms import PoseFields
 
 JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 NOETIC.register(

@@ -6,8 +6,8 @@ from motions import wandering_poses
 
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.transforms import TfSource, TransformTree
-from hand_eye_calib.live.tf_stream import StampedTransform, TfStream
+from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
+from hand_eye_calib.live.tf_stream import TfStream
 
 MOUNT = se3.exp(np.array([1.2, 0.1, 0.8, 0.2, -0.1, 1.5]))
 MS = 1_000_000
@@ -16,7 +16,7 @@ MS = 1_000_000
 def stamped(parent, child, stamp_ns, T_parent_child):
     position = tuple(T_parent_child[:3, 3].tolist())
     quat_xyzw = tuple(se3.to_quat_xyzw(T_parent_child).tolist())
-    return StampedTransform(stamp_ns, parent, child, position, quat_xyzw)
+    return PoseFields(stamp_ns, parent, child, position, quat_xyzw)
 
 
 def moving(parent, child, period_ms, n_poses, start_ms=0):

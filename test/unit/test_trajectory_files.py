@@ -1,26 +1,56 @@
-"""Trajectory files: exact stamps, and errors that name the line."""
+"""Trajectory files in all formats: exact stamps and their units, columns, stamps out of order, and
+errors that name the line.
+"""
+
+import json
 
 import numpy as np
 import pytest
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from published_data import data_folder
 
+import hand_eye_calib as hec
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import read_trajectory, write_trajectory
+from hand_eye_calib.io.trajectory_files import FORMATS, read_trajectory_file, write_trajectory
 
 POSE = "1 2 3 0 0 0 1"
+START_NS = 1_700_000_000_123_456_789
+TRAJECTORY = as_trajectory(wandering_poses(30), start_ns=START_NS)
+POSITIONS = TRAJECTORY.poses[:, :3, 3].tolist()
+QUATS_XYZW = se3.to_quat_xyzw(TRAJECTORY.poses).tolist()
+XYZW, WXYZ = "t,x,y,z,qx,qy,qz,qw", "t,x,y,z,qw,qx,qy,qz"
 
 
 @pytest.fixture
-def tum(tmp_path):
-    """Writes text into a file and returns its path."""
+def file(tmp_path):
+    """Writes lines into a file and returns its path."""
 
-    def write(text):
-        path = tmp_path / "trajectory.txt"
-        path.write_text(text, encoding="utf-8")
+    def write(lines, name="trajectory.csv"):
+        path = tmp_path / name
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return path
 
     return write
+
+
+def rows(stamps, order="xyzw", separator=","):
+    """Lines of stamp, position, quaternion."""
+    quats = [[quat["xyzw".index(axis)] for axis in order] for quat in QUATS_XYZW]
+    return [
+        separator.join([str(stamp), *map(repr, position + quat)])
+        for stamp, position, quat in zip(stamps, POSITIONS, quats, strict=True)
+    ]
+
+
+def assert_is_the_trajectory(found, stamps_ns=TRAJECTORY.stamps_ns):
+    np.testing.assert_array_equal(found.stamps_ns, stamps_ns)
+    np.testing.assert_allclose(found.poses, TRAJECTORY.poses, atol=1e-12)
+
+
+# ---- tum, and what holds for all
 
 
 @pytest.mark.parametrize(
@@ -37,19 +67,19 @@ def tum(tmp_path):
         ("-0.000000001", -1),
     ],
 )
-def test_stamps_are_exactly_the_decimal_text(tum, text, stamp_ns):
-    assert read_trajectory(tum(f"{text} {POSE}\n")).stamps_ns.tolist() == [stamp_ns]
+def test_stamps_are_exactly_the_decimal_text(file, text, stamp_ns):
+    assert hec.read_trajectory(file([f"{text} {POSE}"])).stamps_ns.tolist() == [stamp_ns]
 
 
-def test_columns_are_translation_then_scalar_last_quaternion(tum):
-    pose = read_trajectory(tum(f"0 1 2 3 0 0 {np.sqrt(0.5)} {np.sqrt(0.5)}")).poses[0]
+def test_columns_are_translation_then_scalar_last_quaternion(file):
+    pose = hec.read_trajectory(file([f"0 1 2 3 0 0 {np.sqrt(0.5)} {np.sqrt(0.5)}"])).poses[0]
     quarter_turn_about_z = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     np.testing.assert_allclose(pose, quarter_turn_about_z, atol=1e-15)
 
 
-def test_comments_empty_lines_tabs_and_a_byte_order_mark_are_skipped(tum):
-    path = tum(f"\ufeff# timestamp tx ty tz\n\n  0\t{POSE}\r\n   \n#1 2\n1  {POSE}")
-    assert read_trajectory(path).stamps_ns.tolist() == [0, 1_000_000_000]
+def test_comments_empty_lines_tabs_and_a_byte_order_mark_are_skipped(file):
+    path = file(["\ufeff# timestamp tx ty tz", "", f"  0\t{POSE}\r", "   ", "#1 2", f"1  {POSE}"])
+    assert hec.read_trajectory(path).stamps_ns.tolist() == [0, 1_000_000_000]
 
 
 def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp_path):
@@ -57,7 +87,7 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
     stamps_ns = np.sort(random.choice(2**60, 200, replace=False)) - 2**59
     written = Trajectory(stamps_ns, se3.exp(random.normal(size=(200, 6)) * 3))
     write_trajectory(tmp_path / "t.txt", written)
-    read = read_trajectory(tmp_path / "t.txt")
+    read = hec.read_trajectory(tmp_path / "t.txt")
     np.testing.assert_array_equal(read.stamps_ns, written.stamps_ns)
     np.testing.assert_array_equal(read.poses[:, :3, 3], written.poses[:, :3, 3])
     np.testing.assert_allclose(read.poses, written.poses, rtol=0, atol=2e-15)
@@ -78,8 +108,7 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         ([f"1e999999999 {POSE}"], "line 1: .* timestamp"),
         (
             [f"13173756256617361230 {POSE}"],
-            "line 1: the timestamp 1.31738e.19 is too large for ns; name its unit with "
-            "`stamp_unit`",
+            "line 1: the timestamp 1.31738e.19 is too large for ns; name its unit with",
         ),
         (
             [f"{stamp} {POSE}" for stamp in (0, 33, 66, 99)],
@@ -87,10 +116,7 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         ),
         ([f"0 {POSE}", "1 nan 2 3 0 0 0 1"], "line 2: found a value that is not finite"),
         ([f"0 {POSE}", "1 1 2 3 0 0 0 inf"], "line 2: found a value that is not finite"),
-        (
-            ["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"],
-            "line 3: found a quaternion of length 1.1, expected 1",
-        ),
+        (["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"], "line 3: found a quaternion of length 1.1, ex"),
         (["0 1 2 3 0 0 0 0"], "line 1: found a quaternion of length 0, expected 1"),
         (
             [f"5 {POSE}", f"4.5 {POSE}"],
@@ -102,26 +128,203 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         ),
     ],
 )
-def test_an_unusable_line_is_named(tum, lines, message):
-    path = tum("\n".join(lines))
+def test_an_unusable_line_is_named(file, lines, message):
+    path = file(lines)
     with pytest.raises(InputError, match=message) as caught:
-        read_trajectory(path)
+        hec.read_trajectory(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_unreadable_files(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.txt: No such file"):
-        read_trajectory(tmp_path / "absent.txt")
-    with pytest.raises(InputError, match="directory"):
-        read_trajectory(tmp_path)
+def test_files_that_cannot_be_read_or_written(tmp_path):
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe\x00")
-    with pytest.raises(InputError, match=r"image\.png: not a text file"):
-        read_trajectory(tmp_path / "image.png")
+    for name, message in (
+        ("absent.txt", r"absent\.txt: No such file"),
+        (".", "directory"),
+        ("image.png", r"image\.png: not a text file"),
+    ):
+        with pytest.raises(InputError, match=message):
+            hec.read_trajectory(tmp_path / name)
     with pytest.raises(InputError, match="cannot write .*absent"):
-        write_trajectory(tmp_path / "absent" / "t.txt", Trajectory(np.array([0]), np.eye(4)[None]))
+        write_trajectory(tmp_path / "absent" / "t.txt", TRAJECTORY)
 
 
-def test_an_unknown_format_is_refused_with_the_known_ones(tmp_path):
-    with pytest.raises(ConfigError, match="unknown trajectory format 'bvh'; known are tum"):
-        read_trajectory(tmp_path / "t.bvh", format="bvh")
+# ---- the other formats
+
+
+def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
+    lines = [" ".join(map(repr, pose[:3].ravel().tolist())) for pose in TRAJECTORY.poses]
+    relative_ns = TRAJECTORY.stamps_ns - START_NS
+    poses = file(lines, "poses.txt")
+    stamps = (divmod(stamp, 10**9) for stamp in relative_ns.tolist())
+    times = file([f"{secs}.{nsecs:09d}" for secs, nsecs in stamps], "times.txt")
+    assert_is_the_trajectory(hec.read_trajectory(poses, "kitti", times=times), relative_ns)
+    said = r"poses\.txt: the poses of format kitti have no stamps; name their file with `times`"
+    with pytest.raises(ConfigError, match=said):
+        hec.read_trajectory(poses, "kitti")
+    one, short = file(["0.0"], "one.txt"), file(["0.0", "0.1"], "short.txt")
+    for path, beside, message in (
+        (poses, short, r"30 poses, but .*short\.txt has 2 stamps"),
+        (poses, file(["x"], "odd.txt"), r"odd\.txt, line 1: .* found 'x' for the timestamp"),
+        (file([" ".join(["2"] * 12)], "s.txt"), one, "s.txt, line 1: the 3x3 part is not a rot"),
+        (file(["1 2"], "pair.txt"), one, r"line 1: expected 12 numbers.* found 2"),
+    ):
+        with pytest.raises(InputError, match=message):
+            hec.read_trajectory(path, "kitti", times=beside)
+
+
+def test_euroc_is_nanoseconds_with_the_scalar_first(file):
+    header = (
+        "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
+        "q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1]"
+    )
+    lines = [f"{row}, 0.5" for row in rows(TRAJECTORY.stamps_ns, "wxyz", ", ")]
+    for format in ("euroc", "csv"):
+        assert_is_the_trajectory(hec.read_trajectory(file([header, *lines]), format))
+    small = hec.read_trajectory(file([header, *rows(range(30), "wxyz")]), "euroc")
+    assert small.stamps_ns.tolist() == list(range(30))  # the format's unit, whatever their size
+    with pytest.raises(InputError, match="line 1: expected 8 numbers or more, timestamp, px"):
+        hec.read_trajectory(file(["1,2,3"]), "euroc")
+
+
+MESSAGE = ".pose.pose.position.{}".format
+TURN = ".pose.pose.orientation.{}".format
+
+
+@pytest.mark.parametrize(
+    ("header", "order", "separator"),
+    [
+        (XYZW, "xyzw", ","),
+        ("timestamp; tx; ty; tz; qw; qx; qy; qz", "wxyz", ";"),
+        ("# time px py pz q_w q_x q_y q_z", "wxyz", " "),
+        (",".join(["time", *map(MESSAGE, "xyz"), *map(TURN, "xyzw")]), "xyzw", ","),
+        ("Stamp [ns],Pos_X [m],Pos_Y [m],Pos_Z [m],rot_w,rot_x,rot_y,rot_z", "wxyz", ","),
+    ],
+)
+def test_csv_finds_its_columns_by_their_names(file, header, order, separator):
+    path = file([header, *rows(TRAJECTORY.stamps_ns, order, separator)])
+    assert_is_the_trajectory(hec.read_trajectory(path, "csv"))
+
+
+def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
+    names = ["time", ".header.stamp.secs", ".header.stamp.nsecs", ".child"]
+    names += [*map(MESSAGE, "xyz"), *map(TURN, "xyzw"), ".covariance"]
+    lines = []
+    for number, row in enumerate(rows(TRAJECTORY.stamps_ns)):
+        stamp, _, pose = row.partition(",")
+        lines.append(f'7, {stamp[:-9]}, {stamp[-9:]}, "a, b", {pose}, "(0.0, {number})"')
+    assert_is_the_trajectory(hec.read_trajectory(file([", ".join(names), *lines]), "csv"))
+
+
+def test_without_a_header_the_columns_must_be_named(file):
+    path = file(rows(TRAJECTORY.stamps_ns, "wxyz", " "))
+    said = "so the order of the quaternion is unknown; name them with `columns`, .* there are 8"
+    with pytest.raises(InputError, match=said):
+        hec.read_trajectory(path, "csv")
+    assert_is_the_trajectory(hec.read_trajectory(path, "csv", columns=WXYZ))
+    with pytest.raises(InputError, match=r"line 1: expected 9 columns: .*; found 8"):
+        hec.read_trajectory(path, "csv", columns=f"{WXYZ},extra")
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("t,x,y,z,roll,pitch,a,b", "no column for qx, qy, qz, qw among t, x, .*, b; name all col"),
+        ("t,x,y,a,qx,qy,qz,qw", "no column for z among t, x, y, a"),
+        ("t,x,y,z,q0,q1,q2,q3", "no column for qx, qy, qz, qw among"),
+        (f"t,time,{XYZW[2:]}", "columns t, time could all be t; name them with `columns`"),
+    ],
+)
+def test_columns_that_are_missing_or_not_clear(file, header, message):
+    with pytest.raises(InputError, match=message):
+        hec.read_trajectory(file([header, *rows(TRAJECTORY.stamps_ns)]), "csv")
+
+
+@pytest.mark.parametrize(("unit", "ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3), ("ns", 1)])
+def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, unit, ns):
+    stamps_ns = START_NS // 10**9 * 10**9 + 100_000_000 * np.arange(30)
+    relative_ns = stamps_ns - stamps_ns[0]
+
+    def in_unit(values_ns):
+        return [f"{each // ns}" if ns < 10**9 else f"{each / ns:.1f}" for each in values_ns]
+
+    absolute = file(rows(in_unit(stamps_ns.tolist()), separator=" "))
+    assert_is_the_trajectory(hec.read_trajectory(absolute), stamps_ns)
+    relative = in_unit(relative_ns.tolist())
+    path = file(rows(relative, separator=" "), "relative.txt")
+    assert_is_the_trajectory(hec.read_trajectory(path, stamp_unit=unit), relative_ns)
+    for name in (f"time [{unit}]", f"t_{unit}", f"timestamp ({unit})"):
+        named = file([f"{name},{XYZW[2:]}", *rows(relative)])
+        assert_is_the_trajectory(hec.read_trajectory(named, "csv"), relative_ns)
+    said = r"unclear; read as \w+, the poses are .* s apart; name it with `stamp_unit`"
+    if unit != "s":
+        with pytest.raises(InputError, match=said):
+            hec.read_trajectory(path)
+
+
+def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
+    order = [*range(10), 9, 12, 11, 10, *range(13, 30), 3]
+    lines = rows(TRAJECTORY.stamps_ns)
+    path = file([XYZW, *(lines[index] for index in order)])
+    said = r"line 12: timestamps must increase, .*; 4 such lines; sort .* `repair`"
+    with pytest.raises(InputError, match=said):
+        hec.read_trajectory(path, "csv")
+    said = "went back at 3 of 32 poses, which were sorted; dropped 2 whose stamp was there already"
+    with pytest.warns(UserWarning, match=said):
+        assert_is_the_trajectory(hec.read_trajectory(path, "csv", repair=True))
+
+
+def test_options_that_do_not_go_with_the_format(file):
+    path = file(rows(TRAJECTORY.stamps_ns))
+    cases = [({"stamp_unit": "minutes"}, "unknown unit of stamps 'minutes'; known are s, ms, us")]
+    cases += [({"format": "bvh"}, "unknown trajectory format 'bvh'; known are tum")]
+    for format in FORMATS:
+        if format != "csv":
+            said = f"columns are named for format csv only; the format is {format}"
+            cases.append(({"format": format, "columns": "t"}, said))
+        if format != "kitti":
+            said = f"a file of times belongs to format kitti only; the format is {format}"
+            cases.append(({"format": format, "times": path}, said))
+    for options, message in cases:
+        with pytest.raises(ConfigError, match=message):
+            hec.read_trajectory(path, **options)
+    with pytest.raises(ConfigError, match="tum, mcap, sqlite3, rosbag1; got .kitti."):
+        write_trajectory(path, TRAJECTORY, "kitti")
+
+
+# ---- on the command line, and files of others
+
+
+def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
+    child = as_trajectory(disturbed(child_of(TRAJECTORY.poses), 1, 1e-5, 5e-5), start_ns=START_NS)
+    write_trajectory(tmp_path / "child.tum", child)
+    lines = rows(TRAJECTORY.stamps_ns, "wxyz")
+    files = [str(file([*lines, lines[3]])), str(tmp_path / "child.tum")]
+    command = ["calibrate", *files, "--json", "--reference", "B5", "--columns", WXYZ]
+    command += ["--parent-frame", "a", "--child-frame", "b"]
+    assert main([*command, "--parent-format", "csv", "--out", str(tmp_path / "out")]) == 0
+    out, err = capsys.readouterr()
+    assert "went back at 1 of 31 poses, which were sorted; dropped 1 whose stamp was" in err
+    document = json.loads(out)
+    np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3)
+    assert [entry["file"] for entry in document["inputs"]["files"]] == files
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out)["T_parent_child"] == document["T_parent_child"]
+    assert main([*command, "--format", "tum"]) == 2
+    assert "columns are named for format csv only; the format is tum" in capsys.readouterr().err
+
+
+def test_published_files_of_other_programs():
+    folder = data_folder()
+    counts = {}
+    for pattern, columns in (("asl_*/*.csv", XYZW), ("zxl19/bag*/[ILV]*_FCPE.mat", WXYZ)):
+        for path in sorted(folder.glob(pattern)):
+            trajectory, notes, _ = read_trajectory_file(path, "csv", columns=columns, repair=True)
+            counts[path.name] = len(trajectory)
+            assert 30 < trajectory.duration_s < 100, path
+            assert all("were sorted" in note or "dropped" in note for note in notes)
+    assert len(counts) >= 10
+    export = folder / "zxl19" / "raw_bag1" / "bag1-aft_mapped_to_init.csv"
+    trajectory = read_trajectory_file(export, "csv").trajectory
+    # The stamp of the header, not of the arrival.
+    assert (len(trajectory), trajectory.stamps_ns[0]) == (572, 1636512749922900677)

@@ -18,9 +18,10 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry.trajectory import RateIntegrator
-from hand_eye_calib.io.bags.poses import PoseColumns, PoseFields
+from hand_eye_calib.io.bags.poses import PoseColumns
 from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin, wrong_latitude
 from hand_eye_calib.io.limits import LONGEST_NAME
+from hand_eye_calib.io.transforms import PoseFields
 
 # What unpacking bytes that are not a message of its type may raise.
 MALFORMED = (struct.error, ValueError)

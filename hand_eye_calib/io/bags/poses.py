@@ -13,27 +13,6 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 ObjectArray = NDArray[np.object_]
 
 
-class PoseFields(NamedTuple):
-    """The unpacked part of one message.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    world_frame : str
-    sensor_frame : str or None
-        None if the type has no place for it.
-    position : list of 3 floats
-        m.
-    quat_xyzw : list of 4 floats
-    """
-
-    stamp_ns: int
-    world_frame: str
-    sensor_frame: str | None
-    position: list[float]
-    quat_xyzw: list[float]
-
-
 class PoseColumns(NamedTuple):
     """The unpacked part of N messages in columns.
 

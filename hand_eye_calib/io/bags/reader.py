@@ -28,7 +28,7 @@ from hand_eye_calib.io.bags.messages import (
     unpack_path,
     unpack_transforms,
 )
-from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns, PoseFields, StampedPose
+from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns, StampedPose
 from hand_eye_calib.io.bags.recovery import Message
 from hand_eye_calib.io.bags.storage import BLOCK_SIZE, BagFiles, message_blocks
 from hand_eye_calib.io.bags.topics import (
@@ -41,7 +41,7 @@ from hand_eye_calib.io.bags.topics import (
     unreadable,
 )
 from hand_eye_calib.io.plausibility import PoseWatch
-from hand_eye_calib.io.transforms import TfSource, TransformTree
+from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
 
 # Different frames of one topic that are listed.
 _MOST_FRAMES = 1_000

@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files.columns import measured_by
+from hand_eye_calib.io.trajectory_files.formats import AUTO, FileOptions
 from hand_eye_calib.io.trajectory_files.objects import PoseObject, trajectory_from_object
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, rates_of, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, Table, read_table
+from hand_eye_calib.io.trajectory_files.table import Table, read_table
 
 _Path = str | Path
 _USUAL = FileOptions.format

@@ -15,27 +15,28 @@ from typing import NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.config import STAMP_UNITS
-from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.files import read_text
 from hand_eye_calib.io.limits import LARGEST_TEXT, LONGEST_LINE, MOST_COLUMNS
 from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     POSITION,
-    QUATERNION,
     UNNAMED,
     are_columns,
     choose_columns,
     listed,
+)
+from hand_eye_calib.io.trajectory_files.formats import (
+    AUTO,
+    FIXED_FORMATS,
+    TUM_COLUMNS,
+    FileOptions,
 )
 
 _Path = str | Path
 # A line and its number, from 1.
 Line = tuple[int, str]
 
-#: The format that the lines look like.
-AUTO = "auto"
 _NS_PER_S = 1_000_000_000
 # Characters of a line that a message shows, and of a reason.
 _MOST_SHOWN, _LONGEST_REASON = 60, 120
@@ -50,69 +51,6 @@ _SUFFIXES_OF_TUM = ("", ".txt", ".tum")
 _TIMES = "times.txt"
 # What four columns without names are.
 _OF_FOUR = {"positions": "t,x,y,z", "rates": "t,wx,wy,wz"}
-
-TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
-
-
-class _Format(NamedTuple):
-    """A format whose columns have fixed places, a stamp first unless they are elsewhere."""
-
-    expected: str
-    quantities: tuple[str, ...]
-    separator: str | None = None
-    stamp_unit: str = ""
-
-    @property
-    def n_columns(self) -> int:
-        return len(self.quantities) + (self.quantities != MATRIX)
-
-
-_FORMATS = {
-    "tum": _Format(f"8 numbers, {TUM_COLUMNS}", (*POSITION, *QUATERNION)),
-    "kitti": _Format("12 numbers, the first three rows of a pose", MATRIX),
-    "euroc": _Format(
-        "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz",
-        (*POSITION, "qw", "qx", "qy", "qz"),
-        ",",
-        "ns",
-    ),
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class FileOptions:
-    """How to read a text file; see :func:`hand_eye_calib.read_trajectory`.
-
-    Raises
-    ------
-    ConfigError
-        For what is not known or does not go together.
-    """
-
-    format: str = "tum"
-    columns: str | None = None
-    times: _Path | None = None
-    stamp_unit: str | None = None
-    repair: bool = False
-    measures: str = AUTO
-
-    def __post_init__(self) -> None:
-        if self.stamp_unit is not None and self.stamp_unit not in STAMP_UNITS:
-            raise ConfigError(
-                f"unknown unit of stamps {self.stamp_unit!r}; known are {', '.join(STAMP_UNITS)}"
-            )
-        known = (*FORMATS, AUTO)
-        if self.format not in known:
-            raise ConfigError(
-                f"unknown trajectory format {self.format!r}; known are {', '.join(known)}"
-            )
-        for given, of, what in (
-            (self.columns, "csv", "columns are named for"),
-            (self.times, "kitti", "a file of times belongs to"),
-        ):
-            if given is not None and self.format not in (of, AUTO):
-                raise ConfigError(f"{what} format {of} only; the format is {self.format}")
-
 
 # ---- lines
 
@@ -440,7 +378,7 @@ def _named_four(path: _Path, measures: str) -> str:
 
 def _read_fixed(path: _Path, lines: Lines, layout: Layout, times: _Path | None) -> Table:
     """A format whose columns have fixed places; kitti has its stamps in a file of their own."""
-    format = _FORMATS[layout.format]
+    format = FIXED_FORMATS[layout.format]
     quantities = (
         format.quantities if layout.is_named or layout.format != "tum" else (*POSITION, *UNNAMED)
     )
