@@ -31,7 +31,9 @@ _ROUNDING_M = 1e-5
 def write(name: str, results: Results) -> list[Path]:
     """Study every level and write ``NAME.md`` and ``NAME.csv``; returns their paths."""
     levels = [
-        (dataset, level) for dataset in SIMULATED for level in LEVELS[dataset] if level != 0.0
+        (dataset, level)
+        for dataset in SIMULATED
+        for level in (LEVELS[dataset][1::2] or LEVELS[dataset])
     ]
     tasks = [(results.source, *level) for level in levels]
     rows = [

@@ -133,7 +133,7 @@ def run(arguments: argparse.Namespace) -> int:
     recorded = {"tango": tango_rows}
     if arguments.what == "positions":
         rows = {"receivers": positions.simulated_rows}
-        recorded = {"recorded": positions.recorded_rows, "parts": positions.parts_rows}
+        recorded = {"recorded": positions.recorded_rows}
     tables = {name: markdown_table(of(seeds)) for name, of in rows.items()}
     if data_folder:
         tables |= {name: markdown_table(of(data_folder)) for name, of in recorded.items()}

@@ -18,7 +18,6 @@ from reproduction.writing import triple
 
 # Normal errors are within so many sigmas in nine cases of ten.
 QUANTILE_90 = 1.645
-_N_PARTS = 3
 
 
 @dataclass(frozen=True)
@@ -176,34 +175,3 @@ def recorded_rows(data_folder: Path) -> Iterator[dict[str, object]]:
 
 def _in_mm(values: FloatArray) -> str:
     return ", ".join(f"{1000 * value:.0f}" if np.isfinite(value) else "-" for value in values)
-
-
-def parts_rows(data_folder: Path) -> Iterator[dict[str, object]]:
-    """Rows of the table of recordings in three parts: how far their lever arms are apart, against
-    their covariances with the common-mode floor. No truth is needed for that.
-    """
-    misfits = []
-    for name, _, whole in _recordings(data_folder):
-        parts = [
-            hec.calibrate(part.parent, part.child, child_measures="positions")
-            for part in whole.parts(_N_PARTS, 0.0)
-        ]
-        lever_arms = np.array([part.T_parent_child[:3, 3] for part in parts])
-        covariances = np.array([part.covariance_with_floor[:3, :3] for part in parts])
-        misfits.append(_misfit_of_mean(lever_arms, covariances))
-        variances = np.diagonal(covariances, axis1=1, axis2=2)
-        yield {
-            "Thirds of": name,
-            "Scatter x, y, z (mm)": _in_mm(lever_arms.std(axis=0, ddof=1)),
-            "Sigma x, y, z (mm)": _in_mm(np.sqrt(variances.mean(axis=0))),
-            "Chi-square of 6": f"{misfits[-1]:.1f}",
-        }
-    yield {"": "all, the mean", "scatter": "", "sigma": "", "chi2": f"{np.mean(misfits):.1f}"}
-
-
-def _misfit_of_mean(values: FloatArray, covariances: FloatArray) -> float:
-    """Chi-square of values (K, 3) with covariances (K, 3, 3) about their weighted mean."""
-    weights = np.linalg.inv(covariances)
-    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, values))
-    away = values - mean
-    return float(np.einsum("ki,kij,kj->", away, weights, away))

@@ -14,7 +14,7 @@ from reproduction import comparison
 from reproduction.kitti_truth import RECTIFIED
 from reproduction.published import METHODS, REFERENCES
 from reproduction.results import Results
-from reproduction.rows import METRICS, PUBLISHED, TITLES, agree
+from reproduction.rows import METRICS, TITLES
 from reproduction.writing import markdown_table, percent, write_csv, write_text
 
 SUMMARY_TABLES = {"table1": "kitti_short", "table2": "kitti_long"}
@@ -105,7 +105,6 @@ def write_summary_table(name: str, results: Results) -> list[Path]:
             f"# Table {name[-1]}. {_DRIVES[dataset]}",
             markdown_table(printed),
             f"Best variant of each method by e_at; the smallest error of a column is bold. {_NOTE}",
-            _best_against_rectified(rows),
         ),
         write_csv(results.out / f"{name}.csv", table),
         *_compare_with_print(name, rows, best, results),
@@ -118,18 +117,6 @@ def _print(value: float, bold: float | None = None) -> str:
         return "-"
     text = f"{value:.3f}"
     return f"**{text}**" if bold is not None and text == f"{bold:.3f}" else text
-
-
-def _best_against_rectified(rows: pd.DataFrame) -> str:
-    lines = []
-    for (method, reference), row in best_variants(rows, _RECTIFIED[0]).iterrows():
-        errors = [*row[list(_RECTIFIED)], *rows.loc[(method, "B1"), list(_RECTIFIED)]]
-        titles = ("e_at (m)", "e_aR (deg)", "B1: e_at (m)", "B1: e_aR (deg)")
-        lines.append(
-            {"best against the rectified truth": f"{TITLES[method]} {reference}"}
-            | {title: f"{error:.3f}" for title, error in zip(titles, errors, strict=True)}
-        )
-    return markdown_table(lines)
 
 
 def _compare_with_print(
@@ -212,31 +199,6 @@ def write_variant_table(name: str, results: Results) -> list[Path]:
         | {column: _print(row[column], row[column] if name == best else None) for column in columns}
         for name, row in rows.iterrows()
     )
-    compared = (
-        {
-            "reference": row.reference,
-            "column": column,
-            "ours": getattr(row, metric),
-            "published": getattr(row, published),
-            "agrees": (same := bool(agree(getattr(row, metric), getattr(row, published)))),
-            "why": "" if same else row.why,
-        }
-        for row in solved.itertuples()
-        for column, metric, published in zip(_ERRORS, METRICS, PUBLISHED, strict=True)
-    )
-    blocks = [comparison.describe_rows(solved)]
-    if method == "dnlo":
-        objectives = (
-            {
-                "reference": row.reference,
-                "objective": f"{row.objective:.6f}",
-                "objective at the published answer": f"{row.published_objective:.6f}",
-                "e_at (m)": f"{row.e_at:.4f}",
-                "published e_at (m)": f"{row.published_e_at:.4f}",
-            }
-            for row in solved.itertuples()
-        )
-        blocks += [comparison.describe_dnlo(solved), markdown_table(objectives)]
     return [
         write_text(
             results.out / f"{name}.md",
@@ -245,10 +207,10 @@ def write_variant_table(name: str, results: Results) -> list[Path]:
             f"The best variant by e_at is bold. {_NOTE}",
         ),
         write_csv(results.out / f"{name}.csv", rows[columns].reset_index()),
-        write_csv(results.out / f"{name}_comparison.csv", compared),
         write_text(
             results.out / f"{name}_comparison.md",
             f"# {name}: comparison with the published results",
-            *blocks,
+            comparison.describe_rows(solved),
+            comparison.describe_dnlo(solved) if method == "dnlo" else "",
         ),
     ]

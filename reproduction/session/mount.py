@@ -29,10 +29,7 @@ SHIFTED = {
     "AGV": ("agv_ramps", "agv_long"),
     "car": ("car_ins_lidar", "car_two_slams"),
 }
-SHIFTS = {
-    "0.2 deg": np.radians(0.2), "0.5 deg": np.radians(0.5), "1 deg": np.radians(1.0),
-    "2 deg": np.radians(2.0), "1 cm": 0.01, "2 cm": 0.02, "5 cm": 0.05,
-}  # fmt: skip
+SHIFTS = {"0.5 deg": np.radians(0.5), "2 deg": np.radians(2.0), "1 cm": 0.01, "5 cm": 0.05}
 _BEFORE_S, _AFTER_S = 900.0, 1800.0
 
 # The monitor takes no more poses a second than this.
