@@ -13,15 +13,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.extras import extras
 from hand_eye_calib.gls.increments import SYSTEMATIC, Streams
+from hand_eye_calib.gls.noise_model import ROTATION
 from hand_eye_calib.gls.normal import N_BLOCKS, answers_without
 from hand_eye_calib.gls.parts import part_products
 from hand_eye_calib.gls.problem import Fit, Problem
 from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.gls.stages import STAGES, start
 from hand_eye_calib.gls.tuning import TUNING, Tuning
+from hand_eye_calib.stats import median
 
 # Stages that a quick solve leaves out; the first stages, whose fit a search may fall back on.
 _SLOW, _FIRST = frozenset({"tails", "lasting"}), 3
@@ -71,6 +74,20 @@ def solve(
         tuning=tuning,
     )
     first = _passed(problem, start(problem), STAGES[:_FIRST])
+    kept = _strided(problem, first)
+    if len(kept) < len(stamps_ns):
+        fewer = solve(
+            stamps_ns[kept],
+            Ts_pw_p[kept],
+            Ts_cw_c[kept],
+            systematic,
+            quick,
+            is_clock_free,
+            with_extras,
+            without,
+            tuning,
+        )
+        return _at_all_poses(fewer, kept, first.outliers.spikes)
     fit = _passed(problem, first, STAGES[_FIRST:])
     if not fit.converged:
         plainest = replace(
@@ -86,6 +103,38 @@ def _passed(problem: Problem, fit: Fit, stages: Sequence) -> Fit:
         if stage.__name__ not in problem.without:
             fit = stage(problem, fit)
     return fit
+
+
+def _strided(problem: Problem, fit: Fit) -> IntArray:
+    """Poses to keep: all, but of a camera that sees a target, whose errors repeat from pose to pose
+    and drown the rotation between them, only every so many.
+    """
+    tuning, streams = problem.tuning, problem.streams
+    every = np.arange(len(streams))
+    if fit.model.centre == "sensors" or not problem.is_noisy(fit):
+        return every
+    every = every[~fit.outliers.spikes]
+    most = max((s for s in tuning.strides if len(every) >= s * tuning.fewest_strides), default=1)
+    noise = np.exp(0.5 * fit.levels[ROTATION])
+    rotations = streams.Ts_pw_p[every, :3, :3]
+    for stride in tuning.strides:
+        turned = np.swapaxes(rotations[:-stride], 1, 2) @ rotations[stride:]
+        if noise < tuning.noisy * median(se3.rotation_angle(turned)):
+            return every[:: min(stride, most)]
+    return every[::most]
+
+
+def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) -> AdaptiveSolution:
+    """The solution of some poses, jumps and spikes told of all."""
+    jumps, spikes, weights = (
+        np.zeros(len(spikes) - 1, dtype=bool),
+        spikes.copy(),
+        np.ones(len(spikes)),
+    )
+    jumps[kept[1:][fewer.jumps] - 1] = True
+    spikes[kept[fewer.spikes]] = True
+    weights[kept] = fewer.weights
+    return replace(fewer, jumps=jumps, spikes=spikes, weights=weights, is_drowned=True)
 
 
 def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
@@ -119,7 +168,6 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         objective=0.5 * (posterior.precision.log_determinant + normal.cost),
         converged=fit.converged,
         iterations=fit.n_evaluations,
-        is_drowned=fit.model.centre != "sensors" and problem.is_noisy(fit),
         extras=extras(problem, fit, misfit) if problem.with_extras else None,
     )
 

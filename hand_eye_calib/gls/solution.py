@@ -151,8 +151,7 @@ class AdaptiveSolution:
     spikes : (n + 1,) bool array
         Poses that are wrong by themselves, and left out.
     is_drowned : bool
-        Whether single poses of a camera that sees a target are noisier than the rotation between
-        them.
+        Whether single poses are noisier than the rotation between them: only some were used.
     heavy_tails : bool
         Whether white errors are weighed as of Student's t distribution.
     misfit : float
