@@ -11,16 +11,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from hand_eye_calib.arrays import FloatArray
 
-# Medians: of the absolute value of a normal variable, of the length of a normal vector in three
-# dimensions, and of chi-square by its degrees of freedom.
+# Medians of the absolute value of a normal variable, and of the length of a normal vector in three
+# dimensions.
 MEDIAN_NORMAL, MEDIAN_LENGTH = 0.6745, 1.538
-MEDIAN_CHI2 = {1: 0.455, 6: 5.348}
 
-# What chi-square exceeds once in ten, in a hundred and in a thousand times, by its degrees of
-# freedom; and what any of six normal variables exceeds once in 200 times.
-CHI2_TENTH = {3: 6.25, 6: 10.64}
-CHI2_HUNDREDTH = {1: 6.63, 2: 9.21, 3: 11.34, 4: 13.28, 5: 15.09, 6: 16.81}
-CHI2_THOUSANDTH = {6: 22.457744}
+# What chi-square exceeds with a probability, by its degrees of freedom; and what any of six normal
+# variables exceeds once in 200 times.
+CHI2 = {
+    0.5: {1: 0.455, 6: 5.348},
+    0.1: {3: 6.25, 6: 10.64},
+    0.01: {1: 6.63, 2: 9.21, 3: 11.34, 4: 13.28, 5: 15.09, 6: 16.81},
+    0.001: {6: 22.457744},
+}
 LARGEST_OF_SIX = 3.341479
 
 # A change of so many standard deviations beyond a limit exceeds it nine times out of ten.

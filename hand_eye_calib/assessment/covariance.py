@@ -31,7 +31,7 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict
 from hand_eye_calib.solvers.solution import Solution
-from hand_eye_calib.stats import CHI2_TENTH, MEDIAN_CHI2
+from hand_eye_calib.stats import CHI2
 
 # (B, K) mask of the pairs to leave out to the answers (B, 4, 4) without them.
 SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
@@ -204,7 +204,7 @@ def _white_rotation(Ts: FloatArray) -> float:
     """
     steps = se3.rotation_log(np.swapaxes(Ts[:-1, :3, :3], 1, 2) @ Ts[1:, :3, :3])
     # Differences of steps have six times the variance of white noise.
-    variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / MEDIAN_CHI2[1] / 6.0
+    variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / CHI2[0.5][1] / 6.0
     return float(np.sort(variances)[:2].mean())
 
 
@@ -406,7 +406,7 @@ def widened_by_halves(
     difference = (halves.step[0] - halves.step[1])[part]
     joint = misfit * halves.covariance.sum(axis=0)[part, part]
     away = np.linalg.solve(joint, difference)
-    excess = float(difference @ away) / CHI2_TENTH[len(model)]
+    excess = float(difference @ away) / CHI2[0.1][len(model)]
     if excess <= 1.0:
         return model
     error = model @ away

@@ -23,7 +23,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import AXES
-from hand_eye_calib.stats import CHI2_THOUSANDTH, LARGEST_OF_SIX, NINE_TIMES_OUT_OF_TEN
+from hand_eye_calib.stats import CHI2, LARGEST_OF_SIX, NINE_TIMES_OUT_OF_TEN
 from hand_eye_calib.text import amount, listing
 
 # Shifts that are looked for: one standard deviation per axis (m, rad).
@@ -142,7 +142,7 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
         Change.MOVED if ratio > LARGEST_OF_SIX else Change.SAME if seen else Change.CANNOT_TELL
         for ratio, seen in zip(np.abs(values) / sigmas, visible <= limits, strict=True)
     )
-    together = [Change.MOVED] if chi2 > CHI2_THOUSANDTH[6] else []
+    together = [Change.MOVED] if chi2 > CHI2[0.001][6] else []
     return Moved(
         values=values,
         sigmas=sigmas,

@@ -18,7 +18,7 @@ from hand_eye_calib.gls.block_tridiagonal import inverse_products, transposed
 from hand_eye_calib.gls.increments import Streams
 from hand_eye_calib.gls.reml import walk_covariance
 from hand_eye_calib.gls.state_space import WHITE, Posterior
-from hand_eye_calib.stats import MEDIAN_CHI2, MEDIAN_LENGTH, STUDENT, chi_square_quantile, median
+from hand_eye_calib.stats import CHI2, MEDIAN_LENGTH, STUDENT, chi_square_quantile, median
 
 # False alarms expected in a whole recording.
 _FALSE_ALARMS = 0.01
@@ -186,7 +186,7 @@ def _decisive(of_walk: FloatArray, alarming: float) -> float:
     ordinary = of_walk[of_walk < alarming]
     if len(ordinary) == 0 or np.mean(ordinary**2) > _WALK_KURTOSIS * np.mean(ordinary) ** 2:
         return _DECISIVE * alarming
-    return float(max(median(ordinary) / MEDIAN_CHI2[6], 1.0)) * alarming
+    return float(max(median(ordinary) / CHI2[0.5][6], 1.0)) * alarming
 
 
 def _is_peak(values: FloatArray) -> BoolArray:

@@ -12,7 +12,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.stats import CHI2_HUNDREDTH
+from hand_eye_calib.stats import CHI2
 from hand_eye_calib.text import angle, length
 
 _FORMAT, _VERSION = "hand_eye_calib/rig", 1
@@ -64,7 +64,7 @@ class Closure:
     @property
     def closes(self) -> bool:
         """Whether chance makes it so large more than once in a hundred times."""
-        return self.dof == 0 or self.chi2 <= CHI2_HUNDREDTH[self.dof]
+        return self.dof == 0 or self.chi2 <= CHI2[0.01][self.dof]
 
     @property
     def sentence(self) -> str:
