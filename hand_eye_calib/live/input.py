@@ -44,10 +44,8 @@ class Delivery:
         Messages since the first one.
     longest_wait_s : float
         In the node's queue, since it was last set to 0.
-    has_one_publisher : bool
-        Otherwise nothing is known of lost messages.
-    is_known : bool
-        The middleware numbers messages.
+    has_one_publisher, is_known : bool
+        Nothing is known of lost messages of several, or if the middleware does not number them.
     """
 
     def __init__(self) -> None:
@@ -57,14 +55,8 @@ class Delivery:
         self._next: int | None = None
 
     def note(self, sequence_number: int | None, waited_s: float) -> None:
-        """Count a message.
-
-        Parameters
-        ----------
-        sequence_number : int or None
-            Of its publication; None if the middleware does not tell.
-        waited_s : float
-            Time from its arrival in this process to its callback.
+        """Count a message by the number of its publication, None if the middleware does not tell,
+        and its time from its arrival in this process to its callback.
         """
         self.received += 1
         self.late += waited_s > _LATE_S

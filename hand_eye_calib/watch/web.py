@@ -44,13 +44,13 @@ _HEADERS = {
 }
 
 
-class WebServer:
+class WebServer(ThreadingHTTPServer):
     """Serves the view until :meth:`stop`, in threads of its own.
 
     Parameters
     ----------
     board : Board
-    request : callable
+    ask : callable
         Called with the name of a node and one of :data:`REQUESTS`, in another thread.
     address : (str, int)
         Host and port to listen on; an empty host stands for all addresses of the computer, port 0
@@ -66,33 +66,36 @@ class WebServer:
         If it cannot listen there.
     """
 
+    daemon_threads = True
+    block_on_close = False
+
     def __init__(
         self,
         board: Board,
-        request: Callable[[str, str], None],
+        ask: Callable[[str, str], None],
         address: tuple[str, int] = ("", PORT),
         wanted: str = "",
         key: str = "",
     ) -> None:
         self.key = key or secrets.token_urlsafe(6)
-        self.board, self.request, self.wanted = board, request, wanted
+        self.board, self.ask, self.wanted = board, ask, wanted
         self.stopping = threading.Event()
         self.clients = threading.BoundedSemaphore(_MOST_CLIENTS)
         self._host, port = address
         try:
-            self._server = _Server(address, self)
+            super().__init__(address, _Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise ConfigError(
                 f"cannot serve the page on {self._host}:{port}: {reason}; choose another with "
                 "--web PORT"
             ) from None
-        threading.Thread(target=self._server.serve_forever, name="web", daemon=True).start()
+        threading.Thread(target=self.serve_forever, name="web", daemon=True).start()
 
     @property
     def port(self) -> int:
         """Where it listens."""
-        return int(self._server.server_address[1])
+        return int(self.server_address[1])
 
     def addresses(self) -> list[str]:
         """What to type into a browser, that for other computers first."""
@@ -108,8 +111,11 @@ class WebServer:
     def stop(self) -> None:
         """Close all connections."""
         self.stopping.set()
-        self._server.shutdown()
-        self._server.server_close()
+        self.shutdown()
+        self.server_close()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of browsers that have gone."""
 
 
 def own_address() -> str:
@@ -122,20 +128,8 @@ def own_address() -> str:
         return str(probe.getsockname()[0])
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, address: tuple[str, int], owner: WebServer) -> None:
-        self.owner = owner
-        super().__init__(address, _Handler)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of browsers that have gone."""
-
-
 class _Handler(BaseHTTPRequestHandler):
-    server: _Server
+    server: WebServer
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "hand_eye_calib", ""
     timeout = _PATIENCE_S
@@ -160,8 +154,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._has_key(query):
             self._refuse()
         elif request in REQUESTS:
-            owner = self.server.owner
-            owner.request(owner.view(query.get("node", "")).node, request)
+            self.server.ask(self.server.view(query.get("node", "")).node, request)
             self._send(HTTPStatus.OK, b"", "text/plain")
         else:
             self._send(HTTPStatus.NOT_FOUND, b"there is no such request", "text/plain")
@@ -175,7 +168,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _has_key(self, query: dict[str, str]) -> bool:
         given = query.get("key", "").encode(errors="replace")
-        return hmac.compare_digest(given, self.server.owner.key.encode())
+        return hmac.compare_digest(given, self.server.key.encode())
 
     def _refuse(self) -> None:
         text = b"Open the whole address that the terminal with `hand_eye_calib watch` shows."
@@ -199,12 +192,13 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
 
     def _send_events(self, node: str) -> None:
-        owner = self.server.owner
-        if not owner.clients.acquire(blocking=False):
+        if not self.server.clients.acquire(blocking=False):
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, b"too many browsers", "text/plain")
             return
         self.close_connection = True
-        self._notice_silence()
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: a phone out of reach is noticed soon
+            patience_ms = round(1000 * _PATIENCE_S)
+            self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
         try:
             self._begin(HTTPStatus.OK, "text/event-stream; charset=utf-8")
             self.end_headers()
@@ -213,19 +207,13 @@ class _Handler(BaseHTTPRequestHandler):
         except OSError:
             return  # the browser has gone
         finally:
-            owner.clients.release()
-
-    def _notice_silence(self) -> None:
-        """Let the connection to a phone out of reach end after a while, not after an hour."""
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
-            patience_ms = round(1000 * _PATIENCE_S)
-            self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
+            self.server.clients.release()
 
     def _events(self, node: str) -> Iterator[bytes]:
         """The view whenever it has changed; an empty event every second in between."""
-        owner, sent, sent_s = self.server.owner, "", -_SEND_S
-        while not owner.stopping.wait(_LOOK_S if sent else 0.0):
-            made, now_s = fragment(owner.view(node)), time.monotonic()
+        sent, sent_s = "", -_SEND_S
+        while not self.server.stopping.wait(_LOOK_S if sent else 0.0):
+            made, now_s = fragment(self.server.view(node)), time.monotonic()
             if made != sent:
                 one_line = made.replace("\r", " ").replace("\n", " ")
                 yield f"data: {one_line}\n\n".encode()

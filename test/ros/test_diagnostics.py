@@ -179,13 +179,6 @@ def test_too_little_driving_and_simulated_time_that_does_not_run_are_said(start_
     assert found.checks.text == said
 
 
-def test_a_journal_that_cannot_be_written_is_an_error(start_node, state, tmp_path):
-    (tmp_path / "a_file").write_text("")
-    start_node(f"-p output_directory:={tmp_path / 'a_file' / 'out'}")
-    found = state(lambda each: each.journal.level is Level.ERROR)
-    assert "a crash would lose the session" in found.journal.text
-
-
 class TestStreamChecks:
     """What the checks find is said while one still drives."""
 
