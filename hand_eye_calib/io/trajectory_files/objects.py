@@ -3,8 +3,8 @@ libraries is imported.
 """
 
 from array import array
-from collections.abc import Iterable, Sequence
-from typing import Any, Protocol, TypeAlias
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,11 +13,11 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.columns import QUATERNION, choose_columns, listed
+from hand_eye_calib.io.trajectory_files.columns import POSITION, QUATERNION, choose_columns, listed
 from hand_eye_calib.io.trajectory_files.poses import poses_of, unit_by_size
 from hand_eye_calib.io.trajectory_files.table import Table
 
-_POSE = ("x", "y", "z", *QUATERNION)
+_POSE = (*POSITION, *QUATERNION)
 _NS_PER_S = 1_000_000_000
 _KINDS = (
     "a path, a PoseTrajectory3D of evo, a DataFrame of pandas, a RigidTransform of SciPy, or an "
@@ -28,18 +28,14 @@ _KINDS = (
 class PathOfEvo(Protocol):
     """``evo.core.trajectory.PoseTrajectory3D``; a ``PosePath3D`` has no ``timestamps``."""
 
-    @property
-    def positions_xyz(self) -> Any: ...
-
-    @property
-    def orientations_quat_wxyz(self) -> Any: ...
+    positions_xyz: Any
+    orientations_quat_wxyz: Any
 
 
 class NamedColumns(Protocol):
     """``pandas.DataFrame``, or another table with named columns."""
 
-    @property
-    def columns(self) -> Iterable[Any]: ...
+    columns: Any
 
     def __getitem__(self, key: Any, /) -> Any: ...
 
@@ -53,6 +49,18 @@ class Transforms(Protocol):
 PoseObject: TypeAlias = (
     Trajectory | PathOfEvo | NamedColumns | Transforms | np.ndarray | Sequence[Any]
 )
+
+
+class _Found(NamedTuple):
+    """Matrices (N, 4, 4), or rows (N, 7) of position and quaternion, scalar last; stamps and their
+    unit, sensor and world frame, and notes, as far as the object has them.
+    """
+
+    poses: FloatArray
+    times: Any = None
+    stamp_unit: str | None = None
+    frames: tuple[str, str] = ("", "")
+    notes: Sequence[str] = ()
 
 
 def trajectory_from_object(
@@ -76,51 +84,51 @@ def trajectory_from_object(
         if times is not None or columns or stamp_unit:
             raise ConfigError("a Trajectory has stamps and poses already: give no other option")
         return source, []
-    if columns and not (hasattr(source, "columns") or _is_rows(source)):
+    is_evo, is_table = hasattr(source, "orientations_quat_wxyz"), hasattr(source, "columns")
+    if columns and (is_evo or not (is_table or np.ndim(source) == 2)):  # type: ignore[arg-type]
         raise ConfigError("columns are named for tables and for arrays of rows only")
-    own_times: Any = None
-    frames, notes = ("", ""), list[str]()
-    if hasattr(source, "orientations_quat_wxyz"):
-        values, own_times, frames = _of_evo(source)
+    names = [name.strip() for name in columns.split(",")] if columns is not None else None
+    if is_evo:
+        found = _of_evo(source)
     elif hasattr(source, "as_matrix"):
-        values = np.asarray(source.as_matrix(), dtype=float)
-    elif hasattr(source, "columns"):
-        values, own_times, stamp_unit, notes = _of_table(source, columns, times is None, stamp_unit)
+        found = _Found(np.asarray(source.as_matrix(), dtype=float))
+    elif is_table:
+        found = _of_table(source, names, times is None)
     else:
-        values, own_times = _of_array(source, columns, times is None)
-    if times is None and own_times is None:
+        found = _of_array(source, names, times is None)
+    if times is None and found.times is None:
         raise InputError("the poses have no stamps: give them with `times`, in seconds")
-    stamps_ns = to_nanoseconds(own_times if times is None else times, stamp_unit)
-    if values.ndim not in (2, 3) or len(stamps_ns) != len(values):
+    unit = stamp_unit or found.stamp_unit
+    stamps_ns, poses = to_nanoseconds(found.times if times is None else times, unit), found.poses
+    if poses.ndim not in (2, 3) or len(stamps_ns) != len(poses):
         raise InputError(
             f"there must be one stamp per pose; found {len(stamps_ns)} stamps and poses of shape "
-            f"{values.shape}"
+            f"{poses.shape}"
         )
-    keep, repairs = _in_order(stamps_ns, repair)
-    return _trajectory(stamps_ns[keep], values[keep], frames), notes + repairs
+    notes = [*found.notes]
+    if repair and not (np.diff(stamps_ns) > 0).all():
+        keep = np.unique(stamps_ns, return_index=True)[1]
+        n_repeated = len(stamps_ns) - len(keep)
+        notes.append(f"poses were sorted by time; {n_repeated} repeated ones dropped")
+        stamps_ns, poses = stamps_ns[keep], poses[keep]
+    if poses.shape[1:] == (4, 4):
+        return Trajectory(stamps_ns, poses, *found.frames), notes
+    parts = poses[:, :3], poses[:, 3:]
+    return Trajectory.from_quat_xyzw(stamps_ns, *parts, *found.frames), notes
 
 
-def _trajectory(stamps_ns: IntArray, values: FloatArray, frames: tuple[str, str]) -> Trajectory:
-    """Of matrices (N, 4, 4), or rows (N, 7) of position and quaternion, scalar last."""
-    if values.shape[1:] == (4, 4):
-        return Trajectory(stamps_ns, values, *frames)
-    return Trajectory.from_quat_xyzw(stamps_ns, values[:, :3], values[:, 3:], *frames)
-
-
-def _of_evo(source: Any) -> tuple[FloatArray, Any, tuple[str, str]]:
+def _of_evo(source: Any) -> _Found:
     quats_xyzw = np.roll(np.asarray(source.orientations_quat_wxyz, dtype=float), -1, axis=1)
-    values = np.hstack([np.asarray(source.positions_xyz, dtype=float), quats_xyzw])
+    poses = np.hstack([np.asarray(source.positions_xyz, dtype=float), quats_xyzw])
     meta = getattr(source, "meta", {})
     frames = (str(meta.get("child_frame_id") or ""), str(meta.get("frame_id") or ""))
-    return values, getattr(source, "timestamps", None), frames
+    return _Found(poses, getattr(source, "timestamps", None), frames=frames)
 
 
-def _of_table(
-    source: Any, columns: str | None, needs_times: bool, stamp_unit: str | None
-) -> tuple[FloatArray, Any, str | None, list[str]]:
-    """Poses, stamps, their unit, and notes; an index of times counts as a column of them."""
+def _of_table(source: Any, names: list[str] | None, needs_times: bool) -> _Found:
+    """Of a table; an index of times counts as a column of stamps."""
     own = [str(name) for name in source.columns]
-    names = own if columns is None else [name.strip() for name in columns.split(",")]
+    names = own if names is None else names
     if len(names) != len(own):
         raise InputError(f"{len(names)} columns are named; the table has {len(own)}")
     index = getattr(source, "index", None)
@@ -136,36 +144,32 @@ def _of_table(
         line_numbers=array("q", range(len(cells[0]))),
         numbers=array("d", np.stack(numbers, axis=1).tobytes()),
     )
-    values = np.hstack(poses_of(table))
-    if not chosen.stamp:
-        return values, index, stamp_unit, table.guesses
+    poses = np.hstack(poses_of(table))
+    times, unit = index if is_indexed else None, None
     if len(chosen.stamp) == 2:
-        seconds, rest = (np.asarray(cells[at], np.int64) for at in chosen.stamp)
-        return values, seconds * _NS_PER_S + rest, "ns", table.guesses
-    stamps = np.asarray(cells[chosen.stamp[0]])
-    return values, stamps, stamp_unit or chosen.stamp_unit or None, table.guesses
+        secs, nsecs = (np.asarray(cells[at], np.int64) for at in chosen.stamp)
+        times, unit = secs * _NS_PER_S + nsecs, "ns"
+    elif chosen.stamp:
+        times, unit = np.asarray(cells[chosen.stamp[0]]), chosen.stamp_unit or None
+    return _Found(poses, times, unit, notes=table.guesses)
 
 
-def _is_rows(source: Any) -> bool:
-    return not hasattr(source, "orientations_quat_wxyz") and np.ndim(source) == 2
-
-
-def _of_array(source: Any, columns: str | None, needs_times: bool) -> tuple[FloatArray, Any]:
+def _of_array(source: Any, names: list[str] | None, needs_times: bool) -> _Found:
     try:
         values = np.asarray(source, dtype=float)
     except (TypeError, ValueError):
         raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
     if values.ndim == 3 and values.shape[1:] == (4, 4):
-        return values, None
+        return _Found(values)
     wanted = ("t", *_POSE) if needs_times else _POSE
-    order = [*wanted] if columns is None else [name.strip() for name in columns.split(",")]
+    order = [*wanted] if names is None else names
     if values.ndim != 2 or values.shape[1] != len(order) or not {*wanted} <= {*order}:
         raise InputError(
             f"expected {_KINDS}; found an array {values.shape}. Rows are t,x,y,z,qx,qy,qz,qw, "
             "without t if there are `times`; another order is named with `columns`"
         )
     rows = values[:, [order.index(name) for name in _POSE]]
-    return rows, values[:, order.index("t")] if needs_times else None
+    return _Found(rows, values[:, order.index("t")] if needs_times else None)
 
 
 def to_nanoseconds(times: Any, stamp_unit: str | None = None) -> IntArray:
@@ -199,27 +203,13 @@ def to_nanoseconds(times: Any, stamp_unit: str | None = None) -> IntArray:
             f"stamps must be one-dimensional finite numbers or datetimes; found {stamps.dtype} of "
             f"shape {stamps.shape}"
         )
-    factor = STAMP_UNITS[stamp_unit or _unit_of(stamps)]
-    if len(stamps) and np.abs(stamps).max() > np.iinfo(np.int64).max / factor:
+    whole = np.floor(stamps) if stamps.dtype.kind == "f" else stamps
+    largest = float(np.abs(stamps).max(initial=0))
+    # Stamps with a fraction are in seconds.
+    by_size = unit_by_size(largest) if (stamps == whole).all() else "s"
+    factor = STAMP_UNITS[stamp_unit or by_size]
+    if largest > np.iinfo(np.int64).max / factor:
         raise InputError("stamps are too large for their unit; name it with `stamp_unit`")
-    if stamps.dtype.kind != "f":
-        return np.asarray(stamps.astype(np.int64) * factor)
-    whole = np.floor(stamps)
     # The fraction by itself, so that no digit of an epoch second is lost.
     fraction_ns = np.rint((stamps - whole) * factor).astype(np.int64)
     return np.asarray(whole.astype(np.int64) * factor + fraction_ns)
-
-
-def _unit_of(stamps: Any) -> str:
-    """Of whole numbers by their size; others are seconds."""
-    if stamps.dtype.kind == "f" and (stamps != np.floor(stamps)).any():
-        return "s"
-    return unit_by_size(float(np.abs(stamps).max(initial=0)))
-
-
-def _in_order(stamps_ns: IntArray, repair: bool) -> tuple[Any, list[str]]:
-    """Which poses to keep: all, or with ``repair`` one per stamp in the order of time."""
-    if not repair or (np.diff(stamps_ns) > 0).all():
-        return slice(None), []
-    keep = np.unique(stamps_ns, return_index=True)[1]
-    return keep, [f"poses were sorted by time; {len(stamps_ns) - len(keep)} repeated ones dropped"]
