@@ -264,7 +264,7 @@ _ROWS = {
         "both streams have the same positions and other orientations: the translation between the "
         "sensors is zero ({size})",
         "give positions of the child sensor itself",
-        "such as positions that were fused from the other sensor, or given for another point of "
+        "such as positions that were fused from the other sensor, or computed for another point of "
         "the robot than the sensor",
         evidence=("translation_m", "sigma_m"),
     ),
@@ -291,7 +291,7 @@ _ROWS = {
         code="smoothed_{part}",
     ),
     "world_drift": _Row(
-        "the child's world turns by {deg_per_minute:.2g} deg and moves by {m_per_minute:.2g} m a "
+        "the child's world rotates by {deg_per_minute:.2g} deg and moves by {m_per_minute:.2g} m a "
         "minute against the parent's: at {percent:.2g} % of the sensor's speed",
         "use the poses before that correction, in the frame of the odometry",
         "a map that is corrected bit by bit, a heading that drifts, or poses published in a frame "

@@ -100,7 +100,7 @@ _WHAT_TO_DO = {
     "model": "take the difference as the standard deviation, or record again with more varied "
     "motion; look for an odometry that drifts to one side",
     "halves": "check that both mounts are tight and record again; what the halves agree on holds",
-    "methods": "take the scatter as the standard deviation, or record longer with more varied "
+    "methods": "use their scatter as the standard deviation, or record longer with more varied "
     "motion",
 }
 
@@ -177,12 +177,12 @@ def _contradicted(result: Result) -> Iterator[_Found]:
     ]
     which = f"the prior {listing(apart)}" if apart else "a prior contradicts"
     names = listing([f"prior.{axis}" for axis in axes]) or "the prior"
-    yield f"{which} what the motion shows", f"check value, unit and sign of {names}", axes, {}
+    yield f"{which} the estimate from the motion", f"check value, unit and sign of {names}", axes, {}
 
 
 def _nothing_known(result: Result) -> Iterator[_Found]:
     if len(_unobservable(result)) == _n_within_reach(result):
-        text = "the motion shows nothing of how the sensors are mounted"
+        text = "nothing about the mounting can be determined from this motion"
         yield text, "record motion with rotations about all axes", (), {}
 
 
@@ -347,8 +347,8 @@ RULES = (
     Rule(
         "prior",
         _NEVER,
-        "a prior is more than 4 joint standard deviations from what the motion shows, or a lever "
-        "arm of more than 50 m",
+        "a prior is more than 4 joint standard deviations from the estimate from the motion, or a "
+        "lever arm of more than 50 m",
         _contradicted,
     ),
     Rule("error_finding", _NEVER, "a stream check found an error", _findings_of(Severity.ERROR)),

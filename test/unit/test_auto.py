@@ -110,7 +110,7 @@ class TestWhichAnswerStands:
         dnlo = hec.calibrate(*streams, method="dnlo", reference="B3")
         np.testing.assert_array_equal(result.T_parent_child, dnlo.T_parent_child)
         assert (result.method, result.reference) == ("dnlo", "B3")
-        assert result.method_reason == "auto: dnlo, for reference B3 is given"
+        assert result.method_reason == "auto: dnlo, because the user set reference B3"
 
     def test_the_estimator_is_solved_once(self, monkeypatch):
         solves = []
