@@ -270,7 +270,9 @@ def _solve_auto(
     with_dnlo = replace(config, method="dnlo")
     if config.reference != "auto":
         dnlo = _solve_pairs(pose_pairs, with_dnlo)
-        return replace(dnlo, method_reason=f"auto: dnlo, because the user set reference {config.reference}")
+        return replace(
+            dnlo, method_reason=f"auto: dnlo, because the user set reference {config.reference}"
+        )
     solution = _adaptive_solution(pose_pairs, config, is_clock_free)
     by_model = _evaluated(pose_pairs, solution)
     if len(pose_pairs) < MIN_POSES:

@@ -177,7 +177,12 @@ def _contradicted(result: Result) -> Iterator[_Found]:
     ]
     which = f"the prior {listing(apart)}" if apart else "a prior contradicts"
     names = listing([f"prior.{axis}" for axis in axes]) or "the prior"
-    yield f"{which} the estimate from the motion", f"check value, unit and sign of {names}", axes, {}
+    yield (
+        f"{which} the estimate from the motion",
+        f"check value, unit and sign of {names}",
+        axes,
+        {},
+    )
 
 
 def _nothing_known(result: Result) -> Iterator[_Found]:
