@@ -14,9 +14,13 @@ from typing import Any, Self, TypeAlias
 
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.methods import BACKENDS, METHODS
-
-# Characters of a value that a message shows.
-_MOST_SHOWN = 80
+from hand_eye_calib.text import (
+    AXIS_UNITS,
+    check_frames,
+    parse_prior,
+    parse_targets,
+    shown_value,
+)
 
 REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})"
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
@@ -26,12 +30,8 @@ STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (
     "auto",
     "nav_msgs/msg/Odometry",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-    "sensor_msgs/msg/Imu",
-    "sensor_msgs/msg/NavSatFix",
-    "geometry_msgs/msg/PointStamped",
+    *(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform")),
+    *("sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PointStamped"),
 )
 
 OptionValue: TypeAlias = bool | int | float | str
@@ -60,22 +60,17 @@ def option(
     ----------
     default
         Its type is the option's type.
-    doc
-        One line for a person who is about to set it.
-    unit
-        Unit of the value, empty for none.
-    within
-        Smallest and largest allowed value.
-    choices
-        The allowed values.
+    doc, unit
+        One line for a person who is about to set it; unit of the value, empty for none.
+    within, choices
+        Smallest and largest allowed value; the allowed values.
     pattern, form
         Regular expression that the whole value must match, and the same in words.
     words
         Words that may stand for a number, such as "none".
-    name
-        Public name if it differs from the attribute's, such as ``keyframe.min_translation``.
-    read_only
-        The node cannot change it while it runs.
+    name, read_only
+        Public name if it differs from the attribute's, such as ``keyframe.min_translation``; the
+        node cannot change the option while it runs.
     parse
         For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
     """
@@ -99,12 +94,6 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
-def _shown(value: object) -> str:
-    """A value for a message, which must not grow with it."""
-    text = repr(value)
-    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
-
-
 def check_value(field: OptionField, value: object) -> OptionValue:
     """Check a value of an option and give it the option's own type.
 
@@ -125,8 +114,9 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         value = float(value)
     if type(value) is not kind or not isinstance(value, bool | int | float):
         expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[kind]
-        hint = did_you_mean(str(value), words) if words else ""
-        raise ConfigError(f"{name} must be {expected}; got {_shown(value)}{hint}")
+        raise ConfigError(
+            f"{name} must be {expected}; got {shown_value(value)}{did_you_mean(str(value), words)}"
+        )
     if not math.isfinite(value):
         raise ConfigError(f"{name} must be a finite number; got {value}")
     unit = f" {meta['unit']}" if meta["unit"] else ""
@@ -140,14 +130,18 @@ def check_value(field: OptionField, value: object) -> OptionValue:
 def _checked_text(name: str, value: str, meta: Mapping[str, Any]) -> str:
     if meta["choices"] is not None and value not in meta["choices"]:
         raise ConfigError(
-            f"{name} must be one of {', '.join(meta['choices'])}; got {_shown(value)}"
+            f"{name} must be one of {', '.join(meta['choices'])}; got {shown_value(value)}"
             f"{did_you_mean(value, meta['choices'])}"
         )
     if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
-        raise ConfigError(f"{name} must be {meta['form']}; got {_shown(value)}")
+        raise ConfigError(f"{name} must be {meta['form']}; got {shown_value(value)}")
     if meta["parse"] is not None:
         meta["parse"](name, value)
     return value
+
+
+def _fields(options: Any) -> tuple[OptionField, ...]:
+    return dataclasses.fields(options)
 
 
 class OptionSet:
@@ -182,94 +176,13 @@ class OptionSet:
         return {option_name(field): getattr(self, field.name) for field in _fields(self)}
 
 
-def _fields(options: Any) -> tuple[OptionField, ...]:
-    return dataclasses.fields(options)
-
-
-AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
-_IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
-_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
-
-# Lengths (m) and angles (rad) that a person gives are smaller: no square of one overflows.
-_LARGEST_QUANTITY = 1e6
-
-# Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
-# pitch, yaw (rad): value and standard deviation, or both as the text of the option
-# ``prior.<axis>``. "transform" takes the text of ``prior.transform``.
-Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
-
-
-def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
-    """Values and standard deviations of the axes that a prior option gives: axis name to
-    (value, sigma), in m or rad; empty for an empty text.
-
-    Parameters
-    ----------
-    name : str
-        prior.x ... prior.yaw or prior.transform.
-    text : str
-        ``VALUE+/-SIGMA`` for an axis; ``X Y Z ROLL PITCH YAW +/- SIGMA_TRANSLATION SIGMA_ROTATION``
-        for the transform. Metres and radians, or with units (m, cm, mm, rad, deg).
-
-    Raises
-    ------
-    ConfigError
-        If the text has another form, an unknown unit or a standard deviation of 0.
-    """
-    if not text:
-        return {}
-    axis = name.removeprefix("prior.")
-    axes = tuple(AXIS_UNITS) if axis == "transform" else (axis,)
-    before, plus_minus, after = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
-    values, sigmas, expected = before.split(), after.split(), "VALUE+/-SIGMA"
-    if axis == "transform":
-        expected = "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
-        sigmas = sigmas[:1] * 3 + sigmas[1:] * 3 if len(sigmas) == 2 else sigmas
-    if not plus_minus or len(values) != len(axes) or len(sigmas) != len(axes):
-        raise ConfigError(f"{name} must be {expected}, with its standard deviation; got {text!r}")
-    prior = {}
-    for axis, value, sigma in zip(axes, values, sigmas, strict=True):
-        unit = AXIS_UNITS[axis]
-        prior[axis] = (_quantity(name, value, unit), _quantity(name, sigma, unit))
-        if not prior[axis][1] > 0:
-            raise ConfigError(f"{name} needs a standard deviation above 0; got {text!r}")
-        if unit == "rad" and abs(prior[axis][0]) > 2 * math.pi:
-            raise ConfigError(
-                f"{name} is in radians unless it says deg; got {_shown(value)}: write {value}deg"
-            )
-    return prior
-
-
-def split_frames(text: str) -> tuple[str, str]:
-    """The fixed frame and the sensor's frame of ``WORLD:SENSOR``.
-
-    Raises
-    ------
-    ConfigError
-        If these are not two different frames.
-    """
-    frames = [frame.strip().lstrip("/") for frame in text.split(":")]
-    if len(frames) != 2 or not all(frames) or frames[0] == frames[1]:
-        raise ConfigError(
-            f"expected two frames as WORLD:SENSOR, such as odom:lidar; got {_shown(text)}"
-        )
-    return frames[0], frames[1]
-
-
-def _check_frames(name: str, text: str) -> None:
-    try:
-        split_frames(text or "world:sensor")
-    except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from None
-
-
 def _tf_source(stream: str) -> Any:
     return option(
         "",
         f"Take the poses of the {stream} sensor from /tf and /tf_static instead of {stream}_odom: "
         "WORLD:SENSOR, the fixed frame and the sensor's, such as odom:lidar. Empty for the topic.",
         read_only=True,
-        parse=_check_frames,
+        parse=check_frames,
     )
 
 
@@ -281,58 +194,6 @@ def _measures(stream: str) -> Any:
         choices=("auto", *MEASURES),
         read_only=True,
     )
-
-
-def parse_pose(name: str, text: str) -> tuple[float, ...]:
-    """The six numbers of ``X Y Z ROLL PITCH YAW``, in m and rad; units may be given, as in
-    ``40cm 0 1.85 0 0 -90deg``.
-
-    Raises
-    ------
-    ConfigError
-        If the text has another form.
-    """
-    words = text.split()
-    if len(words) != len(AXIS_UNITS):
-        raise ConfigError(f"{name} must be X Y Z ROLL PITCH YAW; got {_shown(text)}")
-    values = zip(words, AXIS_UNITS.values(), strict=True)
-    return tuple(_quantity(name, word, unit) for word, unit in values)
-
-
-def parse_targets(name: str, text: str) -> dict[str, float]:
-    """Targets of single axes: ``z=10cm yaw=0.5deg``, metres and radians without a unit, as axis
-    name to standard deviation in m or rad.
-
-    Raises
-    ------
-    ConfigError
-        If the text has another form, an axis comes twice or a target is not above 0.
-    """
-    targets: dict[str, float] = {}
-    for word in text.replace(",", " ").split():
-        axis, _, value = word.partition("=")
-        if axis not in AXIS_UNITS or axis in targets:
-            raise ConfigError(
-                f"{name} takes AXIS=TARGET of {', '.join(AXIS_UNITS)}, once each, such as z=10cm "
-                f"yaw=0.5deg; got {_shown(word)}"
-            )
-        targets[axis] = _quantity(f"{name}: {axis}", value, AXIS_UNITS[axis])
-        if not targets[axis] > 0:
-            raise ConfigError(f"{name} needs targets above 0; got {_shown(word)}")
-        if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
-            raise ConfigError(f"{name} is in rad without a unit; write {axis}={value}deg")
-    return targets
-
-
-def _quantity(name: str, text: str, unit: str) -> float:
-    match = _QUANTITY.fullmatch(text)
-    if not match or (match[2] or unit) not in _IN_SI[unit]:
-        units = " or ".join(_IN_SI[unit])
-        raise ConfigError(f"{name} must be numbers in {units}; got {_shown(text)}")
-    value = float(match[1]) * _IN_SI[unit][match[2] or unit]
-    if abs(value) > _LARGEST_QUANTITY:
-        raise ConfigError(f"{name} must be at most {_LARGEST_QUANTITY:g} {unit}; got {text[:20]!r}")
-    return value
 
 
 def _prior(axis: str) -> Any:
@@ -563,8 +424,7 @@ class CalibratorConfig(OptionSet):
         return known
 
 
-# Further child sensors of the node.
-MOST_OTHERS = 7
+MOST_OTHERS = 7  # further child sensors of the node
 
 
 def other_names(count: int = MOST_OTHERS) -> list[str]:

@@ -1,9 +1,13 @@
-"""Numbers, lengths, angles and lists as people read them: on the terminal, on pages and in the log.
-Every place that prints a quantity takes it from here.
+"""Numbers, lengths, angles and lists as people read them, on the terminal, on pages and in the log,
+and as they type them. Every place that prints or reads a quantity takes it from here.
 """
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+from hand_eye_calib.errors import ConfigError
 
 # Shorter lengths (m) are in mm, from the second on in m.
 _MM_BELOW, _M_FROM = 0.00995, 0.995
@@ -122,3 +126,144 @@ def listing(words: Sequence[str]) -> str:
 def counted(count: int, noun: str) -> str:
     """A count and a noun that forms its plural with s."""
     return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
+# --------------------------- what people type: m and rad, or with a unit
+
+# Characters of a value that a message shows.
+_MOST_SHOWN = 80
+
+AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
+_IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
+
+# Lengths (m) and angles (rad) that a person gives are smaller: no square of one overflows.
+_LARGEST_QUANTITY = 1e6
+
+# Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
+# pitch, yaw (rad): value and standard deviation, or both as the text of the option
+# ``prior.<axis>``. "transform" takes the text of ``prior.transform``.
+Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
+
+
+def shown_value(value: object) -> str:
+    """A value for a message, which must not grow with it."""
+    text = repr(value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+
+
+def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
+    """Values and standard deviations of the axes that a prior option gives: axis name to
+    (value, sigma), in m or rad; empty for an empty text.
+
+    Parameters
+    ----------
+    name : str
+        prior.x ... prior.yaw or prior.transform.
+    text : str
+        ``VALUE+/-SIGMA`` for an axis; ``X Y Z ROLL PITCH YAW +/- SIGMA_TRANSLATION SIGMA_ROTATION``
+        for the transform. Metres and radians, or with units (m, cm, mm, rad, deg).
+
+    Raises
+    ------
+    ConfigError
+        If the text has another form, an unknown unit or a standard deviation of 0.
+    """
+    if not text:
+        return {}
+    axis = name.removeprefix("prior.")
+    axes = tuple(AXIS_UNITS) if axis == "transform" else (axis,)
+    before, plus_minus, after = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
+    values, sigmas, expected = before.split(), after.split(), "VALUE+/-SIGMA"
+    if axis == "transform":
+        expected = "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
+        sigmas = sigmas[:1] * 3 + sigmas[1:] * 3 if len(sigmas) == 2 else sigmas
+    if not plus_minus or len(values) != len(axes) or len(sigmas) != len(axes):
+        raise ConfigError(f"{name} must be {expected}, with its standard deviation; got {text!r}")
+    prior = {}
+    for axis, value, sigma in zip(axes, values, sigmas, strict=True):
+        unit = AXIS_UNITS[axis]
+        prior[axis] = (_quantity(name, value, unit), _quantity(name, sigma, unit))
+        if not prior[axis][1] > 0:
+            raise ConfigError(f"{name} needs a standard deviation above 0; got {text!r}")
+        if unit == "rad" and abs(prior[axis][0]) > 2 * math.pi:
+            raise ConfigError(
+                f"{name} is in radians unless it says deg; got {value[:20]}: write {value[:20]}deg"
+            )
+    return prior
+
+
+def parse_pose(name: str, text: str) -> tuple[float, ...]:
+    """The six numbers of ``X Y Z ROLL PITCH YAW``, in m and rad; units may be given, as in
+    ``40cm 0 1.85 0 0 -90deg``.
+
+    Raises
+    ------
+    ConfigError
+        If the text has another form.
+    """
+    words = text.split()
+    if len(words) != len(AXIS_UNITS):
+        raise ConfigError(f"{name} must be X Y Z ROLL PITCH YAW; got {shown_value(text)}")
+    values = zip(words, AXIS_UNITS.values(), strict=True)
+    return tuple(_quantity(name, word, unit) for word, unit in values)
+
+
+def parse_targets(name: str, text: str) -> dict[str, float]:
+    """Targets of single axes: ``z=10cm yaw=0.5deg``, metres and radians without a unit, as axis
+    name to standard deviation in m or rad.
+
+    Raises
+    ------
+    ConfigError
+        If the text has another form, an axis comes twice or a target is not above 0.
+    """
+    targets: dict[str, float] = {}
+    for word in text.replace(",", " ").split():
+        axis, _, value = word.partition("=")
+        if axis not in AXIS_UNITS or axis in targets:
+            raise ConfigError(
+                f"{name} takes AXIS=TARGET of {', '.join(AXIS_UNITS)}, once each, such as z=10cm "
+                f"yaw=0.5deg; got {shown_value(word)}"
+            )
+        targets[axis] = _quantity(f"{name}: {axis}", value, AXIS_UNITS[axis])
+        if not targets[axis] > 0:
+            raise ConfigError(f"{name} needs targets above 0; got {shown_value(word)}")
+        if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
+            raise ConfigError(f"{name} is in rad without a unit; write {axis}={value}deg")
+    return targets
+
+
+def _quantity(name: str, text: str, unit: str) -> float:
+    match = _QUANTITY.fullmatch(text)
+    if not match or (match[2] or unit) not in _IN_SI[unit]:
+        units = " or ".join(_IN_SI[unit])
+        raise ConfigError(f"{name} must be numbers in {units}; got {shown_value(text)}")
+    value = float(match[1]) * _IN_SI[unit][match[2] or unit]
+    if abs(value) > _LARGEST_QUANTITY:
+        raise ConfigError(f"{name} must be at most {_LARGEST_QUANTITY:g} {unit}; got {text[:20]!r}")
+    return value
+
+
+def split_frames(text: str) -> tuple[str, str]:
+    """The fixed frame and the sensor's frame of ``WORLD:SENSOR``.
+
+    Raises
+    ------
+    ConfigError
+        If these are not two different frames.
+    """
+    frames = [frame.strip().lstrip("/") for frame in text.split(":")]
+    if len(frames) != 2 or not all(frames) or frames[0] == frames[1]:
+        raise ConfigError(
+            f"expected two frames as WORLD:SENSOR, such as odom:lidar; got {shown_value(text)}"
+        )
+    return frames[0], frames[1]
+
+
+def check_frames(name: str, text: str) -> None:
+    """Raise ConfigError, with the name of the option, for a text that is no WORLD:SENSOR."""
+    try:
+        split_frames(text or "world:sensor")
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None

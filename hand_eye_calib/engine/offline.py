@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig, Prior
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import OtherAnswers, compare_answers
 from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
@@ -13,6 +13,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import CrossCheck
+from hand_eye_calib.text import AXIS_UNITS, Prior
 
 # Pose pairs that are used unless an option says otherwise: the noise model takes 8 kB for each, and
 # hours at ten a second hold as many.
@@ -66,7 +67,7 @@ def calibrate(
         What counts of a trajectory of poses: "positions" or "rotations" alone.
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
-        ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.config.Prior`.
+        ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.text.Prior`.
     checks : bool, optional
         False: the streams are not checked, the result is not compared with other references and
         halves of the recording, and nothing is solved a second time. True: it is compared also if

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from hand_eye_calib.config import parse_pose
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
@@ -12,6 +11,7 @@ from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.io.results import FILE_NAME, load_result
 from hand_eye_calib.io.urdf import RobotDescription
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.text import parse_pose
 
 _RESULTS, _DESCRIPTIONS = (".yaml", ".yml"), (".urdf", ".xml", ".xacro")
 

@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.config import split_frames
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.limits import MOST_FRAMES
 from hand_eye_calib.io.plausibility import check_positions
+from hand_eye_calib.text import split_frames
 
 
 class TfSource(NamedTuple):

@@ -7,13 +7,14 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 from hand_eye_calib.assessment.covariance import AXES, UNKNOWN_TRANSLATION, Assessment
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig, parse_prior
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.text import parse_prior
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -39,6 +40,7 @@ class TestOption:
         [
             ("prior.z", "1.85+/-0.02", {"z": (1.85, 0.02)}),
             ("prior.z", "185cm +/- 20mm", {"z": (1.85, 0.02)}),
+            ("prior.z", "1.85+-0.02", {"z": (1.85, 0.02)}),
             ("prior.x", "-.5±1e-2", {"x": (-0.5, 0.01)}),
             ("prior.yaw", "-90deg+/-2deg", {"yaw": (-np.pi / 2, np.radians(2))}),
             ("prior.roll", "0.1+/-0.05", {"roll": (0.1, 0.05)}),

@@ -16,13 +16,14 @@ from motions import (
 )
 
 import hand_eye_calib as hec
-from hand_eye_calib.config import AXIS_UNITS, CalibratorConfig
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import offline_config, prior_fields, whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.methods import BACKENDS, METHODS
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.dnl import pair_costs
 from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.text import AXIS_UNITS
 
 PRIOR_FIELDS = {f"prior_{axis}" for axis in (*AXIS_UNITS, "transform")}
 

@@ -11,9 +11,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from hand_eye_calib.cli.options import STREAMS, Options
-from hand_eye_calib.config import CalibratorConfig, split_frames
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.io import remote
+from hand_eye_calib.text import split_frames
 
 SOURCES = ("parent_topic", "child_topic", "parent_tf", "child_tf")
 _KEYS = ("bag", "name", "vehicle", "options", *SOURCES)
