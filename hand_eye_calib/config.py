@@ -24,7 +24,6 @@ from hand_eye_calib.text import (
 
 REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})"
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
-# What a sensor may measure of its poses.
 MEASURES = ("poses", "positions", "rotations", "rates")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (
@@ -119,11 +118,10 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         )
     if not math.isfinite(value):
         raise ConfigError(f"{name} must be a finite number; got {value}")
-    unit = f" {meta['unit']}" if meta["unit"] else ""
-    if meta["minimum"] is not None and value < meta["minimum"]:
-        raise ConfigError(f"{name} must be at least {meta['minimum']}{unit}; got {value}")
-    if meta["maximum"] is not None and value > meta["maximum"]:
-        raise ConfigError(f"{name} must be at most {meta['maximum']}{unit}; got {value}")
+    unit, least, most = (meta[key] for key in ("unit", "minimum", "maximum"))
+    if least is not None and not least <= value <= most:
+        bound = f"at least {least}" if value < least else f"at most {most}"
+        raise ConfigError(f"{name} must be {f'{bound} {unit}'.rstrip()}; got {value}")
     return value
 
 

@@ -14,17 +14,7 @@ from hand_eye_calib.simulation.options import NoiseConfig
 
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
 # public Python API. In the engine each room sees only rooms before it.
-GROUND = {
-    "errors",
-    "text",
-    "quantities",
-    "config",
-    "methods",
-    "arrays",
-    "stats",
-    "plain",
-    "version",
-}
+GROUND = {"errors", "text", "config", "methods", "arrays", "stats", "plain", "version"}
 ENGINE = {
     "errors": set(),
     "arrays": set(),
