@@ -1,6 +1,6 @@
 """``calibrate PATH ...``: two trajectory files, a bag or the parts of one, or the journal of a
-session; three sensors or more; many recordings. ``replay`` is its other name, for bags and journals
-alone.
+session; the stops of an arm; three sensors or more; many recordings. ``replay`` is its other name,
+for bags and journals alone.
 """
 
 import argparse
@@ -32,6 +32,7 @@ examples:
   hand_eye_calib calibrate my_bag --parent-tf odom:lidar --child-topic /vio --out result
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
   hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
+  hand_eye_calib calibrate samples.yaml --out arm
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
@@ -52,6 +53,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--list",
         action="store_true",
         help="show the bag's topics with types, counts, rates and frames, and exit",
+    )
+    parser.add_argument(
+        "--order",
+        choices=("time", "none"),
+        default="time",
+        help="none: the poses of two files are stops without an order, paired by their rows. So "
+        "are the samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH",
     )
     batch = parser.add_argument_group("many recordings")
     batch.add_argument(
@@ -110,12 +118,14 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     """
     if arguments.list:
         return _list_topics(arguments, as_given)
-    from hand_eye_calib.cli import rig
+    from hand_eye_calib.cli import rig, stops
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.cli.reading import are_bags, read_recording
 
     if arguments.topics:
         return rig.calibrate_bag(arguments, as_given)
+    if stops.are_stops(arguments):
+        return deliver(*stops.solved(arguments), None)
     arguments.is_of_bags = arguments.command == "replay" or are_bags(arguments.paths)
     if len(arguments.paths) > 2 and not arguments.is_of_bags:
         return rig.calibrate_files(arguments)

@@ -52,7 +52,7 @@ def deliver(
     calibration: Calibration,
     arguments: argparse.Namespace,
     inputs: dict[str, Any],
-    snapshot: "Snapshot",
+    snapshot: "Snapshot | None",
 ) -> int:
     """Print a calibration, save it if ``--out`` asks for that, and return the exit code.
 
@@ -64,13 +64,13 @@ def deliver(
     inputs : dict
         Where the data came from, in plain values: part of the JSON document and of the saved file's
         provenance.
-    snapshot : Snapshot
+    snapshot : Snapshot or None
         The poses and options that gave it. With them, ``--out`` also runs the cross-checks and
-        writes the report.
+        writes the report. None for stops.
     """
     calibration = with_robot(calibration, arguments)
     evidence: Evidence | None = None
-    if arguments.out:
+    if arguments.out and snapshot:
         with waiting_for("cross-checks with other methods and halves of the recording"):
             calibration, evidence = with_cross_check(calibration, snapshot)
 
@@ -82,7 +82,7 @@ def deliver(
 
     def finish() -> None:
         write_description(calibration, arguments)
-        if evidence is not None:
+        if evidence is not None and snapshot:
             write_report(arguments.out, calibration, evidence, snapshot.config, inputs)
 
     code = exit_code(calibration)
@@ -174,6 +174,9 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
         lines += ["", f"{source} in {target}: maps coordinates of {source} into {target}"]
         transform = document["T_parent_child" if key == "child" else "T_child_parent"]
         lines += transform_lines(transform, reach)
+    if calibration.T_world_world is not None:
+        worlds = f"{calibration.child_world_frame} in {calibration.parent_world_frame}"
+        lines += ["", worlds, *transform_lines(document["T_world_world"])]
     if calibration.T_base_child is not None:
         lines += ["", f"{child} in {calibration.base_frame}"]
         lines += transform_lines(document["T_base_child"], reach)
@@ -202,7 +205,7 @@ def wrapped(text: str, first: str, others: str) -> list[str]:
 
 
 def next_steps(
-    calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot"
+    calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot | None"
 ) -> list[str]:
     """What to do next, in sentences and commands; empty if the result may be used."""
     is_poor = calibration.verdict is Verdict.DO_NOT_USE
@@ -210,7 +213,7 @@ def next_steps(
     if calibration.verdict is Verdict.USE:
         return []
     steps = []
-    if is_of_poses and not is_poor and not calibration.status.failure:
+    if snapshot and is_of_poses and not is_poor and not calibration.status.failure:
         from hand_eye_calib.assessment.excitation import excitation, what_is_missing
 
         motion = what_is_missing(excitation(snapshot.pose_pairs()), calibration)
@@ -224,7 +227,7 @@ def next_steps(
         reach = calibration.out_of_reach
         hidden = [axis for axis in calibration.unobservable() if axis not in reach]
         extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in hidden[:3]]
-        if not extra and not arguments.out and is_of_poses:
+        if not extra and not arguments.out and is_of_poses and snapshot:
             extra = ["--out result"]  # figures that show where the disagreement comes from
     if extra:
         typed = shlex.join(arguments.typed)

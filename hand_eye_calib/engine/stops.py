@@ -1,5 +1,6 @@
 """From stops of an arm to a calibration: ``A X = Z B`` solved, judged, and named by its frames."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +47,7 @@ def calibrate_stops(
         Poses of both sensors, each in its own world: of a hand in the base of a robot, and of the
         camera in the hand in the frame of a target.
     config : CalibratorConfig, optional
-        Its priors and targets count.
+        Its priors, targets and names of frames count.
     frames : StopFrames, optional
 
     Returns
@@ -70,7 +71,7 @@ def calibrate_arm(
     robot: FloatArray,
     tracking: FloatArray,
     config: CalibratorConfig | None = None,
-    names: dict[str, str] | None = None,
+    names: Mapping[str, str] | None = None,
 ) -> Calibration:
     """Calibrate a camera on a robot's hand, or beside the robot with the target on the hand.
 
@@ -92,7 +93,7 @@ def calibrate_arm(
         The camera in the hand, and the target in the base; or the camera in the base, and the
         target in the hand.
     """
-    named = {name: name for name in ("base", "hand", "camera", "target")} | (names or {})
+    named = {name: name for name in ("base", "hand", "camera", "target")} | dict(names or {})
     in_hand = solve(Stops.of_one(robot, se3.inverse(tracking)))
     beside = solve(Stops.of_one(se3.inverse(robot), se3.inverse(tracking)))
     if beside.log_likelihood > in_hand.log_likelihood:
@@ -140,8 +141,8 @@ def _assessed(
         findings=tuple(findings),
         contradictions=fused.contradictions,
         **config.target_fields(),
-        parent_frame=frames.parent,
-        child_frame=frames.child,
+        parent_frame=config.parent_frame or frames.parent,
+        child_frame=config.child_frame or frames.child,
         T_world_world=Z,
         cov_world_world=fit.covariance[6:, 6:],
         parent_world_frame=frames.parent_world,

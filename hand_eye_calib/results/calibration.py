@@ -258,12 +258,14 @@ class Calibration(Result):
                 "matrix": self.T_method,
             }
         if self.T_world_world is not None and self.cov_world_world is not None:
-            document["T_world_world"] = {
-                "of": f"pose of {self.child_world_frame} in {self.parent_world_frame}",
-                "translation": self.T_world_world[:3, 3],
-                "quat_xyzw": se3.to_quat_xyzw(self.T_world_world),
-                "matrix": self.T_world_world,
-            }
+            sigmas_m = sigmas_translation(self.T_world_world, self.cov_world_world)
+            document["T_world_world"] = self._printed_dict(
+                self.T_world_world,
+                self.parent_world_frame,
+                self.child_world_frame,
+                np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m),
+                self.cov_world_world,
+            )
             document["cov_world_world"] = {
                 "of": "error xi in T_world_world @ exp(xi)",
                 "frame": self.child_world_frame,

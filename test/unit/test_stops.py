@@ -1,10 +1,13 @@
 """Calibrations from stops: which way round, frames, verdicts, files."""
 
+import json
+
 import numpy as np
 import pytest
 from real_data import data_folder
 
 import hand_eye_calib as hec
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
 from hand_eye_calib.geometry import se3
@@ -86,3 +89,27 @@ def test_samples_of_others(file, parent, position, within_m):
     assert result.verdict is not hec.Verdict.DO_NOT_USE
     if position:
         np.testing.assert_allclose(result.T_parent_child[:3, 3], position, atol=within_m)
+
+
+class TestCommand:
+    def test_samples_are_the_only_path(self, random, tmp_path, capsys):
+        robot, tracking, X, _ = arm(random)
+        np.savez(tmp_path / "samples.npz", robot=robot, tracking=tracking)
+        out = tmp_path / "out"
+        assert main(["calibrate", str(tmp_path / "samples.npz"), "--out", str(out)]) == 0
+        assert "camera in hand: maps coordinates" in (told := capsys.readouterr().out)
+        assert "target in base" in told
+        np.testing.assert_allclose(hec.load(out).T_parent_child, X, atol=5e-3)
+
+    def test_two_files_without_an_order(self, random, tmp_path, capsys):
+        robot, tracking, X, _ = arm(random)
+        for name, poses in (("hand", robot), ("eye", se3.inverse(tracking))):
+            stamps_ns = np.arange(len(poses)) * 10**9
+            hec.write_trajectory(tmp_path / f"{name}.tum", hec.Trajectory(stamps_ns, poses))
+        files = [str(tmp_path / "hand.tum"), str(tmp_path / "eye.tum")]
+        assert main(["calibrate", *files, "--order", "none", "--json"]) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert document["reference"] == "stops"
+        np.testing.assert_allclose(document["T_parent_child"]["matrix"], X, atol=5e-3)
+        assert main(["calibrate", files[0], "--order", "none"]) == 2
+        assert "two trajectory files, or the samples" in capsys.readouterr().err
