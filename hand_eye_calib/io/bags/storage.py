@@ -14,6 +14,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.io.bags.indexed import messages_of
 from hand_eye_calib.io.bags.recovery import (
     Lose,
     Message,
@@ -205,9 +206,9 @@ class Storage:
         if not wanted:
             return
         n_missing = sum(each.msgcount for each in wanted)
-        for connection, bag_ns, data in self._reader.messages(wanted):
+        for message in messages_of(self._reader, {each.id: kinds[each.id] for each in wanted}):
             n_missing -= 1
-            yield kinds[connection.id], bag_ns, data
+            yield message
         if n_missing:
             self._lose(f"{n_missing} of the messages that its index has are missing")
 
