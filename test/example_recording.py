@@ -1,5 +1,6 @@
 """A folder with everything that commands and Python on the pages of the documentation name."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,8 @@ _ROBOT = """\
 
 def make(folder: Path) -> None:
     """Fill a folder: ``my_drive/``, ``lidar.tum``, ``camera.tum``, ``camera.csv``, ``ins.csv``,
-    ``gnss.csv``, ``imu.csv``, ``flange.tum``, ``camera_on_arm.tum``, ``robot.urdf``, and results.
+    ``gnss.csv``, ``imu.csv``, ``flange.tum``, ``camera_on_arm.tum``,
+    ``samples.yaml``, ``robot.urdf``, and results.
 
     INS, antenna and IMU are where the camera is.
     """
@@ -58,6 +60,10 @@ def make(folder: Path) -> None:
     stamps_ns = drive.stamps_ns
     hec.write_trajectory(folder / "flange.tum", _noisy(stamps_ns, arm, 3))
     hec.write_trajectory(folder / "camera_on_arm.tum", _noisy(stamps_ns, arm @ T_LIDAR_CAMERA, 4))
+
+    camera_on_arm = disturbed(arm @ T_LIDAR_CAMERA, 5, 1e-3, 5e-4)
+    stops = zip(arm[::10].tolist(), se3.inverse(camera_on_arm[::10]).tolist(), strict=True)
+    (folder / "samples.yaml").write_text(json.dumps(list(stops)), encoding="utf-8")
 
     (folder / "robot.urdf").write_text(_ROBOT, encoding="utf-8")
     result = hec.calibrate(lidar, camera, method="dnlo", reference="B5")
