@@ -84,7 +84,7 @@ class CalibratorNode(Node):
         _ = config.measured  # or it raises
         self._session.reconfigure(config)
         self._tf = TfBroadcaster(self, self._log)
-        self._robot = Robot(self, self._log, options, self._tf)
+        self._robot = Robot(self, self._log, options, self._tf.is_own)
         self._others = other_names(options.other_children)
         self._session.take_others(self._others)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *self._others)]
@@ -94,13 +94,7 @@ class CalibratorNode(Node):
             each.resume()
         self._results, self._states = ResultTopics(self), StateTopics(self)
         self._tf.switch(options.publish_tf)
-        self._mount = None
-        if options.monitor:
-            self._session.watch_only(LIMITS)
-            why = self._robot
-            self._mount = MountWatch(
-                self._session, self._robot.installed, lambda: why.problem, self._log
-            )
+        self._mount = self._watch_mount() if options.monitor else None
         self._due_answers: deque[tuple[Future, tuple[bool, str]]] = deque()
         self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
         self._cycle = SolveCycle(
@@ -135,6 +129,11 @@ class CalibratorNode(Node):
         return saved
 
     # ---------------------------------------------------------------- set-up
+
+    def _watch_mount(self) -> MountWatch:
+        robot = self._robot
+        self._session.watch_only(LIMITS)
+        return MountWatch(self._session, robot.installed, lambda: robot.problem, self._log)
 
     def _make_input(self, name: str) -> TopicInput | TfInput:
         options, parts = self._options.node, (self._session, self._log, self._begin_session)

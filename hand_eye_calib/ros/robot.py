@@ -1,8 +1,9 @@
 """What the robot has installed, and its base frame: from files, or from the transform tree."""
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 from rclpy.node import Node
 
@@ -23,12 +24,6 @@ TF = "tf"
 _AGAIN_S = 5.0
 
 
-class _Own(Protocol):
-    """Tells the node's own transforms from those of others."""
-
-    def is_own(self, transform: Any) -> bool: ...
-
-
 class Robot:
     """Completes results with what is installed, and with the pose in the base frame.
 
@@ -38,7 +33,8 @@ class Robot:
     log : NodeLog
     options : NodeConfig
         Its ``installed`` and ``base_frame`` do not change while the node runs.
-    own : TfBroadcaster
+    is_own : callable
+        Whether this node has broadcast a transform itself.
 
     Attributes
     ----------
@@ -52,8 +48,10 @@ class Robot:
         If what is installed cannot be read.
     """
 
-    def __init__(self, node: Node, log: NodeLog, options: NodeConfig, own: _Own) -> None:
-        self._log, self._own = log, own
+    def __init__(
+        self, node: Node, log: NodeLog, options: NodeConfig, is_own: Callable[[Any], bool]
+    ) -> None:
+        self._log, self._is_own = log, is_own
         self._source, self._base_frame = options.installed, options.base_frame
         self._installed: Extrinsic | None = None
         self._frames = FrameTree(STATIC_TOPIC)
@@ -112,7 +110,7 @@ class Robot:
 
     def _hear(self, message: Any) -> None:
         for each in message.transforms:
-            if self._own.is_own(each):
+            if self._is_own(each):
                 continue
             edge = from_transform(each)
             try:

@@ -34,8 +34,8 @@ class Heard:
         monkeypatch.setattr(module, "message_type", lambda wanted_by: object)
         self.lines, self.own, self._callbacks = [], [], []
         logger = SimpleNamespace(**dict.fromkeys(("info", "warning", "error"), self.lines.append))
-        own = SimpleNamespace(is_own=self.own.__contains__)
-        self.robot = Robot(self, NodeLog(logger), NodeConfig(**options), own)
+        is_own = self.own.__contains__
+        self.robot = Robot(self, NodeLog(logger), NodeConfig(**options), is_own)
 
     def create_subscription(self, kind, topic, callback, qos):
         assert topic == "/tf_static"
