@@ -6,13 +6,13 @@ from datetime import datetime
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.monitor import LEARNING_S, Alarm, MountMonitor
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import AxisValues, Level, MountState
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import amount, axes_in_words, listing
 
 # Poses are paired soon, and few are kept.

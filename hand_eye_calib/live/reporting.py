@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.cycle import SolveCycle
 from hand_eye_calib.live.input import PoseInput, with_clock_offset
@@ -22,6 +21,7 @@ from hand_eye_calib.live.state import (
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.records import Comparison
+from hand_eye_calib.results.status import AXES
 
 # If poses wait that no result contains, the result is stale when it is older than this many solve
 # periods, and than so many seconds.

@@ -9,11 +9,10 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
-from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.plain import json_text, plain
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.results.status import ROTATIONS
+from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.ros.conversions import (
     LATCHED,
     to_pose_with_covariance,
