@@ -340,7 +340,7 @@ def _clean_row(kind: str, found: Sequence[tuple[Outcome, set[str]]]) -> dict[str
         "clean recordings": kind,
         "solved": len(found),
         "wrong findings": counted(c for _, codes in found for c in sorted(codes)) or "none",
-        "verdict": counted(one.verdict for one, _ in found),
+        "verdict": counted(_SHORT.get(one.verdict, one.verdict) for one, _ in found),
         "reasons": counted(rule for one, _ in found for rule in dict.fromkeys(one.rules)),
         "largest z": f"{max(largest):.1f}" if largest else "",
     }

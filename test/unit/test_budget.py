@@ -15,21 +15,22 @@ from source_code import SOURCE, imports_of, room_of
 ROOT = SOURCE.parent
 
 # What may not be exceeded. The goals are: 30,000 lines, 19,000 of code, 400 constants, no file
-# above 500 lines, 10 functions above 50, 450 functions in 50 files entered by ``calibrate a b``.
+# above 500 lines, 10 functions above 50, 450 functions in 50 files entered by ``calibrate a b``;
+# 7,000 lines of reproduction, 19,000 of tests, 35,000 words.
 LIMITS = {
-    "lines": 42_600,
-    "lines of code": 26_900,
-    "numeric constants": 830,
-    "files above 500 lines": 10,
-    "functions above 50 lines": 20,
-    "rooms": 28,
+    "lines": 39_700,
+    "lines of code": 24_900,
+    "numeric constants": 760,
+    "files above 500 lines": 6,
+    "functions above 50 lines": 24,
+    "rooms": 29,
     "floors": 15,
-    "arrows between rooms": 180,
-    "functions entered by calibrate": 940,
-    "files entered by calibrate": 92,
-    "lines of reproduction": 9_300,
-    "lines of tests": 24_700,
-    "words of documentation": 57_600,
+    "arrows between rooms": 190,
+    "functions entered by calibrate": 900,
+    "files entered by calibrate": 97,
+    "lines of reproduction": 8_450,
+    "lines of tests": 23_300,
+    "words of documentation": 44_000,
 }
 
 _LONG_FILE, _LONG_FUNCTION = 500, 50
