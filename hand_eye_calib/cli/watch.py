@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.ros.watcher import Watcher
     from hand_eye_calib.watch.board import Board
 
-    board, requests = Board(), queue.SimpleQueue[tuple[str, str]]()
+    board, requests = Board(arguments.node), queue.SimpleQueue[str]()
     came: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda signum, _: came.append(signum))
@@ -74,25 +74,23 @@ def run(arguments: argparse.Namespace) -> int:
         _web(arguments, board, requests) as server,
         _display(server) as show,
     ):
-        session = Session(board, arguments.node, requests, _keys)
+        session = Session(board, requests, _keys)
         while not came and not session.is_over:
             watcher.spin(_LISTEN_S)
             while not requests.empty():
-                watcher.ask(*requests.get())
+                watcher.ask(requests.get())
             show(session.view())
     return 0
 
 
 class Session:
-    """What the person at the terminal has chosen: the node, and keys that wait for a second press.
+    """What the person at the terminal has typed, also keys that wait for a second press.
 
     Parameters
     ----------
     board : Board
-    wanted : str
-        The node to show; empty for the first.
     requests : queue
-        Takes (node, request).
+        Takes the requests.
     keys : callable
         Gives the keys pressed since the last call.
     """
@@ -100,12 +98,11 @@ class Session:
     def __init__(
         self,
         board: "Board",
-        wanted: str,
-        requests: "queue.SimpleQueue[tuple[str, str]]",
+        requests: "queue.SimpleQueue[str]",
         keys: Callable[[], str],
     ) -> None:
         self.is_over = False
-        self._board, self._wanted, self._requests, self._keys = board, wanted, requests, keys
+        self._board, self._requests, self._keys = board, requests, keys
         self._sure_until_s = 0.0
 
     def view(self) -> "View":
@@ -113,19 +110,16 @@ class Session:
         now_s = time.monotonic()
         for key in self._keys():
             self._press(key, now_s)
-        return self._board.view(self._wanted, now_s)
+        return self._board.view(now_s)
 
     def _press(self, key: str, now_s: float) -> None:
-        node = self._board.chosen(self._wanted, now_s)
         if key in ("q", "\x03", "\x04"):
             self.is_over = True
-        elif key in "123456789" and int(key) <= len(self._board.nodes):
-            self._wanted = self._board.nodes[int(key) - 1]
         elif key == "r" and now_s > self._sure_until_s:
             self._sure_until_s = now_s + _SURE_WITHIN_S
-            self._board.answer(node, "reset", False, "forgets all poses: press r again", now_s)
-        elif key in _KEYS and node:
-            self._requests.put((node, _KEYS[key]))
+            self._board.answer("reset", False, "forgets all poses: press r again", now_s)
+        elif key in _KEYS:
+            self._requests.put(_KEYS[key])
 
 
 @contextlib.contextmanager
@@ -194,7 +188,7 @@ def _single_keys() -> Iterator[None]:
 def _web(
     arguments: argparse.Namespace,
     board: "Board",
-    requests: "queue.SimpleQueue[tuple[str, str]]",
+    requests: "queue.SimpleQueue[str]",
 ) -> "Iterator[WebServer | None]":
     """The server of the page, if it is wanted."""
     if arguments.web is None:
@@ -202,10 +196,7 @@ def _web(
         return
     from hand_eye_calib.watch.web import WebServer
 
-    def ask(node: str, request: str) -> None:
-        requests.put((node, request))
-
-    server = WebServer(board, ask, arguments.web, wanted=arguments.node, key=arguments.key)
+    server = WebServer(board, requests.put, arguments.web, key=arguments.key)
     try:
         for address in server.addresses():
             note(f"open {address} in a browser")

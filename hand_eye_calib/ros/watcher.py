@@ -51,8 +51,7 @@ class Watcher:
         self._executor.add_node(self._node)
         self._node.create_timer(_LOOK_S, self._look)
         self._heard: set[str] = set()
-        self._clients: dict[tuple[str, str], Client] = {}
-        self._asked: dict[tuple[str, str], tuple[Future | None, float]] = {}
+        self._asked: dict[str, tuple[Client, Future | None, float]] = {}
         self._look()
 
     def __enter__(self) -> Self:
@@ -72,17 +71,16 @@ class Watcher:
         """Take what comes in, for at most so long."""
         self._executor.spin_once(timeout_sec=seconds)
         for asked in list(self._asked):
-            self._follow(*asked)
+            self._follow(asked)
 
-    def ask(self, node: str, request: str) -> None:
-        """Call ``solve``, ``save`` or ``reset`` of a node; the answer goes to the board."""
-        if node not in self._heard:
-            return
-        key = node, request
-        if key not in self._clients:
-            self._clients[key] = self._node.create_client(Trigger, f"{node}/{request}")
-        self._asked[key] = None, time.monotonic()
-        self._answer(key, None, "asked ...")
+    def ask(self, request: str) -> None:
+        """Call ``solve``, ``save`` or ``reset`` of the node that is shown; the answer goes to the
+        board.
+        """
+        if self._board.node and request not in self._asked:
+            client = self._node.create_client(Trigger, f"{self._board.node}/{request}")
+            self._asked[request] = client, None, time.monotonic()
+            self._answer(request, None, "asked ...")
 
     def _look(self) -> None:
         """Listen to nodes that are new: anybody may have a topic of that name."""
@@ -99,23 +97,23 @@ class Watcher:
         if state is not None and state.node == name:
             self._board.take(state, time.monotonic())
 
-    def _follow(self, node: str, request: str) -> None:
+    def _follow(self, request: str) -> None:
         """Go on with a request: wait for the service, then for the answer."""
-        key = node, request
-        future, asked_s = self._asked[key]
-        client = self._clients[key]
+        client, future, asked_s = self._asked[request]
         if future is None and client.service_is_ready():
-            self._asked[key] = client.call_async(Trigger.Request()), asked_s
+            self._asked[request] = client, client.call_async(Trigger.Request()), asked_s
         elif future is not None and future.done():
-            del self._asked[key]
             response: Any = future.result()
-            self._answer(key, response.success, printable(response.message))
+            self._end(request, response.success, printable(response.message))
         elif time.monotonic() - asked_s > _PATIENCE_S:
-            del self._asked[key]
-            self._answer(key, False, f"no answer within {_PATIENCE_S:.0f} s")
+            self._end(request, False, f"no answer within {_PATIENCE_S:.0f} s")
 
-    def _answer(self, key: tuple[str, str], good: bool | None, text: str) -> None:
-        self._board.answer(*key, good, text, time.monotonic())
+    def _end(self, request: str, good: bool, text: str) -> None:
+        self._node.destroy_client(self._asked.pop(request)[0])
+        self._answer(request, good, text)
+
+    def _answer(self, request: str, good: bool | None, text: str) -> None:
+        self._board.answer(request, good, text, time.monotonic())
 
 
 def state_of(text: str) -> NodeState | None:

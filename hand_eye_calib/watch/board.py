@@ -1,4 +1,4 @@
-"""The state of the nodes, put into the words and bars that a person is shown.
+"""The state of the node, put into the words and bars that a person is shown.
 
 Nothing here knows ROS, a terminal or a browser: states go in, a :class:`View` comes out.
 """
@@ -105,7 +105,6 @@ class View:
     """
 
     node: str
-    nodes: tuple[str, ...]
     tone: Tone
     word: str
     sentence: str
@@ -119,87 +118,63 @@ class View:
     answer: Line | None = None
 
 
-class _Node:
-    """What is known of one node."""
-
-    def __init__(self) -> None:
-        self.state: NodeState | None = None
-        self.heard_s = self.answered_s = -math.inf
-        self.answer: Line | None = None
-
-
 class Board:
-    """Collects the states of the nodes, and makes views of them; may be used from several threads.
+    """Holds the newest state of one node, and makes views of it; may be used from several threads.
 
     Parameters
     ----------
-    most_nodes : int
-        The first so many nodes are kept.
+    wanted : str
+        Fully qualified name of the node; empty for the first that is heard, and for another one
+        when that is silent.
     """
 
-    def __init__(self, most_nodes: int = 50) -> None:
-        self._most_nodes = most_nodes
-        self._nodes: dict[str, _Node] = {}
+    def __init__(self, wanted: str = "") -> None:
+        self._wanted = wanted
+        self._state: NodeState | None = None
+        self._heard_s = self._answered_s = -math.inf
+        self._answer: Line | None = None
         self._lock = threading.Lock()
 
     @property
-    def nodes(self) -> tuple[str, ...]:
-        """Names of the nodes heard so far, fully qualified."""
-        with self._lock:
-            return tuple(sorted(self._nodes))
+    def node(self) -> str:
+        """Fully qualified name of the node that is shown; empty if none was heard."""
+        state = self._state
+        return state.node if state is not None else ""
 
     def take(self, state: NodeState, now_s: float) -> None:
         """Take the state of a node."""
         with self._lock:
-            if state.node in self._nodes or len(self._nodes) < self._most_nodes:
-                known = self._nodes.setdefault(state.node, _Node())
-                known.state, known.heard_s = state, now_s
+            shown = self._wanted or self.node
+            is_silent = now_s - self._heard_s > SILENT_AFTER_S
+            if state.node != shown and (self._wanted or not is_silent):
+                return
+            if state.node != self.node:
+                self._answer = None
+            self._state, self._heard_s = state, now_s
 
-    def answer(self, node: str, request: str, good: bool | None, text: str, now_s: float) -> None:
+    def answer(self, request: str, good: bool | None, text: str, now_s: float) -> None:
         """Take the answer to a button; ``good`` is None while it is awaited."""
         tone = Tone.BUSY if good is None else Tone.GOOD if good else Tone.ACT
         with self._lock:
-            if known := self._nodes.get(node):
-                known.answer, known.answered_s = Line(tone, request, text), now_s
+            self._answer, self._answered_s = Line(tone, request, text), now_s
 
-    def chosen(self, wanted: str, now_s: float) -> str:
-        """The node to show: the one that is wanted, or else the first that is not silent; empty if
-        none was heard.
-        """
+    def view(self, now_s: float) -> View:
+        """What to show; ``now_s`` is on the same clock as that of :meth:`take`."""
         with self._lock:
-            silent = {
-                name: now_s - each.heard_s > SILENT_AFTER_S for name, each in self._nodes.items()
-            }
-        return wanted or min(silent, key=lambda name: (silent[name], name), default="")
-
-    def view(self, wanted: str, now_s: float) -> View:
-        """What to show of a node.
-
-        Parameters
-        ----------
-        wanted : str
-            Its name; empty for the first.
-        now_s : float
-            On the same clock as :meth:`take`.
-        """
-        name, names = self.chosen(wanted, now_s), self.nodes
-        with self._lock:
-            node = self._nodes.get(name)
-            if node is None or node.state is None:
-                return _no_node(name, names)
-            is_answered = now_s - node.answered_s < ANSWER_FOR_S
-            return _view(
-                node.state, names, now_s - node.heard_s, node.answer if is_answered else None
-            )
+            if self._state is None:
+                return _no_node(self._wanted)
+            is_answered = now_s - self._answered_s < ANSWER_FOR_S
+            answer = self._answer if is_answered else None
+            return _view(self._state, now_s - self._heard_s, answer)
 
 
-def _no_node(name: str, names: tuple[str, ...]) -> View:
+def _no_node(name: str) -> View:
     who = f"of {name}" if name else "of a calibrator"
     text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and network?"
-    return View(name, names, Tone.UNKNOWN, "NO NODE", text)
+    return View(name, Tone.UNKNOWN, "NO NODE", text)
 
 
-def _view(state: NodeState, names: tuple[str, ...], silent_s: float, answer: Line | None) -> View:
+def _view(state: NodeState, silent_s: float, answer: Line | None) -> View:
     is_silent = silent_s > SILENT_AFTER_S
     head = _headline(state)
     if is_silent:
@@ -208,15 +183,13 @@ def _view(state: NodeState, names: tuple[str, ...], silent_s: float, answer: Lin
     health = tuple(_health(state, is_silent))
     if state.mount is not None:
         watched = tuple(_watched(axis, state.mount) for axis in AXES)
-        return View(state.node, names, *head, watched=watched, health=health, answer=answer)
+        return View(state.node, *head, watched=watched, health=health, answer=answer)
     result = state.extrinsic.result if state.extrinsic else None
+    title = f"pose of {result.child_frame} in {result.parent_frame}" if result else ""
     return View(
         state.node,
-        names,
         *head,
-        title=f"pose of {result.child_frame} in {result.parent_frame}"
-        if result
-        else "no extrinsic yet",
+        title=title or "no extrinsic yet",
         values=tuple(_values(result)) if result else (),
         bars=tuple(_bar(axis, state.progress) for axis in AXES) if state.progress else (),
         result=tuple(_result(state)),

@@ -5,7 +5,6 @@ from html import escape
 
 from hand_eye_calib.watch.board import Bar, Line, Tone, View
 
-_SHOWN = ' aria-current="true"'
 _CLASSES = {tone: tone.name.lower() for tone in Tone}
 
 
@@ -15,7 +14,7 @@ def fragment(view: View) -> str:
     watched = "the mount: what ten minutes of motion would show"
     return "".join(
         (
-            _nodes(view),
+            f'<p class="node">{escape(view.node or "no node")}</p>',
             f'<section class="headline {_CLASSES[view.tone]}"><h1>{_sign(view.tone)} '
             f"{escape(view.word)}</h1><p>{escape(view.sentence)}</p></section>",
             f'<section class="answer">{_line(view.answer)}</section>' if view.answer else "",
@@ -44,17 +43,6 @@ def _health(view: View) -> Iterator[str]:
         yield f"<ul>{''.join(f'<li>{escape(reason)}</li>' for reason in view.reasons)}</ul>"
     yield from lines[1:]
     yield from map(_line, view.health)
-
-
-def _nodes(view: View) -> str:
-    """A link for each node, if there are several."""
-    if len(view.nodes) < 2:
-        return f'<p class="node">{escape(view.node or "no node")}</p>'
-    links = (
-        f'<a href="#" data-node="{escape(name)}"{_SHOWN * (name == view.node)}>{escape(name)}</a>'
-        for name in view.nodes
-    )
-    return f'<nav aria-label="nodes">{"".join(links)}</nav>'
 
 
 def _bar(bar: Bar) -> str:

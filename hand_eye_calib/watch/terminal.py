@@ -49,9 +49,8 @@ def screen(view: View, width: int, height: int, footer: str = "") -> RenderableT
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
     keys = " " + "   ".join(filter(None, (KEYS if view.bars else WATCHING_KEYS, footer)))
     title = Text(f"hand_eye_calib watch {view.node}".rstrip())
-    choices = [_choices(view)] if len(view.nodes) > 1 else []
     body = Panel(Group(*parts), title=title, title_align="left")
-    return Group(Text(keys, style="dim"), *choices, body)
+    return Group(Text(keys, style="dim"), body)
 
 
 def _bars(view: View, width: int) -> Table:
@@ -82,14 +81,6 @@ def _lines(lines: tuple[Line, ...]) -> Table:
         style = _STYLES[line.tone]
         table.add_row(Text(line.tone.value, style=style), Text(line.name), Text(line.text))
     return table
-
-
-def _choices(view: View) -> Text:
-    """Which key shows which node."""
-    text = Text(" nodes: ")
-    for number, name in enumerate(view.nodes[:9], start=1):
-        text.append(f" {number} {name} ", style="reverse" * (name == view.node))
-    return text
 
 
 class LineLog:

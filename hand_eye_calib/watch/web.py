@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.watch.board import Board, View
+from hand_eye_calib.watch.board import Board
 from hand_eye_calib.watch.html import fragment
 
 PORT = 8765
@@ -51,12 +51,10 @@ class WebServer(ThreadingHTTPServer):
     ----------
     board : Board
     ask : callable
-        Called with the name of a node and one of :data:`REQUESTS`, in another thread.
+        Called with one of :data:`REQUESTS`, in another thread.
     address : (str, int)
         Host and port to listen on; an empty host stands for all addresses of the computer, port 0
         for any that is free.
-    wanted : str
-        Node to show if the browser asks for none.
     key : str
         Empty for a new one.
 
@@ -72,13 +70,12 @@ class WebServer(ThreadingHTTPServer):
     def __init__(
         self,
         board: Board,
-        ask: Callable[[str, str], None],
+        ask: Callable[[str], None],
         address: tuple[str, int] = ("", PORT),
-        wanted: str = "",
         key: str = "",
     ) -> None:
         self.key = key or secrets.token_urlsafe(6)
-        self.board, self.ask, self.wanted = board, ask, wanted
+        self.board, self.ask = board, ask
         self.stopping = threading.Event()
         self.clients = threading.BoundedSemaphore(_MOST_CLIENTS)
         self._host, port = address
@@ -102,11 +99,6 @@ class WebServer(ThreadingHTTPServer):
         hosts = [self._host] if self._host else [own_address(), "localhost"]
         hosts = [f"[{host}]" if ":" in host else host for host in hosts if host]
         return [f"http://{host}:{self.port}/?key={self.key}" for host in hosts]
-
-    def view(self, node: str) -> View:
-        """What to show of a node; of the default one if the name is empty or unknown."""
-        known = node if node in self.board.nodes else self.wanted
-        return self.board.view(known, time.monotonic())
 
     def stop(self) -> None:
         """Close all connections."""
@@ -141,7 +133,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif not self._has_key(query):
             self._refuse()
         elif path == "/events":
-            self._send_events(query.get("node", ""))
+            self._send_events()
         elif path in _FILES:
             self._send_file(path)
         else:
@@ -154,7 +146,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._has_key(query):
             self._refuse()
         elif request in REQUESTS:
-            self.server.ask(self.server.view(query.get("node", "")).node, request)
+            self.server.ask(request)
             self._send(HTTPStatus.OK, b"", "text/plain")
         else:
             self._send(HTTPStatus.NOT_FOUND, b"there is no such request", "text/plain")
@@ -191,7 +183,7 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in _HEADERS.items():
             self.send_header(name, value)
 
-    def _send_events(self, node: str) -> None:
+    def _send_events(self) -> None:
         if not self.server.clients.acquire(blocking=False):
             self._send(HTTPStatus.SERVICE_UNAVAILABLE, b"too many browsers", "text/plain")
             return
@@ -202,18 +194,19 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self._begin(HTTPStatus.OK, "text/event-stream; charset=utf-8")
             self.end_headers()
-            for event in self._events(node):
+            for event in self._events():
                 self.wfile.write(event)
         except OSError:
             return  # the browser has gone
         finally:
             self.server.clients.release()
 
-    def _events(self, node: str) -> Iterator[bytes]:
+    def _events(self) -> Iterator[bytes]:
         """The view whenever it has changed; an empty event every second in between."""
         sent, sent_s = "", -_SEND_S
         while not self.server.stopping.wait(_LOOK_S if sent else 0.0):
-            made, now_s = fragment(self.server.view(node)), time.monotonic()
+            now_s = time.monotonic()
+            made = fragment(self.server.board.view(now_s))
             if made != sent:
                 one_line = made.replace("\r", " ").replace("\n", " ")
                 yield f"data: {one_line}\n\n".encode()

@@ -101,11 +101,11 @@ def mount(**fields):
     return NodeState(node=NODE, mount=replace(MOUNT, **fields), inputs=inputs())
 
 
-def view_of(each, now_s=0.5, node=""):
+def view_of(each, now_s=0.5):
     board = Board()
     if each is not None:
         board.take(each, 0.0)
-    return board.view(node, now_s)
+    return board.view(now_s)
 
 
 def test_a_state_survives_its_json_and_nothing_else_is_one():
@@ -241,22 +241,24 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
 
 
 def test_of_several_nodes_the_first_that_speaks_is_shown_or_the_one_that_is_wanted():
-    board = Board(most_nodes=3)
-    for name, heard_s in (("/a", 0.0), ("/c", 9.0), ("/b", 9.0), ("/d", 9.0)):
-        board.take(state(name), heard_s)
-    assert board.view("", 10.0).node == "/b"
-    assert board.view("/c", 10.0).node == "/c"
-    assert board.view("", 10.0).nodes == ("/a", "/b", "/c")
-    assert board.view("", 99.0).node == "/a"
-    assert board.view("/x", 10.0).word == "NO NODE"
+    first, wanted = Board(), Board("/b")
+    for board in (first, wanted):
+        for name in ("/a", "/b"):
+            board.take(state(name), 0.0)
+    assert (first.view(0.0).node, wanted.view(0.0).node) == ("/a", "/b")
+    first.take(state("/b"), 9.0)  # the other one is silent
+    assert first.view(9.0).node == "/b"
+    other = Board("/x")
+    other.take(state("/a"), 0.0)
+    assert (other.node, other.view(0.0).word) == ("", "NO NODE")
 
 
 def test_an_answer_is_shown_for_a_while():
     board = Board()
     board.take(state(), 0.0)
-    board.answer(NODE, "save", True, "result saved to here", 0.0)
-    assert board.view("", 1.0).answer.text == "result saved to here"
-    assert board.view("", 60.0).answer is None
+    board.answer("save", True, "result saved to here", 0.0)
+    assert board.view(1.0).answer.text == "result saved to here"
+    assert board.view(60.0).answer is None
 
 
 # -------------------------------------------------------------------- terminal
@@ -283,28 +285,27 @@ def test_lines_are_printed_when_something_new_is_said():
 
     def lines(each, now_s):
         board.take(each, now_s)
-        return log.lines(board.view("", now_s), now_s)
+        return log.lines(board.view(now_s), now_s)
 
     first = lines(state(), 1.0)
     assert first[0] == "   1.0 s  ▶ GO ON: Go on for about 25 s: z is behind."
     assert "z 25 %" in first[1]
     assert lines(state(axes={"x": replace(KNOWN, sigma=0.003)}), 2.0) == []
     assert lines(state(at={"done": True}), 3.0)
-    assert log.lines(board.view("", 9.0), 9.0)
-    assert log.lines(board.view("", 10.0), 10.0) == []  # still silent
+    assert log.lines(board.view(9.0), 9.0)
+    assert log.lines(board.view(10.0), 10.0) == []  # still silent
     learning = [mount(is_learning=True, text=f"{second} of 120 s") for second in (1, 2)]
     assert [len(lines(each, 11.0)) for each in learning] == [1, 0]
-    board.answer(NODE, "save", True, "result saved", 12.0)
-    assert log.lines(board.view("", 12.0), 12.0) == ["  12.0 s  ✓ save: result saved"]
+    board.answer("save", True, "result saved", 12.0)
+    assert log.lines(board.view(12.0), 12.0) == ["  12.0 s  ✓ save: result saved"]
 
 
 @pytest.fixture
 def typed():
     """A session at a terminal: function that types keys and returns the view."""
     board, requests, keys = Board(), queue.SimpleQueue(), []
-    for name in ("/a", "/b"):
-        board.take(state(name), time.monotonic())
-    session = Session(board, "", requests, lambda: keys.pop() if keys else "")
+    board.take(state(), time.monotonic())
+    session = Session(board, requests, lambda: keys.pop() if keys else "")
 
     def type_keys(text):
         keys.append(text)
@@ -314,15 +315,13 @@ def typed():
     return type_keys
 
 
-def test_keys_ask_the_node_that_is_shown_and_a_reset_takes_two(typed):
-    assert typed("s").node == "/a"
-    assert typed("2w").node == "/b"
-    assert [typed.requests.get(), typed.requests.get()] == [("/a", "solve"), ("/b", "save")]
-    assert typed("9x").node == "/b"
+def test_keys_ask_and_a_reset_takes_two(typed):
+    typed("sx9w")
+    assert [typed.requests.get(), typed.requests.get()] == ["solve", "save"]
     assert typed("r").answer.text == "forgets all poses: press r again"
     assert typed.requests.empty()
     typed("r")
-    assert typed.requests.get() == ("/b", "reset")
+    assert typed.requests.get() == "reset"
     assert not typed.session.is_over
     typed("q")
     assert typed.session.is_over
@@ -359,20 +358,11 @@ def test_the_fragment_is_well_formed_and_escapes_what_nodes_say():
     assert "".join(root.find(".//h1").itertext()) == "▶ GO ON"
 
 
-def test_the_fragment_lets_choose_among_several_nodes():
-    board = Board()
-    for name in ("/a", "/b"):
-        board.take(state(name), 0.0)
-    root = ElementTree.fromstring(f"<main>{fragment(board.view('/b', 0.0))}</main>")
-    links = {link.get("data-node"): link.get("aria-current") for link in root.iter("a")}
-    assert links == {"/a": None, "/b": "true"}
-
-
 @pytest.fixture
 def server():
     board, requests = Board(), queue.SimpleQueue()
     board.take(state(), time.monotonic())
-    made = WebServer(board, lambda *request: requests.put(request), ("127.0.0.1", 0), key="word")
+    made = WebServer(board, requests.put, ("127.0.0.1", 0), key="word")
     made.requests = requests
     yield made
     made.stop()
@@ -411,7 +401,7 @@ def test_nothing_is_seen_or_asked_without_the_key(server):
     for path in ("/", "/?key=other", "/events?key=", "/events"):
         assert fetch(server, "GET", path).status == 403
     assert fetch(server, "POST", "/save?key=word").status == 200
-    assert server.requests.get(timeout=PATIENCE_S) == (NODE, "save")
+    assert server.requests.get(timeout=PATIENCE_S) == "save"
     assert fetch(server, "POST", "/reset").status == 403
     assert fetch(server, "POST", "/shutdown?key=word").status == 404
     assert fetch(server, "GET", "/save?key=word").status == 404

@@ -9,10 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.watch import web
-from hand_eye_calib.watch.board import Board
-from hand_eye_calib.watch.html import fragment
 
 FOLDER = Path(web.__file__).parent / "page"
 SCRIPT = (FOLDER / "page.js").read_text(encoding="utf-8")
@@ -38,7 +35,6 @@ const keys = ["solve", "save", "reset"].map((request) => element(
 globalThis.document = {title: "", getElementById: (id) => part[id],
   querySelector: () => part.footer, querySelectorAll: () => keys};
 globalThis.location = {search: "?key=word"};
-globalThis.history = {replaceState(a, b, address) { log.address = address; }};
 Object.defineProperty(globalThis, "navigator", {value: {vibrate() { log.shaken += 1; }}});
 let sure = false, answer = {ok: true};
 globalThis.confirm = () => sure;
@@ -76,13 +72,6 @@ class Found(HTMLParser):
                 self.data.setdefault(name, []).append(value)
 
 
-def shown(*names):
-    board = Board()
-    for name in names:
-        board.take(NodeState(node=name), 0.0)
-    return Found(fragment(board.view("", 0.0)))
-
-
 def test_the_script_finds_what_it_looks_for():
     page = Found(PAGE)
     assert set(re.findall(r'getElementById\("(\w+)"\)', SCRIPT)) <= page.ids
@@ -90,16 +79,6 @@ def test_the_script_finds_what_it_looks_for():
     assert tuple(page.data["data-request"]) == web.REQUESTS
     assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
     assert page.data["data-sure"] == ["Forget all poses?"]
-
-
-@pytest.mark.parametrize("names", [(), ("/a",), ("/a", "/b")])
-def test_every_view_has_one_word_for_the_title(names):
-    assert shown(*names).tags.count("h1") == 1
-
-
-def test_a_node_is_chosen_by_what_the_script_reads():
-    assert shown("/a", "/b").data["data-node"] == ["/a", "/b"]
-    assert '"a[data-node]"' in SCRIPT
 
 
 def played(steps):
@@ -144,23 +123,19 @@ def test_the_page_shows_what_comes_and_says_when_nothing_comes():
     assert [each["lost"] for each in states][3:7] == [False, True, True, False]
 
 
-def test_buttons_and_nodes_are_asked_for_by_their_addresses():
+def test_buttons_are_asked_for_by_their_addresses():
     def click(index):
         return f"keys[{index}].heard.click();"
 
-    link = "{closest: () => ({dataset: {node: '/b'}})}"
     states = played(
         [
             click(0) + click(1),
             click(2),
             "sure = true;" + click(2),
-            f"part.view.heard.click({{target: {link}, preventDefault() {{}}}});",
             "answer = {ok: false};" + click(1),
         ]
     )
     asked = [f"POST {name}?key=word" for name in ("solve", "save", "reset")]
     assert [each["posts"] for each in states[:3]] == [asked[:2], asked[:2], asked]
-    assert states[3]["address"] == "?key=word&node=%2Fb"
-    assert states[3]["last"] == "events?key=word&node=%2Fb"
-    assert states[4]["posts"][-1] == "POST save?key=word&node=%2Fb"
-    assert states[4]["lost"]
+    assert states[3]["posts"][-1] == "POST save?key=word"
+    assert states[3]["lost"]

@@ -1,6 +1,6 @@
 "use strict";
 
-// The key comes with the address that the terminal shows; the node is remembered in it.
+// The key comes with the address that the terminal shows.
 const address = new URLSearchParams(location.search);
 const view = document.getElementById("view");
 const connection = document.getElementById("connection");
@@ -48,15 +48,6 @@ setInterval(() => {
   const isClosed = source.readyState === EventSource.CLOSED;
   if (isClosed || Date.now() - heardAt > SILENT_MS) { show(false); connect(); }
 }, RETRY_MS);
-
-view.addEventListener("click", (event) => {
-  const link = event.target.closest("a[data-node]");
-  if (link === null) return;
-  event.preventDefault();
-  address.set("node", link.dataset.node);
-  history.replaceState(null, "", "?" + address);
-  connect();
-});
 
 for (const button of buttons) {
   button.addEventListener("click", () => {
