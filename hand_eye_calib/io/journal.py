@@ -68,38 +68,26 @@ class JournalWriter:
         resumed: "Journal | None" = None,
     ) -> None:
         self._directory = Path(directory)
+        self._directory.mkdir(parents=True, exist_ok=True)
         self._files: dict[str, BinaryIO] = {}
         self._pending: dict[str, list[str]] = {stream: [] for stream in about}
-        self._about: dict[str, Mapping[str, Any]] = {}
-        self._parent_poses = 0
-        if resumed is None:
-            self._begin(about, poses or {})
-        else:
-            self._go_on(resumed)
-        self.describe(about)
-
-    def _begin(self, about: About, poses: Mapping[str, Trajectory]) -> None:
-        self._directory.mkdir(parents=True, exist_ok=True)
-        texts = {}
-        for stream, known in about.items():
-            lines = tum_lines(poses[stream]) if stream in poses else []
-            texts[self._path(stream)] = "\n".join([_head(stream, known), *lines, ""])
-        write_atomically(texts)
+        whole_bytes = {} if resumed is None else resumed.whole_bytes
+        self._about = dict(about) | ({} if resumed is None else resumed.about)
+        poses = poses or {}
         self._parent_poses = len(poses.get("parent", ()))
-        for stream, known in about.items():
-            self._open(stream)
-            self._about[stream] = known
-
-    def _go_on(self, resumed: "Journal") -> None:
-        self._parent_poses = int((resumed.streams == "parent").sum())
-        for stream, end in resumed.whole_bytes.items():
-            self._open(stream)
-            self._files[stream].truncate(end)
-            self._about[stream] = resumed.about[stream]
+        if resumed is not None:
+            self._parent_poses = int((resumed.streams == "parent").sum())
+        texts = {}
+        for stream in about.keys() - whole_bytes.keys():
+            lines = tum_lines(poses[stream]) if stream in poses else []
+            texts[self._path(stream)] = "\n".join([_head(stream, about[stream]), *lines, ""])
+        write_atomically(texts)
+        for stream in self._about:
             self._pending.setdefault(stream, [])
-        for stream in self._pending.keys() - resumed.whole_bytes.keys():
-            write_atomically({self._path(stream): _head(stream, {}) + "\n"})
             self._open(stream)
+            if stream in whole_bytes:
+                self._files[stream].truncate(whole_bytes[stream])
+        self.describe(about)
 
     def _open(self, stream: str) -> None:
         flags = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -293,6 +281,8 @@ def _noted(line: bytes) -> dict[str, Any]:
     for name, kind in kinds.items():
         if not isinstance(noted.get(name, kind()), kind):
             raise ValueError(f"{name} is no {kind.__name__}")
+    if "origin" in noted and [*map(type, noted["origin"])] != [float] * 3:
+        raise ValueError("origin is no latitude, longitude and height")
     return noted
 
 

@@ -41,6 +41,8 @@ _MOST_WAITING = 240
 Engines = Mapping[str, Calibrator]
 # The poses so far by stream.
 Poses = dict[str, Trajectory]
+# Stream, stamp (ns), position and quaternion of a pose.
+_Event = tuple[str, int, Sequence[float], Sequence[float]]
 
 
 def takers(stream: str, engines: Engines) -> list[tuple[str, Calibrator]]:
@@ -123,15 +125,15 @@ class DirectoryLock:
 
 
 class SessionJournal:
-    """Takes poses and frame names in the executor's thread, writes them in its own.
+    """Takes poses in the executor's thread, writes them in its own.
 
     Parameters
     ----------
     directory : path
-    about : mapping of str to mappings
-        Of each stream: options, topic, origin.
-    poses : dict of str to Trajectory
-        Of the session so far.
+    about : callable
+        Gives what is known of each stream: options, topic, frame, origin.
+    poses : callable
+        Gives the poses of the session so far, for a journal that is begun or begun again.
     resumed : Journal, optional
         The session in the directory goes on; otherwise it is kept aside.
 
@@ -142,18 +144,23 @@ class SessionJournal:
     """
 
     def __init__(
-        self, directory: Path, about: About, poses: Poses, resumed: Journal | None = None
+        self,
+        directory: Path,
+        about: Callable[[], About],
+        poses: Callable[[], Poses],
+        resumed: Journal | None = None,
     ) -> None:
         self.directory = Path(directory)
         self.error = ""
+        self._make_about, self._make_poses = about, poses
+        self._about = about()
         self._notes: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
-        self._events: list[tuple[str, int, Sequence[float], Sequence[float]]] = []
+        self._events: list[_Event] = []
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
         self._failed_at_s: float | None = None
-        self._about = {stream: dict(known) for stream, known in about.items()}
         self._is_ours = resumed is not None
         self._writer: JournalWriter | None = None  # in the thread; None while it cannot be written
-        self._jobs.put(partial(self._open, poses, resumed))
+        self._jobs.put(partial(self._open, self._about, poses(), resumed))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
@@ -163,42 +170,33 @@ class SessionJournal:
         """Note a pose that the engine has taken."""
         self._events.append((stream, stamp_ns, position, quat_xyzw))
 
-    def describe(self, about: About) -> None:
-        """Note what is known of the streams."""
-        self._jobs.put(partial(self._describe, about))
-
-    def flush(self, make_poses: Callable[[], Poses]) -> None:
-        """Hand what was noted to the thread; to be called often.
-
-        Parameters
-        ----------
-        make_poses : callable
-            Gives the poses so far, for a journal that is begun again after an error.
-        """
+    def flush(self) -> None:
+        """Hand what is new to the thread; to be called often."""
         events, self._events = self._events, []
+        before, self._about = self._about, self._make_about()
         if self._failed_at_s is not None:
             if time.monotonic() - self._failed_at_s >= _RETRY_S:
                 self._failed_at_s = None
-                self._jobs.put(partial(self._open, make_poses()))
+                self._jobs.put(partial(self._open, self._about, self._make_poses()))
         elif self._jobs.qsize() > _MOST_WAITING:
             self._give_up("the disk does not answer")
-        elif events:
-            self._jobs.put(partial(self._write, events))
+        elif events or self._about != before:
+            self._jobs.put(partial(self._write, events, self._about))
 
     def begin(self) -> None:
         """Start a new session without poses; the one so far is kept aside."""
-        self._jobs.put(partial(self._write, self._events))
-        self._events = []
-        self._jobs.put(self._begin)
+        self._jobs.put(partial(self._write, self._events, self._about))
+        self._events, self._about = [], self._make_about()
+        self._jobs.put(partial(self._begin, self._about))
 
     def notes(self) -> Iterator[tuple[bool, str]]:
         """Lines for the log since the last call, each with whether it is a warning."""
         while not self._notes.empty():
             yield self._notes.get()
 
-    def stop(self, make_poses: Callable[[], Poses], timeout_s: float) -> None:
+    def stop(self, timeout_s: float) -> None:
         """Write what is left and end the thread, unless the disk keeps it busy."""
-        self.flush(make_poses)
+        self.flush()
         self._jobs.put(self._close)
         self._jobs.put(None)
         self._thread.join(timeout_s)
@@ -215,27 +213,27 @@ class SessionJournal:
         while (work := self._jobs.get()) is not None:
             try:
                 work()
-            except OSError as error:
+            except Exception as error:  # a defect, too: the node must say so and go on
                 self._writer = None
-                self._give_up(error.strerror or str(error))
-            except Exception as error:  # a defect: the node must say so and go on
-                self._writer = None
-                self._give_up(f"{type(error).__name__}: {error}")
+                reason = f"{type(error).__name__}: {error}"
+                if isinstance(error, OSError):
+                    reason = error.strerror or str(error)
+                self._give_up(reason)
 
-    def _open(self, poses: Poses, resumed: Journal | None = None) -> None:
+    def _open(self, about: About, poses: Poses, resumed: Journal | None = None) -> None:
         if not self._is_ours:
             self._keep_aside()
         self._is_ours = True
-        self._writer = JournalWriter(self.directory, self._about, poses, resumed)
+        self._writer = JournalWriter(self.directory, about, poses, resumed)
         if self.error:
             self.error = ""
             text = f"the session journal in {self.directory} is being written again"
             self._notes.put((False, text))
 
-    def _begin(self) -> None:
+    def _begin(self, about: About) -> None:
         self._close()
         self._is_ours = False
-        self._open({})
+        self._open(about, {})
 
     def _keep_aside(self) -> None:
         """Keep an earlier session, unless there is nothing in it."""
@@ -252,17 +250,12 @@ class SessionJournal:
         )
         self._notes.put((False, text))
 
-    def _write(self, events: list[tuple[str, int, Sequence[float], Sequence[float]]]) -> None:
+    def _write(self, events: list[_Event], about: About) -> None:
         if self._writer is not None:
             for event in events:
                 self._writer.add_pose(*event)
             self._writer.flush()
-
-    def _describe(self, about: About) -> None:
-        for stream, known in about.items():
-            self._about.setdefault(stream, {}).update(known)
-        if self._writer is not None:
-            self._writer.describe(self._about)
+            self._writer.describe(about)
 
     def _close(self) -> None:
         writer, self._writer = self._writer, None

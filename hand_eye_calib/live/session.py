@@ -1,6 +1,6 @@
 """The live session: its engines, its number, and its journal on disk."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.journal import Journal, has_session, read_journal
 from hand_eye_calib.live.journal import DirectoryLock, SessionJournal, give, poses_so_far, takers
@@ -48,7 +48,6 @@ class LiveSession:
         self._log = log
         self._measures: dict[str, Any] = {}
         self._origins: dict[str, LocalOrigin] = {}
-        self._origins_on_disk: Mapping[str, Sequence[float]] = {}
         self._journal: SessionJournal | None = None
         self._lock: DirectoryLock | None = None
 
@@ -94,8 +93,6 @@ class LiveSession:
         """Take the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
         for own_stream, engine in takers(stream, self.engines):
             engine.set_frame(own_stream, sensor_frame)
-        if self._journal is not None:
-            self._journal.describe({stream: {"frame": sensor_frame}})
 
     def set_measures(self, stream: str, measures: str) -> None:
         """Take what a stream measures, as its message type says, one of config.MEASURES.
@@ -125,8 +122,6 @@ class LiveSession:
         self.calibrator.reconfigure(replace(config, **self._measures))
         for other in self.others.values():
             other.reconfigure(_of_other(config, other.config.child_measures))
-        if self._journal is not None:
-            self._journal.describe(self._about())
         self.has_new_poses = self._n_poses() > 0 and self._is_solved
 
     def reset(self) -> None:
@@ -173,21 +168,20 @@ class LiveSession:
         if directory is not None:
             self._lock = DirectoryLock(directory.parent)
             resumed = self._resume(directory) if resuming else None
-            poses = poses_so_far(self.engines)
-            self._journal = SessionJournal(directory, self._about(), poses, resumed)
+            self._journal = SessionJournal(
+                directory, self._about, lambda: poses_so_far(self.engines), resumed
+            )
 
     def flush_journal(self) -> None:
         """Hand what came in to the disk; to be called often."""
         if self._journal is not None:
-            if self._known_origins() != self._origins_on_disk:
-                self._journal.describe(self._about())
-            self._journal.flush(lambda: poses_so_far(self.engines))
+            self._journal.flush()
             self._log_notes(self._journal)
 
     def stop_journal(self) -> None:
         """Write what is left, and leave the directory to others."""
         if self._journal is not None:
-            self._journal.stop(lambda: poses_so_far(self.engines), _GRACE_S)
+            self._journal.stop(_GRACE_S)
             self._log_notes(self._journal)
             self._journal = None
         if self._lock is not None:
@@ -216,22 +210,21 @@ class LiveSession:
         try:
             journal = read_journal(directory)
             give(journal, directory, self.engines)
-            origins = _origins_in(directory, journal)
         except HandEyeCalibError as error:
             self._log.error(f"cannot resume: {error}; a new session begins")
             for engine in self.engines.values():
                 engine.reset()
             return None
-        for stream, geodetic in origins.items():
-            self.origin(stream).geodetic = geodetic
+        for stream, about in journal.about.items():
+            if "origin" in about:
+                self.origin(stream).geodetic = tuple(about["origin"])
         poses = self._n_poses()
         self.has_new_poses = poses > 0
         self._log.info(f"session resumed from {directory}: {poses} poses")
         return journal
 
     def _about(self) -> dict[str, dict[str, Any]]:
-        """Options, topics, frames and origins, for whoever reads the journal."""
-        self._origins_on_disk = self._known_origins()
+        """Options, topics, frames and origins (rad, rad, m), for whoever reads the journal."""
         config = self.calibrator.config
         of_all = {"options": config.to_options(), "given": sorted(config.given)}
         about: dict[str, dict[str, Any]] = {}
@@ -240,14 +233,9 @@ class LiveSession:
             own_stream, engine = takers(stream, self.engines)[0]
             if frame := engine.frame(own_stream):
                 about[stream]["frame"] = frame
-            if stream in self._origins_on_disk:
-                about[stream]["origin"] = self._origins_on_disk[stream]
+            if stream in self._origins and (geodetic := self._origins[stream].geodetic):
+                about[stream]["origin"] = [*geodetic]
         return about
-
-    def _known_origins(self) -> dict[str, list[float]]:
-        """Latitude and longitude (rad) and height (m) that positions count from, by stream."""
-        known = {stream: origin.geodetic for stream, origin in self._origins.items()}
-        return {stream: [*geodetic] for stream, geodetic in known.items() if geodetic}
 
     def _log_notes(self, journal: SessionJournal) -> None:
         for is_warning, text in journal.notes():
@@ -255,23 +243,6 @@ class LiveSession:
                 self._log.warning(text, "journal")
             else:
                 self._log.info(text)
-
-
-def _origins_in(directory: Path, journal: Journal) -> dict[str, tuple[float, float, float]]:
-    """Latitude and longitude (rad) and height (m) that the positions of a session count from."""
-    origins = {}
-    for stream, about in journal.about.items():
-        if "origin" not in about:
-            continue
-        try:
-            latitude, longitude, height = map(float, about["origin"])
-        except (TypeError, ValueError):
-            raise InputError(
-                f"{directory}: origin must be latitude and longitude (rad) and height (m); found "
-                f"{about['origin']!r} of {stream}"
-            ) from None
-        origins[stream] = latitude, longitude, height
-    return origins
 
 
 def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorConfig:
