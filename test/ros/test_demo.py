@@ -107,28 +107,13 @@ def test_demo_without_ros_says_what_to_install(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_player_gives_up_on_a_node_that_does_not_come(domain, monkeypatch):
+def test_player_does_not_wait_for_ever(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    with (
-        Player(TOPICS, patience_s=0.1) as player,
-        pytest.raises(HandEyeCalibError, match="waited 0.1 s for the node to subscribe"),
-    ):
-        player.play([], speed=1.0)
-    with (
-        Player(TOPICS, patience_s=0.1) as player,
-        pytest.raises(HandEyeCalibError, match="to serve ~/solve"),
-    ):
-        player.wait_for_extrinsic(0)
-
-
-def test_player_stops_waiting_when_told_that_the_node_is_gone(domain, monkeypatch):
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-
-    def gone():
-        raise HandEyeCalibError("the node ended")
-
-    with Player(TOPICS, gone) as player, pytest.raises(HandEyeCalibError, match="the node ended"):
-        player.play([], speed=1.0)
+    with Player(TOPICS, patience_s=0.1) as player:
+        with pytest.raises(HandEyeCalibError, match="waited 0.1 s for the node to subscribe"):
+            player.play([], speed=1.0)
+        with pytest.raises(HandEyeCalibError, match="to serve ~/solve"):
+            player.wait_for_extrinsic(0)
 
 
 def test_demo_notices_a_node_that_dies(tmp_path, monkeypatch):

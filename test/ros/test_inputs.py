@@ -153,13 +153,6 @@ def test_a_publisher_that_restarts_with_another_type_is_heard(start_node, peer):
     np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
 
 
-def test_a_directory_of_nobody_at_the_start_is_one_line_and_code_1(start_node):
-    node = start_node("-p output_directory:=~nosuchuser/x")
-    assert node.wait() == 1
-    assert node.log.startswith("calibrator: output_directory '~nosuchuser/x'")
-    assert node.log.count("\n") == 1
-
-
 def test_publishers_of_a_remapped_topic_are_counted(start_node, peer):
     node = start_node("-p solve_period:=0.1", "-r parent_odom:=/lidar/odom")
     peer.wait_matched(peer.publisher(Odometry, "/lidar/odom"))
@@ -226,6 +219,9 @@ class TestRefusedInput:
                 ["child_measures:=positions", "monitor:=true", "installed:=1 0 0 0 0 0"],
                 "monitor needs poses of both sensors; the parent measures auto, the child positio",
             ),
+            (["monitor:=true"], "monitor needs installed: what the mount is watched against"),
+            (["journal:=resume"], "journal resume needs output_directory: that is where the"),
+            (["output_directory:=~nosuchuser/x"], "output_directory '~nosuchuser/x'"),
         ],
     )
     def test_parameters_that_cannot_go_together_end_the_start_in_one_line(

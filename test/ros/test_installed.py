@@ -96,12 +96,6 @@ def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_mov
     assert not (tmp_path / "journal").exists()
 
 
-def test_a_monitor_without_what_is_installed_does_not_start(start_node):
-    node = start_node("-p monitor:=true")
-    assert node.wait() == 1
-    assert node.log == ("calibrator: monitor needs installed: what the mount is watched against\n")
-
-
 @pytest.mark.parametrize("monitor", ["true", "false"])
 def test_a_wrong_path_to_what_is_installed_ends_the_start_in_one_line(
     start_node, tmp_path, monitor

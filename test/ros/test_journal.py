@@ -3,7 +3,6 @@
 import hashlib
 import os
 import resource
-import shutil
 import signal
 
 import numpy as np
@@ -88,16 +87,6 @@ def test_nothing_to_resume_and_a_damaged_journal_begin_a_new_session(start_node,
         "cannot resume: ", "damaged from its first byte", "a session that cannot be read is kept in"
     )
     wait_written(peer, tmp_path, 0)
-
-
-def test_resume_without_a_directory_is_one_line_and_code_1(start_node):
-    node = start_node("-p journal:=resume")
-    assert node.wait() == 1
-    assert (
-        node.log
-        == "calibrator: journal resume needs output_directory: that is where the session to "
-        "resume is\n"
-    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -222,21 +211,6 @@ def test_participants_choose_a_directory_below_that_of_the_start_only(start_node
     assert peer.set_parameter("output_directory", str(tmp_path / "mine" / "truck")).successful
     wait_written(peer, tmp_path / "mine" / "truck", 0)
     assert not list((tmp_path / "elsewhere").iterdir())
-
-
-def test_a_directory_that_is_removed_is_reported_and_the_journal_comes_back(
-    start_node, peer, tmp_path
-):
-    node = start_node(*QUIET, *into(tmp_path / "out"))
-    publishers = peer.publishers()
-    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
-    peer.feed(publishers, stamps_ns[:60], Ts_pw_p[:60], Ts_cw_c[:60])
-    wait_written(peer, tmp_path / "out", 120)
-    shutil.rmtree(tmp_path / "out")
-    peer.feed(publishers, stamps_ns[60:], Ts_pw_p[60:], Ts_cw_c[60:])
-    node.wait_for_log("cannot write the session journal in", "No such file or directory")
-    wait_written(peer, tmp_path / "out", 240)
-    node.wait_for_log("is being written again")
 
 
 def test_an_earlier_result_is_kept_once_and_replaced_whatever_it_is(start_node, peer, tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from nav_msgs.msg import Odometry
 from ros_harness import PATIENCE_S
+from test_parameter_effects import CHANGES
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 
@@ -17,30 +18,12 @@ PROJECT = Path(__file__).resolve().parents[2]
 
 # Of every parameter a value that is not its default, as typed on the command line and as a ROS
 # parameter.
-GIVEN = {
-    "method": ("dnl", "dnl"),
-    "reference": ("B7", "B7"),
-    "backend": ("ipopt", "ipopt"),
+GIVEN = {name: (str(value), value) for name, (value, _) in CHANGES.items()} | {
     "threshold": ("1", 1.0),
     "min_inlier_fraction": ("1", 1.0),
-    "min_pairs": ("12", 12),
-    "max_pairs": ("400", 400),
-    "keyframe.min_translation": ("0.1", 0.1),
-    "keyframe.min_rotation": ("0.2", 0.2),
-    "keyframe.min_interval": ("3", 3.0),
-    "max_gap": ("1", 1.0),
     "time_offset": ("estimate", "estimate"),
-    "scale": ("0.5", 0.5),
     "target.translation": ("0.1", 0.1),
     "target.rotation": ("0.01", 0.01),
-    "target.axes": ("z=10cm yaw=0.5deg", "z=10cm yaw=0.5deg"),
-    "prior.x": ("1+/-0.1", "1+/-0.1"),
-    "prior.y": ("2+/-0.1", "2+/-0.1"),
-    "prior.z": ("185cm+/-2cm", "185cm+/-2cm"),
-    "prior.roll": ("1deg+/-1deg", "1deg+/-1deg"),
-    "prior.pitch": ("2deg+/-1deg", "2deg+/-1deg"),
-    "prior.yaw": ("-90deg+/-2deg", "-90deg+/-2deg"),
-    "prior.transform": ("1 1 1 0 0 0+/-1 1", "1 1 1 0 0 0+/-1 1"),
     "parent_frame": ("123", "123"),
     "child_frame": ("true", "true"),
     "solve_period": ("4", 4.0),

@@ -1,8 +1,4 @@
 import json
-import os
-import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -189,62 +185,6 @@ def test_a_file_that_was_replaced_is_not_written_to(tmp_path):
     with pytest.raises(OSError, match="another program has replaced its file"):
         writer.flush()
     assert (tmp_path / "parent.tum").read_text() == "mine"
-
-
-def test_a_journal_renamed_while_it_is_looked_for_is_no_error(tmp_path):
-    journal = tmp_path / "journal"
-    journal.mkdir()
-    (journal / "parent.tum").write_bytes(b"")
-    rename = "import os, sys\nwhile True:\n    os.rename(sys.argv[1], sys.argv[1] + 'x')\n"
-    rename += "    os.rename(sys.argv[1] + 'x', sys.argv[1])\n"
-    with subprocess.Popen([sys.executable, "-c", rename, journal]) as process:
-        try:
-            answers = {has_session(journal) for _ in range(20_000)}
-        finally:
-            process.kill()
-    assert True in answers
-
-
-# Journals into each directory that it is given, in a fork of its own; reports its id, each flush,
-# and its end.
-JOURNALS = """
-import os, sys
-sys.path[:0] = sys.argv[1:]
-from test_journal import BOTH, messages
-from hand_eye_calib.io.journal import JournalWriter
-sequence = list(messages(4000))
-for line in sys.stdin:
-    if os.fork():
-        os.wait()
-        print("ended", flush=True)
-        continue
-    print(os.getpid(), flush=True)
-    writer = JournalWriter(line.strip(), BOTH)
-    for count, message in enumerate(sequence, 1):
-        writer.add_pose(*message)
-        if count % 10 == 0:
-            writer.flush()
-            print(count, flush=True)
-    os._exit(0)
-"""
-
-
-def test_kill_at_any_moment_costs_only_what_was_not_flushed(tmp_path):
-    random = np.random.default_rng(0)
-    folders = [os.path.dirname(__file__), os.path.dirname(os.path.dirname(__file__))]
-    command = [sys.executable, "-c", JOURNALS, *folders]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
-    with subprocess.Popen(command, **pipes) as process:
-        for attempt in range(20):
-            directory, flushed = tmp_path / str(attempt), 0
-            process.stdin.write(f"{directory}\n")
-            child, at = int(process.stdout.readline()), random.integers(10, 400)
-            while (line := process.stdout.readline()) != "ended\n":
-                flushed = int(line)
-                if flushed == 10 * at:
-                    os.kill(child, signal.SIGKILL)
-            assert flushed <= count_poses(directory) <= flushed + 10
-        process.stdin.close()
 
 
 def test_further_child_sensors_are_resumed_too(tmp_path):
