@@ -1,5 +1,7 @@
 """Bags of whatever messages a test needs."""
 
+from typing import NamedTuple
+
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -30,9 +32,30 @@ def storage_file(path):
     return path if path.is_file() else next(files)
 
 
+class Pose(NamedTuple):
+    """A row of a PoseBlock."""
+
+    stream: str
+    number: int
+    stamp_ns: int
+    world_frame: str
+    sensor_frame: str | None
+    pose: tuple[float, ...]
+    bag_ns: int
+
+
+def poses_of(bag, parent="/a", child="/b"):
+    """The poses of an open bag one by one."""
+    found = []
+    for block in bag.blocks(parent, child):
+        columns = [column.tolist() for column in vars(block).values()]
+        found += [Pose(*row[:5], tuple(row[5]), row[6]) for row in zip(*columns, strict=True)]
+    return found
+
+
 def all_poses(path, parent="/a", child="/b"):
     with PoseBag(path) as bag:
-        return list(bag.poses(parent, child))
+        return poses_of(bag, parent, child)
 
 
 def write_compressed(path, streams, storage="mcap", mode="STORAGE"):

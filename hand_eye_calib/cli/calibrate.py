@@ -22,6 +22,8 @@ from hand_eye_calib.cli.robot import add_robot_arguments
 from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
+    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags.topics import TopicInfo
     from hand_eye_calib.io.remote import AsGiven
 
 EXAMPLES = """\
@@ -36,7 +38,7 @@ examples:
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
-_HEADINGS = ("topic", "type", " count", " rate", " duration", "frames", "poses")
+_HEADINGS = ("topic", "type", " count", " rate", "frames", "poses")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -143,13 +145,13 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
     with PoseBag(*arguments.paths) as bag:
         with waiting_for(f"reading {bag}"):
-            topics = bag.describe()
+            topics = [_described(bag, topic) for topic in bag.topics()]
         document: dict[str, Any] = {
             "bag": as_given(str(bag)),
             "start_ns": bag.start_ns,
             "end_ns": bag.end_ns,
             "duration_s": bag.duration_s,
-            "topics": [topic._asdict() for topic in topics],
+            "topics": topics,
             "warnings": as_given(bag.warnings),
         }
     for text in document["warnings"]:
@@ -161,7 +163,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     else:
         title = f"{document['bag']}, {document['duration_s']:.1f} s"
         print_table(title, _HEADINGS, map(list, map(_cells, topics)))
-        if any(topic.is_usable for topic in topics):
+        if any(topic["is_usable"] for topic in topics):
             print(
                 "--parent-topic and --child-topic take the topics with poses, --parent-tf and "
                 "--child-tf frames of /tf: odom:lidar"
@@ -169,11 +171,25 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     return 0
 
 
-def _cells(topic: Any) -> Iterator[str]:
-    yield printable(topic.name)
-    yield topic.type or "several types"
-    yield str(topic.count)
-    yield "" if topic.rate_hz is None else f"{topic.rate_hz:.1f} Hz"
-    yield "" if topic.duration_s is None else f"{topic.duration_s:.1f} s"
-    yield "\n".join(printable(frame) for frame in topic.frames)
-    yield "yes" if topic.is_usable else ""
+def _described(bag: "PoseBag", topic: "TopicInfo") -> dict[str, Any]:
+    """A topic, its rate in the bag's time, the frames of its first messages, and whether it can be
+    one of the two sensors.
+    """
+    from hand_eye_calib.io.bags.messages import SENSOR_TYPES
+
+    is_sampled = topic.count > 1 and bag.duration_s > 0
+    return {
+        **topic._asdict(),
+        "rate_hz": (topic.count - 1) / bag.duration_s if is_sampled else None,
+        "frames": bag.frames_on(topic.name),
+        "is_usable": topic.type in SENSOR_TYPES,
+    }
+
+
+def _cells(topic: dict[str, Any]) -> Iterator[str]:
+    yield printable(topic["name"])
+    yield topic["type"] or "several types"
+    yield str(topic["count"])
+    yield "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
+    yield "\n".join(printable(frame) for frame in topic["frames"])
+    yield "yes" if topic["is_usable"] else ""

@@ -132,7 +132,7 @@ def _play(player_type: "type[Player]", bag_path: Path, log_path: Path, stamp_ns:
     # From 102 on the ports overlap with those that Linux gives to clients.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     with _node(log_path) as check, player_type(TOPICS, check) as player, PoseBag(bag_path) as bag:
-        player.play(bag.poses(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
+        player.play(bag.blocks(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
         return player.wait_for_extrinsic(stamp_ns)
 
 

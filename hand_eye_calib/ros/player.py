@@ -21,7 +21,7 @@ from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.ros.conversions import LATCHED, from_transform, to_time
 
 if TYPE_CHECKING:  # what reads bags is not needed to play poses
-    from hand_eye_calib.io.bags import StampedPose
+    from hand_eye_calib.io.bags import PoseBlock
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -92,19 +92,20 @@ class Player:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def play(self, poses: Iterable["StampedPose"], speed: float) -> None:
+    def play(self, blocks: Iterable["PoseBlock"], speed: float) -> None:
         """Publish poses ``speed`` times as fast as they were recorded, once the node listens to
         both topics.
         """
         publishers = self._publishers.values()
         self._wait(lambda: all(each.get_subscription_count() for each in publishers), "subscribe")
         start_s, first_ns = time.monotonic(), None
-        for pose in poses:
-            first_ns = pose.stamp_ns if first_ns is None else first_ns
-            due_s = start_s + (pose.stamp_ns - first_ns) * 1e-9 / speed
-            while (remaining_s := due_s - time.monotonic()) > 0:
-                self._executor.spin_once(timeout_sec=remaining_s)
-            self._publishers[pose.stream].publish(_odometry(pose))
+        for block in blocks:
+            for row, stamp_ns in enumerate(block.stamps_ns.tolist()):
+                first_ns = stamp_ns if first_ns is None else first_ns
+                due_s = start_s + (stamp_ns - first_ns) * 1e-9 / speed
+                while (remaining_s := due_s - time.monotonic()) > 0:
+                    self._executor.spin_once(timeout_sec=remaining_s)
+                self._publishers[block.streams[row]].publish(_odometry(block, row))
         self._check()
 
     def wait_for_extrinsic(self, stamp_ns: int) -> LiveExtrinsic:
@@ -137,12 +138,12 @@ class Player:
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
 
-def _odometry(pose: "StampedPose") -> Odometry:
+def _odometry(block: "PoseBlock", row: int) -> Odometry:
     message = Odometry()
-    message.header.stamp = to_time(pose.stamp_ns)
-    message.header.frame_id = pose.world_frame
-    message.child_frame_id = pose.sensor_frame or ""
+    message.header.stamp = to_time(int(block.stamps_ns[row]))
+    message.header.frame_id = block.world_frames[row]
+    message.child_frame_id = block.sensor_frames[row] or ""
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
-    position.x, position.y, position.z = pose.position
-    orientation.x, orientation.y, orientation.z, orientation.w = pose.quat_xyzw
+    position.x, position.y, position.z, *quat_xyzw = block.poses[row].tolist()
+    orientation.x, orientation.y, orientation.z, orientation.w = quat_xyzw
     return message

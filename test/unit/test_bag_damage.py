@@ -25,6 +25,7 @@ from bag_making import (
     STORAGES,
     all_poses,
     bag_path,
+    poses_of,
     storage_file,
     write_compressed,
 )
@@ -73,7 +74,7 @@ def read(path):
     """Poses and warnings, or None and the one line of an error."""
     try:
         with PoseBag(path) as bag:
-            poses = list(bag.poses("/a", "/b"))
+            poses = poses_of(bag)
             found = poses, bag.warnings
     except InputError as error:
         found = None, [str(error)]
@@ -96,7 +97,7 @@ def places(size, seed):
 
 
 def stamped(poses):
-    return [(pose.stream, pose.stamp_ns, pose.position, pose.quat_xyzw) for pose in poses]
+    return [(pose.stream, pose.stamp_ns, pose.pose) for pose in poses]
 
 
 def test_cut_off_anywhere(bag, capsys):

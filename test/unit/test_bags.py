@@ -18,6 +18,7 @@ from bag_making import (
     all_poses,
     bag_path,
     path_message,
+    poses_of,
     storage_file,
     tf_message,
     write_compressed,
@@ -72,7 +73,7 @@ def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(new_b
         assert [pose.stamp_ns for pose in found] == source.stamps_ns.tolist()
         assert [pose.number for pose in found] == list(range(1, len(source) + 1))
         assert {(pose.world_frame, pose.sensor_frame) for pose in found} == {frames}
-        values = [[*pose.position, *pose.quat_xyzw] for pose in found]
+        values = [pose.pose for pose in found]
         quats_xyzw = se3.to_quat_xyzw(source.poses)
         np.testing.assert_array_equal(values, np.c_[source.poses[:, :3, 3], quats_xyzw])
 
@@ -254,7 +255,7 @@ def test_both_sensors_from_transforms(tmp_path):
     )
     with PoseBag(path) as bag:
         sources = bag.select_topics(TfSource("map", "lidar"), TfSource("odom", "camera"))
-        poses = list(bag.poses(*sources))
+        poses = poses_of(bag, *sources)
         assert bag.warnings == []
     assert [pose.bag_ns for pose in poses] == sorted(pose.bag_ns for pose in poses)
     assert {pose[0:1] + pose[3:5] for pose in poses} == {
@@ -349,7 +350,7 @@ def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
         streams = {"/a": (PARENT[part], ODOMETRY), "/b": (PARENT[part], ODOMETRY)}
         paths.append(new_bag(storage, streams, f"part{number}"))
     with PoseBag(*paths) as bag:
-        poses = list(bag.poses("/a", "/b"))
+        poses = poses_of(bag)
         assert bag.topics() == [("/a", ODOMETRY, 120), ("/b", ODOMETRY, 120)]
         assert (bag.start_ns, bag.end_ns) == (PARENT.stamps_ns[0], PARENT.stamps_ns[-1])
     assert [pose.stamp_ns for pose in poses if pose.stream == "parent"] == PARENT.stamps_ns.tolist()
@@ -360,7 +361,7 @@ def test_bags_of_one_sensor_each_are_read_side_by_side(new_bag):
     lidar = new_bag("rosbag1", {"/a": STREAMS["/a"]}, "lidar")
     with PoseBag(lidar, new_bag("mcap", {"/b": STREAMS["/b"]}, "camera")) as bag:
         assert bag.select_topics() == ("/a", "/b")
-        poses = list(bag.poses("/a", "/b"))
+        poses = poses_of(bag)
     assert [pose.bag_ns for pose in poses] == sorted([*PARENT.stamps_ns, *CHILD.stamps_ns])
 
 
@@ -395,12 +396,12 @@ def test_a_directory_with_damaged_metadata_or_without_is_read_by_its_files(new_b
     for text in ("", "nothing: here", "[", "{}", "rosbag2_bagfile_information: 3"):
         (path / "metadata.yaml").write_text(text)
         with PoseBag(path) as bag:
-            assert list(bag.poses("/a", "/b")) == whole
+            assert poses_of(bag) == whole
             (warning,) = bag.warnings
         assert "metadata.yaml is damaged" in warning
     (path / "metadata.yaml").unlink()
     with PoseBag(path) as bag:
-        assert list(bag.poses("/a", "/b")) == whole
+        assert poses_of(bag) == whole
         assert bag.warnings == []
 
 
@@ -454,7 +455,7 @@ def test_a_pose_that_jumps_away_and_back_is_warned_about(new_bag, change, by, un
     poses[index] = change(poses[index])
     path = new_bag(streams=STREAMS | {"/b": (as_trajectory(poses), ODOMETRY)})
     with PoseBag(path) as bag:
-        list(bag.poses("/a", "/b"))
+        poses_of(bag)
         (warning,) = bag.warnings
         assert bag.warnings == [warning]  # asking twice changes nothing
     assert f"/b: 1 of 120 poses jump away and back (first message {index + 1}, stamp " in warning
@@ -468,7 +469,7 @@ def test_lasting_jumps_and_quick_motion_are_nothing_unusual(new_bag):
     quick = as_trajectory(wandering_poses(120, step_m=3.0))
     jumped = Trajectory(CHILD.stamps_ns, jumped)
     with PoseBag(new_bag(streams={"/a": (quick, POSE_STAMPED), "/b": (jumped, ODOMETRY)})) as bag:
-        list(bag.poses("/a", "/b"))
+        poses_of(bag)
         assert bag.warnings == []
 
 
@@ -530,5 +531,5 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
     poses = all_poses(folder / "fuse" / "turtlebot3.bag", "/odom", "/none")
     assert len(poses) == 2741
     assert {(pose.world_frame, pose.sensor_frame) for pose in poses} == {("odom", "base_footprint")}
-    lengths = np.linalg.norm([pose.quat_xyzw for pose in poses], axis=1)
+    lengths = np.linalg.norm([pose.pose[3:] for pose in poses], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-6)

@@ -382,7 +382,7 @@ def test_command_writes_the_published_layout(tmp_path, capsys):
     ("storage", "name"), [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")]
 )
 def test_command_writes_bags(tmp_path, capsys, storage, name):
-    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags import PoseBag, PoseBlock
 
     assert (
         simulate(
@@ -392,16 +392,13 @@ def test_command_writes_bags(tmp_path, capsys, storage, name):
     )
     drive = simulate_drive((0, 0), dataclasses.replace(HILLY_DRIVE, poses=30), REALISTIC)
     with PoseBag(tmp_path / "sims" / "run_01" / name) as bag:
-        poses = list(bag.poses(simulate_command.PARENT_TOPIC, simulate_command.CHILD_TOPIC))
+        topics = simulate_command.PARENT_TOPIC, simulate_command.CHILD_TOPIC
+        poses = PoseBlock.concatenate(bag.blocks(*topics))
     for stream, trajectory in (("parent", drive.parent), ("child", drive.child)):
-        ours = [pose for pose in poses if pose.stream == stream]
-        assert [pose.stamp_ns for pose in ours] == trajectory.stamps_ns.tolist()
-        assert {(pose.sensor_frame, pose.world_frame) for pose in ours} == {
-            (stream, f"{stream}_odom")
-        }
-        np.testing.assert_allclose(
-            [pose.position for pose in ours], trajectory.poses[:, :3, 3], atol=0
-        )
+        ours = poses[poses.streams == stream]
+        assert ours.stamps_ns.tolist() == trajectory.stamps_ns.tolist()
+        assert ({*ours.sensor_frames}, {*ours.world_frames}) == ({stream}, {f"{stream}_odom"})
+        np.testing.assert_array_equal(ours.poses[:, :3], trajectory.poses[:, :3, 3])
 
 
 def test_command_gives_sensors_that_are_independent_unless_told_otherwise(tmp_path, capsys):

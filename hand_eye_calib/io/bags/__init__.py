@@ -3,9 +3,9 @@
 Only the messages of the chosen topics are read, and of these only stamp, frames and pose.
 """
 
-from hand_eye_calib.io.bags.poses import PoseBlock, StampedPose
+from hand_eye_calib.io.bags.poses import PoseBlock
 from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.topics import TopicDescription, TopicInfo
+from hand_eye_calib.io.bags.topics import TopicInfo
 from hand_eye_calib.io.bags.trajectories import read_bag_trajectory, trajectory_of
 from hand_eye_calib.io.bags.writer import STORAGES, write_bag
 
@@ -13,8 +13,6 @@ __all__ = [
     "STORAGES",
     "PoseBag",
     "PoseBlock",
-    "StampedPose",
-    "TopicDescription",
     "TopicInfo",
     "read_bag_trajectory",
     "trajectory_of",

@@ -347,6 +347,24 @@ def unpack_transforms(data: Buffer, is_ros1: bool) -> Iterator[PoseFields]:
         yield PoseFields(stamp_ns, *frames, values[:3], values[3:])
 
 
+def frames_in(data: Buffer, message_type: str, is_ros1: bool) -> set[str]:
+    """The frames of a message of SENSOR_TYPES or TF_TYPES: ``world:sensor`` as far as it says.
+
+    Raises
+    ------
+    struct.error, ValueError
+        If the bytes are not such a message.
+    """
+    if message_type in TF_TYPES:
+        found = unpack_transforms(data, is_ros1)
+        return {f"{each.world_frame}:{each.sensor_frame}" for each in found}
+    cursor = _Cursor(data, is_ros1)
+    _, frame = cursor.header()
+    row = MESSAGE_TYPES.get(message_type)
+    sensor_frame = cursor.name() if row and row.has_child_frame else ""
+    return {":".join(filter(None, (frame, sensor_frame)))}
+
+
 # ---- what the messages of a topic measure
 
 # What a row that is not finite lacks.

@@ -1,6 +1,6 @@
-"""Poses of messages and of bags, one by one and in columns."""
+"""Poses of messages and of bags in columns."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
@@ -29,21 +29,6 @@ class PoseColumns(NamedTuple):
     world_frames: list[str]
     sensor_frames: Sequence[str | None]
     poses: FloatArray
-
-
-class StampedPose(NamedTuple):
-    """A pose of a stream: a row of PoseBlock, its position (m) and quaternion (scalar last) as
-    recorded, neither checked nor normalised.
-    """
-
-    stream: str
-    number: int
-    stamp_ns: int
-    world_frame: str
-    sensor_frame: str | None
-    position: tuple[float, float, float]
-    quat_xyzw: tuple[float, float, float, float]
-    bag_ns: int
 
 
 @dataclass(frozen=True)
@@ -95,13 +80,6 @@ class PoseBlock:
         world, sensor = (np.array(each, dtype=object) for each in columns[1:3])
         stamps_ns, *_, poses = columns
         return cls(streams, message_numbers, stamps_ns, world, sensor, poses, bag_ns)
-
-    def rows(self) -> Iterator[StampedPose]:
-        """Iterate over the poses one by one."""
-        columns = [column.tolist() for column in vars(self).values()]
-        for *fields, pose, bag_ns in zip(*columns, strict=True):
-            row: Any = (*fields, tuple(pose[:3]), tuple(pose[3:]), bag_ns)
-            yield StampedPose(*row)
 
     def trajectory(self) -> Trajectory:
         """Poses of one stream in the order of stamps; of those with equal stamps the first."""

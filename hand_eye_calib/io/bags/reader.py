@@ -24,17 +24,17 @@ from hand_eye_calib.io.bags.messages import (
     TF_TYPES,
     MalformedMessage,
     MessageReader,
+    frames_in,
     measured_as,
     unpack_path,
     unpack_transforms,
 )
-from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns, StampedPose
+from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns
 from hand_eye_calib.io.bags.recovery import Message
 from hand_eye_calib.io.bags.storage import BLOCK_SIZE, BagFiles, message_blocks
 from hand_eye_calib.io.bags.topics import (
     Part,
     Source,
-    TopicDescription,
     TopicInfo,
     Topics,
     joined,
@@ -42,9 +42,6 @@ from hand_eye_calib.io.bags.topics import (
 )
 from hand_eye_calib.io.plausibility import PoseWatch
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
-
-# Different frames of one topic that are listed.
-_MOST_FRAMES = 1_000
 
 
 class PoseBag:
@@ -141,28 +138,24 @@ class PoseBag:
         """All topics, in the order of their names."""
         return list(self._topics.values())
 
-    def describe(self) -> list[TopicDescription]:
-        """All topics with rates and frames; reads all poses and transforms.
+    def frames_on(self, topic: str) -> list[str]:
+        """Pairs of frames in the first messages of a topic: ``world:sensor`` of poses, as far as
+        they say, ``parent:child`` of transforms.
 
         Raises
         ------
         InputError
             If a message cannot be read.
         """
-        frames: dict[str, dict[tuple[str, str | None], None]] = {each: {} for each in self._topics}
-        spans_ns: dict[str, tuple[int, int]] = {}
-        wanted = {*SENSOR_TYPES, *TF_TYPES}
-        names = [info.name for info in self.topics() if info.type in wanted]
-        for part in chain.from_iterable(self._unpackable(names)):
-            found_ns, pairs = part.stamps_and_frames()
-            name = part.kind.topic
-            if len(frames[name]) < _MOST_FRAMES:
-                frames[name] |= pairs
-            if len(found_ns):
-                first_ns, last_ns = int(found_ns.min()), int(found_ns.max())
-                before = spans_ns.get(name, (first_ns, last_ns))
-                spans_ns[name] = (min(first_ns, before[0]), max(last_ns, before[1]))
-        return self._topics.described(frames, spans_ns, (self.start_ns or 0, self.end_ns or 0))
+        found = set[str]()
+        if self._topics.type_of(topic) not in {*SENSOR_TYPES, *TF_TYPES}:
+            return []
+        for number, (kind, _, data) in enumerate(next(self._blocks([topic]), []), start=1):
+            try:
+                found |= frames_in(data, kind.type, kind.encoding == "ros1")
+            except MALFORMED as error:
+                raise unreadable(kind, number, error) from error
+        return sorted(found)
 
     def select_topics(
         self, parent: Source | None = None, child: Source | None = None
@@ -217,13 +210,6 @@ class PoseBag:
         return measured_as(self._topics.type_of(source), wanted, source)
 
     # ---- poses
-
-    def poses(
-        self, parent: Source, child: Source | None, max_gap_s: float = CalibratorConfig.max_gap
-    ) -> Iterator[StampedPose]:
-        """Iterate over the poses of both streams one by one; see :meth:`blocks`."""
-        for block in self.blocks(parent, child, max_gap_s):
-            yield from block.rows()
 
     def blocks(
         self,

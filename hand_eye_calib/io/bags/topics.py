@@ -4,21 +4,13 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import numpy as np
-
 from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.bags.messages import (
-    MALFORMED,
-    MESSAGE_TYPES,
     PATH_TYPE,
     POSE_TYPES,
     SENSOR_TYPES,
     TF_TYPES,
-    MalformedMessage,
-    unpack_path,
-    unpack_poses,
-    unpack_transforms,
 )
 from hand_eye_calib.io.bags.recovery import MessageKind
 from hand_eye_calib.io.transforms import TfSource
@@ -31,8 +23,6 @@ _PARENT_WORDS = ("parent", "base", "lidar")
 _CHILD_WORD = "child"
 
 Source = str | TfSource
-# Pairs of frames, of a world and a sensor, in the order of their appearance.
-Frames = dict[tuple[str, str | None], None]
 
 
 class TopicInfo(NamedTuple):
@@ -55,31 +45,6 @@ class TopicInfo(NamedTuple):
         return f"{self.name} ({self.type or 'several types'}, {self.count} messages)"
 
 
-class TopicDescription(NamedTuple):
-    """A topic with its rate and frames.
-
-    Attributes
-    ----------
-    name, type, count
-        As in TopicInfo.
-    rate_hz, duration_s : float or None
-        Of the stamps if the topic has poses, otherwise of the bag; None if there are too few
-        messages.
-    frames : list of str
-        ``world:sensor`` of poses, as far as they say; ``parent:child`` of transforms.
-    is_usable : bool
-        Whether poses can be read from it.
-    """
-
-    name: str
-    type: str
-    count: int  # type: ignore[assignment]
-    rate_hz: float | None
-    duration_s: float | None
-    frames: list[str]
-    is_usable: bool
-
-
 class Topics(dict[str, TopicInfo]):
     """The topics of a bag by their names; ``bag`` is its name, for messages."""
 
@@ -89,25 +54,6 @@ class Topics(dict[str, TopicInfo]):
         if not self:
             return f"There are no topics in {self.bag}"
         return f"The bag has {', '.join(map(str, self.values()))}"
-
-    def described(
-        self,
-        frames: Mapping[str, Frames],
-        spans_ns: Mapping[str, tuple[int, int]],
-        span_ns: tuple[int, int],
-    ) -> list[TopicDescription]:
-        """With their frames, and their first and last stamps, or those of the bag."""
-        found = []
-        for name, info in self.items():
-            first_ns, last_ns = spans_ns.get(name, span_ns)
-            duration_s = (last_ns - first_ns) * 1e-9
-            is_sampled = info.count > 1 and duration_s > 0
-            rate_hz = (info.count - 1) / duration_s if is_sampled else None
-            pairs = [":".join(filter(None, pair)) for pair in sorted(frames[name], key=str)]
-            is_usable = info.type in SENSOR_TYPES
-            sampled_s = duration_s if is_sampled else None
-            found.append(TopicDescription(*info, rate_hz, sampled_s, pairs, is_usable))
-        return found
 
     def type_of(self, source: Source | None) -> str:
         """Message type of a topic; empty for frames, and for what is not there."""
@@ -185,30 +131,6 @@ class Part(NamedTuple):
     numbers: IntArray
     messages: list[bytes]
     bag_ns: IntArray
-
-    def stamps_and_frames(self) -> tuple[IntArray, Frames]:
-        """Stamps of the poses (none of transforms), and the pairs of frames."""
-        kind, is_ros1 = self.kind, self.kind.encoding == "ros1"
-        if kind.type in MESSAGE_TYPES:
-            try:
-                columns = unpack_poses(self.messages, kind.type, is_ros1)
-            except MalformedMessage as error:
-                raise unreadable(kind, int(self.numbers[error.index]), error) from error
-            pairs = zip(columns.world_frames, columns.sensor_frames, strict=True)
-            return columns.stamps_ns, dict.fromkeys(pairs)
-        found_ns, frames = [np.empty(0, dtype=np.int64)], Frames()
-        for number, data in zip(self.numbers, self.messages, strict=True):
-            try:
-                if kind.type == PATH_TYPE:
-                    world_frame, stamps_ns, _ = unpack_path(data, is_ros1)
-                    found_ns.append(stamps_ns)
-                    frames[world_frame, None] = None
-                else:
-                    transforms = unpack_transforms(data, is_ros1)
-                    frames |= {(each.world_frame, each.sensor_frame): None for each in transforms}
-            except MALFORMED as error:
-                raise unreadable(kind, int(number), error) from error
-        return np.concatenate(found_ns), frames
 
 
 def unreadable(kind: MessageKind, number: int, error: Exception) -> InputError:

@@ -49,15 +49,14 @@ def read_trajectory(
     repair: bool = False,
     measures: str = "auto",
 ) -> Trajectory:
-    """Read a trajectory from a text file, from a bag if ``topic`` or ``tf`` is given, or from an
-    object of another library.
+    """Read a trajectory from a text file, from a bag if ``topic`` or ``tf`` is given, or from
+    numbers in memory.
 
     Parameters
     ----------
     source : str, path-like or object
-        A file or a bag; or a PoseTrajectory3D of evo, a pandas DataFrame with the columns of a csv
-        file (or an index of datetimes), a SciPy RigidTransform or an array (N, 4, 4) with
-        ``times``, an array (N, 8) of rows t, x, y, z, qx, qy, qz, qw or (N, 7) without t.
+        A file or a bag; or matrices (N, 4, 4) with ``times``, rows (N, 8) of t, x, y, z, qx, qy,
+        qz, qw or (N, 7) without t, or a pandas DataFrame with columns of these names.
     format : str
         "tum", "kitti", "euroc", "csv", or "auto" for what the file looks like.
     topic : str, optional
