@@ -86,14 +86,27 @@ def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Quantity, .
     keep = np.maximum(*(np.linalg.norm(vectors, axis=1) for vectors in (x, y))) < MAX_ROTATION
     x, y = x[keep], y[keep]
     axes = np.linalg.eigh(x.T @ x)[1][:, ::-1]
-    columns = np.concatenate([(x @ axes)[:, None, :] * axes[None], -se3.skew(x)], axis=2)
+    columns = _along(x, axes)
     values, sigmas, _ = _regress(columns, y - x)
     variance = median(((y - x - columns @ values) ** 2).sum(axis=1)) / MEDIAN_LENGTH**2
+    # Noise of the parent makes the gain too small, that of the child in the reverse regression too
+    # large: what lies between them, noise alone explains.
+    reverse, of_reverse, _ = _regress(_along(y, axes), x - y)
+    other = 1.0 / (1.0 + reverse[:3]) - 1.0
+    is_nearer = np.abs(other) < np.abs(values[:3])
+    sigmas = np.where(is_nearer, of_reverse[:3], sigmas[:3])
+    values = np.where(values[:3] * other < 0.0, 0.0, np.where(is_nearer, other, values[:3]))
     squared = ((x @ axes) ** 2).mean(axis=0)
     # Little rotation beside much may come from an axis that is slightly off.
     biases = np.where(squared < _LITTLE**2 * squared[0], 1.0, variance / (squared + 1e-300))
-    gains = zip(values, sigmas, biases, strict=False)
+    gains = zip(values, sigmas, biases, strict=True)
     return tuple(Quantity(1.0 + value, sigma, bias) for value, sigma, bias in gains), axes
+
+
+def _along(vectors: FloatArray, axes: FloatArray) -> FloatArray:
+    """Columns (K, 3, 6) of a gain along each axis, and of a small rotation."""
+    along = (vectors @ axes)[:, None, :] * axes[None]
+    return np.concatenate([along, -se3.skew(vectors)], axis=2)
 
 
 def find_smoothing(
