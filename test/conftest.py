@@ -5,6 +5,8 @@ import signal
 import pytest
 from hypothesis import settings
 
+from hand_eye_calib.cli.main import main
+
 # Tests never time anything, and CI must not differ from run to run.
 settings.register_profile("hand_eye_calib", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("hand_eye_calib")
@@ -24,6 +26,20 @@ def _ros_stays_here(tmp_path_factory):
     patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
     yield
     patch.undo()
+
+
+@pytest.fixture
+def run(capsys):
+    """Runs a command in this process; returns exit code, stdout and stderr."""
+
+    def call(*arguments):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call
 
 
 @pytest.fixture

@@ -150,20 +150,6 @@ def test_a_bit_flipped_anywhere(bag, capsys):
     assert harmed >= 10
 
 
-@pytest.mark.parametrize("kind", STORAGES)
-def test_many_flipped_bits_give_poses_or_one_line(tmp_path, kind):
-    write_bag(bag_path(tmp_path, kind), STREAMS, kind)
-    file = storage_file(bag_path(tmp_path, kind))
-    data, random, refused = file.read_bytes(), np.random.default_rng(3), 0
-    for flips in [1, 10, 100] * 8:
-        damaged = bytearray(data)
-        for position in random.integers(0, len(data), flips):
-            damaged[position] ^= 1 << int(random.integers(8))
-        file.write_bytes(damaged)
-        refused += read(file)[0] is None
-    assert refused
-
-
 # ---- files cut off, in chunks, and without an index
 
 STAMPS_NS = 1_000 + 100_000_007 * np.arange(4000)
@@ -171,9 +157,8 @@ LONG = Trajectory(STAMPS_NS, se3.exp(np.random.default_rng(1).normal(size=(4000,
 LONG = dict.fromkeys(STREAMS, (LONG, ODOMETRY))
 
 
-@pytest.mark.parametrize("share", [0.3, 0.5, 0.9])
 @pytest.mark.parametrize("kind", [*STORAGES, "zstd"])
-def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind, share):
+def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
     """The recorder lost power: no index, the last chunk incomplete, no metadata.yaml."""
     path = bag_path(tmp_path, kind)
     if kind == "zstd":
@@ -181,17 +166,19 @@ def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind, share):
     else:
         write_bag(path, LONG, kind)
     whole, file = all_poses(path), storage_file(path)
-    file.write_bytes(file.read_bytes()[: int(file.stat().st_size * share)])
     if path.is_dir():
         (path / "metadata.yaml").unlink()
-    recovered, (warning,) = read(path)
-    if kind == "sqlite3" and recovered is None:
-        assert share == 0.3  # the list of topics is not there
-        return
-    assert share - 0.35 < len(recovered) / len(whole) < share + 0.1
-    assert recovered == whole[: len(recovered)]
-    assert re.search(r"cut off or damaged .* lost", warning)
-    assert re.search(rf"recovered are {len(recovered)} messages covering [0-9.]+ s$", warning)
+    size = file.stat().st_size
+    for share in (0.9, 0.5, 0.3):
+        os.truncate(file, int(size * share))
+        recovered, (warning,) = read(path)
+        if kind == "sqlite3" and recovered is None:
+            assert share == 0.3  # the list of topics is not there
+            return
+        assert share - 0.35 < len(recovered) / len(whole) < share + 0.1
+        assert recovered == whole[: len(recovered)]
+        assert re.search(r"cut off or damaged .* lost", warning)
+        assert re.search(rf"recovered are {len(recovered)} messages covering [0-9.]+ s$", warning)
 
 
 def test_a_damaged_chunk_is_left_out_and_said_so(tmp_path):

@@ -4,6 +4,7 @@ say together.
 
 import contextlib
 import csv
+import functools
 import json
 import os
 import re
@@ -27,7 +28,6 @@ from hand_eye_calib.cli.batch.results import COLUMNS, content_hash, row_of, writ
 from hand_eye_calib.cli.batch.tasks import Task, read_batch
 from hand_eye_calib.cli.batch.vehicles import vehicles_of
 from hand_eye_calib.cli.batch.workers import on_cores, on_dask, work
-from hand_eye_calib.cli.main import main
 from hand_eye_calib.cli.reporting import REPORT
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
@@ -42,17 +42,8 @@ STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]
 
 
 @pytest.fixture
-def run(capsys):
-    """Runs replay in this process; returns exit code, stdout and stderr."""
-
-    def call(*arguments):
-        try:
-            code = main(["replay", *map(str, arguments)])
-        except SystemExit as end:
-            code = end.code
-        return code, *capsys.readouterr()
-
-    return call
+def run(run):
+    return functools.partial(run, "replay")
 
 
 def write_drive(path, n_poses, seed):

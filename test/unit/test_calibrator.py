@@ -121,6 +121,7 @@ def test_flat_ground_is_a_status_not_a_number():
         ({"scale": "big"}, "scale must be none or auto or estimate or a number"),
         ({"time_offset": float("nan")}, "time_offset must be a finite number"),
         ({"method": "park", "backend": "ipopt"}, "park has no ipopt backend"),
+        ({"method": "auto", "backend": "ipopt"}, "method auto has no ipopt backend"),
     ],
 )
 def test_impossible_options_are_refused(options, message):
@@ -165,16 +166,6 @@ class TestRefusals:
         with pytest.raises(KeyError, match="lidar"):
             calibrator.add_poses(["parent", "lidar", "child"], *poses)
         assert calibrator.statistics("parent").received == 1
-
-    def test_repeated_stamps(self):
-        calibrator = Calibrator()
-        assert calibrator.add_pose("child", 5, *IDENTITY)
-        assert calibrator.add_pose("child", 3, *IDENTITY)
-        assert not calibrator.add_pose("child", 5, *IDENTITY)
-        assert not calibrator.add_pose("child", 3, *IDENTITY)
-        statistics = calibrator.statistics("child")
-        assert (statistics.received, statistics.refused_duplicate) == (2, 2)
-        assert (statistics.first_stamp_ns, statistics.last_stamp_ns) == (3, 5)
 
     def test_frames(self):
         calibrator = Calibrator()

@@ -160,13 +160,20 @@ def test_an_axis_known_by_a_prior_alone_counts_with_its_sigma(answers):
     assert contradictions(known, [moved(other, 0.3) for other in others]) == []
 
 
-def test_every_solve_is_checked_with_other_references_and_halves():
+@pytest.fixture(scope="module")
+def mounts():
+    """Streams of the parent, of a child, and of one whose mount came loose half-way."""
     parent = wandering_poses(300)
     child = disturbed(child_of(parent), 1, 0.003, 0.003)
     loosened = child.copy()
     loosened[150:] = loosened[150:] @ se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1]))
-    good = calibrate(as_trajectory(parent), as_trajectory(child))
-    bad = calibrate(as_trajectory(parent), as_trajectory(loosened), method="dnlo")
+    return as_trajectory(parent), as_trajectory(child), as_trajectory(loosened)
+
+
+def test_every_solve_is_checked_with_other_references_and_halves(mounts):
+    parent, child, loosened = mounts
+    good = calibrate(parent, child)
+    bad = calibrate(parent, loosened, method="dnlo")
     for row in good.cross_check.values():
         assert row.of_methods > 0
         assert row.of_halves > 0
@@ -175,13 +182,9 @@ def test_every_solve_is_checked_with_other_references_and_halves():
     assert "halves" in [reason.rule for reason in bad.reasons]
 
 
-def test_from_python_for_a_sound_and_a_loose_mount():
-    parent = wandering_poses(300)
-    child = disturbed(child_of(parent), 1, 0.003, 0.003)
-    loosened = child.copy()
-    loosened[150:] = loosened[150:] @ se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1]))
-    for of_child, apart in ((child, False), (loosened, True)):
-        streams = as_trajectory(parent), as_trajectory(of_child)
+def test_from_python_for_a_sound_and_a_loose_mount(mounts):
+    for of_child, apart in ((mounts[1], False), (mounts[2], True)):
+        streams = mounts[0], of_child
         found = hec.cross_check(calibrate(*streams, reference="B5"), *streams)
         assert list(found) == ["x", "y", "z", "roll", "pitch", "yaw"]
         assert apart or (column(found, "of_methods") > 0).all()

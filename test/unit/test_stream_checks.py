@@ -24,7 +24,6 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.simulation.drive import simulate_drive
@@ -319,31 +318,6 @@ class TestCommand:
         assert document["findings"][0]["options"] == {"scale": 0.001}
         assert document["streams"]["child"]["poses"] == 500
 
-    def test_bag(self, tmp_path, capsys):
-        parent, child = drive()
-        streams = {
-            "/a": (parent, "geometry_msgs/msg/PoseStamped"),
-            "/b": (reordered(child), "geometry_msgs/msg/PoseStamped"),
-        }
-        write_bag(tmp_path / "bag", streams)
-        assert (
-            main(
-                [
-                    "check",
-                    str(tmp_path / "bag"),
-                    "--parent-topic",
-                    "/a",
-                    "--child-topic",
-                    "/b",
-                    "--json",
-                ]
-            )
-            == 1
-        )
-        assert [f["code"] for f in json.loads(capsys.readouterr().out)["findings"]] == [
-            "quaternion_order"
-        ]
-
     def test_out_is_a_page_with_a_picture(self, files, tmp_path, capsys):
         pytest.importorskip("matplotlib")
         parent, child = drive()
@@ -358,10 +332,6 @@ class TestCommand:
         assert "<code>quaternion_order</code> (child, likely)" in page
         assert "100.0" in page.split("<figcaption>")[1].split("added to the child")[0]
         assert page.count("<svg") == 1
-
-    def test_three_inputs_are_too_many(self, capsys):
-        assert main(["check", "a", "b", "c"]) == 2
-        assert "one bag or two trajectory files" in capsys.readouterr().err
 
     def test_calibrate_says_the_same(self, files, capsys):
         parent, child = drive()
