@@ -29,6 +29,7 @@ from hand_eye_calib.assessment.moved import (
     scatter_of_recordings,
     shift_covariance,
     solve,
+    squared_shift,
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
@@ -151,7 +152,7 @@ class _Blocks:
         """
         informative = np.trace(self.H, axis1=1, axis2=2) > 0
         H, S = self.H[informative], self.S[informative]
-        squared = (S * solve(H + 1e-6 * np.linalg.inv(shift_covariance()), S)).sum(axis=1)
+        squared = squared_shift(H, S, 1e-6)
         return max(float(squared.sum()) / max(6 * len(S) - n_parameters, 1), 1.0)
 
 

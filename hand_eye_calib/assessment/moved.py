@@ -195,6 +195,18 @@ def solve(H: FloatArray, S: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(H, columns)[..., 0])
 
 
+def most_likely(H: FloatArray, S: FloatArray, ridge: float) -> FloatArray:
+    """Shifts (..., 6) that H (..., 6, 6) and S (..., 6) show, with a share ``ridge`` of the
+    information of the shifts that are looked for.
+    """
+    return solve(H + ridge * np.linalg.inv(shift_covariance()), S)
+
+
+def squared_shift(H: FloatArray, S: FloatArray, ridge: float) -> FloatArray:
+    """Squares of these shifts in units of their covariance: ``S' H^-1 S``."""
+    return np.asarray((S * most_likely(H, S, ridge)).sum(axis=-1))
+
+
 def probability(log_ratios: FloatArray, before: float) -> float:
     """Probability of a shift at one of several times, from its logarithmic likelihood ratio at each
     and its probability before that.

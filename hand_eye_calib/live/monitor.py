@@ -21,7 +21,12 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.floor import common_mode_floor
 from hand_eye_calib.assessment.mount_change import noise_covariance, residuals_and_jacobians
-from hand_eye_calib.assessment.moved import log_ratio, shift_covariance
+from hand_eye_calib.assessment.moved import (
+    log_ratio,
+    most_likely,
+    shift_covariance,
+    squared_shift,
+)
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -67,6 +72,8 @@ _MOST_OF_TYPICAL = 20.0
 # it beforehand (standard deviation over a stretch) counts as much as so many stretches.
 _STRETCH_S, _ASSUMED_SCALE, _ASSUMED_STRETCHES = 60, 0.003, 2.0
 _LEAST_VARIANCE = 1e-12
+# Share of the information of the shifts that are looked for, without which a shift may be anything.
+_RIDGE = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,55 +100,35 @@ class Alarm:
 
 
 class _Seconds:
-    """Information of the newest seconds of motion, the newest first; at most MEMORY_S of them."""
+    """Information H (n, 6, 6) and S (n, 6) of the newest seconds of motion, the newest first; at
+    most MEMORY_S of them.
+    """
 
     def __init__(self) -> None:
-        self._stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
-        self._H, self._S = np.zeros((0, 6, 6)), np.zeros((0, 6))
+        self.stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self.H, self.S = np.zeros((0, 6, 6)), np.zeros((0, 6))
 
     def __len__(self) -> int:
-        return len(self._S)
+        return len(self.S)
 
     def add(self, stamp_ns: int, H: FloatArray, S: FloatArray) -> None:
-        """Add a second; the oldest goes if there are too many."""
-        self._stamps_ns = np.append(np.int64(stamp_ns), self._stamps_ns)[:MEMORY_S]
-        self._H = np.concatenate([H[None], self._H])[:MEMORY_S]
-        self._S = np.concatenate([S[None], self._S])[:MEMORY_S]
+        """Add a second."""
+        self.stamps_ns = np.append(np.int64(stamp_ns), self.stamps_ns)
+        self.H, self.S = np.concatenate([H[None], self.H]), np.concatenate([S[None], self.S])
+        self.keep(MEMORY_S)
 
-    def forget_all_but(self, newest: int) -> None:
-        """Keep so many of the newest seconds."""
-        self._stamps_ns = self._stamps_ns[:newest]
-        self._H, self._S = self._H[:newest], self._S[:newest]
+    def keep(self, newest: int) -> None:
+        """Forget all but so many of the newest seconds."""
+        self.stamps_ns = self.stamps_ns[:newest]
+        self.H, self.S = self.H[:newest], self.S[:newest]
 
-    def newest(self, lags: IntArray | int) -> tuple[FloatArray, FloatArray]:
-        """H (..., 6, 6) and S (..., 6) of so many of the newest seconds."""
-        last = np.asarray(lags) - 1
-        return np.cumsum(self._H, axis=0)[last], np.cumsum(self._S, axis=0)[last]
-
-    def all(self) -> tuple[FloatArray, FloatArray]:
-        """H (6, 6) and S (6,) of all of them."""
-        return self._H.sum(axis=0), self._S.sum(axis=0)
-
-    def oldest(self) -> tuple[FloatArray, FloatArray]:
-        """H (6, 6) and S (6,) of the oldest second."""
-        return self._H[-1], self._S[-1]
-
-    def windows(self, length: int) -> tuple[FloatArray, FloatArray]:
-        """H (w, 6, 6) and S (w, 6) of windows of so many seconds, back from the newest."""
-        n_windows = len(self) // length
-        H, S = self._H[: n_windows * length], self._S[: n_windows * length]
-        return (
-            H.reshape(n_windows, length, 6, 6).sum(axis=1),
-            S.reshape(n_windows, length, 6).sum(axis=1),
-        )
-
-    def stamp_ns(self, lag: int) -> int:
-        """When the newest so many seconds began."""
-        return int(self._stamps_ns[min(lag, len(self)) - 1])
+    def newest(self, lags: IntArray) -> tuple[FloatArray, FloatArray]:
+        """H (l, 6, 6) and S (l, 6) of so many of the newest seconds."""
+        return np.cumsum(self.H, axis=0)[lags - 1], np.cumsum(self.S, axis=0)[lags - 1]
 
     def answer(self) -> FloatArray:
         """Shift (6,) that all of them together show."""
-        return _shift_shown(*self.all())
+        return most_likely(self.H.sum(axis=0), self.S.sum(axis=0), _RIDGE)
 
 
 class _Scale:
@@ -176,11 +163,6 @@ class _Scale:
         self._variance += share * (_STRETCH_S * squared - self._variance)
         self._stretches += 1
         self._seconds, self._information, self._score = 0, 0.0, 0.0
-
-
-def _shift_shown(H: FloatArray, S: FloatArray) -> FloatArray:
-    prior = np.linalg.inv(shift_covariance())
-    return np.asarray(np.linalg.solve(H + 1e-3 * prior, S))
 
 
 class MountMonitor:
@@ -298,7 +280,7 @@ class MountMonitor:
         self._noise, _ = noise_covariance(residuals)
         for _ in range(2):
             H, S, _ = _information(residuals, jacobians, self._noise)
-            shift = _shift_shown(H, S)
+            shift = most_likely(H, S, _RIDGE)
             self._noise, _ = noise_covariance(residuals + jacobians @ shift)
         floor = _floor([each for _, each in learned], self._installed)
         self._covariance = self._covariance + floor
@@ -318,8 +300,8 @@ class MountMonitor:
         H, S = self._scale.take_out(both_H, both_S, self.long_run)
         if len(self._memory) == MEMORY_S and self.alarm is None:
             kept = 1.0 - 1.0 / _OLD_MEMORY_S
-            H_oldest, S_oldest = self._memory.oldest()
-            self._old = kept * self._old[0] + H_oldest, kept * self._old[1] + S_oldest
+            H_old, S_old = self._old
+            self._old = kept * H_old + self._memory.H[-1], kept * S_old + self._memory.S[-1]
         self._memory.add(stamp_ns, H, S)
         share = 1.0 / _NOISE_MEMORY_S
         self._noise = (1.0 - share) * self._noise + share * scatter
@@ -341,7 +323,7 @@ class MountMonitor:
         self._since_alarm += 1
         if self.alarm is not None and (put_back_s := self._put_back_s()):
             self.alarm = None
-            self._memory.forget_all_but(put_back_s)
+            self._memory.keep(put_back_s)
             return None
         lags, H, S, before = self._sums()
         ratios = log_ratio(H, S, 1.0, _KNOCKS[:, None]).max(axis=0)
@@ -351,8 +333,8 @@ class MountMonitor:
         covariance = np.linalg.inv(H[best] + np.linalg.inv(shift_covariance(1.0, 1.0)))
         is_new = self.alarm is None
         self.alarm = Alarm(
-            since_ns=self._memory.stamp_ns(int(lags[best])),
-            raised_ns=self._memory.stamp_ns(1) if self.alarm is None else self.alarm.raised_ns,
+            since_ns=int(self._memory.stamps_ns[lags[best] - 1]),
+            raised_ns=self.alarm.raised_ns if self.alarm else int(self._memory.stamps_ns[0]),
             shift=self._to_parent @ covariance @ S[best],
             sigmas=self._sigmas(covariance),
             log_ratio=float(ratios[best]),
@@ -369,9 +351,8 @@ class MountMonitor:
         """
         lags = _LAGS[: np.searchsorted(_LAGS, len(self._memory), side="right")]
         newest_H, newest_S = self._memory.newest(lags)
-        all_H, all_S = (
-            old + newer for old, newer in zip(self._old, self._memory.all(), strict=True)
-        )
+        all_H = self._old[0] + self._memory.H.sum(axis=0)
+        all_S = self._old[1] + self._memory.S.sum(axis=0)
         H = np.concatenate([newest_H, all_H[None]]) / self.long_run
         S = np.concatenate([newest_S, all_S[None]]) / self.long_run
         known = np.linalg.inv(self._covariance) + H[-1] - H
@@ -404,9 +385,8 @@ class MountMonitor:
         """
         if self.is_learning:
             return np.full(6, np.inf)
-        H_old, _ = self._old
-        H, _ = self._memory.all()
-        known = (H_old + H) / self.long_run
+        H = self._memory.H.sum(axis=0)
+        known = (self._old[0] + H) / self.long_run
         before = np.linalg.inv(np.linalg.inv(self._covariance) + known) + self._wander
         H /= len(self._memory)
         H[:3, :3] -= self._motions_per_s * self._information_of_noise()
@@ -485,15 +465,15 @@ def _long_run_variance(memory: _Seconds, known: float) -> float:
     several lengths, each about the answer of all; what is known while there are too few.
     """
     answer = memory.answer()
-    ridge = 1e-3 * np.linalg.inv(shift_covariance())
     found = []
     for length in _WINDOWS:
         n_windows = len(memory) // length
         if n_windows < _FEWEST_WINDOWS:
             break
-        H, S = memory.windows(length)
-        S = S - H @ answer
-        squared = (S * np.linalg.solve(H + ridge, S[..., None])[..., 0]).sum(axis=1)
+        newest = n_windows * length
+        H = memory.H[:newest].reshape(n_windows, length, 6, 6).sum(axis=1)
+        S = memory.S[:newest].reshape(n_windows, length, 6).sum(axis=1) - H @ answer
+        squared = squared_shift(H, S, _RIDGE)
         seen = np.minimum(squared, _MOST_OF_TYPICAL * np.median(squared)).sum() / 6
         found.append((seen + _ASSUMED_WINDOWS * _ASSUMED) / (n_windows + _ASSUMED_WINDOWS))
     return max(found, default=known)
