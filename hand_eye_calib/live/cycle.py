@@ -106,6 +106,10 @@ class SolveCycle:
         """Whether there is a result with all six degrees of freedom."""
         return self.result is not None and self.result.status is SolveStatus.OK
 
+    def age_s(self, steady_s: float) -> float:
+        """Age of the result at a steady time."""
+        return 0.0 if self.solved_at_s is None else steady_s - self.solved_at_s
+
     def ask(self, on_solved: OnSolved) -> None:
         """Solve as soon as possible."""
         self._asked.append(on_solved)

@@ -89,19 +89,7 @@ class MountWatch:
         """Whether the mount has moved, and what can be seen of it on this robot."""
         monitor = self._monitor
         if monitor is None:
-            return MountState(
-                level=Level.WARN,
-                text=self._why_unknown() or "no poses yet",
-                is_learning=False,
-                seconds_of_motion=0,
-                alarms=0,
-                long_run=1.0,
-                shift={},
-                shift_sigma={},
-                visible_1min={},
-                visible_10min={},
-                since_ns=None,
-            )
+            return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")
         visible, alarm = monitor.visible(_LONG_S), monitor.alarm
         if alarm is not None:
             level, text = Level.ERROR, in_words(alarm)

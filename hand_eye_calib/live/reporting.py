@@ -33,7 +33,7 @@ def extrinsic_state(
     *,
     accepts_poses: bool,
     tf_static: tuple[Broadcast, str],
-    stale_after_s: float,
+    waited_for_s: float | None,
     steady_s: float,
     clock_ns: int,
 ) -> ExtrinsicState:
@@ -45,15 +45,18 @@ def extrinsic_state(
     accepts_poses : bool
     tf_static : (Broadcast, str)
         What is done about ``/tf_static``, and the reason.
-    stale_after_s : float
-        Age from which on the result should have been followed by another.
+    waited_for_s : float or None
+        The solve period while poses wait; None on a parked robot.
     steady_s : float
         Steady time.
     clock_ns : int
         The node's clock; 0 if it does not run yet.
     """
     seen, result = cycle.seen, cycle.result
-    level, text = _judged(cycle, accepts_poses, tf_static, stale_after_s, steady_s)
+    age_s, stale_s = cycle.age_s(steady_s), np.inf
+    if waited_for_s is not None:
+        stale_s = max(_STALE_S, _STALE_PERIODS * waited_for_s)
+    level, text = _judged(cycle, accepts_poses, tf_static, age_s, stale_s)
     rotation = np.degrees(seen.rotation).tolist() if seen else []
     return ExtrinsicState(
         level=level,
@@ -68,28 +71,19 @@ def extrinsic_state(
         rotation_deg=dict(zip("xyz", rotation, strict=False)),
         tf_static=tf_static[0],
         tf_static_reason=tf_static[1],
-        result=_result_state(result, _age_s(cycle, steady_s), clock_ns) if result else None,
+        result=_result_state(result, age_s, clock_ns) if result else None,
     )
-
-
-def stale_after_s(has_new_poses: bool, solve_period_s: float) -> float:
-    """Age from which on a result is stale; on a parked robot none is, as no poses wait."""
-    return max(_STALE_S, _STALE_PERIODS * solve_period_s) if has_new_poses else np.inf
-
-
-def _age_s(cycle: SolveCycle, steady_s: float) -> float:
-    return 0.0 if cycle.solved_at_s is None else steady_s - cycle.solved_at_s
 
 
 def _judged(
     cycle: SolveCycle,
     accepts_poses: bool,
     tf_static: tuple[Broadcast, str],
+    age_s: float,
     stale_s: float,
-    steady_s: float,
 ) -> tuple[Level, str]:
     """Level and message: the gravest that applies."""
-    result, failure, age_s = cycle.result, cycle.failure, _age_s(cycle, steady_s)
+    result, failure = cycle.result, cycle.failure
     if failure is not None and failure.kind is FailureKind.UNEXPECTED:
         return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
     if not accepts_poses:

@@ -147,9 +147,9 @@ class InputState(Part):
 class ChecksState(Part):
     """Findings of the stream checks; ``age_s`` is None before the first one."""
 
-    age_s: float | None
-    correlation: float | None
-    findings: tuple[str, ...]
+    age_s: float | None = None
+    correlation: float | None = None
+    findings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,15 +173,15 @@ class MountState(Part):
         Stamp from which on it has been moved.
     """
 
-    is_learning: bool
-    seconds_of_motion: int
-    alarms: int
-    long_run: float
-    shift: AxisValues
-    shift_sigma: AxisValues
-    visible_1min: AxisValues
-    visible_10min: AxisValues
-    since_ns: int | None
+    is_learning: bool = False
+    seconds_of_motion: int = 0
+    alarms: int = 0
+    long_run: float = 1.0
+    shift: AxisValues = field(default_factory=dict)
+    shift_sigma: AxisValues = field(default_factory=dict)
+    visible_1min: AxisValues = field(default_factory=dict)
+    visible_10min: AxisValues = field(default_factory=dict)
+    since_ns: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

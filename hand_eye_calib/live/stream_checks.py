@@ -81,9 +81,7 @@ class StreamChecks:
                 f"not checked yet: that takes {MIN_DURATION_S:g} s of motion with rotations of "
                 f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
             )
-            return ChecksState(
-                level=Level.WARN, text=text, age_s=None, correlation=None, findings=()
-            )
+            return ChecksState(level=Level.WARN, text=text)
         faults = self.faults()
         return ChecksState(
             level=Level.WARN if faults else Level.OK,

@@ -28,7 +28,6 @@ from hand_eye_calib.live.reporting import (
     extrinsic_state,
     input_states,
     progress_state,
-    stale_after_s,
 )
 from hand_eye_calib.live.saving import Saver
 from hand_eye_calib.live.session import LiveSession, check_below, output_path
@@ -223,7 +222,7 @@ class CalibratorNode(Node):
                 cycle,
                 accepts_poses=self._inputs[0].is_enabled,
                 tf_static=self._tf.state,
-                stale_after_s=stale_after_s(self._session.has_new_poses, options.solve_period),
+                waited_for_s=options.solve_period if self._session.has_new_poses else None,
                 steady_s=steady_s,
                 clock_ns=clock_ns,
             ),

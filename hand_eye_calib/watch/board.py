@@ -21,9 +21,8 @@ from hand_eye_calib.live.state import (
     ResultState,
 )
 from hand_eye_calib.results.records import AxisProgress, Comparison
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import amount, duration, two_digits
-
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 _AXES_OF_ROTATIONS = {"roll": "x", "pitch": "y", "yaw": "z"}
 

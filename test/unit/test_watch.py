@@ -64,10 +64,7 @@ AT = Progress(
     axes=dict.fromkeys(AXES, ROTATION) | {"x": KNOWN, "y": KNOWN, "z": BEHIND},
 )
 CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, correlation=0.9, findings=())
-MOUNT = MountState(
-    level=Level.OK, text="it has not", is_learning=False, seconds_of_motion=200, alarms=0,
-    long_run=2.0, shift={}, shift_sigma={}, visible_1min={}, visible_10min={}, since_ns=None,
-)  # fmt: skip
+MOUNT = MountState(level=Level.OK, text="it has not", seconds_of_motion=200)
 
 
 def inputs(parent=Level.OK, child=Level.OK):
