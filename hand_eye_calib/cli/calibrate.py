@@ -145,7 +145,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
     with PoseBag(*arguments.paths) as bag:
         with waiting_for(f"reading {bag}"):
-            topics = [_described(bag, topic) for topic in bag.topics()]
+            topics = [_described(bag, topic) for topic in bag.topics.values()]
         document: dict[str, Any] = {
             "bag": as_given(str(bag)),
             "start_ns": bag.start_ns,

@@ -137,7 +137,7 @@ def _read_bag(arguments: argparse.Namespace) -> _Read:
 
     with PoseBag(arguments.paths[0]) as bag:
         wanted = sources_from(arguments)
-        selected = bag.select_topics(wanted["parent"], wanted["child"])
+        selected = bag.topics.select(wanted["parent"], wanted["child"])
         sources = dict(zip(STREAMS, selected, strict=True))
         measures = measures_of(bag, sources, config_from(arguments))
         blocks = bag.blocks(*selected, measures=measures)

@@ -339,7 +339,7 @@ def _topics_of(typed: argparse.Namespace) -> list[str]:
 
     try:
         with PoseBag(*typed.paths) as bag:
-            return [topic.name for topic in bag.topics() if topic.type in SENSOR_TYPES]
+            return [topic.name for topic in bag.topics.values() if topic.type in SENSOR_TYPES]
     except HandEyeCalibError:
         return []
 

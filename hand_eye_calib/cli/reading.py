@@ -292,7 +292,7 @@ def read_bags(
     from hand_eye_calib.io.bags import PoseBag
 
     with PoseBag(*paths) as bag:
-        parent, child = bag.select_topics(wanted["parent"], wanted["child"])
+        parent, child = bag.topics.select(wanted["parent"], wanted["child"])
         sources = {"parent": parent, "child": child}
         if not all(wanted.values()):
             note(

@@ -81,21 +81,30 @@ class TransformTree(FrameTree):
 
     Edges are noted with :meth:`note` in a first pass over the messages. Poses are kept with
     :meth:`keep` in a second one, when it is known which edges are needed.
+
+    Attributes
+    ----------
+    static : dict of str to PoseFields
+        The last static transform of each frame.
     """
 
     def __init__(self) -> None:
         super().__init__("the bag's transforms")
+        self.static: dict[str, PoseFields] = {}
         self._kept: defaultdict[str, _Kept] = defaultdict(_Kept)
 
     def note(self, transform: PoseFields, is_static: bool) -> None:
-        """Add an edge, without its pose.
+        """Add an edge; of a static one the last transform is kept.
 
         Raises
         ------
         InputError
             If the frame has another parent already, or there are too many frames.
         """
-        self.add(transform.world_frame, transform.sensor_frame or "", is_static=is_static)
+        frame = transform.sensor_frame or ""
+        self.add(transform.world_frame, frame, is_static=is_static)
+        if is_static:
+            self.static[frame] = transform
         if len(self.edges) > MOST_FRAMES:
             raise InputError(f"the transforms have more than {MOST_FRAMES} frames")
 

@@ -37,7 +37,7 @@ from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, storage, write_bag
-from hand_eye_calib.io.bags.writer import write_streams
+from hand_eye_calib.io.bags.writer import stamped_messages, write_streams
 
 MIB = 1 << 20
 # What a command may take: LARGEST_GROWTH, the interpreter and its libraries.
@@ -383,20 +383,7 @@ def database(path, rows, script=""):
 @pytest.fixture(scope="module")
 def odometry():
     """Bytes of a message."""
-    types = JAZZY.types
-    zero, none = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(36)
-    stamp = types["builtin_interfaces/msg/Time"](1, 0)
-    pose = types["geometry_msgs/msg/Pose"](
-        types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0),
-        types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-    )
-    twist = types["geometry_msgs/msg/Twist"](zero, zero)
-    message = types[ODOMETRY](
-        types["std_msgs/msg/Header"](stamp, "odom"),
-        "lidar",
-        types["geometry_msgs/msg/PoseWithCovariance"](pose, none),
-        types["geometry_msgs/msg/TwistWithCovariance"](twist, none),
-    )
+    ((_, message),) = stamped_messages(JAZZY.types, STREAMS["/a"][0][:1], ODOMETRY, is_ros1=False)
     return bytes(JAZZY.serialize_cdr(message, ODOMETRY))
 
 

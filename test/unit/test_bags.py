@@ -115,9 +115,9 @@ def test_topics_are_listed_and_others_do_not_get_in_the_way(tmp_path, new_bag):
     path = with_others(tmp_path / "others", LOG, ("/path", PATH, path_message([], [])))
     assert all_poses(path) == all_poses(new_bag())
     with PoseBag(path) as bag:
-        assert bag.select_topics() == ("/a", "/b")
-        assert bag.topics()[:2] == [("/a", ODOMETRY, 120), ("/b", POSE_STAMPED, 90)]
-        assert str(bag.topics()[2]) == "/log (std_msgs/msg/String, 1 messages)"
+        assert bag.topics.select() == ("/a", "/b")
+        assert [*bag.topics.values()][:2] == [("/a", ODOMETRY, 120), ("/b", POSE_STAMPED, 90)]
+        assert str(bag.topics["/log"]) == "/log (std_msgs/msg/String, 1 messages)"
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
     goal = {"/goal_pose": (PARENT[:1], POSE_STAMPED)}  # published once: no sensor
     for streams in (STREAMS, STREAMS | goal):
         with PoseBag(new_bag(streams=streams, name=f"bag{len(streams)}")) as bag:
-            assert bag.select_topics(*named) == selected
+            assert bag.topics.select(*named) == selected
 
 
 def test_a_path_counts_where_there_are_not_two_others(tmp_path):
@@ -136,7 +136,7 @@ def test_a_path_counts_where_there_are_not_two_others(tmp_path):
     write_messages(tmp_path / "path", [path])
     write_bag(tmp_path / "poses", {"/z": STREAMS["/a"]})
     with PoseBag(tmp_path / "path", tmp_path / "poses") as bag:
-        assert bag.select_topics() == ("/path", "/z")
+        assert bag.topics.select() == ("/path", "/z")
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, me
         PoseBag(with_others(tmp_path / "bag", LOG)) as bag,
         pytest.raises(InputError, match=message) as caught,
     ):
-        bag.select_topics(*named)
+        bag.topics.select(*named)
     listing = (
         "The bag has /a (nav_msgs/msg/Odometry, 120 messages), "
         "/b (geometry_msgs/msg/PoseStamped, 90 messages), /log (std_msgs/msg/String, 1 messages)"
@@ -166,7 +166,7 @@ def test_without_names_there_must_be_exactly_two_pose_topics(new_bag, count):
     path = new_bag(streams={f"/odom_{number}": STREAMS["/a"] for number in range(count)})
     message = "name the topics of poses with --parent-topic and --child-topic"
     with PoseBag(path) as bag, pytest.raises(InputError, match=message):
-        bag.select_topics()
+        bag.topics.select()
 
 
 def test_several_publishers_and_types_on_one_topic(tmp_path):
@@ -188,7 +188,7 @@ def test_several_publishers_and_types_on_one_topic(tmp_path):
         PoseBag(tmp_path / "two.bag") as bag,
         pytest.raises(InputError, match="topic /a of .* is of type several types"),
     ):
-        bag.select_topics("/a", "/b")
+        bag.topics.select("/a", "/b")
 
 
 # ---- transforms
@@ -254,7 +254,7 @@ def test_both_sensors_from_transforms(tmp_path):
         tmp_path / "bag", transforms([("lidar", "map", PARENT), ("camera", "odom", CHILD)])
     )
     with PoseBag(path) as bag:
-        sources = bag.select_topics(TfSource("map", "lidar"), TfSource("odom", "camera"))
+        sources = bag.topics.select(TfSource("map", "lidar"), TfSource("odom", "camera"))
         poses = poses_of(bag, *sources)
         assert bag.warnings == []
     assert [pose.bag_ns for pose in poses] == sorted(pose.bag_ns for pose in poses)
@@ -351,7 +351,7 @@ def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
         paths.append(new_bag(storage, streams, f"part{number}"))
     with PoseBag(*paths) as bag:
         poses = poses_of(bag)
-        assert bag.topics() == [("/a", ODOMETRY, 120), ("/b", ODOMETRY, 120)]
+        assert [*bag.topics.values()] == [("/a", ODOMETRY, 120), ("/b", ODOMETRY, 120)]
         assert (bag.start_ns, bag.end_ns) == (PARENT.stamps_ns[0], PARENT.stamps_ns[-1])
     assert [pose.stamp_ns for pose in poses if pose.stream == "parent"] == PARENT.stamps_ns.tolist()
     assert [pose.number for pose in poses if pose.stream == "child"] == list(range(1, 121))
@@ -360,7 +360,7 @@ def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
 def test_bags_of_one_sensor_each_are_read_side_by_side(new_bag):
     lidar = new_bag("rosbag1", {"/a": STREAMS["/a"]}, "lidar")
     with PoseBag(lidar, new_bag("mcap", {"/b": STREAMS["/b"]}, "camera")) as bag:
-        assert bag.select_topics() == ("/a", "/b")
+        assert bag.topics.select() == ("/a", "/b")
         poses = poses_of(bag)
     assert [pose.bag_ns for pose in poses] == sorted([*PARENT.stamps_ns, *CHILD.stamps_ns])
 
@@ -522,7 +522,7 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
     for path in paths:
         try:
             with PoseBag(path) as bag:
-                counts = {topic.name: topic.count for topic in bag.topics()}
+                counts = {topic.name: topic.count for topic in bag.topics.values()}
                 assert len(list(bag._messages([*counts]))) == sum(counts.values())
         except InputError as error:
             refused[path.name] = str(error)

@@ -35,8 +35,6 @@ from hand_eye_calib.io.bags.storage import BLOCK_SIZE, BagFiles, message_blocks
 from hand_eye_calib.io.bags.topics import (
     Part,
     Source,
-    TopicInfo,
-    Topics,
     joined,
     unreadable,
 )
@@ -56,6 +54,8 @@ class PoseBag:
 
     Attributes
     ----------
+    topics : Topics
+        By their names, in the order of these; chooses those that are meant.
     start_ns, end_ns : int or None
         Bag time of the first and last message; None if there is none.
 
@@ -81,7 +81,7 @@ class PoseBag:
         found = defaultdict[str, list[tuple[str, int]]](list)
         for name, about in chain(*(each.topics.items() for each in self._files.storages)):
             found[name].append(about)
-        self._topics: Topics = joined(found, str(self))
+        self.topics = joined(found, str(self))
         spans = [(each.start_ns, each.end_ns) for each in self._files.storages]
         known = [(first, last) for first, last in spans if first is not None and last is not None]
         self.start_ns = min((first for first, _ in known), default=None)
@@ -134,10 +134,6 @@ class PoseBag:
 
     # ---- topics
 
-    def topics(self) -> list[TopicInfo]:
-        """All topics, in the order of their names."""
-        return list(self._topics.values())
-
     def frames_on(self, topic: str) -> list[str]:
         """Pairs of frames in the first messages of a topic: ``world:sensor`` of poses, as far as
         they say, ``parent:child`` of transforms.
@@ -148,7 +144,7 @@ class PoseBag:
             If a message cannot be read.
         """
         found = set[str]()
-        if self._topics.type_of(topic) not in {*SENSOR_TYPES, *TF_TYPES}:
+        if self.topics.type_of(topic) not in {*SENSOR_TYPES, *TF_TYPES}:
             return []
         for number, (kind, _, data) in enumerate(next(self._blocks([topic]), []), start=1):
             try:
@@ -157,46 +153,13 @@ class PoseBag:
                 raise unreadable(kind, number, error) from error
         return sorted(found)
 
-    def select_topics(
-        self, parent: Source | None = None, child: Source | None = None
-    ) -> tuple[Source, Source]:
-        """Choose the sources of the parent's and the child's poses.
-
-        What is not named is chosen if there is only one way to do it: with neither named, the bag
-        has exactly two topics of poses. The parent is the one whose name has the word parent, base
-        or lidar, or the first in alphabetical order. Topics of paths count if there are not enough
-        others.
-
-        Parameters
-        ----------
-        parent, child : str, TfSource or None
-            A topic, or a pair of frames.
-
-        Raises
-        ------
-        InputError
-            If a named topic is not in the bag or holds no poses, if both are the same, or if there
-            is a choice to make. The message lists the topics that are there.
-        """
-        return self._topics.select(parent, child)
-
-    def check(self, source: Source) -> None:
-        """Refuse a topic that is not in the bag or has no poses, and frames without transforms.
-
-        Raises
-        ------
-        InputError
-            The message lists the topics that are there.
-        """
-        self._topics.check(source)
-
     def expected(self, *sources: Source | None) -> int | None:
         """Number of poses that the sources will give, as far as the bag says; None for paths and
         transforms.
         """
-        if not all(self._topics.type_of(source) in MESSAGE_TYPES for source in sources):
+        if not all(self.topics.type_of(source) in MESSAGE_TYPES for source in sources):
             return None
-        return sum(self._topics[str(source)].count for source in sources)
+        return sum(self.topics[str(source)].count for source in sources)
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
         """What a source measures, one of config.MEASURES: what is wanted of it, or what messages of
@@ -207,7 +170,7 @@ class PoseBag:
         ConfigError
             If its messages do not have what is wanted.
         """
-        return measured_as(self._topics.type_of(source), wanted, source)
+        return measured_as(self.topics.type_of(source), wanted, source)
 
     # ---- poses
 
@@ -249,7 +212,7 @@ class PoseBag:
         direct: dict[str, str] = {}
         paths, transforms = {}, {}
         for stream, source in sources.items():
-            type_ = self._topics.type_of(source)
+            type_ = self.topics.type_of(source)
             if isinstance(source, TfSource):
                 transforms[stream] = source
             elif source is not None and type_ in MESSAGE_TYPES:
@@ -341,7 +304,7 @@ class PoseBag:
 
     def _transformed_poses(self, sources: dict[str, TfSource], max_gap_s: float) -> list[PoseBlock]:
         """A PoseBlock for each stream whose poses come from the transform tree."""
-        tree, _ = self._tree_and_static()
+        tree = self._tree()
         chains = [side for source in sources.values() for side in tree.chain(source)]
         for transform, is_static, bag_ns in self._transforms(set(chain.from_iterable(chains))):
             tree.keep(transform, is_static, bag_ns)
@@ -372,26 +335,24 @@ class PoseBag:
         InputError
             If the transforms form no tree or are damaged.
         """
-        tree, static = self._tree_and_static()
-        for frame, last in static.items():
+        tree = self._tree()
+        for frame, last in tree.static.items():
             if tree.edges[frame].is_static:
                 tree.edges[frame].pose = checked_pose(last.position, last.quat_xyzw)
         return tree
 
-    def _tree_and_static(self) -> tuple[TransformTree, dict[str, PoseFields]]:
-        """All edges without their poses, and the last static transform of each frame."""
-        tree, static = TransformTree(), dict[str, PoseFields]()
+    def _tree(self) -> TransformTree:
+        """All edges without the poses of those that move."""
+        tree = TransformTree()
         for transform, is_static, _ in self._transforms():
             tree.note(transform, is_static)
-            if is_static:
-                static[transform.sensor_frame or ""] = transform
-        return tree, static
+        return tree
 
     def _transforms(
         self, frames: Container[str] | None = None
     ) -> Iterator[tuple[PoseFields, bool, int]]:
         """Transforms, whether each is static, and its bag time; of some frames, or of all."""
-        names = [topic.name for topic in self.topics() if topic.type in TF_TYPES]
+        names = [topic.name for topic in self.topics.values() if topic.type in TF_TYPES]
         for number, (kind, bag_ns, data) in enumerate(self._messages(names), start=1):
             try:
                 for transform in unpack_transforms(data, kind.encoding == "ros1"):

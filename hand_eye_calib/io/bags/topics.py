@@ -82,8 +82,15 @@ class Topics(dict[str, TopicInfo]):
                 f"{', '.join(SENSOR_TYPES)}{frames}. {self}"
             )
 
-    def select(self, parent: Source | None, child: Source | None) -> tuple[Source, Source]:
-        """Choose what is not named, if there is only one way to do it.
+    def select(
+        self, parent: Source | None = None, child: Source | None = None
+    ) -> tuple[Source, Source]:
+        """Choose the sources of the parent's and the child's poses.
+
+        What is not named is chosen if there is only one way to do it: with neither named, the bag
+        has exactly two topics of poses. The parent is the one whose name has the word parent, base
+        or lidar, or the first in alphabetical order. Topics of paths count if there are not enough
+        others.
 
         Raises
         ------

@@ -50,7 +50,7 @@ def trajectory_of(
     """The trajectory of one source of an open bag, as :func:`read_bag_trajectory` gives it, and
     what a person should know of it.
     """
-    bag.check(source)
+    bag.topics.check(source)
     kind = bag.measured(source, measures)
     notes: list[str] = []
     blocks = list(bag.blocks(source, None, measures={"parent": measures}))
