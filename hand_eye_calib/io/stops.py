@@ -19,7 +19,6 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.files import read_text
 from hand_eye_calib.io.limits import LARGEST_YAML
-from hand_eye_calib.io.yaml_files import parse_yaml
 
 # Names of both poses of a sample, the robot's first.
 _NAMES = (
@@ -79,6 +78,8 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     path = Path(path)
     if path.suffix == ".npz":
         return _of_stacks(path)
+    from hand_eye_calib.io.yaml_files import parse_yaml
+
     text = read_text(path, _EXPECTED, LARGEST_YAML)
     # OpenCV's header and tag are not of YAML.
     document = parse_yaml(re.sub(r"^%YAML:.*|!!opencv-matrix", "", text), str(path))

@@ -112,30 +112,20 @@ def saved(tmp_path_factory):
     "change",
     [
         {"consistency": 5},
-        {"consistency": {"x": "far"}},
         {"consistency": {"B10": {"translation_m": "x"}}},
-        {"consistency": [1, 2]},
         {"cross_check": 5},
         {"cross_check": {"x": "far"}},
-        {"cross_check": {"B10": {"translation_m": "x"}}},
         {"cross_check": {"x": {"sigma": "a", "of_methods": 1, "of_halves": 1}}},
-        {"noise": 3},
         {"noise": {"in_words": 3}},
         {"warnings": 7},
-        {"warnings": {"a": 1}},
         {"warnings": [5]},
-        {"observability": [5]},
-        {"observability": []},
         {"observability": None},
         {"covariance": {"matrix": [[1]]}},
-        {"covariance": {"matrix": "abc"}},
         {"T_parent_child": {"matrix": [[1, 0, 0, 0]] * 4}},
         {"T_parent_child": {"matrix": [[float("nan")] * 4] * 4}},
-        {"T_parent_child": []},
         {"time_offset_s": "soon"},
         {"scale": None},
         {"n_poses": [1]},
-        {"stamp_ns": 1e300},
         {"parent_frame": 5},
         {"objective": {}},
         {"status": ["ok"]},
@@ -345,10 +335,10 @@ def calibrate(run, tmp_path):
     return lambda: run("calibrate", *files, "--method", "park", "--out", tmp_path / "out")[0]
 
 
-def test_calibrate_keeps_earlier_results(calibrate, tmp_path):
-    (tmp_path / "out" / "extrinsic.yaml").write_bytes(b"\xff earlier")
+def test_earlier_results_are_kept_whatever_they_hold(calibrate, tmp_path):
+    (tmp_path / "out" / "extrinsic.yaml").write_bytes(b"\xff\xfe not text")
     assert calibrate() == 0
-    assert (tmp_path / "out" / "previous" / "extrinsic.yaml").read_bytes() == b"\xff earlier"
+    assert (tmp_path / "out" / "previous" / "extrinsic.yaml").read_bytes() == b"\xff\xfe not text"
     assert load_result(tmp_path / "out").method == "park"
 
 

@@ -323,15 +323,16 @@ def test_latitude_and_longitude_become_metres_of_the_first_position(tmp_path, he
     assert 1e-4 < turned.max() < 1e-3
 
 
-def test_latitudes_that_are_longitudes_are_named(tmp_path):
-    path = table(tmp_path / "a.csv", "lat,lon,height,yaw", [139.7, 139.8], [35, 35], [0, 0], [0, 0])
-    with pytest.raises(InputError, match="line 2: found latitude 139.7 .* seem to be swapped"):
-        read(path)
-
-
-def test_latitudes_that_cannot_be_are_refused(tmp_path):
-    path = table(tmp_path / "a.csv", "lat,lon,height,yaw", [60.0, 91.0], [1, 1], [0, 0], [0, 0])
-    with pytest.raises(InputError, match="line 3: found latitude 91, longitude 1; expected deg"):
+@pytest.mark.parametrize(
+    ("lat", "lon", "message"),
+    [
+        ([139.7, 139.8], [35, 35], "line 2: found latitude 139.7 .* seem to be swapped"),
+        ([60.0, 91.0], [1, 1], "line 3: found latitude 91, longitude 1; expected deg"),
+    ],
+)
+def test_latitudes_that_cannot_be_are_refused(tmp_path, lat, lon, message):
+    path = table(tmp_path / "a.csv", "lat,lon,height,yaw", lat, lon, [0, 0], [0, 0])
+    with pytest.raises(InputError, match=message):
         read(path)
 
 

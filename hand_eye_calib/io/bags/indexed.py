@@ -23,11 +23,7 @@ _MESSAGE, _MESSAGE_HEAD, _MESSAGE_SIZE = 5, struct.Struct("<H4xQ"), 22
 
 
 def messages_of(reader: Any, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
-    """Messages of some connections, by their number, in the order of time.
-
-    Of mcap and rosbag1, rosbags has the index and the decompression. Its own iteration over the
-    messages of a chunk takes twice as long.
-    """
+    """Messages of some connections, by their number, in the order of time."""
     if hasattr(reader, "indexes"):
         return _rosbag1_messages(reader, kinds)
     if hasattr(reader.storage, "chunks"):
