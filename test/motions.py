@@ -5,6 +5,7 @@ import numpy as np
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.geodetic import LocalOrigin
+from hand_eye_calib.io.trajectory_files import write_trajectory
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
 
@@ -59,6 +60,14 @@ def as_trajectory(poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **fra
     return Trajectory(
         start_ns + np.round(np.arange(len(poses)) * 1e9 / rate_hz).astype(np.int64), poses, **frames
     )
+
+
+def write_pair(folder, parent, child):
+    """Paths of two text files with the trajectories."""
+    paths = [str(folder / "parent.tum"), str(folder / "child.tum")]
+    for path, trajectory in zip(paths, (parent, child), strict=True):
+        write_trajectory(path, trajectory)
+    return paths
 
 
 def feed(calibrator, stream, trajectory):

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.checks.streams import check_lengths, tidy
+from hand_eye_calib.checks.streams import check_lengths
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -144,7 +144,7 @@ def test_lengths_in_millimetres_are_noticed_whatever_carries_the_sensors(recordi
 
 
 class TestArms:
-    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("seed", range(2))
     @pytest.mark.parametrize("interval_s", [0.2, 1.0, 5.0])
     def test_stops_have_no_error(self, seed, interval_s):
         parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.stops(seed))
@@ -189,20 +189,6 @@ class TestArms:
         assert (outside <= [1.5 * dof.sigma for dof in result.observability[:3]]).all()
         if name == "primesense":
             assert 0.005 - 2 * result.time_offset_sigma_s < result.time_offset_s < 0.030
-
-    def test_repeated_and_disordered_stamps_are_found(self):
-        rows = real_data.asl_rows("asl_robot_arm", "robot_arm_sim_hand")
-        _, findings = tidy(
-            np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:4], rows[:, 4:], "parent"
-        )
-        assert "duplicates" in [finding.code for finding in findings]
-
-
-def test_the_height_above_a_flat_drive_is_unobservable_with_an_estimated_offset():
-    recording = real_data.zxl19_raw()
-    result = calibrate(recording.parent, recording.child, time_offset="estimate")
-    assert result.unobservable() == ["z"]
-    assert result.T_method[2, 3] > 1.0  # what noise gives
 
 
 _AT_1_HZ = {

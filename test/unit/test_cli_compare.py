@@ -9,7 +9,6 @@ from result_making import shift
 from result_making import shifted as result
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import SolveStatus
 
@@ -30,7 +29,7 @@ xyz="{xyz}" rpy="{rpy}"/></joint></robot>"""
 
 
 @pytest.fixture
-def saved(tmp_path, monkeypatch, capsys):
+def saved(tmp_path, monkeypatch):
     """Folders with results: two that agree, one that has moved; and a description."""
     monkeypatch.chdir(tmp_path)
     frames = {"parent_frame": "lidar", "child_frame": "camera"}
@@ -41,12 +40,6 @@ def saved(tmp_path, monkeypatch, capsys):
     hec.save(result(seed=4, **flat, **frames), "flat")
     (tmp_path / "robot.urdf").write_text(urdf_of(X))
     return tmp_path
-
-
-def run(capsys, *words):
-    code = main([str(word) for word in words])
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
 
 
 @pytest.mark.parametrize(
@@ -60,14 +53,14 @@ def run(capsys, *words):
         (["first", "third", "--with", "second"], 4, "moved: third of 2"),
     ],
 )
-def test_the_exit_code_is_the_verdict(saved, capsys, words, code, text):
-    found, out, err = run(capsys, "compare", *words)
+def test_the_exit_code_is_the_verdict(saved, run, words, code, text):
+    found, out, err = run("compare", *words)
     assert (found, err) == (code, "")
     assert text in out
 
 
-def test_json_has_it_all(saved, capsys):
-    code, out, _ = run(capsys, "compare", "third", "--with", "robot.urdf", "--json")
+def test_json_has_it_all(saved, run):
+    code, out, _ = run("compare", "third", "--with", "robot.urdf", "--json")
     document = json.loads(out)
     assert (code, document["verdict"], document["moved"]) == (4, "moved", ["third"])
     (difference,) = document["differences"]
@@ -87,40 +80,39 @@ def test_json_has_it_all(saved, capsys):
         (["first", "n" * 256], 1, "n...: File name too long; give a shorter name"),
     ],
 )
-def test_what_cannot_be_compared_is_one_line(saved, capsys, words, code, text):
-    found, out, err = run(capsys, "compare", *words)
+def test_what_cannot_be_compared_is_one_line(saved, run, words, code, text):
+    found, out, err = run("compare", *words)
     assert (found, out, err.count("\n")) == (code, "", 1)
     assert text in err
     assert len(err) < 400
 
 
-def test_info_writes_the_result_into_the_description(saved, capsys):
+def test_info_writes_the_result_into_the_description(saved, run):
     words = ("info", "third", "--urdf", "robot.urdf", "--write", "patched.urdf")
-    code, _, err = run(capsys, *words)
+    code, _, err = run(*words)
     assert (code, err) == (0, "hand_eye_calib: note: wrote patched.urdf: joint b changed\n")
-    assert run(capsys, "compare", "third", "--with", "patched.urdf")[0] == 0
+    assert run("compare", "third", "--with", "patched.urdf")[0] == 0
     before, after = (saved / name for name in ("robot.urdf", "patched.urdf"))
     changed = zip(before.read_text().splitlines(), after.read_text().splitlines(), strict=True)
     assert [old.startswith("xyz=") for old, new in changed if old != new] == [True]
 
 
-def test_an_axis_that_is_not_known_is_not_written(saved, capsys):
+def test_an_axis_that_is_not_known_is_not_written(saved, run):
     words = ("info", "flat", "--urdf", "robot.urdf", "--write", "patched.urdf")
-    code, _, err = run(capsys, *words)
+    code, _, err = run(*words)
     assert (code, (saved / "patched.urdf").exists()) == (1, False)
     assert "z not known" in err
-    assert run(capsys, "info", "first", "--write", "p.urdf")[0] == 2
+    assert run("info", "first", "--write", "p.urdf")[0] == 2
 
 
-def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, capsys):
-    assert main(["simulate", "--out", "drive"]) == 0
+def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, run):
+    assert run("simulate", "--out", "drive")[0] == 0
     drive = saved / "drive" / "run_01"
     truth = np.loadtxt(drive / "T_S2_S1.txt")
     T = se3.from_quat_xyzw(truth[1:4], truth[4:])
     (saved / "true.urdf").write_text(urdf_of(T))
-    capsys.readouterr()
     code, out, _ = run(
-        capsys, "calibrate", drive / "T_S1_W1.txt", drive / "T_S2_W2.txt", "--urdf", "true.urdf",
+        "calibrate", drive / "T_S1_W1.txt", drive / "T_S2_W2.txt", "--urdf", "true.urdf",
         "--parent-frame", "lidar", "--child-frame", "camera", "--base-frame", "base", "--json",
     )  # fmt: skip
     document = json.loads(out)
@@ -134,4 +126,4 @@ def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, capsys):
     hec.save(saved_result, "in_base")
     np.testing.assert_allclose(hec.load("in_base").T_base_child, in_base, atol=1e-6)
     assert '<parent link="base"/>' in (saved / "in_base" / "extrinsic.urdf.xacro").read_text()
-    assert "--frame-id base --child-frame-id camera" in run(capsys, "info", "in_base")[1]
+    assert "--frame-id base --child-frame-id camera" in run("info", "in_base")[1]

@@ -5,15 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 from published_data import data_folder
+from result_making import calibration
 
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.results.calibration import (
-    Calibration,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-)
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 from reproduction.coverage import __main__ as command
 from reproduction.coverage import classes, measures, mixed, motions, study
 from reproduction.coverage.bound import ideal_estimate
@@ -244,18 +240,11 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
 
 
 def _calibration(T_parent_child, covariance, scale):
-    return Calibration(
+    return calibration(
         T_parent_child=T_parent_child,
         covariance=covariance,
         status=SolveStatus.OK,
         observability=(),
-        objective=0.0,
-        method="dnlo",
-        reference="B1",
-        backend="fast",
-        n_poses=2,
-        n_pairs=1,
-        n_inliers=1,
         scale=scale,
     )
 

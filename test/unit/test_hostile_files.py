@@ -8,7 +8,7 @@ import xml.dom.minidom
 
 import pytest
 import yaml
-from motions import as_trajectory, child_of, disturbed, wandering_poses
+from motions import as_trajectory, child_of, disturbed, wandering_poses, write_pair
 from result_making import calibration
 
 from hand_eye_calib.cli.batch.results import stored
@@ -256,7 +256,7 @@ def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
 )
 def test_empty_lines_take_no_memory_beside_that_of_the_text(tmp_path, format, end):
     path = tmp_path / "empty.txt"
-    path.write_bytes(end.encode() * 100_000)
+    path.write_bytes(end.encode() * 50_000)
     tracemalloc.start()
     with pytest.raises(InputError, match="no poses in it"):
         read_trajectory_file(path, format)
@@ -328,9 +328,7 @@ def test_rotations_out_of_this_world_are_named(tmp_path, value):
 @pytest.fixture
 def calibrate(run, tmp_path):
     """Runs calibrate into the folder ``out``."""
-    files = tmp_path / "parent.tum", tmp_path / "child.tum"
-    for path, trajectory in zip(files, (PARENT, CHILD), strict=True):
-        write_trajectory(path, trajectory)
+    files = write_pair(tmp_path, PARENT, CHILD)
     (tmp_path / "out").mkdir()
     return lambda: run("calibrate", *files, "--method", "park", "--out", tmp_path / "out")[0]
 

@@ -224,47 +224,27 @@ def test_ali_as_published_finds_the_truth_without_noise():
 # The reader of the published data
 
 
-def test_reader_says_what_the_folder_lacks(tmp_path):
-    (tmp_path / "published").mkdir()
-    with pytest.raises(InputError, match="found no kitti_tests, no simulation_tests"):
-        published.load_simulated(tmp_path)
-
-
-@pytest.fixture
-def data_folder(tmp_path):
-    for name in ("kitti_tests", "simulation_tests/mixture", "published"):
-        (tmp_path / name).mkdir(parents=True)
-    return tmp_path
-
-
-def test_reader_names_a_missing_file(data_folder):
-    with pytest.raises(
-        InputError, match=r"cannot read .*simulation_tests_mixture\.csv: No such file"
-    ):
-        published.load_simulated(data_folder, ["mixture"])
+HEADER = "algorithm,method,err_tr,err_R,abs_tr,abs_R,T\n"
+ROW = 'Park,B1,1,1,1,1,"[[1 0 0 0]\n [0 1 0 0]\n [0 0 1 0]\n [0 0 0 1]]"\n'
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["a,b\n1,2\n", "algorithm,method,err_tr,err_R,abs_tr,abs_R,T\nPark,B1,1,1,1,1,[[1 2 3]]\n"],
-    ids=["columns", "matrix"],
+    ("text", "message"),
+    [
+        (None, r"cannot read .*simulation_tests_mixture\.csv: No such file"),
+        ("a,b\n1,2\n", r"simulation_tests_mixture\.csv is not a file of published results"),
+        (HEADER + "Park,B1,1,1,1,1,[[1 2 3]]\n", r"mixture\.csv is not a file of published res"),
+        (HEADER + ROW, r"trajectories of mixture do not go with .*: expected 38 runs \(found 0\)"),
+    ],
+    ids=["absent", "columns", "matrix", "no trajectories"],
 )
-def test_reader_names_a_file_that_holds_something_else(data_folder, text):
-    (data_folder / "published" / "simulation_tests_mixture.csv").write_text(text)
-    with pytest.raises(
-        InputError, match=r"simulation_tests_mixture\.csv is not a file of published results"
-    ):
-        published.load_simulated(data_folder, ["mixture"])
-
-
-def test_reader_refuses_results_without_their_trajectories(data_folder):
-    row = 'Park,B1,1,1,1,1,"[[1 0 0 0]\n [0 1 0 0]\n [0 0 1 0]\n [0 0 0 1]]"\n'
-    (data_folder / "published" / "simulation_tests_mixture.csv").write_text(
-        f"algorithm,method,err_tr,err_R,abs_tr,abs_R,T\n{row}"
-    )
-    with pytest.raises(
-        InputError,
-        match=r"trajectories of mixture do not go with the published results: expected 38 runs "
-        r"\(found 0\)",
-    ):
-        published.load_simulated(data_folder, ["mixture"])
+def test_reader_says_what_the_folder_lacks(tmp_path, text, message):
+    (tmp_path / "published").mkdir()
+    with pytest.raises(InputError, match="found no kitti_tests, no simulation_tests"):
+        published.load_simulated(tmp_path)
+    for name in ("kitti_tests", "simulation_tests/mixture"):
+        (tmp_path / name).mkdir(parents=True)
+    if text is not None:
+        (tmp_path / "published" / "simulation_tests_mixture.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        published.load_simulated(tmp_path, ["mixture"])

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from result_making import NAMES
+from result_making import calibration as made
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import (
@@ -10,12 +12,7 @@ from hand_eye_calib.geometry.extrinsic import (
     sigmas_rpy,
     sigmas_translation,
 )
-from hand_eye_calib.results.calibration import (
-    Calibration,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-)
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 
 SAMPLES = 20_000
 # A camera that looks ahead on a lidar: z of the camera is x of the lidar.
@@ -103,22 +100,14 @@ def test_the_other_direction_has_its_own_sigmas():
 def calibration(rotation, sigmas_deg):
     T, covariance = transform(rotation), covariance_about_parent(rotation, sigmas_deg)
     sigmas = np.r_[0.01, 0.02, 0.03, np.radians(sigmas_deg)]
-    axes = ("x", "y", "z", "roll", "pitch", "yaw")
-    return Calibration(
+    return made(
         T_parent_child=T,
         covariance=covariance,
         status=SolveStatus.OK,
         observability=tuple(
             DofObservability(name, DofVerdict.OBSERVED, sigma)
-            for name, sigma in zip(axes, sigmas, strict=True)
+            for name, sigma in zip(NAMES, sigmas, strict=True)
         ),
-        objective=0.0,
-        method="dnlo",
-        reference="B5",
-        backend="fast",
-        n_poses=100,
-        n_pairs=95,
-        n_inliers=95,
     )
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
+from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses, write_pair
 
 from hand_eye_calib.assessment.covariance import AXES, UNKNOWN_TRANSLATION, Assessment
 from hand_eye_calib.assessment.prior import fuse
@@ -12,7 +12,6 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import load_result
-from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.text import parse_prior
 
@@ -131,16 +130,21 @@ class TestFlatGround:
         assert result.T_parent_child[2, 3] == pytest.approx(1.85, abs=0.03)
 
 
-class TestFullMotion:
-    def drive(self):
-        poses = wandering_poses(300)
-        return as_trajectory(disturbed(poses, 1, 0.01, 0.005)), as_trajectory(
-            disturbed(child_of(poses, MOUNT), 2, 0.01, 0.005)
-        )
+@pytest.fixture(scope="module")
+def wandering():
+    """Two streams of full motion, and their calibration without a prior."""
+    poses = wandering_poses(300)
+    streams = [
+        as_trajectory(disturbed(each, seed, 0.01, 0.005))
+        for seed, each in ((1, poses), (2, child_of(poses, MOUNT)))
+    ]
+    return streams, calibrate(*streams, reference="B10")
 
-    def test_a_vague_prior_changes_nothing(self):
-        plain = calibrate(*self.drive(), reference="B10")
-        vague = calibrate(*self.drive(), reference="B10", prior={"z": (0.0, 100.0)})
+
+class TestFullMotion:
+    def test_a_vague_prior_changes_nothing(self, wandering):
+        streams, plain = wandering
+        vague = calibrate(*streams, reference="B10", prior={"z": (0.0, 100.0)})
         np.testing.assert_allclose(vague.T_parent_child, plain.T_parent_child, atol=1e-5)
         assert [dof.verdict for dof in vague.observability] == [
             dof.verdict for dof in plain.observability
@@ -150,9 +154,9 @@ class TestFullMotion:
         ("axis", "prior"),
         [("x", (-0.6, 0.001)), ("x", (100.0, 1e-9)), ("z", (15.0, 0.05)), ("yaw", (0.2, 0.01))],
     )
-    def test_a_contradiction_is_refused_and_the_prior_left_out(self, axis, prior):
-        plain = calibrate(*self.drive(), reference="B10")
-        result = calibrate(*self.drive(), reference="B10", prior={axis: prior})
+    def test_a_contradiction_is_refused_and_the_prior_left_out(self, wandering, axis, prior):
+        streams, plain = wandering
+        result = calibrate(*streams, reference="B10", prior={axis: prior})
         assert result.status is SolveStatus.CONTRADICTED
         assert result.status.failure == "a prior contradicts the motion"
         assert result.verdict is Verdict.DO_NOT_USE
@@ -173,10 +177,7 @@ def test_along_an_unobservable_axis_only_an_impossible_distance_contradicts():
 
 
 def test_the_command_refuses_a_contradiction(tmp_path, capsys):
-    paths = []
-    for name, stream in zip(("parent", "child"), flat_drive(), strict=True):
-        paths.append(str(tmp_path / f"{name}.tum"))
-        write_trajectory(paths[-1], stream)
+    paths = write_pair(tmp_path, *flat_drive())
     frames = ["--parent-frame", "lidar", "--child-frame", "camera"]
     command = ["calibrate", *paths, *frames, "--reference", "B10", "--out", str(tmp_path / "out")]
     assert main([*command, "--prior", "x=100+/-1e-9"]) == 1

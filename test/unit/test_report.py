@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from motions import write_pair
 
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
@@ -25,7 +26,6 @@ from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.report import render
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
@@ -339,10 +339,7 @@ def test_long_recordings_are_downsampled(monkeypatch):
 @pytest.fixture
 def files(tmp_path):
     drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=100), REALISTIC)
-    paths = [tmp_path / "parent.tum", tmp_path / "child.tum"]
-    for path, trajectory in zip(paths, (drive.parent, drive.child), strict=True):
-        write_trajectory(path, trajectory)
-    return [str(path) for path in paths]
+    return write_pair(tmp_path, drive.parent, drive.child)
 
 
 def calibrate(files, out):

@@ -114,13 +114,6 @@ def test_extrinsics_and_worlds_have_the_published_distribution():
     np.testing.assert_allclose(worlds.std(axis=0), 1 / np.sqrt(6), rtol=0.08)
 
 
-def test_seed_decides_everything():
-    once, again, other = (simulate_drive(seed, PUBLISHED_DRIVE, MIXTURE) for seed in (5, 5, 6))
-    np.testing.assert_array_equal(once.child.poses, again.child.poses)
-    assert np.abs(once.parent.poses - other.parent.poses).max() > 0.1
-    assert np.abs(once.T_parent_child - other.T_parent_child).max() > 0.1
-
-
 def test_hilly_drive_reveals_every_direction():
     """Information of the translation: how far the terms (R_A - I) t spread; on flat ground its
     smallest eigenvalue is zero.
@@ -203,23 +196,6 @@ def test_mixture_is_noise_then_drift_then_jumps():
     child = noise.add_drift(noise.add_gaussian(clean.child.poses, 0.005, gaussian), 0.025, drift)
     np.testing.assert_allclose(noisy.parent.poses, noise.add_jumps(parent, 0.05, jumps), atol=1e-12)
     np.testing.assert_allclose(noisy.child.poses, noise.add_jumps(child, 0.05, jumps), atol=1e-12)
-
-
-def test_drift_and_noise_touch_the_sensors_they_should():
-    clean = simulate_drive(8)
-    drift, gaussian = (
-        simulate_drive(8, noise=NoiseConfig(drift=0.05)),
-        simulate_drive(8, noise=NoiseConfig(gaussian=0.01)),
-    )
-    np.testing.assert_array_equal(drift.parent.poses, clean.parent.poses)
-    assert np.abs(drift.child.poses - clean.child.poses).max() > 0.05
-    parent_error, child_error = (
-        errors_of(noisy.poses, true.poses)[0]
-        for noisy, true in ((gaussian.parent, clean.parent), (gaussian.child, clean.child))
-    )
-    assert 0.008 < parent_error.std() < 0.012
-    assert 0.008 < child_error.std() < 0.012
-    assert abs(np.corrcoef(parent_error.ravel(), child_error.ravel())[0, 1]) < 0.2
 
 
 # --- against the published trajectories -----------------------------------------------

@@ -1,6 +1,7 @@
 """Each usual mistake is found and named; sound streams are left in peace."""
 
 import dataclasses
+import functools
 import json
 import re
 import tracemalloc
@@ -8,7 +9,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
-from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
+from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses, write_pair
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.checks.check import check_streams
@@ -24,7 +25,6 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
@@ -269,13 +269,7 @@ def test_stamps_in_another_unit(factor, unit):
 class TestCommand:
     @pytest.fixture
     def files(self, tmp_path):
-        def write(parent, child):
-            paths = [str(tmp_path / name) for name in ("parent.tum", "child.tum")]
-            for path, stream in zip(paths, (parent, child), strict=True):
-                write_trajectory(path, stream)
-            return paths
-
-        return write
+        return functools.partial(write_pair, tmp_path)
 
     def test_good_streams(self, files, capsys):
         assert main(["check", *files(*drive())]) == 0

@@ -7,7 +7,15 @@ import os
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, geodetic, planar_poses, wandering_poses
+from motions import (
+    as_trajectory,
+    child_of,
+    disturbed,
+    geodetic,
+    planar_poses,
+    wandering_poses,
+    write_pair,
+)
 from published_data import data_folder
 
 import hand_eye_calib as hec
@@ -406,16 +414,14 @@ def test_files_of_two_formats_need_no_options(tmp_path, streams, capsys):
 
 
 def test_repeated_stamps_are_dropped_with_a_note(tmp_path, streams, capsys):
-    for name, trajectory in zip(("parent.txt", "child.txt"), streams, strict=True):
-        write_trajectory(tmp_path / name, trajectory)
-    files = [str(tmp_path / name) for name in ("parent.txt", "child.txt")]
+    files = write_pair(tmp_path, *streams)
     command = ["calibrate", *files, "--json", "--reference", "B5"]
     assert main(command) == 0
     whole = json.loads(capsys.readouterr().out)
-    lines = (tmp_path / "child.txt").read_text().splitlines()
+    lines = (tmp_path / "child.tum").read_text().splitlines()
     stamp = lines[30].split()[0]
     lines[31:31] = [lines[30], " ".join([stamp, *lines[40].split()[1:]])]
-    (tmp_path / "child.txt").write_text("\n".join(lines))
+    (tmp_path / "child.tum").write_text("\n".join(lines))
     assert main(command) == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["T_parent_child"] == whole["T_parent_child"]
