@@ -24,7 +24,7 @@ from reproduction.coverage.classes import make
 
 @pytest.fixture(scope="module")
 def streams():
-    poses = wandering_poses(1200)
+    poses = wandering_poses(500)
     parent = as_trajectory(poses)
     child = as_trajectory(disturbed(child_of(poses), 1, 0.002, 0.001))
     return parent, child, hec.calibrate(parent, child, reference="B5").T_parent_child
