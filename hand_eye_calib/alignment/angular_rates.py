@@ -258,14 +258,12 @@ def _masked_correlation(
     covariance = np.fft.irfft(a * b, size) - sum_a * sum_b / divisor
     square_a, square_b = np.fft.irfft(aa * one_b, size), np.fft.irfft(one_a * bb, size)
     variance_a, variance_b = square_a - sum_a**2 / divisor, square_b - sum_b**2 / divisor
-    varied = (variance_a > 1e-9 * square_a.max(initial=0.0)) & (
-        variance_b > 1e-9 * square_b.max(initial=0.0)
-    )
-    coefficients = np.where(
-        varied, covariance / np.sqrt(np.where(varied, variance_a * variance_b, 1.0)), 0.0
-    )
+    varied = variance_a > 1e-9 * square_a.max(initial=0.0)
+    varied &= variance_b > 1e-9 * square_b.max(initial=0.0)
+    scale = np.sqrt(np.where(varied, variance_a * variance_b, 1.0))
     lags = np.arange(size)
-    return np.where(lags < len(first), lags, lags - size), coefficients, count
+    lags = np.where(lags < len(first), lags, lags - size)
+    return lags, np.where(varied, covariance / scale, 0.0), count
 
 
 def _spectra(signal: FloatArray, size: int) -> list[np.ndarray]:

@@ -50,9 +50,11 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     poses, measured = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     if not is_child:
         poses, measured = measured, poses
-    if not isinstance(config.scale, str):
-        measured = _scaled(measured, config.scale if is_child else 1.0)
-        poses = _scaled(poses, 1.0 if is_child else config.scale)
+    given = 1.0 if isinstance(config.scale, str) else config.scale
+    if is_child:
+        measured = _scaled(measured, given)
+    else:
+        poses = _scaled(poses, given)
     positions = measured[:, :3, 3]
     with_scale = config.scale in ("auto", "estimate")
     solution = _solved(pose_pairs.stamps_ns, poses, positions, with_scale)
@@ -61,7 +63,6 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     fused = fuse(T, assess_lever_arm(poses, solution), config.prior())
     result = _calibration(solution, fused.assessment, pose_pairs, config)
     status = SolveStatus.CONTRADICTED if fused.contradictions else result.status
-    given = config.scale if not isinstance(config.scale, str) else 1.0
     scale = solution.scale if is_child else 1.0 / solution.scale
     axes = fused.assessment.observability[:3]
     is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)

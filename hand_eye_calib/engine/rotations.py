@@ -67,8 +67,8 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
     has_rates = "rates" in (config.parent_measures, config.child_measures)
     solution, Ts_cw_c = _solved(pose_pairs.stamps_ns, Ts_pw_p, Ts_as_read, has_rates)
     findings = _unrelated(Ts_pw_p, Ts_cw_c, solution)
-    if findings and (found := _rate_unit(motion_pairs(Ts_pw_p, Ts_as_read, "B1"), config)):
-        findings = [found]
+    if findings and has_rates:
+        findings = _rate_unit(motion_pairs(Ts_pw_p, Ts_as_read, "B1"), config) or findings
     assessment = assess_rotation(Ts_pw_p, solution)
     fused = fuse(solution.T_parent_child, assessment, config.prior())
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
@@ -91,7 +91,7 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         time_offset_sigma_s=solution.time_offset_sigma_s,
         rate_bias=_rate_bias(solution, config) if has_rates else None,
         noise=solution.describe(pose_pairs.stamps_ns),
-        findings=tuple(findings),
+        findings=findings,
         contradictions=fused.contradictions,
         **config.target_fields(),
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
@@ -163,7 +163,7 @@ def _residuals(pairs: MotionPairs, solution: AdaptiveSolution, pose_pairs: PoseP
 
 def _unrelated(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, solution: AdaptiveSolution
-) -> list[Finding]:
+) -> tuple[Finding, ...]:
     """A finding if the rotations of one stream do not explain those of the other."""
     span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
@@ -172,30 +172,27 @@ def _unrelated(
     most = turned >= np.quantile(turned, _TURNING)  # a sensor may stand still for long
     share = float(np.median(left[most]) / max(float(np.median(turned[most])), 1e-12))
     if share < _UNRELATED:
-        return []
-    return [
-        finding(
-            "unrelated_parts",
-            share=min(share, 1.0),
-            part="rotation of one sensor",
-            other="other",
-            units="the unit of the rates",
-        )
-    ]
+        return ()
+    found = finding(
+        "unrelated_parts",
+        share=min(share, 1.0),
+        part="rotation of one sensor",
+        other="other",
+        units="the unit of the rates",
+    )
+    return (found,)
 
 
-def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> Finding | None:
+def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, ...]:
     """A finding if the rates of one stream are in degrees and those of the other in radians."""
-    sizes = {
-        stream: float(np.quantile(se3.rotation_angle(Ts[:, :3, :3]), _TURNING))
-        for stream, Ts in (("parent", steps.Ts_parenti_parentj), ("child", steps.Ts_childi_childj))
-    }
-    stream, other = ("child", "parent") if config.child_measures == "rates" else ("parent", "child")
-    if getattr(config, f"{stream}_measures") != "rates":
-        return None
-    ratio = sizes[stream] / max(sizes[other], 1e-12)
-    is_unit = min(abs(ratio / _DEGREES - 1.0), abs(ratio * _DEGREES - 1.0)) < _UNIT_WITHIN
-    if not is_unit:
-        return None
+    of_parent, of_child = (
+        float(np.quantile(se3.rotation_angle(Ts[:, :3, :3]), _TURNING))
+        for Ts in (steps.Ts_parenti_parentj, steps.Ts_childi_childj)
+    )
+    stream, ratio = "child", of_child / max(of_parent, 1e-12)
+    if config.child_measures != "rates":
+        stream, ratio = "parent", of_parent / max(of_child, 1e-12)
+    if min(abs(ratio / _DEGREES - 1.0), abs(ratio * _DEGREES - 1.0)) >= _UNIT_WITHIN:
+        return ()
     unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
-    return finding("rate_unit", stream, ratio=ratio, unit=unit, read_as=read_as)
+    return (finding("rate_unit", stream, ratio=ratio, unit=unit, read_as=read_as),)

@@ -17,7 +17,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls import noise_model, reml
+from hand_eye_calib.gls import reml
 from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,
     SCALE,
@@ -29,16 +29,23 @@ from hand_eye_calib.gls.increments import (
     summed,
     turned,
 )
-from hand_eye_calib.gls.noise_model import N_FAST, Extent, NoiseModel, Slow
+from hand_eye_calib.gls.noise_model import (
+    LOWEST_VARIANCE,
+    N_FAST,
+    ROTATION,
+    TRANSLATION,
+    WALK_ROTATION,
+    WALK_TRANSLATION,
+    Extent,
+    NoiseModel,
+    Slow,
+)
 from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
 from hand_eye_calib.gls.parts import part_products
 from hand_eye_calib.gls.problem import sample
 from hand_eye_calib.gls.solution import LeverArmSolution
 from hand_eye_calib.gls.stages import rough_levels
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
-
-# Of the latent states.
-_WHITE_ROTATION = slice(3, 6)
 
 # Log variance (rad^2) of orientations that may be anything, and bounds of their walk.
 _ANY_ROTATION = float(np.log(100.0))
@@ -64,8 +71,8 @@ _LONG_M = 10.0
 _UNKNOWN_M = 0.2
 
 # An error that lasts is part of the model if the loss is so much lower with it; it starts at this
-# share of the rest.
-_LEAST_GAIN, _FIRST_SHARE = 4.0, np.exp(-1.0)
+# share of the rest, a logarithm.
+_LEAST_GAIN, _FIRST_SHARE = 4.0, -1.0
 
 # Noise levels need no more poses than this.
 _MOST_POSES = 300
@@ -128,35 +135,21 @@ def _first_answer(
     and know the scale.
     """
     lever_arm, scale = np.zeros(3), 1.0
+    of_all = Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions
     for size in _START_WINDOWS:
-        windows = _windows(Ts_pw_p, positions, size)
-        lever_arm, scale = _fitting(*windows, lever_arm, scale, with_scale)
+        windows = [_windows(values, min(size, len(positions))) for values in of_all]
+        lever_arm, scale = _fitting(windows, lever_arm, scale, with_scale)
         with_scale = False
     return lever_arm, scale
 
 
-def _windows(
-    Ts_pw_p: FloatArray, positions: FloatArray, size: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Orientations (n, k, 3, 3), path (n, k, 3) and positions (n, k, 3) of windows, centred."""
-    size = min(size, len(positions))
-    count = len(positions) // size
-    axes, path, measured = (
-        _centred(values[: count * size].reshape(count, size, *values.shape[1:]))
-        for values in (Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions)
-    )
-    return axes, path, measured
-
-
 def _fitting(
-    axes: FloatArray,
-    path: FloatArray,
-    measured: FloatArray,
-    lever_arm: FloatArray,
-    scale: float,
-    with_scale: bool,
+    windows: list[FloatArray], lever_arm: FloatArray, scale: float, with_scale: bool
 ) -> tuple[FloatArray, float]:
-    """Lever arm and scale that fit windows best, from first ones on."""
+    """Lever arm and scale that fit windows of orientations (n, k, 3, 3), path and positions (n, k,
+    3) best, from first ones on.
+    """
+    axes, path, measured = windows
     information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * axes.shape[1] * np.eye(3)
     for _ in range(_START_STEPS):
         predicted = axes @ lever_arm + path
@@ -183,17 +176,16 @@ def unexplained_share(
     """
     predicted = Ts_pw_p[:, :3, :3] @ solution.lever_arm + Ts_pw_p[:, :3, 3]
     size = max(len(positions) // _PARTS, min(_PARTS, len(positions)))
-    end = len(positions) // size * size
-    expected, measured = (
-        _centred(path[:end].reshape(-1, size, 3))
-        for path in (predicted, solution.scale * positions)
-    )
+    expected, measured = (_windows(path, size) for path in (predicted, solution.scale * positions))
     residuals = measured @ _rotations(measured, expected) - expected
     left, whole = ((path**2).sum(axis=(1, 2)) for path in (residuals, measured))
     return float(np.sqrt(np.median(left) / np.median(whole))) if np.median(whole) else 1.0
 
 
-def _centred(windows: FloatArray) -> FloatArray:
+def _windows(values: FloatArray, size: int) -> FloatArray:
+    """Values (N, ...) of windows of a size, (n, size, ...), each less its mean."""
+    whole = len(values) // size * size
+    windows = values[:whole].reshape(-1, size, *values.shape[1:])
     return windows - windows.mean(axis=1, keepdims=True)
 
 
@@ -213,7 +205,7 @@ def _aligned(Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray) 
     for start in range(0, n_poses, size):
         first = max(min(start, n_poses - size), 0)  # the last window is as long as the others
         window = slice(first, first + size)
-        turn = _rotations(_centred(positions[None, window]), _centred(predicted[None, window]))[0]
+        turn = _rotations(_windows(positions[window], size), _windows(predicted[window], size))[0]
         rotations[start : start + size] = turn @ Ts_pw_p[start : start + size, :3, :3]
     return se3.from_rotation_translation(rotations, positions)
 
@@ -299,8 +291,7 @@ class _State:
         their world.
         """
         streams = self.streams
-        moved = Streams(streams.stamps_s, streams.Ts_pw_p, streams.Ts_pw_p @ self.X)
-        course = course_of(moved, self.X)
+        course = course_of(replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X)
         back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
         worlds = streams.Ts_cw_c[:-1, :3, :3] @ back_p
         return replace(
@@ -353,32 +344,34 @@ class _State:
         """With noise levels fitted, for a drift that grows with time or with the path, whichever is
         more likely.
         """
-        prior = _prior(self.model, self.levels)
-        fits = []
-        for walk_by in ("time", "distance"):
-            model = replace(self.model, walk_by=walk_by)
-            fits.append((model, reml.fit(self.sampled_space(model), self.levels, prior)))
+        models = (replace(self.model, walk_by=walk_by) for walk_by in ("time", "distance"))
+        return self._likeliest([(model, self.levels) for model in models])[0]
+
+    def _likeliest(self, starts: list[tuple[NoiseModel, FloatArray]]) -> tuple[_State, float]:
+        """With the likeliest of some models, fitted from log levels on, and its loss."""
+        fits = [
+            (model, reml.fit(self.sampled_space(model), levels, _prior(model, levels)))
+            for model, levels in starts
+        ]
         model, fit = min(fits, key=lambda each: each[1].loss)
-        return replace(self, model=model, levels=fit.levels)
+        return replace(self, model=model, levels=fit.levels), fit.loss
 
     def with_lasting_error(self) -> _State:
         """With an error of the positions that lasts, if the data ask for it."""
-        extent, levels = self.model.extent, self.levels
-        start = np.logaddexp(levels[noise_model.TRANSLATION], levels[noise_model.WALK_TRANSLATION])
-        fits = []
-        for kind in ("body", "world"):
-            for tau_s in self.model.taus_s():
-                model = self.model.richer((Slow(kind, "translation"),))
-                more = [start + np.log(_FIRST_SHARE), np.log(max(tau_s, 2 * extent.interval_s))]
-                richer = np.concatenate([levels, more])
-                fits.append(
-                    (model, reml.fit(self.sampled_space(model), richer, _prior(model, richer)))
+        levels, shortest_s = self.levels, 2 * self.model.extent.interval_s
+        first = np.logaddexp(levels[TRANSLATION], levels[WALK_TRANSLATION]) + _FIRST_SHARE
+        found, loss = self._likeliest(
+            [
+                (
+                    self.model.richer((Slow(kind, "translation"),)),
+                    np.r_[levels, first, np.log(max(tau_s, shortest_s))],
                 )
-        model, best = min(fits, key=lambda each: each[1].loss)
+                for kind in ("body", "world")
+                for tau_s in self.model.taus_s()
+            ]
+        )
         before = Posterior(self.sampled_space(), levels).loss
-        if before - best.loss < _LEAST_GAIN:
-            return self
-        return replace(self, model=model, levels=best.levels)
+        return found if before - loss >= _LEAST_GAIN else self
 
     def with_outliers(self, posterior: Posterior) -> _State:
         """With jumps, which are large steps of the walk, and positions wrong by themselves."""
@@ -393,7 +386,7 @@ class _State:
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         path = Ts_cw_c[:, :3, 3] + turned(Ts_cw_c[:, :3, :3], states)
         spread = posterior.precision.selected_inverse[0][:, range(3), range(3)]
-        drift = 3.0 * float(np.exp(self.levels[noise_model.WALK_TRANSLATION]))
+        drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
         worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
         streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
@@ -401,7 +394,7 @@ class _State:
 
     def moved(self, posterior: Posterior) -> _State:
         """After a step, with the orientations that the positions ask for."""
-        turns = posterior.states_after(posterior.normal.step)[:, _WHITE_ROTATION]
+        turns = posterior.states_after(posterior.normal.step)[:, 3:6]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
         parameters = self.parameters.copy()
@@ -414,7 +407,7 @@ class _State:
         )
 
 
-def _worse(squares: FloatArray, least: float = noise_model.LOWEST_VARIANCE) -> BoolArray:
+def _worse(squares: FloatArray, least: float = LOWEST_VARIANCE) -> BoolArray:
     """Which positions (N,) are clearly worse than the best quarter, by the squared errors (N,) of
     those around. Errors no larger than the least square, that of the odometry's drift from one
     position to the next, are never worse.
@@ -454,14 +447,12 @@ def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
     """What is known of log levels beforehand, for a search from these."""
     prior = model.prior(levels)
     lower, upper = prior.lower.copy(), prior.upper.copy()
-    white, walk = noise_model.TRANSLATION, noise_model.WALK_TRANSLATION
-    total = np.logaddexp(levels[walk], levels[white] + np.log(2.0))
-    least = np.log(noise_model.LOWEST_VARIANCE)
-    lower[white] = max(least, total + _LEAST_WHITE_SHARE)
-    lower[walk] = max(least, total + _LEAST_WALK_SHARE)
-    lower[noise_model.ROTATION] = upper[noise_model.ROTATION] = _ANY_ROTATION
-    lower[noise_model.WALK_ROTATION] = _LEAST_WALK
-    upper[noise_model.WALK_ROTATION] = _MOST_WALK
+    total = np.logaddexp(levels[WALK_TRANSLATION], levels[TRANSLATION] + np.log(2.0))
+    least = np.log(LOWEST_VARIANCE)
+    lower[TRANSLATION] = max(least, total + _LEAST_WHITE_SHARE)
+    lower[WALK_TRANSLATION] = max(least, total + _LEAST_WALK_SHARE)
+    lower[ROTATION] = upper[ROTATION] = _ANY_ROTATION
+    lower[WALK_ROTATION], upper[WALK_ROTATION] = _LEAST_WALK, _MOST_WALK
     return replace(prior, lower=lower, upper=upper)
 
 

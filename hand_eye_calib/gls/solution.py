@@ -40,27 +40,6 @@ _NOTABLE_JITTER_S = 1e-4
 
 
 @dataclass(frozen=True)
-class SlowNoise:
-    """An error that lasts.
-
-    Attributes
-    ----------
-    kind : {"body", "world", "scale"}
-        What it is fixed to, or that it is a drifting scale.
-    part : {"translation", "rotation", "scale"}
-    sigma : float
-        Standard deviation per axis, in m, rad or as a share.
-    tau_s : float
-        Correlation time.
-    """
-
-    kind: str
-    part: str
-    sigma: float
-    tau_s: float
-
-
-@dataclass(frozen=True)
 class NoiseLevels:
     """Standard deviations per axis, of both sensors' trajectories together.
 
@@ -77,7 +56,7 @@ class NoiseLevels:
     centre : {"sensors", "child", "parent"}
         What white rotation noise turns the trajectories about: the sensors, or the origin of the
         child's or the parent's world.
-    slow : tuple of SlowNoise
+    slow : tuple of CorrelatedError
     interval_s : float
         Typical interval between poses.
     """
@@ -89,7 +68,7 @@ class NoiseLevels:
     jitter_s: float
     walk_by: str
     centre: str
-    slow: tuple[SlowNoise, ...]
+    slow: tuple[CorrelatedError, ...]
     interval_s: float
 
     @classmethod
@@ -97,7 +76,12 @@ class NoiseLevels:
         """From log levels."""
         sigmas = np.exp(0.5 * levels)
         slow = tuple(
-            SlowNoise(process.kind, process.part, float(sigmas[at]), float(np.exp(levels[at + 1])))
+            CorrelatedError(
+                kind=process.kind,
+                part=process.part,
+                sigma=float(sigmas[at]),
+                tau_s=float(np.exp(levels[at + 1])),
+            )
             for process, at in zip(model.slow, range(N_FAST, len(levels), 2), strict=True)
         )
         return cls(
@@ -253,7 +237,7 @@ class AdaptiveSolution:
             translation_drift_m_after_a_metre=noise.translation_drift * self._after_a_metre,
             drift_grows_with=noise.walk_by,
             stamp_jitter_s=noise.jitter_s,
-            lasting=tuple(CorrelatedError(**vars(slow)) for slow in noise.slow),
+            lasting=noise.slow,
             rotation_turns_about=noise.centre,
             heavy_tails=self.heavy_tails,
             systematic=self.systematic,
@@ -408,7 +392,7 @@ class LeverArmSolution:
         return Noise(
             translation_white_m=white,
             translation_drift_m_per_pose=walk,
-            rotation_drift_rad_per_pose=float(np.radians(turned)),
+            rotation_drift_rad_per_pose=turned,
             drift_grows_with=self.model.walk_by,
             share_of_worse_positions=worse,
             jumps_before_stamp_ns=tuple(stamps_ns[1:][self.jumps].tolist()),
@@ -418,7 +402,7 @@ class LeverArmSolution:
         )
 
 
-def _slow_in_words(slow: SlowNoise) -> str:
+def _slow_in_words(slow: CorrelatedError) -> str:
     if slow.kind == "scale":
         return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
     size = length(slow.sigma) if slow.part == "translation" else angle(slow.sigma)

@@ -14,6 +14,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.gls.increments import N_SYSTEMATIC, TIME, parameters_of
 from hand_eye_calib.gls.normal import NormalEquations, selected
 from hand_eye_calib.gls.problem import Fit, Problem
+from hand_eye_calib.gls.state_space import Posterior
 from hand_eye_calib.gls.tuning import Tuning
 
 _BIAS = parameters_of("bias")
@@ -54,6 +55,14 @@ def systematic(problem: Problem, fit: Fit) -> Fit:
     if problem.is_clock_free and with_time:
         credible = with_time
     best = min(credible, key=lambda name: credible[name].criterion)
+    if "bias" in best:
+        # A scale is not of first order if it is large, and then a bias along the direction of
+        # travel seems to be nearer: both are judged at their own parameters.
+        scales = [name for name in credible if "scale" in name]
+        nearest = sorted(scales, key=lambda name: credible[name].criterion)[:1]
+        best = min(
+            (best, *nearest), key=lambda name: _own_criterion(fit, posterior, credible[name])
+        )
     chosen = replace(
         fit,
         systematic=best,
@@ -63,6 +72,13 @@ def systematic(problem: Problem, fit: Fit) -> Fit:
     ).moved(models[best].fit.step)
     states = posterior.states_after(models[best].fit.step, _columns(chosen.columns, tried))
     return chosen.freed(problem.streams, states)
+
+
+def _own_criterion(fit: Fit, posterior: Posterior, model: Model) -> float:
+    """Criterion of a model where its own step leads, under the same noise."""
+    own = replace(fit, columns=model.parameters).moved(model.fit.step)
+    columns = own.linearised(own.poses, own.course, own.error, own.columns).columns
+    return posterior.with_columns(columns).normal.cost + model.criterion - model.fit.cost
 
 
 def _models(
