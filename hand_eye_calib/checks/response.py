@@ -45,6 +45,10 @@ _TUNING, _ROUNDS = 3.0, 4
 # An axis whose root mean square rotation is below this share of the main axis's has no gain.
 _LITTLE = 0.1
 
+# Noise of the parent explains a gain only if the child has this share of the parent's squared
+# rotations about the axis.
+_SHARED = 0.25
+
 # Farthest step of a stencil. Rotation vectors near half a turn may point either way.
 _FAR = 4
 MAX_ROTATION = 2.8
@@ -93,10 +97,13 @@ def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Quantity, .
     # large: what lies between them, noise alone explains.
     reverse, of_reverse, _ = _regress(_along(y, axes), x - y)
     other = 1.0 / (1.0 + reverse[:3]) - 1.0
-    is_nearer = np.abs(other) < np.abs(values[:3])
+    powers = [((vectors @ axes) ** 2).mean(axis=0) for vectors in (x, y)]
+    is_shared = powers[1] > _SHARED * powers[0]
+    is_nearer = is_shared & (np.abs(other) < np.abs(values[:3]))
     sigmas = np.where(is_nearer, of_reverse[:3], sigmas[:3])
-    values = np.where(values[:3] * other < 0.0, 0.0, np.where(is_nearer, other, values[:3]))
-    squared = ((x @ axes) ** 2).mean(axis=0)
+    is_between = is_shared & (values[:3] * other < 0.0)
+    values = np.where(is_between, 0.0, np.where(is_nearer, other, values[:3]))
+    squared = powers[0]
     # Little rotation beside much may come from an axis that is slightly off.
     biases = np.where(squared < _LITTLE**2 * squared[0], 1.0, variance / (squared + 1e-300))
     gains = zip(values, sigmas, biases, strict=True)
