@@ -94,16 +94,14 @@ def calibrate_arm(
         target in the hand.
     """
     named = {name: name for name in ("base", "hand", "camera", "target")} | dict(names or {})
-    in_hand = solve(Stops.of_one(robot, se3.inverse(tracking)))
-    beside = solve(Stops.of_one(se3.inverse(robot), se3.inverse(tracking)))
-    if beside.log_likelihood > in_hand.log_likelihood:
-        frames = StopFrames(named["base"], named["camera"], named["hand"], named["target"])
-        fit, poses = beside, se3.inverse(robot)
-    else:
-        frames = StopFrames(named["hand"], named["camera"], named["base"], named["target"])
-        fit, poses = in_hand, robot
-    config = config or CalibratorConfig()
-    return _assessed(fit, poses, se3.inverse(tracking), config, frames, [])
+    Ts_target_camera = se3.inverse(tracking)
+    fits = [
+        (solve(Stops.of_one(poses, Ts_target_camera)), poses, parent, world)
+        for poses, parent, world in ((robot, "hand", "base"), (se3.inverse(robot), "base", "hand"))
+    ]
+    fit, poses, parent, world = max(fits, key=lambda each: each[0].log_likelihood)
+    frames = StopFrames(named[parent], named["camera"], named[world], named["target"])
+    return _assessed(fit, poses, Ts_target_camera, config or CalibratorConfig(), frames, [])
 
 
 def _is_clearly_better(one: RobotWorld, other: RobotWorld) -> bool:
