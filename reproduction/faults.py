@@ -238,9 +238,9 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
             f"{len(faulty)} calibrations with `{'` or `'.join(METHODS)}`: of simulated hilly "
             "drives of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), "
             "whose answer without the fault counts as the truth. z is the largest error of an axis "
-            "in its stated standard deviations; z and the error are the largest of all. Findings "
-            "and verdicts are counted, the verdicts for each severity in turn: `no` is DO NOT USE, "
-            "`care` USE WITH CARE.",
+            "in its stated standard deviations; z and the error are the largest of all. Verdicts "
+            "and the three most frequent findings are counted: `no` is DO NOT USE, `care` USE WITH "
+            "CARE.",
             _unsafe_text(faulty),
             f"Without a fault, these recordings end in {counted(f.verdict for f in sound)}; z is "
             f"at most {max((f.z for f in sound), default=0.0):.1f}.",
@@ -273,21 +273,13 @@ def _row(fault: Fault, found: Sequence[Outcome]) -> dict[str, str]:
         for code in dict.fromkeys(one.findings)
         if not code.endswith(("gaps", "one_axis"))
     )
-    verdicts = (
-        counted(
-            _SHORT.get(one.verdict, one.verdict)
-            for one in found
-            if one.key.split()[1] == str(index)
-        )
-        for index in range(len(fault.severities))
-    )
     answered = [one for one in found if math.isfinite(one.z)]
     severities = ", ".join(f"{severity:g}" for severity in fault.severities)
     return {
         "": fault.code,
         "fault": f"{fault.what}: {severities} {fault.unit}".strip(),
-        "findings": counted(named) or "none",
-        "verdicts": "; ".join(filter(None, verdicts)),
+        "findings": counted(named, most=3) or "none",
+        "verdicts": counted(_SHORT.get(one.verdict, one.verdict) for one in found),
         "error": _largest(answered),
         "largest z": f"{max(one.z for one in answered):.1f}" if answered else "",
     }
@@ -312,14 +304,20 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
         wrong.setdefault(name, set()).update(codes)
     n_wrong = sum(map(bool, wrong.values()))
     unexplained = [found for found in outcomes if set(found.rules) - _PHYSICAL]
+    rows = {kind: of for kind, of in rows.items() if any(_is_worth_telling(*one) for one in of)}
     table = markdown_table(_clean_row(kind, of_kind) for kind, of_kind in rows.items())
     return (
         f"Wrong findings in {n_wrong} of {len(wrong)} clean recordings ({n_wrong / len(wrong):.1%})"
         f", solved with the default method. {len(outcomes) - len(unexplained)} of "
         f"{len(outcomes)} results are called USE or have reasons that the recording itself has: an "
         "axis that the motion does not show, or less well than the target, the common-mode floor, "
-        f"outliers, a finding that is right.{_contradicted_text(unexplained)}\n\n{table}"
+        f"outliers, a finding that is right.{_contradicted_text(unexplained)} "
+        f"Listed are those, and what is more than {_LIMIT_Z:g} standard deviations off.\n\n{table}"
     )
+
+
+def _is_worth_telling(found: Outcome, wrong: set[str]) -> bool:
+    return bool(wrong) or bool(set(found.rules) - _PHYSICAL) or found.z > _LIMIT_Z
 
 
 def _contradicted_text(outcomes: Sequence[Outcome]) -> str:

@@ -112,9 +112,9 @@ def percent(part: int, whole: int) -> str:
     return f"{part} of {whole} ({share:.2f} %)"
 
 
-def counted(words: Iterable[str]) -> str:
+def counted(words: Iterable[str], most: int | None = None) -> str:
     """Words with how often they occur, the most frequent first."""
-    return ", ".join(f"{word} {count}" for word, count in Counter(words).most_common())
+    return ", ".join(f"{word} {count}" for word, count in Counter(words).most_common(most))
 
 
 def triple(values: Iterable[float], factor: float = 1.0, form: str = ".1f") -> str:

@@ -88,7 +88,8 @@ GOALS = (
 
 def page(rows: Sequence[Row], absent: Sequence[str], seeds: int) -> str:
     """The page in Markdown, from rows, folders of recordings that were not there, and the number of
-    recordings per class. Of the methods after the first only the pooled rows are shown.
+    recordings per class. Tables of errors over the truth have a row for each recording, the others
+    the pooled rows; ``--rows`` writes all.
     """
     methods = list(dict.fromkeys(row.method for row in rows))
     blocks = [
@@ -109,14 +110,20 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: int) -> str:
             row
             for row in rows
             if row.table == table
-            and (row.method == methods[0] or row.name in (POOLED.get(table), "tango"))
+            and (row.name in (POOLED.get(table), "tango") or _is_shown(row, methods[0]))
         ]
         if chosen:
             shown = (_shown(row, columns, methods[0]) for row in chosen)
             blocks += [f"## {_TITLES[table]}", _ABOUT[table], markdown_table(shown)]
-    others = f" Of {', '.join(methods[1:])} the pooled rows are shown." if methods[1:] else ""
-    about = f"{seeds} recordings of each class, as `reproduction/coverage/` makes them.{others}"
+    about = (
+        f"{seeds} recordings of each class, as `reproduction/coverage/` makes them. The rows of "
+        "every class are in `reproduction/coverage/baseline.json`."
+    )
     return "\n\n".join(filter(None, [*blocks, about])) + "\n"
+
+
+def _is_shown(row: Row, first: str) -> bool:
+    return row.method == first and row.table in ("known answer", "mixed", "levels")
 
 
 def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:

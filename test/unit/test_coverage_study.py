@@ -272,7 +272,7 @@ def test_one_class_from_end_to_end(monkeypatch):
     assert found["flat_agv"].value("refused") == 1.0
     assert found["mixed_arm"].table == "mixed"
     assert set(found["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
-    assert "| hand_white | " in page(rows, ["a folder"], 2)
+    assert "| all classes | " in page(rows, ["a folder"], 2)
 
 
 def test_rows_survive_the_file(tmp_path):
