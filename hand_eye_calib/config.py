@@ -194,6 +194,24 @@ def _measures(stream: str) -> Any:
     )
 
 
+def _invert(stream: str) -> Any:
+    return option(
+        "none",
+        f"Invert the {stream}'s poses, if they are those of the world in the sensor, or its "
+        "orientations alone.",
+        choices=("none", "poses", "orientations"),
+    )
+
+
+def _quaternion(stream: str) -> Any:
+    return option(
+        "xyzw",
+        f"Order in which the {stream}'s quaternions were written: wxyz puts right what was read "
+        "as x y z w.",
+        choices=("xyzw", "wxyz"),
+    )
+
+
 def _prior(axis: str) -> Any:
     unit = AXIS_UNITS[axis]
     example = "1.85+/-0.02 or 185cm+/-2cm" if unit == "m" else "-90deg+/-2deg"
@@ -313,8 +331,17 @@ class CalibratorConfig(OptionSet):
         words=("none", "auto", "estimate"),
         within=(1e-6, 1e6),
     )
+    parent_scale: float = option(
+        1.0,
+        "Factor from the parent's lengths to metres, such as 0.001 for millimetres.",
+        within=(1e-6, 1e6),
+    )
     parent_measures: str = _measures("parent")
     child_measures: str = _measures("child")
+    parent_invert: str = _invert("parent")
+    child_invert: str = _invert("child")
+    parent_quaternion: str = _quaternion("parent")
+    child_quaternion: str = _quaternion("child")
     prior_x: str = _prior("x")
     prior_y: str = _prior("y")
     prior_z: str = _prior("z")

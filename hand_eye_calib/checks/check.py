@@ -69,7 +69,7 @@ _SCALE_ERROR = 0.03
 # are interpolated across if their clocks differ by more.
 _COARSE, _SLOW_GAP = 0.5, 1.5
 
-_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet", 1e3: "kilometres"}
+_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet"}
 _UNIT_TOLERANCE = 0.1
 
 # Shortest duration and smallest rotation with which the checks of a live session mean something.
@@ -242,11 +242,14 @@ def _with_lengths(findings: list[Finding], parent: Trajectory) -> list[Finding]:
 
 
 def unit_of(scale: float) -> tuple[float, str] | None:
-    """Factor to metres and name of the usual unit of length that a scale is about; None if it is
-    about none.
+    """Factor and name of the unit of length that a scale is about, of the child or, above 1, of
+    the parent; None if it is about none.
     """
-    near = (each for each in _UNITS.items() if abs(scale / each[0] - 1.0) < _UNIT_TOLERANCE)
-    return next(near, None)
+    for factor, name in _UNITS.items():
+        for each in (factor, 1.0 / factor):
+            if abs(scale / each - 1.0) < _UNIT_TOLERANCE:
+                return each, name
+    return None
 
 
 def _check_agreeing(
@@ -382,9 +385,18 @@ def _check_scale(scale: Scale, known: float) -> list[Finding]:
 
 
 def in_other_units(scale: float, sigma: float, unit: str, factor: float) -> Finding:
-    """The finding that the child's lengths are in another unit, by the scale that was found."""
+    """The finding that a stream's lengths are in another unit, by the scale that was found: the
+    child's if it is below 1, otherwise the parent's.
+    """
+    is_child = scale < 1.0
     return wording.finding(
-        "units", "child", options={"scale": factor}, scale=scale, sigma=sigma, unit=unit
+        "units",
+        "child" if is_child else "parent",
+        options={"scale": factor} if is_child else {"parent_scale": round(1.0 / factor, 9)},
+        other="parent" if is_child else "child",
+        scale=scale,
+        sigma=sigma,
+        unit=unit,
     )
 
 

@@ -120,8 +120,8 @@ _ROWS = {
         "the parent moves at {speed_m_s:.0f} m/s and changes its velocity by "
         "{acceleration_m_s2:.0f} m/s within a second, as no vehicle does: its lengths can hardly "
         "be in metres",
-        "give the lengths of both streams in metres; those of a file also by the unit in its "
-        "header, such as x_mm or x [mm]",
+        "give the lengths of both streams in metres, those of a file also by the unit in its "
+        "header, such as x_mm; if they are millimetres, solve with",
         "such as lengths in millimetres",
         evidence=("speed_m_s", "acceleration_m_s2"),
     ),
@@ -226,7 +226,7 @@ _ROWS = {
         confidence=_CERTAIN,
     ),
     "units": _Row(
-        "the child's lengths are {unit} while the parent's are metres (factor {scale:.5g} +/- "
+        "{whose} lengths are {unit} while the {other}'s are metres (factor {scale:.5g} +/- "
         "{sigma:.2g})",
         "convert them to metres",
         evidence=("scale", "sigma"),
@@ -355,12 +355,40 @@ def finding(
     )
 
 
+# Code of a finding to the option that puts a stream right, and its value.
+_CONVENTIONS = {
+    "inverse": ("invert", "poses"),
+    "inverse_orientation": ("invert", "orientations"),
+    "quaternion_order": ("quaternion", "wxyz"),
+}
+
+
+def conventions(code: str, stream: str) -> dict[str, float | str]:
+    """The options that put the convention of a stream, or of both, right; empty if none can."""
+    if code not in _CONVENTIONS:
+        return {}
+    kind, value = _CONVENTIONS[code]
+    return {f"{each}_{kind}": value for each in ("parent", "child") if stream in (each, "both")}
+
+
 def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
     """The same findings; those that the options answer already are notes, and so are a few jumps if
     the method rejects outliers.
     """
     given = config.to_options()
     rejects_outliers = METHODS[config.method].rejects_outliers
+
+    def undone(found: Finding) -> Finding:
+        """A stream that was put right already, and needs it again, was right before."""
+        if found.code not in _CONVENTIONS:
+            return found
+        usual = {
+            name: getattr(CalibratorConfig, name) if given[name] == value else value
+            for name, value in found.options.items()
+        }
+        return replace(found, options=usual)
+
+    findings = [undone(found) for found in findings]
 
     def is_answered(found: Finding) -> bool:
         if found.code == "jumps" and rejects_outliers and found.evidence["share"] < _FEW_JUMPS:

@@ -26,6 +26,7 @@ from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.checks.streams import coarse_poses
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.misread import put_right
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import synchronise
@@ -155,20 +156,14 @@ class Explanation:
         return self.fit.unexplained < self.limit
 
 
-def _reordered(trajectory: Trajectory) -> Trajectory:
-    """Quaternions read as x y z w that were written w x y z, put right."""
-    quats = np.roll(se3.to_quat_xyzw(trajectory.poses), -1, axis=1)
-    return Trajectory(trajectory.stamps_ns, se3.from_quat_xyzw(trajectory.poses[:, :3, 3], quats))
+def _misread(trajectory: Trajectory, **convention: str) -> Trajectory:
+    """The trajectory with its poses put right, but for its names."""
+    return Trajectory(trajectory.stamps_ns, put_right(trajectory.poses, **convention))
 
 
-def _inverted(trajectory: Trajectory) -> Trajectory:
-    return Trajectory(trajectory.stamps_ns, se3.inverse(trajectory.poses))
-
-
-def _orientations_inverted(trajectory: Trajectory) -> Trajectory:
-    poses = trajectory.poses.copy()
-    poses[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-    return Trajectory(trajectory.stamps_ns, poses)
+_reordered = functools.partial(_misread, quaternion="wxyz")
+_inverted = functools.partial(_misread, invert="poses")
+_orientations_inverted = functools.partial(_misread, invert="orientations")
 
 
 def _with_axes(matrix: FloatArray, trajectory: Trajectory) -> Trajectory:
@@ -357,30 +352,30 @@ def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
     """
     hypothesis = explanation.hypothesis
     if hypothesis.code not in ("", "inverse"):
+        code, stream = hypothesis.code, hypothesis.stream
+        options = wording.conventions(code, stream)
         return replace(
             explanation,
-            findings=(
-                wording.finding(hypothesis.code, hypothesis.stream, detail=hypothesis.detail),
-            ),
+            findings=(wording.finding(code, stream, options=options, detail=hypothesis.detail),),
         )
     evidence, inverted_fit = _evidence_for_inverse(streams, explanation, lag_s)
     if evidence < _INVERTED:
         if not hypothesis.code:
             return explanation
         confidence = _confidence(-evidence, _INVERTED)
-        finding = wording.finding("inverse", hypothesis.stream, confidence=confidence)
+        finding = _inverse(hypothesis.stream, confidence)
         return replace(explanation, findings=(finding,))
     if hypothesis.code:
         other = "parent" if hypothesis.stream == "child" else "child"
         confidence = _confidence(evidence, _INVERTED)
-        finding = wording.finding("inverse", other, confidence=confidence)
+        finding = _inverse(other, confidence)
         return Explanation(Hypothesis("inverse", other, _inverted), inverted_fit, (finding,))
     likely = np.inf if _may_be_an_arm(streams) else _LIKELY_INVERTED
     confidence = _confidence(evidence, likely)
     if confidence is Confidence.POSSIBLE:
         finding = wording.finding("inverse_both", "both", Severity.WARNING, confidence)
         return replace(explanation, findings=(finding,))
-    finding = wording.finding("inverse_both")
+    finding = wording.finding("inverse_both", options=wording.conventions("inverse", "both"))
     return Explanation(_BOTH_INVERTED, inverted_fit, (finding,))
 
 
@@ -392,6 +387,11 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
         np.linalg.norm(each - np.median(each, axis=0), axis=1).max() < _REACH_M
         for each in positions
     )
+
+
+def _inverse(stream: str, confidence: Confidence) -> Finding:
+    options = wording.conventions("inverse", stream)
+    return wording.finding("inverse", stream, confidence=confidence, options=options)
 
 
 def _confidence(evidence: float, likely: float) -> Confidence:

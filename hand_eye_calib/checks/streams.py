@@ -493,4 +493,13 @@ def check_lengths(parent: Trajectory) -> list[Finding]:
     change = quantile(np.linalg.norm(changes, axis=1), _USUAL)
     if speed < _FASTEST and change < _HARDEST:
         return []
-    return [wording.finding("lengths", "parent", speed_m_s=speed, acceleration_m_s2=change)]
+    of_millimetres: dict[str, float | str] = {"parent_scale": 0.001, "scale": 0.001}
+    return [
+        wording.finding(
+            "lengths",
+            "parent",
+            options=of_millimetres,
+            speed_m_s=speed,
+            acceleration_m_s2=change,
+        )
+    ]

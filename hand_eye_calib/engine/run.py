@@ -14,7 +14,7 @@ from hand_eye_calib.checks.findings import Confidence, Finding, Severity
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.estimation import fixed_time_offset
-from hand_eye_calib.engine.snapshot import GAP_INTERVALS, Snapshot
+from hand_eye_calib.engine.snapshot import GAP_INTERVALS, STREAMS, Snapshot, conventions
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -24,8 +24,10 @@ from hand_eye_calib.results.calibration import Calibration
 Progress: TypeAlias = Callable[[float, str], None]
 Options: TypeAlias = Mapping[str, Any]
 
-# Options that a check can be certain of.
-_MENDED = ("time_offset", "scale")
+# Options that a check can be certain of; and those in whose convention a stream may have been
+# written, of which being likely is enough: the second solve proves it.
+_MENDED = ("time_offset", "scale", "parent_scale")
+_CONVENTIONS = tuple(f"{each}_{kind}" for each in STREAMS for kind in ("invert", "quaternion"))
 
 # A model's own time offset moves poses along their velocities. From this one (s) on, poses are
 # paired anew instead; positions alone later, as their model knows the offset better than speeds do.
@@ -142,6 +144,12 @@ def review(
         return first
     given = snapshot.config.given.union(settled)
     certain = _certain(first.check.findings, given)
+    if {*certain} & {*_CONVENTIONS, "parent_scale"}:
+        # The scale was compared with that of a solve of streams as they should not be.
+        certain = {name: value for name, value in certain.items() if value != "estimate"}
+        second = _solved_with(snapshot, certain)
+        is_clear = second and not any(each.makes_unusable for each in second.check.findings)
+        return _repaired(first, second, certain) if second and is_clear else first
     if "time_offset" not in given and snapshot.config.time_offset == "estimate":
         return _of_clear_offset(first, certain)
     options = _offset_of_model(calibration, snapshot, given) | certain
@@ -176,6 +184,20 @@ def _of_clear_offset(first: Run, certain: Options) -> Run:
     return _telling(without, others, first.check.findings)
 
 
+def _repaired(first: Run, second: Run, options: Options) -> Run:
+    """The second of two runs, with the options that repair the streams, saying so."""
+    what = [each.what for each in first.check.findings if {*each.options} & {*options}]
+    done = ", ".join(f"{name} {value}" for name, value in options.items())
+    undo = ", ".join(f"{name} {getattr(CalibratorConfig, name)}" for name in options)
+    told = (
+        f"repaired: {'; '.join(what)}. Solved with {done}: {second.calibration.verdict.value}; as "
+        f"the streams are: {first.calibration.verdict.value} (undo with {undo})",
+    )
+    calibration = second.calibration
+    calibration = replace(calibration, warnings=(*told, *calibration.warnings))
+    return replace(second, calibration=calibration, options=dict(options), told=told)
+
+
 def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
     """The snapshot with other options. Poses that were paired with another time offset are paired
     anew, from the stamps of the pairs.
@@ -187,7 +209,13 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         return replace(snapshot, config=config)
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
-    parent, child = snapshot.streams
+    usual = {
+        name: getattr(CalibratorConfig, name)
+        for stream in STREAMS
+        for name in conventions(config, stream)
+    }
+    # As they are: what is put right is put right once.
+    parent, child = replace(snapshot, config=replace(snapshot.config, **usual)).streams
     max_gap_s = max(config.max_gap, GAP_INTERVALS * parent.interval_s)
     return replace(
         snapshot,
@@ -255,21 +283,24 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
 def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, float | str]:
     """Options that mend a finding for certain and that the user did not set, by name.
 
-    A unit is set as it is. Anything else is estimated, so that its uncertainty counts. Lengths that
-    differ by a few per cent only give a warning: odometry whose scale drifts looks like that, too.
+    Units and conventions are set as they are. Anything else is estimated, so that its uncertainty
+    counts. Lengths that differ by a few per cent only give a warning: odometry whose scale drifts
+    looks like that, too.
     """
     return {
-        name: value if finding.code == "units" else "estimate"
+        name: "estimate" if finding.code in ("time_offset", "scale") else value
         for finding in findings
-        if finding.confidence is Confidence.CERTAIN
         for name, value in finding.options.items()
-        if name in _MENDED and name not in given and _is_grave(finding, name)
+        if name not in given and _is_sure(finding, name)
     }
 
 
-def _is_grave(finding: Finding, option: str) -> bool:
-    least = (Severity.ERROR,) if option == "scale" else (Severity.ERROR, Severity.WARNING)
-    return finding.severity in least
+def _is_sure(finding: Finding, option: str) -> bool:
+    if option in _CONVENTIONS:
+        return finding.makes_unusable and finding.confidence is not Confidence.POSSIBLE
+    is_warned = option == "time_offset" and finding.severity is Severity.WARNING
+    is_certain = finding.confidence is Confidence.CERTAIN
+    return option in _MENDED and is_certain and (finding.makes_unusable or is_warned)
 
 
 def _offset_of_model(

@@ -19,7 +19,8 @@ from hand_eye_calib.alignment.time_offset import (
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import ESTIMATORS, cross_checked
 from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
-from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.geometry.misread import put_right
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs, select_keyframes, synchronise
 from hand_eye_calib.results.calibration import Calibration
@@ -74,13 +75,13 @@ class Snapshot:
 
     @property
     def parent(self) -> Trajectory:
-        """Trajectory of the parent's poses that are not paired yet."""
-        return _as_trajectory(self.buffered_parent)
+        """Trajectory of the parent's poses that are not paired yet, in its right convention."""
+        return _put_right(self.buffered_parent, "parent", self.config)
 
     @property
     def child(self) -> Trajectory:
-        """Trajectory of the child's poses that are not paired yet."""
-        return _as_trajectory(self.buffered_child)
+        """Trajectory of the child's poses that are not paired yet, in its right convention."""
+        return _put_right(self.buffered_child, "child", self.config)
 
     def resolved(self) -> "Snapshot":
         """The snapshot with its time offset in seconds, estimated if the options ask for that: from
@@ -127,8 +128,13 @@ class Snapshot:
 
     @cached_property
     def _pose_pairs(self) -> PosePairs:
-        made = pair_poses(self.config, self.parent, self.child, self.paired_at, self.kept)
-        return downsample(PosePairs.concatenate(self.kept, made), self.config.max_pairs)
+        kept = self.kept
+        if len(kept) and conventions(self.config, "parent") | conventions(self.config, "child"):
+            parent = _corrected(Trajectory(kept.stamps_ns, kept.Ts_pw_p), "parent", self.config)
+            child = _corrected(Trajectory(kept.stamps_ns, kept.Ts_cw_c), "child", self.config)
+            kept = PosePairs(kept.stamps_ns, parent.poses, child.poses)
+        made = pair_poses(self.config, self.parent, self.child, self.paired_at, kept)
+        return downsample(PosePairs.concatenate(kept, made), self.config.max_pairs)
 
     def estimate(self, cross_check: bool | None = None) -> Calibration:
         """Estimate the extrinsic.
@@ -245,8 +251,30 @@ def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
     return replace(trajectory, measures=measures)
 
 
-def _as_trajectory(poses: "RawPoses | Trajectory") -> Trajectory:
-    return poses if isinstance(poses, Trajectory) else poses.trajectory
+def conventions(config: CalibratorConfig, stream: str) -> dict[str, float | str]:
+    """The options, by name, that say in which convention a stream was written, if it is not the
+    usual one.
+    """
+    names = [f"{stream}_invert", f"{stream}_quaternion"]
+    names += ["parent_scale"] if stream == "parent" else []
+    given = {name: getattr(config, name) for name in names}
+    return {name: each for name, each in given.items() if each != getattr(CalibratorConfig, name)}
+
+
+def _put_right(poses: "RawPoses | Trajectory", stream: str, config: CalibratorConfig) -> Trajectory:
+    trajectory = poses if isinstance(poses, Trajectory) else poses.trajectory
+    return _corrected(trajectory, stream, config) if conventions(config, stream) else trajectory
+
+
+def _corrected(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
+    """The trajectory of a stream in the usual convention, from that of the options."""
+    invert, order = getattr(config, f"{stream}_invert"), getattr(config, f"{stream}_quaternion")
+    needs = {"poses"} if invert == "poses" else {"poses", "rotations"}
+    if (invert, order) != ("none", "xyzw") and trajectory.measures not in needs:
+        name = f"{stream}_invert {invert}" if invert != "none" else f"{stream}_quaternion {order}"
+        raise ConfigError(f"{name} cannot be: the {stream} measures {trajectory.measures}")
+    right = replace(trajectory, poses=put_right(trajectory.poses, invert, order))
+    return right.scaled(config.parent_scale) if stream == "parent" else right
 
 
 def name_frames(

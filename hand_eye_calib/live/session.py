@@ -247,8 +247,7 @@ class LiveSession:
 
 def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorConfig:
     """The options for a further child sensor: what is set for the child in numbers is not its."""
-    of_child = {field.name for field in fields(config) if field.name.startswith("prior_")}
-    of_child |= {"child_frame"}
+    of_child = {each.name for each in fields(config) if each.name.startswith(("prior_", "child_"))}
     numbers = ("time_offset", "scale")
     of_child |= {name for name in numbers if not isinstance(getattr(config, name), str)}
     defaults = {name: getattr(CalibratorConfig, name) for name in of_child}

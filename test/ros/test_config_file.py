@@ -16,9 +16,12 @@ PROJECT = Path(__file__).resolve().parents[2]
 HEADER = """\
 # Parameters of the node calibrator: all there are, at their defaults.
 # Numbers with a decimal point must keep it: to ROS, 2 and 2.0 are of different types.
-# time_offset and scale are not set here: what is set counts as known, even if it is the default.
+# Options in comments are not set here: what is set counts as known, even if it is the default.
 """
-ONLY_SHOWN = ("time_offset", "scale")
+CONVENTIONS = [
+    f"{each}_{kind}" for each in ("parent", "child") for kind in ("invert", "quaternion")
+]
+ONLY_SHOWN = ("time_offset", "scale", "parent_scale", *CONVENTIONS)
 
 
 def fields():

@@ -17,6 +17,7 @@ from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.run import review, run, with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.misread import put_right
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
 from reproduction.coverage.classes import make
@@ -49,17 +50,72 @@ def test_a_unit_that_is_certain_is_used_and_said(streams):
     assert result.findings == ()
 
 
-@pytest.mark.parametrize("of_child", [1000.0, 1.0])
-def test_a_parent_in_millimetres_is_never_used(streams, of_child):
-    """Both streams agree, and a child in metres would be scaled to millimetres."""
-    parent, child, _ = streams
-    result = hec.calibrate(parent.scaled(1000.0), child.scaled(of_child))
+def test_both_streams_in_millimetres_are_never_used(streams):
+    parent, child, expected = streams
+    result = hec.calibrate(parent.scaled(1000.0), child.scaled(1000.0), reference="B5")
     assert result.verdict is Verdict.DO_NOT_USE
     (finding,) = result.findings
     assert (finding.code, finding.stream) == ("lengths", "parent")
     assert "its lengths can hardly be in metres" in result.headline
-    assert "give the lengths of both streams in metres" in finding.advice
     assert finding.evidence["speed_m_s"] > 1000
+    asked = hec.calibrate(
+        parent.scaled(1000.0), child.scaled(1000.0), reference="B5", **finding.options
+    )
+    np.testing.assert_allclose(asked.T_parent_child, expected, atol=1e-9)
+
+
+def written_otherwise(trajectory, convention):
+    """As another program writes it: what the option of that name puts right."""
+    if convention == {"quaternion": "wxyz"}:
+        quats = np.roll(se3.to_quat_xyzw(trajectory.poses), 1, axis=1)
+        poses = se3.from_quat_xyzw(trajectory.poses[:, :3, 3], quats)
+    else:
+        poses = put_right(trajectory.poses, **convention)
+    return replace(trajectory, poses=poses)
+
+
+REPAIRS = [{"invert": "poses"}, {"invert": "orientations"}, {"quaternion": "wxyz"}]
+
+
+@pytest.mark.parametrize("convention", REPAIRS, ids=str)
+@pytest.mark.parametrize("stream", ["parent", "child"])
+def test_a_stream_in_another_convention_is_repaired_and_that_is_said(streams, stream, convention):
+    given = dict(zip(("parent", "child"), streams, strict=False))
+    given[stream] = written_otherwise(given[stream], convention)
+    ((name, value),) = convention.items()
+    result = hec.calibrate(**given, reference="B5")
+    np.testing.assert_allclose(result.T_parent_child, streams[2], atol=1e-9)
+    assert result.verdict is Verdict.USE
+    (said,) = (text for text in result.warnings if text.startswith("repaired: "))
+    assert f"Solved with {stream}_{name} {value}: USE; as the streams are: DO NOT USE" in said
+    assert f"undo with {stream}_{name} {getattr(CalibratorConfig, f'{stream}_{name}')}" in said
+
+
+def test_a_convention_that_was_given_is_kept_and_the_advice_undoes_it(streams):
+    parent, child, expected = streams
+    as_it_is = hec.calibrate(parent, written_otherwise(child, REPAIRS[0]), child_invert="none")
+    assert as_it_is.verdict is Verdict.DO_NOT_USE
+    assert as_it_is.reasons[0].options == {"child_invert": "poses"}
+    wrong = hec.calibrate(parent, child, child_invert="poses", reference="B5")
+    assert wrong.verdict is Verdict.DO_NOT_USE
+    assert wrong.reasons[0].options == {"child_invert": "none"}
+
+
+def test_kept_pairs_are_put_right_like_poses(streams):
+    parent, child, expected = streams
+    child = written_otherwise(child, REPAIRS[0])
+    snapshot = whole_snapshot(offline_config(parent, child, {"reference": "B5"}), parent, child)
+    kept = replace(
+        snapshot,
+        kept=snapshot.pose_pairs(),
+        buffered_parent=parent[:0],
+        buffered_child=child[:0],
+        paired_at="child",
+    )
+    found = with_options(kept, {"child_invert": "poses"})
+    np.testing.assert_allclose(found.estimate().T_parent_child, expected, atol=1e-9)
+    shifted = with_options(kept, {"child_invert": "poses", "time_offset": 0.0})
+    np.testing.assert_allclose(shifted.estimate().T_parent_child, expected, atol=1e-9)
 
 
 def test_a_slow_arm_in_millimetres_is_noticed_and_a_drone_in_metres_is_not():

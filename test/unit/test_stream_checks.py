@@ -322,7 +322,7 @@ class TestCommand:
         )
         assert f"wrote {out / 'check.html'}" in capsys.readouterr().err
         page = (out / "check.html").read_text(encoding="utf-8")
-        assert "No result from these streams is right (quaternion_order)" in page
+        assert "calibrate with --child-quaternion wxyz" in page
         assert "<code>quaternion_order</code> (child, likely)" in page
         assert "100.0" in page.split("<figcaption>")[1].split("added to the child")[0]
         assert page.count("<svg") == 1
@@ -330,7 +330,7 @@ class TestCommand:
     def test_calibrate_says_the_same(self, files, capsys):
         parent, child = drive()
         paths = files(parent, inverted(child))
-        main(["calibrate", *paths, "--reference", "B5", "--json"])
+        main(["calibrate", *paths, "--reference", "B5", "--child-invert", "none", "--json"])
         document = json.loads(capsys.readouterr().out)
         assert document["findings"][0]["code"] == "inverse"
         assert document["verdict"] == "DO NOT USE"
