@@ -24,6 +24,12 @@ from hand_eye_calib.text import (
 
 REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})"
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
+# As of results/exports.py.
+EXPORT_FORMATS = (
+    *("autoware", "fast_lio", "fast_livo2", "lio_sam", "kalibr", "openvins", "vins", "orbslam3"),
+    *("apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap", "driveworks"),
+    *("easy_handeye2", "opencv", "numpy"),
+)
 MEASURES = ("poses", "positions", "rotations", "rates")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (

@@ -11,6 +11,7 @@ from hand_eye_calib.cli.robot import (
     require_description,
     write_description,
 )
+from hand_eye_calib.config import EXPORT_FORMATS
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,11 +24,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = (
         "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json\n"
+        "  hand_eye_calib info result --as kalibr > camchain-imucam.yaml\n"
         "  hand_eye_calib info result --bundle wrong_answer.zip\n"
         "  hand_eye_calib info result --move camera.tum --to camera_as_lidar.tum"
     )
     parser.add_argument(
         "result", metavar="RESULT", help="extrinsic.yaml, or the directory that holds it"
+    )
+    parser.add_argument(
+        "--as",
+        dest="format",
+        choices=EXPORT_FORMATS,
+        metavar="FORMAT",
+        help=f"print it as the file of another program instead: {', '.join(EXPORT_FORMATS)}",
     )
     add_description_arguments(parser)
     parser.add_argument(
@@ -70,8 +79,11 @@ def run(arguments: argparse.Namespace) -> int:
         for text in write_bundle(arguments.result, arguments.bundle):
             note(text)
         note(f"wrote {arguments.bundle}")
-    text = as_text(calibration, with_details=arguments.verbose)
-    print(json_text(calibration.to_dict()) if arguments.json else text)
+    if arguments.format:
+        print(calibration.export(arguments.format), end="")
+    else:
+        text = as_text(calibration, with_details=arguments.verbose)
+        print(json_text(calibration.to_dict()) if arguments.json else text)
     write_description(calibration, arguments)
     return 0
 

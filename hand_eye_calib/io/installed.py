@@ -8,12 +8,15 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.frames import FrameTree
+from hand_eye_calib.io.exports import SUFFIXES, open_export
 from hand_eye_calib.io.results import FILE_NAME, load_result
 from hand_eye_calib.io.urdf import RobotDescription
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import parse_pose
 
-_RESULTS, _DESCRIPTIONS = (".yaml", ".yml"), (".urdf", ".xml", ".xacro")
+# Results say what they are, within so many bytes.
+_FORMAT, _SEARCHED = b"hand_eye_calib/extrinsic", 65_536
+_DESCRIPTIONS = (".urdf", ".xml", ".xacro")
 
 
 def read_installed(text: str, parent_frame: str, child_frame: str) -> Extrinsic:
@@ -41,8 +44,9 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     Parameters
     ----------
     text : str
-        A robot description (``.urdf``), a result (``extrinsic.yaml``, or its directory), a bag
-        with ``/tf_static``, or ``X Y Z ROLL PITCH YAW`` in m and rad.
+        A robot description (``.urdf``), a result (``extrinsic.yaml``, or its directory), a file of
+        another program, one of results/exports.py, a bag with ``/tf_static``, or
+        ``X Y Z ROLL PITCH YAW`` in m and rad.
 
     Raises
     ------
@@ -59,8 +63,10 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     if not exists:
         numbers = _numbers(text)
         return lambda parent_frame, child_frame: numbers
-    if path.suffix in _RESULTS or (path / FILE_NAME).exists():
+    if (path / FILE_NAME).exists() or path.name == FILE_NAME or _is_result(path):
         return partial(_of_result, load_result(path), path)
+    if path.suffix in SUFFIXES:
+        return open_export(path).of
     is_description = path.suffix in _DESCRIPTIONS
     frames = RobotDescription(path).frames if is_description else frames_of_bag(path)
     return partial(of_frames, frames, origin=str(path))
@@ -86,6 +92,15 @@ def frames_of_bag(path: str | Path) -> FrameTree:
 
     with PoseBag(path) as bag:
         return bag.static_frames()
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a file under another name is a result of this package."""
+    try:
+        with path.open("rb") as file:
+            return path.suffix in (".yaml", ".yml") and _FORMAT in file.read(_SEARCHED)
+    except OSError:
+        return False
 
 
 def _numbers(text: str) -> Extrinsic:

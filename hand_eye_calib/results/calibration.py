@@ -156,6 +156,41 @@ class Calibration(Result):
         poses = scaled.poses @ self.T_child_parent
         return Trajectory(scaled.stamps_ns, poses, self.parent_frame, child.world_frame)
 
+    def export(self, format: str) -> str:
+        """The extrinsic as a file of another program.
+
+        Parameters
+        ----------
+        format : str
+            "autoware", "fast_lio", "fast_livo2", "lio_sam", "kalibr", "openvins", "vins",
+            "orbslam3", "apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap",
+            "driveworks", "easy_handeye2", "opencv" or "numpy"; docs/exports.md has a page of them.
+
+        Returns
+        -------
+        str
+            The text of the file. A comment says by the frames' names what the numbers map. Where
+            the format has the sensors the other way round, the transform is inverted, and so is
+            the sign of the time offset.
+
+        Raises
+        ------
+        ConfigError
+            For an unknown format.
+        InputError
+            Under DO NOT USE, and if an axis is not known that the other numbers depend on. One that
+            stands alone is a text such as MEASURE_Z_BY_HAND.
+
+        Examples
+        --------
+        >>> print(result.export("fast_lio"))  # doctest: +SKIP
+        """
+        from hand_eye_calib.results.exports import export_text
+
+        numbers = self.usable_numbers()
+        usable = numbers | self.usable_angles() if numbers else {}
+        return export_text(self, format, self.headline, usable)
+
     def _printed(self) -> list[float]:
         angles = se3.rotation_to_rpy(self.T_parent_child[:3, :3])
         return [*self.T_parent_child[:3, 3].tolist(), *angles.tolist()]

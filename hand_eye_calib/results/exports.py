@@ -1,0 +1,421 @@
+"""Extrinsics in the files of other programs: a row per format says in whose frame the numbers are.
+
+Which way round a transform goes is what people get wrong most often. So each file says by the names
+of the frames what its numbers map, and whether the calibration was inverted for it. Where the
+directions come from is in docs/exports.md.
+"""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.errors import ConfigError, InputError, printable
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.result import Result
+from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.text import axes_in_words
+from hand_eye_calib.version import package_version
+
+# Beginnings of the words in a frame's name that say what the sensor is; nearest to the body first,
+# as the parent is taken for nearer than the child if the names say nothing.
+_ROLES = {
+    "base": ("base", "ego", "vehicle", "chassis", "rig", "hand", "tool", "flange"),
+    "imu": ("imu", "body", "gyro", "ins", "novatel", "xsens"),
+    "lidar": ("lidar", "velo", "ouster", "livox", "laser", "hesai", "pandar", "rslidar", "scan"),
+    "camera": ("cam", "image", "optical", "rgb", "stereo", "realsense", "zed", "vio", "vision"),
+    "gnss": ("gnss", "gps", "antenna", "rtk"),
+}
+_RANKS = {role: rank for rank, role in enumerate(_ROLES)}
+# Decimals of what is written: a thousandth of a micrometre.
+_DECIMALS = 12
+# What PX4 accepts for a delay (ms).
+_LONGEST_DELAY_MS = 300.0
+
+
+class Layout(NamedTuple):
+    """How a format writes one pair of sensors.
+
+    Attributes
+    ----------
+    target, source : str
+        The numbers are ``T_target_source``: sensors' roles, and after a colon which of the two it
+        always is.
+    keys : tuple of str
+        What a reader looks for: a pose, or translation and rotation.
+    text : str
+        The file, with ``%(name)s`` where numbers and names go.
+    clock : int
+        ``t_target = t_source + clock * shift``; 0 if the file has no shift.
+    by_axis : str
+        Axes that stand alone, so that one which is not known can be left to measure by hand.
+    """
+
+    target: str
+    source: str
+    keys: tuple[str, ...]
+    text: str
+    clock: int = 0
+    by_axis: tuple[str, ...] = ()
+
+
+_YAML_ROWS = "%(about)s\ncam0:\n  {key}:\n%(rows)s\n  timeshift_cam_imu: %(shift)s\n"
+_OPENCV = (
+    "%%YAML:1.0\n---\n%(about)s\n{key}: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: {dt}\n"
+    "   data: [ %(matrix)s ]\n"
+)
+_LIO = "    extrinsic_T: [ %(t)s ]\n    extrinsic_R: [ %(R)s ]\n"
+_DLIO = "%(about)s\ndlio:\n  extrinsics:\n    {key}:\n      t: [ %(t)s ]\n      R: [ %(R)s ]\n"
+_KITTI = "comment: %(about)s\nR: %(R_plain)s\nT: %(t_plain)s\n"
+_STAMPED = (
+    "  translation: {x: %(x)s, y: %(y)s, z: %(z)s}\n"
+    "  rotation: {x: %(qx)s, y: %(qy)s, z: %(qz)s, w: %(qw)s}\n"
+)
+_PARENT, _CHILD = ":parent", ":child"
+
+#: The layouts of each format.
+FORMATS: dict[str, tuple[Layout, ...]] = {
+    "autoware": (
+        Layout(
+            _PARENT,
+            _CHILD,
+            (),
+            "%(about)s\n%(target)s:\n  %(source)s:\n    x: %(x)s\n    y: %(y)s\n    z: %(z)s\n"
+            "    roll: %(roll)s\n    pitch: %(pitch)s\n    yaw: %(yaw)s\n",
+            by_axis=(*TRANSLATIONS, *ROTATIONS),
+        ),
+    ),
+    "fast_lio": (
+        Layout(
+            "imu",
+            "lidar",
+            ("extrinsic_T", "extrinsic_R"),
+            "%(about)s\ncommon:\n    time_offset_lidar_to_imu: %(shift)s\nmapping:\n"
+            "    extrinsic_est_en: false\n" + _LIO,
+            1,
+        ),
+    ),
+    "fast_livo2": (
+        Layout(
+            "imu",
+            "lidar",
+            ("extrinsic_T", "extrinsic_R"),
+            "%(about)s\nextrin_calib:\n" + _LIO + "time_offset:\n    imu_time_offset: %(shift)s\n",
+            1,
+        ),
+        Layout(
+            "camera",
+            "lidar",
+            ("Pcl", "Rcl"),
+            "%(about)s\nextrin_calib:\n    Rcl: [ %(R)s ]\n    Pcl: [ %(t)s ]\n"
+            "time_offset:\n    img_time_offset: %(shift)s\n",
+            -1,
+        ),
+    ),
+    "lio_sam": (
+        Layout(
+            "lidar",
+            "imu",
+            ("extrinsicTrans", "extrinsicRot"),
+            "%(about)s\nlio_sam:\n  extrinsicTrans: [ %(t)s ]\n  extrinsicRot: [ %(R)s ]\n"
+            "  extrinsicRPY: [ %(R)s ]  # the orientation of the IMU is that of its axes\n",
+        ),
+    ),
+    "kalibr": (
+        Layout("camera", "imu", ("T_cam_imu",), _YAML_ROWS.format(key="T_cam_imu"), -1),
+        Layout(
+            "camera:child",
+            "camera:parent",
+            ("T_cn_cnm1",),
+            "%(about)s\n# %(source)s is cam0, %(target)s is cam1.\ncam1:\n  T_cn_cnm1:\n%(rows)s\n",
+        ),
+    ),
+    "openvins": (
+        Layout(
+            "imu",
+            "camera",
+            ("T_imu_cam",),
+            "%%YAML:1.0\n\n" + _YAML_ROWS.format(key="T_imu_cam"),
+            1,
+        ),
+    ),
+    "vins": (
+        Layout(
+            "imu",
+            "camera",
+            ("body_T_cam0",),
+            _OPENCV.format(key="body_T_cam0", dt="d") + "td: %(shift)s\n",
+            1,
+        ),
+    ),
+    "orbslam3": (
+        Layout("imu", "camera", ("IMU.T_b_c1",), _OPENCV.format(key="IMU.T_b_c1", dt="f")),
+        Layout("imu", "camera", ("Tbc",), ""),  # read in files of an older version
+        Layout(
+            "camera:parent",
+            "camera:child",
+            ("Stereo.T_c1_c2",),
+            _OPENCV.format(key="Stereo.T_c1_c2", dt="f"),
+        ),
+    ),
+    "apollo": (
+        Layout(
+            _PARENT,
+            _CHILD,
+            (),
+            "%(about)s\nheader:\n  seq: 0\n  stamp: {secs: 0, nsecs: 0}\n  frame_id: %(target)s\n"
+            "child_frame_id: %(source)s\ntransform:\n" + _STAMPED,
+        ),
+    ),
+    "dlio": (
+        Layout(
+            "base",
+            "lidar",
+            ("baselink2lidar.t", "baselink2lidar.R"),
+            _DLIO.format(key="baselink2lidar"),
+        ),
+        Layout(
+            "base", "imu", ("baselink2imu.t", "baselink2imu.R"), _DLIO.format(key="baselink2imu")
+        ),
+    ),
+    "glim": (
+        Layout(
+            "lidar",
+            "imu",
+            ("T_lidar_imu",),
+            '{\n  "sensors": {\n    "comment": %(about)s,\n'
+            '    "T_lidar_imu": [ %(t)s, %(xyzw)s ]\n  }\n}\n',
+        ),
+    ),
+    "msa": (
+        Layout(
+            _PARENT,
+            _CHILD,
+            (),
+            "%(about)s\n%(source)s:\n  parent: %(target)s\n  child: %(source)s\n"
+            "  value: [ %(t)s, %(xyzw)s ]\n",
+        ),
+    ),
+    "px4": (
+        Layout(
+            _PARENT,
+            "gnss:child",
+            (),
+            "%(about)s\nparam set EKF2_GPS_POS_X %(x)s\nparam set EKF2_GPS_POS_Y %(y_frd)s\n"
+            "param set EKF2_GPS_POS_Z %(z_frd)s\n",
+            by_axis=TRANSLATIONS,
+        ),
+        Layout(
+            _PARENT,
+            _CHILD,
+            (),
+            "%(about)s\nparam set EKF2_EV_POS_X %(x)s\nparam set EKF2_EV_POS_Y %(y_frd)s\n"
+            "param set EKF2_EV_POS_Z %(z_frd)s\n%(ev_delay)s\n",
+            by_axis=TRANSLATIONS,
+        ),
+    ),
+    "kitti": (
+        Layout("camera", "lidar", ("T", "R"), _KITTI),
+        Layout("lidar", "imu", ("T", "R"), _KITTI),
+    ),
+    "nuscenes": (
+        Layout(
+            _PARENT,
+            _CHILD,
+            ("translation", "rotation"),
+            '[\n  {\n    "comment": %(about)s,\n    "channel": %(source)s,\n'
+            '    "translation": [ %(t)s ],\n    "rotation": [ %(wxyz)s ]\n  }\n]\n',
+        ),
+    ),
+    "colmap": (
+        Layout(
+            _CHILD,
+            _PARENT,
+            ("cam_from_rig_translation", "cam_from_rig_rotation"),
+            '[\n  {\n    "cameras": [\n      { "image_prefix": %(source)s, "ref_sensor": true },\n'
+            '      {\n        "comment": %(about)s,\n        "image_prefix": %(target)s,\n'
+            '        "cam_from_rig_rotation": [ %(wxyz)s ],\n'
+            '        "cam_from_rig_translation": [ %(t)s ]\n      }\n    ]\n  }\n]\n',
+        ),
+    ),
+    "driveworks": (
+        Layout(
+            _PARENT,
+            _CHILD,
+            ("nominalSensor2Rig_FLU.t", "nominalSensor2Rig_FLU.roll-pitch-yaw"),
+            '{\n  "rig": {\n    "sensors": [\n      {\n        "comment": %(about)s,\n'
+            '        "name": %(source)s,\n        "nominalSensor2Rig_FLU": {\n'
+            '          "roll-pitch-yaw": [ %(rpy_deg)s ],\n          "t": [ %(t)s ]\n'
+            "        }\n      }\n    ]\n  }\n}\n",
+        ),
+    ),
+    "easy_handeye2": (
+        Layout(
+            _PARENT,
+            _CHILD,
+            (),
+            "%(about)s\nparameters:\n  name: hand_eye_calib\n  calibration_type: %(eye)s\n"
+            "  robot_base_frame: %(robot)s\n  robot_effector_frame: %(effector)s\n"
+            "  tracking_base_frame: %(source)s\n  tracking_marker_frame: marker\n"
+            "  freehand_robot_movement: true\ntransform:\n" + _STAMPED,
+        ),
+    ),
+    "opencv": (
+        Layout(_PARENT, _CHILD, ("T_parent_child",), _OPENCV.format(key="T_parent_child", dt="d")),
+    ),
+    "numpy": (Layout(_PARENT, _CHILD, (), "%(about)s\n%(plain_rows)s\n"),),
+}
+# Those whose comments are values of JSON, and the one whose comment is a line.
+_JSON = ("glim", "nuscenes", "colmap", "driveworks")
+
+
+class Arrangement(NamedTuple):
+    """Which of both sensors a layout's target is.
+
+    Attributes
+    ----------
+    layout : Layout
+    is_inverted : bool
+        Whether the numbers are ``T_child_parent``.
+    is_certain : bool
+        Whether the frames' names say that.
+    """
+
+    layout: Layout
+    is_inverted: bool
+    is_certain: bool
+
+
+def role_of(frame: str) -> str:
+    """What a sensor is, by the name of its frame; empty if it does not say."""
+    words = re.findall("[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", frame).lower())
+    found = [
+        role for role, starts in _ROLES.items() if any(word.startswith(starts) for word in words)
+    ]
+    # camera_base_link is a camera's, imu_link of the base an IMU's.
+    return next((role for role in found if role != "base"), found[0] if found else "")
+
+
+def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> Arrangement:
+    """The layout that fits the sensors best, and which way round."""
+    roles = {"parent": role_of(parent_frame), "child": role_of(child_frame)}
+    found = []
+    for order, layout in enumerate(layouts):
+        for places in (("parent", "child"), ("child", "parent")):
+            wanted = [each.partition(":") for each in layout[:2]]
+            if any(each[2] not in ("", place) for each, place in zip(wanted, places, strict=True)):
+                continue
+            role_at = {place: each[0] for each, place in zip(wanted, places, strict=True)}
+            matches = sum(role_at[place] == roles[place] != "" for place in places)
+            misses = sum(role_at[place] not in ("", roles[place]) for place in places)
+            is_natural = _RANKS.get(role_at["parent"], 0) <= _RANKS.get(role_at["child"], 0)
+            fit = Arrangement(layout, places[0] == "child", not misses)
+            found.append((matches, -misses, -order, is_natural, fit))
+    return max(found, key=lambda each: each[:4])[4]
+
+
+def export_text(result: Result, name: str, headline: str, usable: Mapping[str, float | str]) -> str:
+    """A calibration in the format of another program; see
+    :meth:`~hand_eye_calib.results.calibration.Calibration.export`.
+
+    Parameters
+    ----------
+    result : Result
+    name : str
+        One of :data:`FORMATS`.
+    headline : str
+        Its verdict.
+    usable : mapping
+        The numbers by axis of what is mounted, a text for one that is not known; empty under DO NOT
+        USE.
+    """
+    if name not in FORMATS:
+        raise ConfigError(f"unknown format {name!r}; known are {', '.join(FORMATS)}")
+    if not usable:
+        raise InputError(f"nothing is written: {headline}")
+    frames, T = (result.parent_frame, result.child_frame), result.T_parent_child
+    layout, is_inverted, is_certain = arranged(FORMATS[name], *frames)
+    if layout.target == _PARENT:
+        frames, T = (result.mounting[0], result.child_frame), result.mounting[1]
+    unknown = [axis for axis in result.unobservable() if axis not in layout.by_axis]
+    if unknown and not (layout.by_axis == TRANSLATIONS and set(unknown) <= {*ROTATIONS}):
+        raise InputError(
+            f"nothing is written: this recording does not determine {axes_in_words(unknown)}, and "
+            f"the numbers of format {name} depend on each other; measure it by hand and calibrate "
+            "again with --prior"
+        )
+    target, source = frames[::-1] if is_inverted else frames
+    about = [
+        f"{name}, by hand_eye_calib {package_version()}. {headline}",
+        f"Maps coordinates of {source} into {target}: the pose of {source} in {target}.",
+    ]
+    if is_inverted:
+        about.append(f"Inverted: the calibration is the pose of {frames[1]} in {frames[0]}.")
+    if not is_certain:
+        roles = [each.partition(":")[0] for each in layout[:2]]
+        pairs = zip(roles, (target, source), strict=True)
+        said = [f"{frame} is the {role}" for role, frame in pairs if role]
+        about.append(f"Assumed, as the names of the frames do not say it: {', '.join(said)}.")
+    if name == "driveworks":
+        about.append(f"The axes of {source} must be x forward, y left, z up.")
+    if name == "px4":
+        about.append(f"x forward, y right, z down, from axes of {target} forward, left, up.")
+    about.append(f"Clocks: t({frames[0]}) = t({frames[1]}) + {_number(result.time_offset_s)} s.")
+    lines = [printable(" ".join(line.split())) for line in about]
+    texts = _numbers(se3.inverse(T) if is_inverted else T, usable if result.unobservable() else {})
+    shift = layout.clock * (-1 if is_inverted else 1) * result.time_offset_s
+    texts |= {"target": json.dumps(target), "source": json.dumps(source), "shift": _number(shift)}
+    is_fixed = "base" in target.lower()  # a camera beside the robot, not on its hand
+    texts |= {"eye": "eye_on_base" if is_fixed else "eye_in_hand", "robot": '"base"'}
+    texts |= {"effector": '"hand"', ("robot" if is_fixed else "effector"): json.dumps(target)}
+    delay_ms = -1e3 * result.time_offset_s
+    texts["ev_delay"] = f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
+    if not 0 <= delay_ms <= _LONGEST_DELAY_MS:
+        texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
+    texts["about"] = "\n".join(f"# {line}" for line in lines)
+    if name in _JSON:
+        texts["about"] = json.dumps(lines)
+    elif name == "kitti":
+        texts["about"] = json.dumps(" ".join(lines))
+    return layout.text % texts
+
+
+def _numbers(T: FloatArray, by_hand: Mapping[str, float | str]) -> dict[str, str]:
+    """The texts of a pose (4, 4) that layouts need; axes by themselves may be known by hand."""
+    quat_xyzw = se3.to_quat_xyzw(T).tolist()
+    t, R, rpy = T[:3, 3], T[:3, :3], se3.rotation_to_rpy(T[:3, :3])
+    axes: dict[str, float | str] = dict(
+        zip((*TRANSLATIONS, *ROTATIONS), [*t.tolist(), *rpy.tolist()], strict=True)
+    )
+    axes |= {axis: value for axis, value in by_hand.items() if axis in axes}
+    texts = {axis: each if isinstance(each, str) else _number(each) for axis, each in axes.items()}
+    for axis in "yz":
+        value = axes[axis]
+        texts[f"{axis}_frd"] = value if isinstance(value, str) else _number(-value)
+    rows = [_listed(row) for row in T]
+    return texts | {
+        "t": _listed(t),
+        "t_plain": _listed(t, " "),
+        "R": _listed(R.ravel()),
+        "R_plain": _listed(R.ravel(), " "),
+        "rows": "\n".join(f"    - [{row}]" for row in rows),
+        "plain_rows": "\n".join(_listed(row, " ") for row in T),
+        "matrix": ",\n           ".join(rows),
+        "xyzw": _listed(quat_xyzw),
+        "wxyz": _listed([quat_xyzw[3], *quat_xyzw[:3]]),
+        "rpy_deg": _listed(np.degrees(rpy)),
+        **dict(zip(("qx", "qy", "qz", "qw"), map(_number, quat_xyzw), strict=True)),
+    }
+
+
+def _listed(values: Sequence[float] | FloatArray, separator: str = ", ") -> str:
+    return separator.join(map(_number, values))
+
+
+def _number(value: float) -> str:
+    """A number that every parser takes for one with a fraction, never in powers of ten."""
+    text = f"{round(float(value), _DECIMALS) + 0.0:.{_DECIMALS}f}".rstrip("0")
+    return f"{text}0" if text.endswith(".") else text

@@ -1,0 +1,295 @@
+"""Results as files of other programs: each maps one point by hand, and reads back."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import yaml
+from result_making import NAMES, good_calibration
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.config import EXPORT_FORMATS
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.exports import open_export
+from hand_eye_calib.io.installed import read_installed
+from hand_eye_calib.io.results import save_result
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.results.exports import FORMATS, arranged, role_of
+
+OFFSET_S = 0.0125
+POINT = np.array([0.3, -1.2, 2.5, 1.0])
+
+# Format, parent, child, and whether the file's numbers map the child's coordinates into the
+# parent's.
+CASES = [
+    ("autoware", "sensor_kit_base_link", "velodyne_top", True),
+    ("fast_lio", "imu_link", "livox_frame", True),
+    ("fast_lio", "livox_frame", "imu_link", False),
+    ("fast_livo2", "imu_link", "livox_frame", True),
+    ("fast_livo2", "cam0", "lidar", True),
+    ("fast_livo2", "lidar", "cam0", False),
+    ("lio_sam", "imu_link", "velodyne", False),
+    ("lio_sam", "velodyne", "imu_link", True),
+    ("kalibr", "imu0", "cam0", False),
+    ("kalibr", "camera_optical", "imu", True),
+    ("kalibr", "cam0", "cam1", False),
+    ("openvins", "imu0", "cam0", True),
+    ("openvins", "cam0", "imu0", False),
+    ("vins", "body", "cam0", True),
+    ("orbslam3", "imu", "cam0", True),
+    ("orbslam3", "camera_left", "camera_right", True),
+    ("apollo", "novatel", "velodyne128", True),
+    ("dlio", "base_link", "lidar", True),
+    ("dlio", "base_link", "imu", True),
+    ("glim", "imu", "os_lidar", False),
+    ("glim", "os_lidar", "imu", True),
+    ("msa", "base_link", "front_3d_lidar", True),
+    ("kitti", "velo", "cam0", False),
+    ("kitti", "imu", "velodyne", False),
+    ("nuscenes", "ego", "LIDAR_TOP", True),
+    ("colmap", "cam0", "cam1", False),
+    ("driveworks", "rig", "camera_front", True),
+    ("easy_handeye2", "tool0", "camera_link", True),
+    ("opencv", "a", "b", True),
+    ("numpy", "a", "b", True),
+]
+
+
+def result(parent="imu", child="camera", **changes):
+    return good_calibration(
+        parent_frame=parent, child_frame=child, time_offset_s=OFFSET_S, **changes
+    )
+
+
+def unknown(*axes):
+    """What makes some axes unobservable."""
+    return {
+        "status": SolveStatus.UNOBSERVABLE,
+        "observability": tuple(
+            DofObservability(
+                name, DofVerdict.UNOBSERVABLE if name in axes else DofVerdict.OBSERVED, 0.001
+            )
+            for name in NAMES
+        ),
+    }
+
+
+def document(text):
+    """A file as any reader of YAML has it, without what only OpenCV understands."""
+    return yaml.safe_load(re.sub(r"^%YAML.*|!!opencv-matrix", "", text, flags=re.MULTILINE))
+
+
+def matrix_of(name, text):
+    """The pose (4, 4) in a file, taken out of it by hand."""
+    found = document(text)
+    if name == "autoware":
+        ((_, children),) = found.items()
+        ((_, values),) = children.items()
+        rotation = Rotation.from_euler("xyz", [values[key] for key in ("roll", "pitch", "yaw")])
+        return [values[key] for key in "xyz"], rotation
+    if name in ("fast_lio", "fast_livo2"):
+        section = found.get("mapping") or found["extrin_calib"]
+        keys = ("Pcl", "Rcl") if "Pcl" in section else ("extrinsic_T", "extrinsic_R")
+        return section[keys[0]], section[keys[1]]
+    if name == "lio_sam":
+        assert found["lio_sam"]["extrinsicRPY"] == found["lio_sam"]["extrinsicRot"]
+        return found["lio_sam"]["extrinsicTrans"], found["lio_sam"]["extrinsicRot"]
+    if name == "dlio":
+        ((_, values),) = found["dlio"]["extrinsics"].items()
+        return values["t"], values["R"]
+    if name in ("kalibr", "openvins"):
+        ((_, camera),) = found.items()
+        T = np.array(next(each for key, each in camera.items() if key.startswith("T_")))
+        return T[:3, 3], T[:3, :3].ravel()
+    if name in ("vins", "orbslam3", "opencv"):
+        T = np.array(next(each["data"] for each in found.values() if isinstance(each, dict)))
+        return T.reshape(4, 4)[:3, 3], T.reshape(4, 4)[:3, :3].ravel()
+    if name in ("apollo", "easy_handeye2"):
+        pose = found["transform"]
+        rotation = Rotation.from_quat([pose["rotation"][key] for key in "xyzw"])
+        return [pose["translation"][key] for key in "xyz"], rotation
+    if name == "glim":
+        values = json.loads(text)["sensors"]["T_lidar_imu"]
+        return values[:3], Rotation.from_quat(values[3:])
+    if name == "msa":
+        ((_, entry),) = found.items()
+        return entry["value"][:3], Rotation.from_quat(entry["value"][3:])
+    if name == "kitti":
+        lines = dict(line.split(":", 1) for line in text.splitlines())
+        return [float(each) for each in lines["T"].split()], [*map(float, lines["R"].split())]
+    if name == "nuscenes":
+        (record,) = json.loads(text)
+        return record["translation"], Rotation.from_quat(np.roll(record["rotation"], -1))
+    if name == "colmap":
+        camera = json.loads(text)[0]["cameras"][1]
+        rotation = Rotation.from_quat(np.roll(camera["cam_from_rig_rotation"], -1))
+        return camera["cam_from_rig_translation"], rotation
+    if name == "driveworks":
+        pose = json.loads(text)["rig"]["sensors"][0]["nominalSensor2Rig_FLU"]
+        return pose["t"], Rotation.from_euler("xyz", pose["roll-pitch-yaw"], degrees=True)
+    T = np.loadtxt(text.splitlines())
+    return T[:3, 3], T[:3, :3].ravel()
+
+
+@pytest.mark.parametrize(("name", "parent", "child", "is_direct"), CASES)
+def test_a_file_maps_a_point_as_it_says_and_reads_back(name, parent, child, is_direct, tmp_path):
+    calibration = result(parent, child)
+    text = calibration.export(name)
+    t, rotation = matrix_of(name, text)
+    R = rotation.as_matrix() if isinstance(rotation, Rotation) else np.reshape(rotation, (3, 3))
+    T = calibration.T_parent_child if is_direct else calibration.T_child_parent
+    np.testing.assert_allclose(R @ POINT[:3] + t, (T @ POINT)[:3], atol=1e-9)
+
+    source, target = (child, parent) if is_direct else (parent, child)
+    assert f"Maps coordinates of {source} into {target}" in text
+    assert ("Inverted" in text) is not is_direct
+    assert "Assumed" not in text
+
+    (tmp_path / "foreign.yaml").write_text(text)
+    found = read_installed(str(tmp_path / "foreign.yaml"), parent, child)
+    np.testing.assert_allclose(found.T_parent_child, calibration.T_parent_child, atol=1e-9)
+    if role_of(child) != role_of(parent) and name not in ("nuscenes", "driveworks"):
+        found = read_installed(str(tmp_path / "foreign.yaml"), child, parent)
+        np.testing.assert_allclose(found.T_parent_child, calibration.T_child_parent, atol=1e-9)
+
+
+def test_every_format_is_tried():
+    assert {name for name, *_ in CASES} | {"px4"} == {*FORMATS}
+    assert tuple(FORMATS) == EXPORT_FORMATS
+
+
+@pytest.mark.parametrize(
+    ("name", "parent", "child", "key", "expected_s"),
+    [
+        # t_imu = t_cam + shift
+        ("kalibr", "imu", "cam0", ("cam0", "timeshift_cam_imu"), OFFSET_S),
+        ("kalibr", "cam0", "imu", ("cam0", "timeshift_cam_imu"), -OFFSET_S),
+        ("openvins", "imu", "cam0", ("cam0", "timeshift_cam_imu"), OFFSET_S),
+        ("vins", "cam0", "imu", ("td",), -OFFSET_S),
+        # t_lidar = t_imu - offset
+        ("fast_lio", "imu", "lidar", ("common", "time_offset_lidar_to_imu"), OFFSET_S),
+        ("fast_livo2", "lidar", "imu", ("time_offset", "imu_time_offset"), -OFFSET_S),
+        # t_lidar = t_image + offset
+        ("fast_livo2", "lidar", "camera", ("time_offset", "img_time_offset"), OFFSET_S),
+        ("fast_livo2", "camera", "lidar", ("time_offset", "img_time_offset"), -OFFSET_S),
+    ],
+)
+def test_the_sign_of_a_time_offset_is_that_of_the_program(name, parent, child, key, expected_s):
+    found = document(result(parent, child).export(name))
+    for part in key:
+        found = found[part]
+    assert found == pytest.approx(expected_s)
+
+
+def test_px4_has_its_own_axes_and_a_delay():
+    calibration = result("base_link", "vio")
+    x, y, z = calibration.translation
+    lines = dict(
+        line.split()[2:] for line in calibration.export("px4").splitlines() if line[0] == "p"
+    )
+    values = [float(lines[f"EKF2_EV_POS_{axis}"]) for axis in "XYZ"]
+    assert values == pytest.approx([x, -y, -z])
+    assert "EKF2_EV_DELAY" not in lines  # the camera's clock is behind: no delay
+    late = good_calibration(parent_frame="base_link", child_frame="vio", time_offset_s=-0.05)
+    assert "param set EKF2_EV_DELAY 50.0\n" in late.export("px4")
+    antenna = result("base_link", "gnss_antenna", **unknown("roll", "pitch", "yaw"))
+    assert f"param set EKF2_GPS_POS_Y {-y:.12f}" in antenna.export("px4")
+
+
+def test_an_axis_that_is_not_known_is_measured_by_hand_or_refused():
+    flat = result("base_link", "lidar", **unknown("z"))
+    assert "z: MEASURE_Z_BY_HAND\n" in flat.export("autoware")
+    assert "EKF2_EV_POS_Z MEASURE_Z_BY_HAND\n" in flat.export("px4")
+    for name in {*FORMATS} - {"autoware", "px4"}:
+        with pytest.raises(InputError, match="does not determine z, and .* --prior"):
+            flat.export(name)
+    with pytest.raises(ConfigError, match="unknown format 'kalbir'; known are autoware"):
+        flat.export("kalbir")
+
+
+def test_what_the_names_do_not_say_is_assumed_and_said():
+    text = result("a", "b").export("fast_lio")
+    assert (
+        "Assumed, as the names of the frames do not say it: a is the imu, b is the lidar." in text
+    )
+    assert role_of("CAM_FRONT") == role_of("frontCamera") == "camera"
+    assert (role_of("camera_base_link"), role_of("base_link"), role_of("odom")) == (
+        "camera",
+        "base",
+        "",
+    )
+    # The name of one of both decides.
+    assert arranged(FORMATS["kalibr"], "cam0", "b").is_inverted is False
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("mapping: {extrinsic_T: [1, 2], extrinsic_R: [1]}", "expected a matrix, or"),
+        ("cam0: {T_cam_imu: [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}", "rotation is not one"),
+        ("param set EKF2_EV_POS_X 0.1", "have a position and no rotation"),
+        ("some: text", "expected a calibration: extrinsic.yaml"),
+        ("[1, 2, 3]", "expected a calibration"),
+        ("base_link: {other: {x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}", "no frame 'imu' in"),
+        (
+            "cam0: {T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,1,0]]}\n"
+            "cam1: {T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,1,0]]}",
+            "has 2 extrinsics, and none",
+        ),
+    ],
+)
+def test_a_file_that_does_not_say_it_is_refused_in_one_line(text, message, tmp_path):
+    path = tmp_path / "foreign.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        open_export(path).of("imu", "lidar")
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_of_several_cameras_the_named_one_is_read(tmp_path):
+    identity, moved = np.eye(4).tolist(), se3.from_rotation_translation(np.eye(3), [1, 2, 3])
+    path = tmp_path / "camchain.yaml"
+    path.write_text(
+        yaml.safe_dump({"cam0": {"T_cam_imu": identity}, "cam1": {"T_cam_imu": moved.tolist()}})
+    )
+    found = open_export(path).of("imu", "cam1").T_parent_child
+    np.testing.assert_allclose(found, se3.inverse(moved))
+
+
+def test_the_parsers_of_others_read_the_same(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    for name, key in (
+        ("opencv", "T_parent_child"),
+        ("vins", "body_T_cam0"),
+        ("orbslam3", "IMU.T_b_c1"),
+    ):
+        calibration = result("imu", "camera")
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(calibration.export(name))
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        T = storage.getNode(key).mat()
+        np.testing.assert_allclose(T, calibration.T_parent_child, atol=1e-6)
+        if name == "vins":
+            assert storage.getNode("td").real() == OFFSET_S
+    # OpenVINS reads its YAML with OpenCV, too, a row of numbers at a time.
+    path.write_text(result("imu", "camera").export("openvins"))
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    rows = storage.getNode("cam0").getNode("T_imu_cam")
+    T = [[rows.at(row).at(column).real() for column in range(4)] for row in range(4)]
+    np.testing.assert_allclose(T, calibration.T_parent_child, atol=1e-9)
+
+
+def test_info_prints_a_format_and_compare_reads_it(tmp_path, capsys):
+    save_result(result("imu", "camera"), tmp_path / "result")
+    assert main(["info", str(tmp_path / "result"), "--as", "kalibr"]) == 0
+    text = capsys.readouterr().out
+    assert text == result("imu", "camera").export("kalibr")
+    (tmp_path / "camchain.yaml").write_text(text)
+    assert (
+        main(["compare", str(tmp_path / "result"), "--with", str(tmp_path / "camchain.yaml")]) == 0
+    )
+    assert "same" in capsys.readouterr().out
