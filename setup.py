@@ -117,6 +117,7 @@ setup(
         "completion": ["argcomplete>=2.0"],
         "fleet": ["fsspec[http]>=2024.2"],
         "notebook": ["ipykernel>=6.29", "pandas>=2.1"],
+        "px4": ["pyulog>=1.0"],
         "test": [
             "colcon-common-extensions",
             "hypothesis>=6.98",

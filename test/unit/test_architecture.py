@@ -69,6 +69,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "mcap": "io/bags/recovery.py",
     "backports": "io/bags/storage.py",
     "fsspec": "io/remote.py",
+    "pyulog": "io/trajectory_files/foreign.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
     "pandas": ("results/calibration.py", "results/tables.py"),

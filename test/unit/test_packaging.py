@@ -35,6 +35,7 @@ DECLARED_AS = {
     "matplotlib": ("matplotlib", "python3-matplotlib"),
     "numpy": ("numpy", "python3-numpy"),
     "pandas": ("pandas", None),  # optional, for tables in Python
+    "pyulog": ("pyulog", None),  # optional, for logs of PX4 alone
     "rich": ("rich", "python3-rich"),
     "rosbags": ("rosbags", "python3-rosbags-pip"),
     "scipy": ("scipy", "python3-scipy"),

@@ -13,7 +13,8 @@ csv
     semicolons or white space. Positions are x, y and z, or latitude, longitude and height;
     orientations are quaternions, or roll, pitch and yaw or heading.
 auto
-    Whichever of these the lines look like.
+    Whichever of these the lines look like, or the file of another program: NMEA, GPX, RTKLIB,
+    ULog, COLMAP, nerfstudio, g2o, Motive, Vicon, .npy (``foreign.py``).
 
 Lines that start with ``#`` and empty lines are skipped, but a csv file's header may start with
 ``#``. Lengths are in metres if the header names no other unit. The units of stamps and of angles

@@ -5,8 +5,8 @@ have, and what stands in which column.
 import re
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import datetime
 from decimal import Decimal, InvalidOperation
 from itertools import takewhile
 from pathlib import Path
@@ -26,6 +26,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     choose_columns,
     listed,
 )
+from hand_eye_calib.io.trajectory_files.foreign import Rows, rows_of
 from hand_eye_calib.io.trajectory_files.formats import (
     AUTO,
     FIXED_FORMATS,
@@ -42,9 +43,14 @@ _NS_PER_S = 1_000_000_000
 _MOST_SHOWN, _LONGEST_REASON = 60, 120
 # A stamp in nanoseconds since 1970 has at least so many digits.
 _DIGITS_OF_NS = 17
-_MATLAB = b"MATLAB 5.0 MAT-file"
 _NOT_EMPTY = re.compile("[^\n]+")
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|nan|[-+]?inf")
+_ISO = re.compile(
+    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d{1,18}))?\s*(Z|[-+]\d\d:?\d\d)?", re.IGNORECASE
+)
+_NUMBER = re.compile(
+    rf"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|nan|[-+]?inf|{_ISO.pattern}", re.IGNORECASE
+)
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
 # Of eight numbers in files so called, the scalar is the last.
 _SUFFIXES_OF_TUM = ("", ".txt", ".tum")
@@ -84,16 +90,6 @@ class Lines:
         InputError
             If it cannot be read.
         """
-        start = b""
-        # What cannot be opened is refused by the reader.
-        if Path(path).is_file():
-            with suppress(OSError), open(path, "rb") as file:
-                start = file.read(len(_MATLAB))
-        if start == _MATLAB:
-            raise InputError(
-                f"{path}: a binary file of MATLAB; save the poses as text, "
-                "save('poses.txt', 'poses', '-ascii', '-double')"
-            )
         return cls(path, read_text(path, f"lines of {expected}", LARGEST_TEXT))
 
     def __iter__(self) -> Iterator[Line]:
@@ -130,8 +126,14 @@ def _cells_of(text: str) -> list[str]:
         return text.split()
     import csv
 
-    reader = csv.reader([text], delimiter="," if "," in text else ";", skipinitialspace=True)
-    return [cell.strip() for cell in next(reader)]
+    delimiter = ";" if ";" in text else ","
+    row = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))
+    cells = [cell.strip() for cell in row]
+    if delimiter == ";" and "," in text:
+        return [
+            cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells
+        ]
+    return cells
 
 
 def _is_row(cells: Sequence[str]) -> bool:
@@ -315,6 +317,10 @@ def _stamp(cells: Sequence[str]) -> Decimal:
                 f"expected whole seconds and nanoseconds; found {secs[:40]!r} and {nsecs[:40]!r}"
             )
         return Decimal(int(secs) * _NS_PER_S + int(nsecs))
+    if date := _ISO.fullmatch(cells[0]):
+        day, clock, fraction, zone = date.groups()
+        moment = datetime.fromisoformat(f"{day}T{clock}{zone or 'Z'}")
+        return Decimal(int(moment.timestamp())) + Decimal(f"0.{fraction or 0}")
     try:
         stamp = Decimal(cells[0])
     except InvalidOperation:
@@ -337,6 +343,8 @@ def read_table(path: _Path, options: FileOptions) -> Table:
     ConfigError
         If the stamps of format kitti are nowhere.
     """
+    if (found := rows_of(path, options.columns)) is not None:
+        return _of_rows(path, found, options.measures)
     lines = Lines.of_file(path, "a trajectory")
     layout = Layout(options.format, True)
     columns, times, guesses = options.columns, options.times, list[str]()
@@ -363,6 +371,20 @@ def read_table(path: _Path, options: FileOptions) -> Table:
     table.guesses[:0] = guesses
     is_auto_tum = options.format == AUTO and layout.format == "tum"
     table.is_scalar_last_usual = is_auto_tum and Path(path).suffix.lower() in _SUFFIXES_OF_TUM
+    return table
+
+
+def _of_rows(path: _Path, found: Rows, measures: str) -> Table:
+    """The rows of a format of another program."""
+    names = found.header.split(",")
+    chosen = choose_columns(path, names, measures=measures)
+    expected = f"{len(names)} values: {listed(names)}"
+    table = Table(path, expected, tuple(chosen.quantities), chosen.stamp_unit, chosen.units)
+    lines = ((number, "\0".join(map(str, row))) for number, row in enumerate(found.rows, 1))
+    at = [*chosen.quantities.values()]
+    table.fill(lines, lambda text: text.split("\0"), len(names), at, chosen.stamp)
+    for note in found.notes:
+        table.guess(note)
     return table
 
 

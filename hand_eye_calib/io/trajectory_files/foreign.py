@@ -1,0 +1,362 @@
+"""Trajectories in the formats of other programs that are no table of numbers: each becomes rows
+under a header, which are read as any csv file.
+
+A format is a function that knows its files by their first bytes. What cannot be read gets one
+sentence that says what it is and what to do.
+"""
+
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.files import read_text
+from hand_eye_calib.io.limits import LARGEST_TEXT
+
+_POSE = "x,y,z,qx,qy,qz,qw"
+_HEAD_BYTES = 4096
+# Binary files by their first bytes: what they are, and what to do.
+_NOT_READ = {
+    b"MATLAB 5.0 MAT-file": "a binary file of MATLAB; save the poses as text, "
+    "save('poses.txt', 'poses', '-ascii', '-double')",
+    b"PK\x03\x04": "a spreadsheet or another zip file; save the sheet as csv",
+    b"\x89HDF": "an HDF5 file; save the poses as csv or .npy",
+    b"#ROSBAG": "a bag; name it .bag and give it as one",
+    b"\x89MCAP": "a bag; name it .mcap and give it as one",
+    b"SQLite format 3": "a database, perhaps a bag; name it .db3 and give it as one",
+    b"\x80\x04": "a pickle of Python, which is not read as it could run anything; save .npy or csv",
+}
+# Of axes forward, right, down those forward, left, up; of OpenGL's camera that of OpenCV.
+_FLIP = np.diag([1.0, -1.0, -1.0])
+# From north, east, down to east, north, up.
+_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+class Rows(NamedTuple):
+    """The rows of a file under names of columns, and what a person should know."""
+
+    header: str
+    rows: Iterable[Sequence[Any]]
+    notes: tuple[str, ...] = ()
+
+
+def rows_of(path: str | Path, choice: str | None = None) -> Rows | None:
+    """The rows of a file in one of these formats; None for any other.
+
+    Parameters
+    ----------
+    path : str or path-like
+    choice : str, optional
+        Which of several bodies is meant.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    path = Path(path)
+    try:
+        if not path.is_file():  # a pipe would wait for ever
+            return None
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except (OSError, ValueError):
+        return None  # the reader of tables says why
+    if head.startswith(b"\x93NUMPY"):
+        return _of_numpy(path)
+    if head.startswith(b"ULog\x01\x12\x35"):
+        return _of_ulog(path)
+    for start, sentence in _NOT_READ.items():
+        if head.startswith(start):
+            raise InputError(f"{path}: {sentence}")
+    text = head.decode("utf-8-sig", "replace").lstrip()
+    for pattern, read in _FORMATS:
+        if re.search(pattern, text):
+            whole = read_text(path, "a trajectory", LARGEST_TEXT)
+            try:
+                return read(whole, choice)
+            except (ValueError, KeyError, IndexError, TypeError, ElementTree.ParseError) as error:
+                reason = " ".join(str(error).split())[:200]
+                raise InputError(f"{path}: {reason or type(error).__name__}") from None
+    return None
+
+
+# ---- positions on the earth
+
+
+def _of_nmea(text: str, _: str | None) -> Rows:
+    """GGA sentences; the day is that of RMC or ZDA, if there is one."""
+    rows: list[tuple[float, float, float, float]] = []
+    day, seconds = 0.0, -1.0
+    for line in text.splitlines():
+        cells = line.partition("*")[0].strip().split(",")
+        kind = cells[0][-3:]
+        if kind == "RMC" and len(cells) > 9 and cells[9]:
+            day = datetime.strptime(cells[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
+        elif kind == "ZDA" and len(cells) > 4 and all(cells[1:5]):
+            year, month, date = map(int, cells[4:1:-1])
+            day = datetime(year, month, date, tzinfo=UTC).timestamp()
+        elif kind == "GGA" and len(cells) > 11 and cells[6] not in ("", "0") and cells[9]:
+            clock, lat, north, lon, east = cells[1:6]
+            now = 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
+            if now < seconds - 43_200 and not day:  # past midnight
+                rows = [(t - 86_400, *rest) for t, *rest in rows]  # type: ignore[misc]
+            seconds = now
+            degrees = (
+                (-1 if side in "SW" else 1) * (int(each[:n]) + float(each[n:]) / 60)
+                for each, n, side in ((lat, 2, north), (lon, 3, east))
+            )
+            rows.append((day + now, *degrees, float(cells[9]) + float(cells[11] or 0)))  # type: ignore[arg-type]
+    if not rows:
+        raise ValueError("NMEA without positions: expected GGA sentences with a fix")
+    note = "" if day else "NMEA without a date: stamps are seconds of the day, in UTC"
+    return Rows("t [s],lat [deg],lon [deg],height [m]", rows, tuple(filter(None, [note])))
+
+
+def _of_gpx(text: str, _: str | None) -> Rows:
+    if "<!DOCTYPE" in text[:_HEAD_BYTES]:
+        raise ValueError("GPX with a document type is not read; remove it")
+    points = ElementTree.fromstring(text).iterfind(".//{*}trkpt")
+    rows = []
+    for point in points:
+        time, height = point.findtext("{*}time"), point.findtext("{*}ele")
+        if time is None:
+            raise ValueError("a point of the GPX track has no time; record it with times")
+        rows.append((time, point.attrib["lat"], point.attrib["lon"], height or "0"))
+    return Rows("t,lat [deg],lon [deg],height [m]", rows, ("heights of GPX are above the sea",))
+
+
+def _of_rtklib(text: str, _: str | None) -> Rows:
+    lines = text.splitlines()
+    header = next(line for line in lines if re.match(r"%\s+(GPST|UTC|JST)\b", line))
+    names = {"latitude(deg)": "lat [deg],lon [deg],height [m]", "e-baseline": "x [m],y [m],z [m]"}
+    names["x-ecef"] = names["e-baseline"]
+    columns = next((each for name, each in names.items() if name in header), None)
+    if columns is None:
+        raise ValueError(
+            "RTKLIB with angles in degrees, minutes, seconds: set out-solformat to llh, degrees"
+        )
+    gps_epoch = 315_964_800
+
+    def rows() -> Iterator[Sequence[Any]]:
+        for line in lines:
+            cells = line.replace(",", " ").split()
+            if not cells or cells[0].startswith("%"):
+                continue
+            if "/" in cells[0]:
+                stamp: Any = f"{cells[0].replace('/', '-')}T{cells[1]}Z"
+            else:
+                stamp = repr(gps_epoch + 604_800 * int(cells[0]) + float(cells[1]))
+            yield stamp, *cells[2:5]
+
+    note = "stamps are of GPS time, 18 s ahead of UTC since 2017" if "GPST" in header else ""
+    return Rows(f"t,{columns}", rows(), tuple(filter(None, [note])))
+
+
+# ---- poses
+
+
+def _of_g2o(text: str, _: str | None) -> Rows:
+    rows = []
+    for line in text.splitlines():
+        tag, *cells = line.split() or [""]
+        if tag == "VERTEX_SE3:QUAT":
+            rows.append(cells[:8])
+        elif tag in ("VERTEX_SE2", "VERTEX2"):
+            half = float(cells[3]) / 2
+            rows.append([*cells[:3], "0", "0", "0", repr(np.sin(half)), repr(np.cos(half))])
+    if not rows:
+        raise ValueError("g2o without poses: expected VERTEX_SE3:QUAT or VERTEX_SE2")
+    rows.sort(key=lambda row: int(row[0]))
+    return Rows(f"t [s],{_POSE}", rows, (_NUMBERED.format("vertices"),))
+
+
+def _of_colmap(text: str, _: str | None) -> Rows:
+    """Lines of images, each followed by one of points; poses of the world in the camera."""
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    images = [line.split(maxsplit=9) for line in lines[::2] if line.strip()]
+    if any(len(image) != 10 for image in images):
+        raise ValueError(
+            "COLMAP images.txt: expected an image and its points in turn, on two lines"
+        )
+    stamps, is_time = _stamps_of_names([image[9] for image in images])
+    values = np.array([[float(each) for each in image[1:8]] for image in images])
+    Ts_camera_world = se3.from_quat_xyzw(values[:, 4:], values[:, [1, 2, 3, 0]])
+    return _of_poses(stamps, se3.inverse(Ts_camera_world), is_time, "images")
+
+
+def _of_json(text: str, _: str | None) -> Rows:
+    document = json.loads(text)
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not frames or "transform_matrix" not in frames[0]:
+        raise ValueError("JSON that is not read; expected transforms.json of nerfstudio, or csv")
+    stamps, is_time = _stamps_of_names([str(each["file_path"]) for each in frames])
+    matrices = np.array([each["transform_matrix"] for each in frames], dtype=float)
+    Ts_world_gl = np.tile(np.eye(4), (len(frames), 1, 1))
+    Ts_world_gl[:, :3] = matrices[:, :3]
+    Ts_world_gl[:, :3, :3] = Ts_world_gl[:, :3, :3] @ _FLIP
+    found = _of_poses(stamps, Ts_world_gl, is_time, "images")
+    turned = "axes of the camera: x right, y down, z forward, not those of OpenGL in the file"
+    return found._replace(notes=(*found.notes, turned))
+
+
+def _of_motive(text: str, choice: str | None) -> Rows:
+    """A take of OptiTrack's Motive with rigid bodies."""
+    import csv
+
+    lines = [*csv.reader(text.splitlines())]
+    about = dict(zip(lines[0][::2], lines[0][1::2], strict=False))
+    top = next((row for row, cells in enumerate(lines) if "Time (Seconds)" in cells), 0)
+    kinds = next((row for row in range(1, top) if "Rigid Body" in lines[row]), None)
+    if kinds is None:
+        raise ValueError("Motive without rigid bodies: export them")
+    parts = lines[top - 1]
+    found: dict[str, dict[str, int]] = {}
+    for at, (kind, name, part, axis) in enumerate(
+        zip(lines[kinds], lines[kinds + 1], parts, lines[top], strict=False)
+    ):
+        if (
+            kind == "Rigid Body"
+            and part in ("Rotation", "Position")
+            and axis in ("X", "Y", "Z", "W")
+        ):
+            key = axis.lower() if part == "Position" else f"q{axis.lower()}"
+            found.setdefault(name, {})[key] = at
+    body = _chosen(found, choice, "rigid bodies")
+    wanted = _POSE.split(",")
+    if {*wanted} - found[body].keys():
+        raise ValueError("Motive with Euler angles: export with rotation type Quaternion")
+    unit = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}[
+        about.get("Length Units", "Meters")
+    ]
+    places = [lines[top].index("Time (Seconds)"), *(found[body][name] for name in wanted)]
+    rows = [[row[k] for k in places] for row in lines[top + 1 :] if len(row) > max(places)]
+    rows = [row for row in rows if all(row)]  # not tracked
+    header = f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw"
+    return Rows(header, rows, (f"poses of rigid body {body}",))
+
+
+def _of_vicon(text: str, choice: str | None) -> Rows:
+    """Segments of Vicon Nexus or Tracker, whose rotations are rotation vectors."""
+    import csv
+
+    lines = [*csv.reader(text.splitlines())]
+    rate_hz, names, columns, units = float(lines[1][0]), lines[2], lines[3], lines[4]
+    if "RX" not in columns:
+        raise ValueError("Vicon without segments: export Segments or Objects (global), not markers")
+    starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
+    body = _chosen(starts, choice, "segments")
+    at, unit = starts[body], units[starts[body] + 3]
+    rows = [cells for cells in lines[5:] if len(cells) >= at + 6 and all(cells[at : at + 6])]
+    values = np.array([[float(each) for each in cells[at : at + 6]] for cells in rows])
+    angles = values[:, :3] * (np.pi / 180 if units[at].startswith("deg") else 1.0)
+    poses = se3.from_rotation_translation(se3.rotation_exp(angles), np.zeros((len(rows), 3)))
+    quats = se3.to_quat_xyzw(poses)
+    joined = np.c_[[int(cells[0]) / rate_hz for cells in rows], values[:, 3:], quats].tolist()
+    header = f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw"
+    return Rows(header, joined, (f"poses of {body}; rotations read as rotation vectors",))
+
+
+def _of_numpy(path: Path) -> Rows:
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
+    if values.dtype.names:
+        return Rows(",".join(values.dtype.names), values.tolist())
+    if values.ndim != 2 or values.shape[1] not in (4, 8) or values.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: an array {values.shape} of {values.dtype}; expected rows (N, 8) of t, x, y, "
+            "z, qx, qy, qz, qw, or (N, 4) of t, x, y, z"
+        )
+    return Rows(f"t,{_POSE}" if values.shape[1] == 8 else "t,x,y,z", values.tolist())
+
+
+def _of_ulog(path: Path) -> Rows:
+    """A log of PX4: the odometry of its estimator, or its position and attitude."""
+    try:
+        from pyulog import ULog
+    except ImportError:
+        raise MissingDependencyError(
+            f"{path} is a log of PX4; to read it needs pyulog: pip install 'hand_eye_calib[px4]'"
+        ) from None
+    try:
+        log = ULog(str(path), ["vehicle_odometry", "vehicle_visual_odometry"])
+        by_name = {each.name: each.data for each in log.data_list}
+        data = by_name.get("vehicle_odometry") or by_name["vehicle_visual_odometry"]
+        stamps_us = data["timestamp_sample" if "timestamp_sample" in data else "timestamp"]
+        quats = np.stack([data[f"q[{k}]"] for k in (1, 2, 3, 0)], axis=1).astype(float)
+        names = "xyz" if "x" in data else [f"position[{k}]" for k in range(3)]
+        positions = np.stack([data[name] for name in names], axis=1).astype(float)
+    except Exception as error:  # of many kinds, at damaged logs
+        reason = " ".join([type(error).__name__, *str(error).split()])
+        raise InputError(f"{path}: a log of PX4 without vehicle_odometry ({reason})") from None
+    good = np.isfinite(quats).all(axis=1) & np.isfinite(positions).all(axis=1)
+    quats, positions = quats[good], positions[good] @ _ENU_NED.T
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    rotations = _ENU_NED @ se3.from_quat_xyzw(np.zeros_like(positions), quats)[:, :3, :3] @ _FLIP
+    poses = se3.from_rotation_translation(rotations, positions)
+    stamps = [f"{int(each) / 1e6:.6f}" for each in stamps_us[good]]
+    note = "axes: x forward, y left, z up, in east, north, up; PX4 has forward, right, down"
+    return _of_poses(stamps, poses, True, "")._replace(notes=(note,))
+
+
+# ---- parts of several
+
+_NUMBERED = "the file has no times: the numbers of its {} are taken for seconds, to pair by them"
+
+
+def _of_poses(stamps: Sequence[str], poses: FloatArray, is_time: bool, what: str) -> Rows:
+    rotations = se3.nearest_rotation(poses[:, :3, :3])
+    if np.abs(rotations - poses[:, :3, :3]).max() > 1e-3:
+        raise ValueError("a matrix is no rotation")
+    quats = se3.to_quat_xyzw(se3.from_rotation_translation(rotations, poses[:, :3, 3]))
+    values = np.c_[poses[:, :3, 3], quats].tolist()
+    order = sorted(range(len(stamps)), key=lambda row: float(stamps[row]))
+    rows = [(stamps[row], *values[row]) for row in order]
+    return Rows(f"t,{_POSE}", rows, () if is_time else (_NUMBERED.format(what),))
+
+
+def _stamps_of_names(names: Sequence[str]) -> tuple[list[str], bool]:
+    """The last number of each name of an image, and whether these are times."""
+    numbers = [re.findall(r"\d+\.\d+|\d+", Path(name).stem) for name in names]
+    if not all(numbers):
+        lacking = names[[bool(each) for each in numbers].index(False)]
+        raise ValueError(
+            f"image {lacking[:60]!r} has no number in its name, so that it has no time"
+        )
+    stamps = [each[-1] for each in numbers]
+    # Seconds since 1970 have ten digits before the point, and no recording has so many images.
+    return stamps, min(len(each.partition(".")[0]) for each in stamps) >= 10
+
+
+def _chosen(found: Any, choice: str | None, what: str) -> str:
+    """The only body, or the one that is named."""
+    names = [*found]
+    if choice in names:
+        return str(choice)
+    if len(names) != 1:
+        listed = ", ".join(names[:20])
+        raise ValueError(f"several {what}: {listed}; name one with `columns`")
+    return str(names[0])
+
+
+_Reader = Callable[[str, str | None], Rows]
+_FORMATS: tuple[tuple[str, _Reader], ...] = (
+    (r"\A<\?xml[^>]*>\s*(<!--.*?-->\s*)*<gpx|\A<gpx", _of_gpx),
+    (r"\A\{", _of_json),
+    (r"(?m)\A\$[A-Z]{5},", _of_nmea),
+    (r"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)", _of_rtklib),
+    (r"(?m)\A#.*\n(#.*\n)*#\s+IMAGE_ID, QW", _of_colmap),
+    (r"(?m)^(VERTEX_SE3:QUAT|VERTEX_SE2|VERTEX2) ", _of_g2o),
+    (r"\AFormat Version,", _of_motive),
+    (r"\A(Segments|Objects|Trajectories)\b.*\r?\n\d+", _of_vicon),
+)

@@ -1,0 +1,254 @@
+"""Trajectories in the formats of other programs: each reads as the table of the same poses, and
+what cannot be read is told in one sentence.
+"""
+
+import json
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from motions import as_trajectory, geodetic, wandering_poses
+
+from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.trajectory_files import AUTO, read_trajectory_file
+
+N = 40
+TRUTH = as_trajectory(wandering_poses(N), rate_hz=10.0, start_ns=1_700_000_000_000_000_000)
+SECONDS = TRUTH.stamps_ns / 1e9
+P, Q = TRUTH.poses[:, :3, 3], se3.to_quat_xyzw(TRUTH.poses)
+LAT, LON, HEIGHT = geodetic(P - P[0], (48.1, 11.5, 550.0))
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def dates(form):
+    return [datetime.fromtimestamp(each, UTC).strftime(form) for each in SECONDS]
+
+
+def joined(rows, separator=" "):
+    return "".join(separator.join(map(str, row)) + "\n" for row in rows)
+
+
+def minutes(degrees, n_digits):
+    """Degrees as NMEA has them."""
+    return f"{int(degrees):0{n_digits}d}{degrees % 1 * 60:012.9f}"
+
+
+def of_nmea():
+    return "".join(
+        f"$GPRMC,{clock},A,,,,,,,{day},,*00\r\n$GNGGA,{clock},{minutes(lat, 2)},N,"
+        f"{minutes(lon, 3)},E,4,12,0.8,{height - 45.0:.6f},M,45.0,M,,*00\r\n"
+        for clock, day, lat, lon, height in zip(
+            [each[:-4] for each in dates("%H%M%S.%f")],
+            dates("%d%m%y"),
+            LAT,
+            LON,
+            HEIGHT,
+            strict=True,
+        )
+    )
+
+
+def of_gpx():
+    points = "".join(
+        f'<trkpt lat="{lat:.12f}" lon="{lon:.12f}"><ele>{h:.6f}</ele><time>{t}Z</time></trkpt>\n'
+        for t, lat, lon, h in zip(dates("%Y-%m-%dT%H:%M:%S.%f"), LAT, LON, HEIGHT, strict=True)
+    )
+    space = 'xmlns="http://www.topografix.com/GPX/1/1"'
+    track = f"<trk><trkseg>{points}</trkseg></trk>"
+    return f'<?xml version="1.0"?>\n<gpx version="1.1" {space}>{track}</gpx>'
+
+
+def of_rtklib(weeks=False):
+    times = dates("%Y/%m/%d %H:%M:%S.%f")
+    if weeks:
+        since = SECONDS - 315_964_800
+        times = [f"{int(each // 604_800)} {each % 604_800:.3f}" for each in since]
+    head = "% program   : RTKPOST\n%  GPST   latitude(deg) longitude(deg)  height(m)   Q  ns\n"
+    rows = zip(times, LAT, LON, HEIGHT, [1] * N, [9] * N, strict=True)
+    return head + joined(rows)
+
+
+def of_colmap():
+    poses = se3.inverse(TRUTH.poses)
+    quats = se3.to_quat_xyzw(poses)[:, [3, 0, 1, 2]]
+    head = (
+        "# Image list with two lines of data per image:\n"
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+    )
+    rows = [
+        f"{k + 1} {' '.join(map(repr, [*quats[k].tolist(), *poses[k, :3, 3].tolist()]))} 1 "
+        f"cam 0/{TRUTH.stamps_ns[k]}.png\n1.5 2.5 -1 3.5 4.5 7\n"
+        for k in reversed(range(N))
+    ]
+    return head + "# POINTS2D[] as (X, Y, POINT3D_ID)\n" + "".join(rows)
+
+
+def of_nerfstudio():
+    frames = [
+        {"file_path": f"images/{stamp}.png", "transform_matrix": (pose @ OPENGL).tolist()}
+        for stamp, pose in zip(TRUTH.stamps_ns, TRUTH.poses, strict=True)
+    ]
+    return json.dumps({"camera_model": "OPENCV", "frames": frames})
+
+
+def of_motive():
+    head = (
+        "Format Version,1.23,Take Name,a,Export Frame Rate,100.0,Rotation Type,Quaternion,"
+        "Length Units,Millimeters\n\n,Type,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,"
+        "Rigid Body,Rigid Body,Rigid Body,Marker\n,Name,drone,drone,drone,drone,drone,drone,drone,"
+        "drone,drone:1\n,,1,1,1,1,1,1,1,1,2\n,,Rotation,Rotation,Rotation,Rotation,Position,"
+        "Position,Position,Mean Marker Error,Position\nFrame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X\n"
+    )
+    rows = [
+        [k, t, *q, *(1e3 * p), 0.1, 1]
+        for k, (t, q, p) in enumerate(zip(SECONDS, Q, P, strict=True))
+    ]
+    lost = [N, SECONDS[-1] + 1, *[""] * 7, "", ""]
+    return head + joined([*rows, lost], ",")
+
+
+def of_vicon():
+    head = "Objects\n10\n,,drone:drone\nFrame,Sub Frame,RX,RY,RZ,TX,TY,TZ\n,,rad,rad,rad,mm,mm,mm\n"
+    vectors = se3.rotation_log(TRUTH.poses[:, :3, :3])
+    return head + joined(([k, 0, *vectors[k], *(1e3 * P[k])] for k in range(N)), ",")
+
+
+def of_g2o():
+    rows = [["VERTEX_SE3:QUAT", k, *P[k], *Q[k]] for k in range(N)]
+    return joined(rows) + "EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n"
+
+
+def of_iso():
+    times = dates("%Y-%m-%dT%H:%M:%S.%f")
+    rows = ([f"{times[k]}Z", *P[k], *Q[k]] for k in range(N))
+    return "time,x,y,z,qx,qy,qz,qw\n" + joined(rows, ",")
+
+
+def of_decimal_comma():
+    rows = ([repr(each).replace(".", ",") for each in [SECONDS[k], *P[k], *Q[k]]] for k in range(N))
+    rows = [[each.replace("np,float64(", "").rstrip(")") for each in row] for row in rows]
+    return "t;x;y;z;qx;qy;qz;qw\n" + joined(rows, ";")
+
+
+@pytest.mark.parametrize(
+    ("text", "measures", "starts_at_0", "note"),
+    [
+        (of_nmea(), "positions", False, ""),
+        (of_gpx(), "positions", False, "above the sea"),
+        (of_rtklib(), "positions", False, "18 s ahead of UTC"),
+        (of_rtklib(weeks=True), "positions", False, "18 s ahead of UTC"),
+        (of_colmap(), "poses", False, ""),
+        (of_nerfstudio(), "poses", False, "not those of OpenGL"),
+        (of_motive(), "poses", False, "rigid body drone"),
+        (of_vicon(), "poses", True, "rotation vectors"),
+        (of_iso(), "poses", False, ""),
+        (of_decimal_comma(), "poses", False, ""),
+    ],
+    ids=[
+        *("nmea", "gpx", "rtklib", "rtklib_weeks", "colmap"),
+        *("nerfstudio", "motive", "vicon", "iso", "decimal_comma"),
+    ],
+)
+def test_a_file_of_another_program_has_the_same_poses(tmp_path, text, measures, starts_at_0, note):
+    path = tmp_path / "anything.txt"
+    path.write_bytes(text.encode())
+    found = read_trajectory_file(path, AUTO)
+    trajectory = found.trajectory
+    assert trajectory.measures == measures
+    assert len(trajectory) == N
+    start_ns = TRUTH.stamps_ns[0] if starts_at_0 else 0
+    np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0)
+    expected = TRUTH.poses.copy()
+    if measures == "positions":
+        expected[:, :3, :3], expected[:, :3, 3] = np.eye(3), P - P[0]
+    np.testing.assert_allclose(trajectory.poses, expected, atol=2e-6)
+    assert note in " ".join(found.guesses)
+
+
+def test_arrays_and_graphs(tmp_path):
+    rows = np.c_[SECONDS, P, Q]
+    np.save(tmp_path / "a.npy", rows)
+    names = [(name, float) for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")]
+    np.save(tmp_path / "b.npy", np.array([tuple(row) for row in rows], dtype=names))
+    for name in ("a.npy", "b.npy"):
+        found = read_trajectory_file(tmp_path / name, AUTO).trajectory
+        np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-12)
+    (tmp_path / "a.g2o").write_text(of_g2o())
+    found = read_trajectory_file(tmp_path / "a.g2o", AUTO)
+    np.testing.assert_allclose(found.trajectory.poses, TRUTH.poses, atol=1e-12)
+    assert found.trajectory.stamps_ns[1] == 1_000_000_000
+    assert "numbers of its vertices are taken for seconds" in found.guesses[0]
+
+
+def test_a_log_of_px4_is_turned_to_east_north_up(tmp_path, monkeypatch):
+    """With pyulog's own objects where it is installed, and without it one sentence."""
+    (tmp_path / "log.ulg").write_bytes(b"ULog\x01\x12\x35" + bytes(20))
+    try:
+        import pyulog
+    except ImportError:
+        with pytest.raises(MissingDependencyError, match=r"hand_eye_calib\[px4\]"):
+            read_trajectory_file(tmp_path / "log.ulg", AUTO)
+        return
+    to_ned, flip = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1.0, -1, -1])
+    poses = se3.from_rotation_translation(to_ned @ TRUTH.poses[:, :3, :3] @ flip, P @ to_ned.T)
+    quats, positions = se3.to_quat_xyzw(poses), poses[:, :3, 3]
+    data = {f"q[{k}]": quats[:, (k - 1) % 4] for k in range(4)}
+    data |= {f"position[{k}]": positions[:, k] for k in range(3)}
+    data["timestamp_sample"] = (TRUTH.stamps_ns // 1000).astype(np.uint64)
+
+    class Log:
+        def __init__(self, *_):
+            message = type("Data", (), {"name": "vehicle_odometry", "data": data})
+            self.data_list = [message]
+
+    monkeypatch.setattr(pyulog, "ULog", Log)
+    found = read_trajectory_file(tmp_path / "log.ulg", AUTO).trajectory
+    np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-9)
+    assert (found.stamps_ns == TRUTH.stamps_ns).all()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"MATLAB 5.0 MAT-file, Platform: GLNXA64\x00\x01IM" + bytes(99), "save the poses as text"),
+        (b"PK\x03\x04" + bytes(40), "save the sheet as csv"),
+        (b"\x89HDF\r\n\x1a\n" + bytes(40), "HDF5"),
+        (b"\x89MCAP0\r\n" + bytes(40), "name it .mcap"),
+        (b"\x93NUMPY\x01\x00" + bytes(10), "cannot read"),
+        (b"<gpx><trkpt lat='1' lon='2'/></gpx>", "has no time"),
+        (b"<gpx><trkpt", "no element found|not well-formed|unclosed token"),
+        (b'{"type": "FeatureCollection"}', "transforms.json of nerfstudio"),
+        (b"$GPRMC,123519,A,,,,,,,230394,,*6A\n", "expected GGA sentences with a fix"),
+        (b"%  GPST  latitude(d'\") longitude(d'\")\n1 2 3\n", "set out-solformat to llh, degrees"),
+        (of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(), "rotation type Quaternion"),
+        (b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n", "not markers"),
+        (b"VERTEX_SE2 0 x y 1\n", "could not convert|expected"),
+        (of_colmap().replace(str(TRUTH.stamps_ns[3]), "a").encode(), "has no number in its name"),
+    ],
+)
+def test_what_cannot_be_read_is_told_in_one_sentence(tmp_path, content, message):
+    path = tmp_path / "file"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as error:
+        read_trajectory_file(path, AUTO)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def test_of_several_bodies_one_is_named(tmp_path):
+    text = of_vicon().replace("drone:drone", "drone:drone,,,,,,cart:cart")
+    text = text.replace("TX,TY,TZ", "TX,TY,TZ,RX,RY,RZ,TX,TY,TZ").replace(
+        "mm,mm,mm", "mm,mm,mm,rad,rad,rad,mm,mm,mm"
+    )
+    lines = [
+        line + ",0,0,0,1,2,3" if line[:1].isdigit() and "," in line else line
+        for line in text.splitlines()
+    ]
+    (tmp_path / "vicon.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match="several segments: drone:drone, cart:cart; name one"):
+        read_trajectory_file(tmp_path / "vicon.csv", AUTO)
+    found = read_trajectory_file(tmp_path / "vicon.csv", AUTO, columns="cart:cart").trajectory
+    assert isinstance(found, Trajectory)
+    np.testing.assert_allclose(found.poses[:, :3, 3], [[0.001, 0.002, 0.003]] * N)
