@@ -11,7 +11,6 @@ wrong with them.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import numpy as np
 
@@ -27,12 +26,11 @@ from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.aligned import (
-    Aligned,
-    check_aligned,
+from hand_eye_calib.checks.agreement import (
+    Known,
+    check_agreement,
     check_independent,
     check_same,
-    solved,
 )
 from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
 from hand_eye_calib.checks.hypotheses import (
@@ -56,7 +54,6 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 
@@ -72,11 +69,11 @@ _COARSE, _SLOW_GAP = 0.5, 1.5
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet"}
 _UNIT_TOLERANCE = 0.1
 
+# Most motions that faults of their response are looked for in.
+_MAX_MOTIONS = 1500
+
 # Shortest duration and smallest rotation with which the checks of a live session mean something.
 MIN_DURATION_S, MIN_ROTATION_RAD = 20.0, float(np.radians(30.0))
-
-
-_Model: TypeAlias = AdaptiveSolution | Callable[[PosePairs], AdaptiveSolution | None] | None
 
 
 @dataclass(frozen=True)
@@ -114,8 +111,7 @@ def check_streams(
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
     correlation: Correlation | None = None,
-    model: object = None,
-    may_solve: bool = True,
+    known: Known | None = None,
 ) -> CheckResult:
     """Check two streams.
 
@@ -130,10 +126,8 @@ def check_streams(
         Longest time between two poses that interpolation may bridge, in seconds.
     correlation : Correlation, optional
         Of the angular rates of the streams as they are, if it is known.
-    model : AdaptiveSolution, optional
-        The adaptive estimator's solution of these streams, if it is known.
-    may_solve : bool
-        Solve with that estimator if it is not known.
+    known : ((4, 4) array, (6,) array), optional
+        An extrinsic of these streams, and its standard deviations.
 
     Returns
     -------
@@ -168,17 +162,17 @@ def check_streams(
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
     findings = _with_lengths([*findings, *explanation.findings], parent)
-    known = time_offset_s, scale
-    solve = solved if may_solve else None
-    of_result = model if isinstance(model, AdaptiveSolution) else None
-    return _check_agreeing(streams, explanation, correlation, findings, known, of_result or solve)
+    options = time_offset_s, scale
+    return _check_agreeing(streams, explanation, correlation, findings, options, known)
 
 
 def _offset(streams: StreamPair, correlation: Correlation, fit: SimilarityFit) -> TimeOffset:
     """The time offset of streams that agree: the coarse one if they are too slow to refine it."""
     if streams.are_slow:
         return TimeOffset(correlation.offset_s, streams.interval_s, correlation, None)
-    return refine_time_offset(streams.parent, streams.child, correlation, streams.max_gap_s, fit)
+    return refine_time_offset(
+        streams.parent, streams.child, correlation, streams.max_gap_s, fit, least_s=_OFFSET_NOTE_S
+    )
 
 
 def _on_one_clock(
@@ -258,10 +252,10 @@ def _check_agreeing(
     correlation: Correlation,
     findings: list[Finding],
     known: tuple[float, float],
-    model: _Model,
+    known_X: Known | None,
 ) -> CheckResult:
     """What else there is to say of streams that agree under a hypothesis, with a known time offset
-    and scale, and the adaptive estimator's solution or what gives it.
+    and scale.
     """
     is_sound = not any(finding.makes_unusable for finding in findings)
     corrected = explanation.hypothesis.undo(streams)
@@ -270,16 +264,15 @@ def _check_agreeing(
         corrected.parent, corrected.child.shifted(correlation.offset_s), corrected.max_gap_s
     )
     scale = None if explanation.same_unit else _scale(pose_pairs, explanation.fit)
-    rotations = _motions(pose_pairs).Ts_parenti_parentj[:, :3, :3]
     fit = scale.fit if scale else explanation.fit
-    aligned = _aligned(streams, offset.seconds, fit, model) if is_sound else None
+    rotations = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3]
     findings = [
         *findings,
-        *check_offset(aligned.refined(offset) if aligned else offset, known[0]),
+        *check_offset(offset, known[0]),
         *(_check_scale(scale, known[1]) if scale else []),
         *([wording.finding("unit_unseen")] if explanation.same_unit else []),
         *_check_axes(rotations, explanation.fit.sigma_rotation),
-        *(_check_aligned(streams, offset.seconds, aligned) if aligned else []),
+        *(_check_agreement(streams, offset.seconds, fit, known_X) if is_sound else []),
     ]
     rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
     return CheckResult(
@@ -298,29 +291,20 @@ def _scale(pose_pairs: PosePairs, start: SimilarityFit) -> Scale | None:
         return None
 
 
-def _check_aligned(streams: StreamPair, offset_s: float, aligned: Aligned) -> list[Finding]:
-    """Findings about streams that agree; of one that was computed from the other, no more than
-    that.
+def _check_agreement(
+    streams: StreamPair, offset_s: float, fit: SimilarityFit, known: Known | None
+) -> list[Finding]:
+    """Findings about streams that agree without any mistake undone; of one that was computed from
+    the other, no more than that.
     """
+    of_fit = fit.T_parent_child, np.sqrt(np.diag(fit.covariance)[:6])
+    best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
     if copied := check_independent(streams.parent, streams.child, offset_s):
-        return [*copied, *check_same(aligned)]
-    return check_aligned(aligned)
-
-
-def _aligned(streams: StreamPair, offset_s: float, fit: SimilarityFit, model: _Model) -> Aligned:
-    """Streams that agree without any mistake undone, on one clock and in one unit of length."""
+        return [*copied, *check_same(*best)]
     child = streams.child.shifted(offset_s).scaled(fit.scale)
     pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
-    is_of_result = isinstance(model, AdaptiveSolution)
-    solution = model if isinstance(model, AdaptiveSolution) else model and model(pose_pairs)
-    return Aligned(
-        solution=solution if solution and solution.converged else None,
-        is_of_result=is_of_result,
-        pose_pairs=pose_pairs,
-        motions=_motions(pose_pairs),
-        T_parent_child=fit.T_parent_child,
-        covariance=fit.covariance[:6, :6],
-    )
+    motions = _motions(pose_pairs, _MAX_MOTIONS)
+    return check_agreement(pose_pairs, motions, fit.T_parent_child, best)
 
 
 def can_check(parent: Trajectory, child: Trajectory) -> bool:
@@ -400,9 +384,9 @@ def in_other_units(scale: float, sigma: float, unit: str, factor: float) -> Find
     )
 
 
-def _motions(pose_pairs: PosePairs) -> MotionPairs:
+def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
     """Motions over 3 s, or less if there are too few of those."""
-    motions = (pairs_over(pose_pairs, lag_s, MAX_PAIRS) for lag_s in LAGS_S)
+    motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in LAGS_S)
     # There are enough over one of the lags: the fit is over it.
     return next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
 

@@ -276,11 +276,40 @@ _ROWS = {
         evidence=("gain", "sigma"),
     ),
     "position_clock": _Row(
-        "the {stream}'s positions are {size_s:.3f} +/- {sigma_s:.3f} s {late} against its "
+        "the {stream}'s positions are {size_s:.3f} +/- {sigma_s:.3f} s late against its "
         "orientations: at this speed a shift of {shift_m:.2g} m",
         "use the poses before that filter, or correct the delay of the positions",
-        "positions and orientations of one stream come from different sources or filters",
+        "positions and orientations of one stream come from different sources or filters, or the "
+        "other stream is of another body, such as a trailer",
         evidence=("delay_s", "sigma_s", "shift_m"),
+    ),
+    "worlds_turned": _Row(
+        "{whose} positions are turned against its orientations by {turned_deg:.2f} deg, mainly "
+        "about {axis} of its world",
+        "give positions and orientations in one and the same world",
+        "magnetic declination or grid convergence in one of them, or poses that were fused with "
+        "the other sensor's through a wrong transform",
+        evidence=("turned_rad", "sigmas"),
+    ),
+    "axis_scale": _Row(
+        "{whose} {axis} coordinates are {factor:.4f} +/- {sigma:.4f} times as long as its others",
+        "write all coordinates in metres, from one source",
+        "heights in feet or of a barometer, or map coordinates whose scale depends on the latitude",
+        evidence=("factor", "sigma"),
+    ),
+    "axis_lag": _Row(
+        "{whose} {axis} coordinates are {delay_s:.3f} +/- {sigma_s:.3f} s late against its others: "
+        "at this speed a shift of {shift_m:.2g} m",
+        "use positions whose coordinates come from one source",
+        "such as heights of a barometer",
+        evidence=("delay_s", "sigma_s", "shift_m"),
+    ),
+    "constant_coordinate": _Row(
+        "{whose} {axis} coordinates do not follow the motion, as if they were constant: by a "
+        "factor of {factor:.3f} +/- {sigma:.3f}",
+        "give positions in three dimensions",
+        "positions in 2D",
+        evidence=("factor", "sigma"),
     ),
     "smoothed": _Row(
         "{whose} {part} are smoothed over about {smoothing_s:.2f} s, which the other's are not: "
@@ -296,7 +325,7 @@ _ROWS = {
         "use the poses before that correction, in the frame of the odometry",
         "a map that is corrected bit by bit, a heading that drifts, or poses published in a frame "
         "that moves",
-        evidence=("evidence", "rate_rad_s", "speed_m_s", "share_of_speed"),
+        evidence=("rate_rad_s", "speed_m_s", "share_of_speed"),
         severity=_WARNING,
     ),
     "unit_unseen": _Row(

@@ -1,27 +1,25 @@
-"""How the child's motion follows the parent's, for orientations and positions separately: gain and
-smoothing.
+"""How the child's motion follows the parent's, beyond an extrinsic and a scale: one linear
+regression per kind of motion, with a column for each thing that may be wrong.
 
-Two sensors on one rigid body feel the same motion at the same time, so that with X
+Two sensors on one rigid body feel the same motion at the same time. With chords a, b and rotation
+vectors x, y of parent and child over a span, in the parent's axes (b and y turned by X),
 
-    w_A = R w_B,        R v_B = v_A + (dR_A/dt) t
+    b - a = (R_A - I) t + ...,        y - x = ...
 
-for rotations w and displacements v over a short span. A gain of the rotations and smoothing break
-this and are easily taken for a part of X. So is a delay of one part, which
-:mod:`~hand_eye_calib.gls.extras` finds.
+where the dots are columns: a small rotation of X, a scale, and one group of columns per fault. All
+groups are in one table of products, summed over blocks of time: to fit a group is to solve a small
+part of it, and the jackknife over the blocks gives standard deviations. Rotations and displacements
+over some seconds (:func:`long_response`) show gains, scales by axis, worlds that are turned or that
+move; those over 0.4 s (:func:`short_response`) show delays and smoothing, which change a motion of
+angular frequency f by ``1 - i f d - f^2 c``: -d times the velocity and c times the acceleration.
 
-A filter changes a motion of angular frequency f by the factor 1 - i f d - f^2 c + ...: it adds -d
-times the velocity and c times the acceleration. Both are columns of a linear regression.
-
-Columns come from poses that the displacements do not use: white noise has no part in both sides.
-Noise that accumulates has. It makes the stream that the column comes from look less smooth than it
-is, never smoother. So columns of the child show that the child is smoothed, columns of the parent
-that the parent is.
+Columns of the short response come from poses that the displacements do not use: white noise has no
+part in both sides. Noise that accumulates makes the stream that a column comes from look less
+smooth than it is, never smoother. So columns of the child show that the child is smoothed.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
@@ -31,23 +29,21 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
-# Half of the span of a displacement (s); an interval of the poses if that is longer.
-_HALF_SPAN_S = 0.2
-
-# Instants of a stencil may be off by this share of a step.
-_TOLERANCE = 0.3
+# Half of the span of a short displacement (s); an interval of the poses if that is longer. Instants
+# of a stencil may be off by this share of a step.
+_HALF_SPAN_S, _TOLERANCE = 0.2, 0.3
 _MAX_INSTANTS, _MIN_INSTANTS = 1500, 150
 _BLOCKS = 10
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING, _ROUNDS = 3.0, 4
 
-# An axis whose root mean square rotation is below this share of the main axis's has no gain.
-_LITTLE = 0.1
+# Smoothing below this share of the squared interval of the poses, or so many times what noise may
+# make of it, is none.
+_SMOOTHING_INTERVALS2, _BIASES = 0.1, 2.0
 
-# Noise of the parent explains a gain only if the child has this share of the parent's squared
-# rotations about the axis.
-_SHARED = 0.25
+# An axis whose root mean square rotation is below this share of the main axis's has no gain.
+LITTLE = 0.1
 
 # Farthest step of a stencil. Rotation vectors near half a turn may point either way.
 _FAR = 4
@@ -55,119 +51,235 @@ MAX_ROTATION = 2.8
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """A value, its standard deviation by the jackknife over blocks of time, and by how much noise
-    of the rotations may push it.
+class Fitted:
+    """What a group of columns is fitted with.
+
+    Attributes
+    ----------
+    values, sigmas : (m,) arrays
+        Of the group's columns; standard deviations by the jackknife over blocks of time.
+    share : float
+        Share of the squared residuals that the group takes away.
     """
 
-    value: float
-    sigma: float
-    bias: float
+    values: FloatArray
+    sigmas: FloatArray
+    share: float
 
-    def exceeds(self, least: float, sigmas: float) -> bool:
-        """Whether the value is more than ``least``, and more than so many standard deviations."""
-        return self.value > max(least, sigmas * self.sigma)
-
-
-#: Smoothing (s^2) by part ("position", "rotation") and stream ("parent", "child").
-Smoothing: TypeAlias = dict[tuple[str, str], Quantity]
-_Regression: TypeAlias = tuple[FloatArray, FloatArray, float]
+    @property
+    def significance(self) -> FloatArray:
+        """Values (m,) in standard deviations."""
+        return np.abs(self.values) / np.maximum(self.sigmas, 1e-12)
 
 
-def rotation_gains(pairs: MotionPairs, R: FloatArray) -> tuple[tuple[Quantity, ...], FloatArray]:
-    """Factors of the child's rotations about the principal axes of the motion, the axis with the
-    most rotation first, and those axes in the parent sensor's frame, as columns.
+class Regression:
+    """Robust linear regression of rows on named groups of columns.
 
     Parameters
     ----------
-    pairs : MotionPairs
-        Over times that are long enough for rotations to exceed their noise.
-    R : (3, 3) array
-        About the rotation of X.
+    target : (K, r) array
+        In standard deviations of the noise, or any unit if all rows have one.
+    columns : mapping of str to (K, r, m) array
+    base : sequence of str
+        Groups that every fit has.
     """
-    x = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
-    y = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3]) @ R.T
-    keep = np.maximum(*(np.linalg.norm(vectors, axis=1) for vectors in (x, y))) < MAX_ROTATION
-    x, y = x[keep], y[keep]
+
+    def __init__(
+        self, target: FloatArray, columns: Mapping[str, FloatArray], base: Sequence[str]
+    ) -> None:
+        self._base = list(base)
+        ends = np.cumsum([column.shape[2] for column in columns.values()])
+        self._where = {
+            name: np.arange(end - column.shape[2], end)
+            for (name, column), end in zip(columns.items(), ends, strict=True)
+        }
+        flat = np.concatenate([*columns.values(), target[:, :, None]], axis=2)
+        edges = np.linspace(0, len(flat), _BLOCKS + 1).astype(int)[:-1]
+        known = self._indices(())
+        weights = np.ones(len(flat))
+        for _ in range(_ROUNDS):
+            weighted = flat * weights[:, None, None]
+            self.blocks = np.stack(
+                [
+                    np.tensordot(part, other, axes=((0, 1), (0, 1)))
+                    for part, other in zip(
+                        np.split(weighted, edges[1:]), np.split(flat, edges[1:]), strict=True
+                    )
+                ]
+            )
+            values = _solved(self.blocks.sum(axis=0), known)
+            lengths = np.linalg.norm(target - flat[:, :, known] @ values, axis=1)
+            sigma = max(median(lengths) / np.sqrt(target.shape[1]), 1e-12)
+            weights = 1.0 / (1.0 + (lengths / sigma) ** 2 / (target.shape[1] * _TUNING**2)) ** 2
+        self.sigma, self._weight = sigma, float(weights.sum())
+
+    def _indices(self, groups: Sequence[str], without: str = "") -> IntArray:
+        names = [*(name for name in self._base if name != without), *groups]
+        return np.concatenate([self._where[name] for name in names])
+
+    def fit(self, *groups: str, without: str = "") -> Fitted:
+        """Fit groups beside the base, or beside what is left of it."""
+        known, total = self._indices(groups, without), self.blocks.sum(axis=0)
+        start = len(self._indices((), without))
+        values = _solved(total, known)
+        left_out = np.stack([_solved(total - block, known) for block in self.blocks])
+        spread = left_out - left_out.mean(axis=0)
+        sigmas = np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum(axis=0))
+        costs = [_cost(total, indices) for indices in (known[:start], known)]
+        share = 1.0 - costs[1] / max(costs[0], 1e-300)
+        return Fitted(values[start:], sigmas[start:], share)
+
+    def powers(self, group: str) -> FloatArray:
+        """Sums of squares (m,) of the group's columns."""
+        where = self._where[group]
+        return np.asarray(self.blocks.sum(axis=0)[where, where])
+
+    def biases(self, group: str) -> FloatArray:
+        """By how much noise of the columns (m,), if it is as large as that of the rows, may push
+        values.
+        """
+        return np.asarray(self.sigma**2 * self._weight / np.maximum(self.powers(group), 1e-300))
+
+
+def _solved(products: FloatArray, columns: IntArray) -> FloatArray:
+    normal = products[np.ix_(columns, columns)]
+    units = 1.0 / np.sqrt(np.diag(normal) + 1e-300)
+    balanced = normal * np.outer(units, units) + 1e-9 * np.eye(len(columns))
+    return np.asarray(units * np.linalg.solve(balanced, units * products[columns, -1]))
+
+
+def _cost(products: FloatArray, columns: IntArray) -> float:
+    return float(products[-1, -1] - products[columns, -1] @ _solved(products, columns))
+
+
+# ------------------------------------------------------------------ motions over seconds
+
+
+def long_response(
+    pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
+) -> tuple[Regression, FloatArray]:
+    """Regression of rotations and displacements over seconds, and the principal axes of the
+    rotations (columns, parent's frame).
+
+    Groups: ``turned_child``, ``turned_parent``: positions turned against orientations, a rotation
+    vector in the stream's world; ``axes_child``, ``axes_parent``: factors, less 1, of the
+    coordinates of a stream's positions; ``drift``: velocity and angular rate of the child's world;
+    ``gain``: factors, less 1, of the child's rotations about the principal axes.
+    """
+    R, t = T_parent_child[:3, :3], T_parent_child[:3, 3]
+    A, B = motions.Ts_parenti_parentj, motions.Ts_childi_childj
+    x, y = se3.rotation_log(A[:, :3, :3]), se3.rotation_log(B[:, :3, :3]) @ R.T
+    keep = np.maximum(np.linalg.norm(x, axis=1), np.linalg.norm(y, axis=1)) < MAX_ROTATION
+    motions, A, B, x, y = motions[keep], A[keep], B[keep], x[keep], y[keep]
+    a, b = A[:, :3, 3], B[:, :3, 3] @ R.T
+    chords = A[:, :3, :3] - np.eye(3)
+    target_t, target_r = b - a - chords @ t, y - x
+    units = [
+        max(median(np.linalg.norm(v, axis=1)) / MEDIAN_LENGTH, least)
+        for v, least in ((target_t, 1e-7), (target_r, 1e-8))
+    ]
+    K = len(x)
+    none = np.zeros((K, 3, 3))
+    from_parent = np.swapaxes(pose_pairs.Ts_pw_p[motions.i, :3, :3], 1, 2)
+    from_child = R @ np.swapaxes(pose_pairs.Ts_cw_c[motions.i, :3, :3], 1, 2)
+    dp = pose_pairs.Ts_pw_p[motions.j, :3, 3] - pose_pairs.Ts_pw_p[motions.i, :3, 3]
+    dc = pose_pairs.Ts_cw_c[motions.j, :3, 3] - pose_pairs.Ts_cw_c[motions.i, :3, 3]
+    # What the other stream makes of these displacements.
+    to_parent, to_child = (np.swapaxes(each, 1, 2) for each in (from_parent, from_child))
+    dp_seen = _times(to_parent, b - chords @ t)
+    dc_seen = _times(to_child, a + chords @ t)
+    seconds = (pose_pairs.stamps_ns[motions.j] - pose_pairs.stamps_ns[motions.i]) * 1e-9
+    moved = from_child * seconds[:, None, None]
+    middle = 0.5 * (pose_pairs.Ts_cw_c[motions.i, :3, 3] + pose_pairs.Ts_cw_c[motions.j, :3, 3])
+    middle = middle - middle.mean(axis=0)
     axes = np.linalg.eigh(x.T @ x)[1][:, ::-1]
-    columns = _along(x, axes)
-    values, sigmas, _ = _regress(columns, y - x)
-    variance = median(((y - x - columns @ values) ** 2).sum(axis=1)) / MEDIAN_LENGTH**2
-    # Noise of the parent makes the gain too small, that of the child in the reverse regression too
-    # large: what lies between them, noise alone explains.
-    reverse, of_reverse, _ = _regress(_along(y, axes), x - y)
-    other = 1.0 / (1.0 + reverse[:3]) - 1.0
-    powers = [((vectors @ axes) ** 2).mean(axis=0) for vectors in (x, y)]
-    is_shared = powers[1] > _SHARED * powers[0]
-    is_nearer = is_shared & (np.abs(other) < np.abs(values[:3]))
-    sigmas = np.where(is_nearer, of_reverse[:3], sigmas[:3])
-    is_between = is_shared & (values[:3] * other < 0.0)
-    values = np.where(is_between, 0.0, np.where(is_nearer, other, values[:3]))
-    squared = powers[0]
-    # Little rotation beside much may come from an axis that is slightly off.
-    biases = np.where(squared < _LITTLE**2 * squared[0], 1.0, variance / (squared + 1e-300))
-    gains = zip(values, sigmas, biases, strict=True)
-    return tuple(Quantity(1.0 + value, sigma, bias) for value, sigma, bias in gains), axes
+    along = (x @ axes)[:, None, :] * axes[None]
+    columns = {
+        "lever": (chords, none),
+        "rotation": (se3.skew(b), se3.skew(y)),
+        "scale": (b[:, :, None], none[:, :, :1]),
+        "turned_child": (-from_child @ se3.skew(dc), none),
+        "turned_parent": (from_parent @ se3.skew(dp), none),
+        "axes_child": (from_child * dc_seen[:, None, :], none),
+        "axes_parent": (-from_parent * dp_seen[:, None, :], none),
+        "drift": (
+            np.concatenate([moved, -moved @ se3.skew(middle)], axis=2),
+            np.concatenate([none, moved], axis=2),
+        ),
+        "gain": (none, along),
+    }
+    target = np.concatenate([target_t / units[0], target_r / units[1]], axis=1)
+    stacked = {
+        name: np.concatenate([of_t / units[0], of_r / units[1]], axis=1)
+        for name, (of_t, of_r) in columns.items()
+    }
+    return Regression(target, stacked, ("lever", "rotation", "scale")), axes
 
 
-def _along(vectors: FloatArray, axes: FloatArray) -> FloatArray:
-    """Columns (K, 3, 6) of a gain along each axis, and of a small rotation."""
-    along = (vectors @ axes)[:, None, :] * axes[None]
-    return np.concatenate([along, -se3.skew(vectors)], axis=2)
+def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
 
-def find_smoothing(
+# ------------------------------------------------------------------ motions over 0.4 s
+
+
+def short_response(
     pose_pairs: PosePairs, T_parent_child: FloatArray, gain: FloatArray
-) -> tuple[Smoothing, float] | None:
-    """By how much each stream is smoothed, and the typical time from one pose to the next, s; None
-    if too few poses follow each other.
+) -> tuple[Regression, Regression, float] | None:
+    """Regressions of rotations and of displacements over 0.4 s, and the least smoothing (s^2) of
+    displacements that noise cannot explain; None if too few poses follow each other.
 
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-        In one unit of length.
-    T_parent_child : (4, 4) array
-        About X.
-    gain : (3, 3) array
-        Matrix from the parent's rotation vectors to the child's, both in the parent's axes.
+    Groups of both: ``late``: the child's part is late (s); ``smooth_child``, ``smooth_parent``
+    (s^2). Of displacements: ``late_axes_child``, ``late_axes_parent``: by coordinate.
     """
     stencil = _stencil(pose_pairs.stamps_ns)
     if stencil is None:
         return None
-    at, step_s, interval_s = stencil
+    at, h, interval_s = stencil
     R = T_parent_child[:3, :3]
-    streams = ((pose_pairs.Ts_pw_p, np.eye(3)), (pose_pairs.Ts_cw_c, R))
-    rotations = [_rotations(poses[:, :3, :3], to_parent, at) for poses, to_parent in streams]
-    x, y = rotations[0][0] @ gain.T, rotations[1][0]
-    tilt = -se3.skew(x)
-    of_rotations = [
-        _regress(
-            np.concatenate(
-                [
-                    tilt,
-                    -change[:, :, None] / (2 * step_s),
-                    bend[:, :, None] / (3 * step_s**2),
-                ],
-                axis=2,
-            ),
-            y - x,
-        )
-        for _, change, bend in rotations
-    ]
-    positions = [_displacements(poses, to_parent, at) for poses, to_parent in streams]
-    of_positions, bias = _positions(pose_pairs, positions, at, step_s, of_rotations[0][2] ** 2)
-    found = {}
-    for part, column, regressions, pushed in (
-        ("rotation", 4, of_rotations, 0.0),
-        ("position", 6, of_positions, bias),
-    ):
-        # A smoother parent is a child that is less smooth.
-        for stream, sign, (values, sigmas, _) in zip(
-            ("parent", "child"), (-1.0, 1.0), regressions, strict=True
-        ):
-            quantity = Quantity(sign * float(values[column]), float(sigmas[column]), pushed)
-            found[part, stream] = quantity
-    return found, interval_s
+    P, C = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
+    x, late_p, bend_p = _rotations(P[:, :3, :3], np.eye(3), at)
+    y, late_c, bend_c = _rotations(C[:, :3, :3], R, at)
+    x = x @ gain.T
+    skew = se3.skew(y)
+    rotations = Regression(
+        y - x,
+        {
+            "rotation": skew,
+            "late": -0.5 * (late_p + late_c)[:, :, None] / (2 * h),
+            "smooth_child": bend_c[:, :, None] / (3 * h**2),
+            "smooth_parent": -bend_p[:, :, None] / (3 * h**2),
+        },
+        ("rotation", "late"),
+    )
+    chords = np.swapaxes(P[at[0], :3, :3], 1, 2) @ (P[at[2], :3, :3] - P[at[-2], :3, :3])
+    a, faster_p, bend_a = _displacements(P, at)
+    b, faster_c, bend_b = _displacements(C, at)
+    to_parent, to_child = (
+        {k: turn @ np.swapaxes(poses[at[k], :3, :3], 1, 2) for k in (-1, 0, 1)}
+        for poses, turn in ((P, np.eye(3)), (C, R))
+    )
+    # Columns are turned by other orientations than the displacements.
+    from_parent, from_child = (0.5 * (each[-1] + each[1]) for each in (to_parent, to_child))
+    b_in = _times(to_child[0], b)
+    late = -0.5 * (_times(from_parent, faster_p) + _times(from_child, faster_c)) / (2 * h)
+    displacements = Regression(
+        b_in - _times(to_parent[0], a) - chords @ T_parent_child[:3, 3],
+        {
+            "lever": chords,
+            "rotation": se3.skew(b_in),
+            "late": late[:, :, None],
+            "late_axes_child": -from_child * faster_c[:, None, :] / (2 * h),
+            "late_axes_parent": from_parent * faster_p[:, None, :] / (2 * h),
+            "smooth_child": _times(from_child, bend_b)[:, :, None] / (3 * h**2),
+            "smooth_parent": -_times(from_parent, bend_a)[:, :, None] / (3 * h**2),
+        },
+        ("lever", "rotation", "late"),
+    )
+    # An error of an orientation turns a displacement and its bend alike.
+    lengths = [median(np.linalg.norm(vectors, axis=1)) for vectors in (a, bend_a)]
+    pushed = _BIASES * rotations.sigma**2 * lengths[0] / max(lengths[1] / (3 * h**2), 1e-12)
+    return rotations, displacements, _SMOOTHING_INTERVALS2 * interval_s**2 + pushed
 
 
 def _stencil(stamps_ns: IntArray) -> tuple[dict[int, IntArray], float, float] | None:
@@ -202,81 +314,16 @@ def _rotations(
         start, end = rotations[at[k]], rotations[at[m]]
         return se3.rotation_log(np.swapaxes(start, 1, 2) @ end) @ to_parent.T
 
-    change = between(1, 3) - between(-3, -1)
     bend = between(3, 4) - between(0, 1) - between(-1, 0) + between(-4, -3)
-    return between(-2, 2), change, bend
+    return between(-2, 2), between(1, 3) - between(-3, -1), bend
 
 
 def _displacements(
-    poses: FloatArray, to_parent: FloatArray, at: dict[int, IntArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Displacements (K, 3) of a stream over four steps, in the parent's axes; and the difference of
-    the accelerations at both ends, times 3 steps squared, from other poses than those ends, and
-    turned by other orientations.
+    poses: FloatArray, at: dict[int, IntArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Displacements (K, 3) of a stream over four steps, in its world; the difference of those over
+    two steps at both ends, from other poses; and of the accelerations, times 3 steps squared.
     """
     p = {k: poses[rows, :3, 3] for k, rows in at.items()}
-
-    def in_body(vectors: FloatArray, k: int = 0) -> FloatArray:
-        return np.einsum("kji,kj->ki", poses[at[k], :3, :3], vectors) @ to_parent.T
-
     bend = (p[4] - p[3] - p[1] + p[0]) - (p[0] - p[-1] - p[-3] + p[-4])
-    return in_body(p[2] - p[-2]), 0.5 * (in_body(bend, -1) + in_body(bend, 1))
-
-
-def _positions(
-    pose_pairs: PosePairs,
-    displacements: list[tuple[FloatArray, FloatArray]],
-    at: dict[int, IntArray],
-    step_s: float,
-    variance: float,
-) -> tuple[list[_Regression], float]:
-    """Regressions for the smoothing of both streams' positions, and by how much noise may push it.
-
-    Noise of the parent's orientations, half of the ``variance`` of the rotations, is in the columns
-    of the lever arm.
-    """
-    (x, _), (y, _) = displacements
-    rotations = pose_pairs.Ts_pw_p[:, :3, :3]
-    chords = np.swapaxes(rotations[at[0]], 1, 2) @ (rotations[at[2]] - rotations[at[-2]])
-    base = np.concatenate([chords, -se3.skew(x)], axis=2)
-    bends = [bend / (3 * step_s**2) for _, bend in displacements]
-    found = [
-        _regress(np.concatenate([base, bend[:, :, None]], axis=2), y - x, variance)
-        for bend in bends
-    ]
-    # The same noise of an orientation turns a displacement and its bend.
-    lengths = [median(np.linalg.norm(vectors, axis=1)) for vectors in (x, bends[0])]
-    return found, variance * lengths[0] / max(lengths[1], 1e-12)
-
-
-def _regress(columns: FloatArray, target: FloatArray, variance: float = 0.0) -> _Regression:
-    """Values and standard deviations (m,), and the standard deviation of what remains: robust
-    linear regression of (K, 3) on (K, 3, m), with the jackknife over blocks of time. ``variance``
-    is that of noise in the first three columns, which would make their values too small.
-    """
-    K, _, m = columns.shape
-    flat = np.concatenate([columns, target[:, :, None]], axis=2)
-    edges = np.linspace(0, K, _BLOCKS + 1).astype(int)[:-1]
-    products = np.einsum("kai,kaj->kij", flat, flat).reshape(K, -1)
-    weights = np.ones(K)
-    for _ in range(_ROUNDS):
-        blocks = np.add.reduceat(products * weights[:, None], edges).reshape(_BLOCKS, m + 1, m + 1)
-        total = blocks.sum(axis=0)
-        ridge = np.diag(1e-9 * np.diag(total)[:m] + 1e-300)
-        ridge[:3, :3] -= _of_noise(total[:3, :3], variance * weights.sum())
-        values = np.linalg.solve(total[:m, :m] + ridge, total[:m, m])
-        lengths = np.linalg.norm(target - columns @ values, axis=1)
-        sigma = max(median(lengths) / MEDIAN_LENGTH, 1e-12)
-        weights = 1.0 / (1.0 + (lengths / sigma) ** 2 / (3 * _TUNING**2)) ** 2
-    rest = total - blocks
-    shares = rest[:, :m, :m] + (1.0 - 1.0 / _BLOCKS) * ridge
-    left_out = np.linalg.solve(shares, rest[:, :m, m:])[..., 0]
-    spread = left_out - left_out.mean(axis=0)
-    sigmas = np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum(axis=0))
-    return values, sigmas, sigma
-
-
-def _of_noise(gram: FloatArray, amount: float) -> FloatArray:
-    """What noise of this amount adds to sums of products (3, 3): at most half of them."""
-    sizes, directions = np.linalg.eigh(gram)
-    return (directions * np.minimum(amount, 0.5 * np.maximum(sizes, 0.0))) @ directions.T
+    return p[2] - p[-2], (p[3] - p[1]) - (p[-1] - p[-3]), bend

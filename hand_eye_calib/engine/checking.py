@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from hand_eye_calib.alignment.angular_rates import (
     MIN_VARIATION,
     Correlation,
@@ -17,6 +19,7 @@ from hand_eye_calib.alignment.angular_rates import (
 )
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.checks import findings as wording
+from hand_eye_calib.checks.agreement import Known
 from hand_eye_calib.checks.check import (
     CheckResult,
     check_offset,
@@ -54,19 +57,13 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         return CheckResult(gravest_first(_check_parts(snapshot, calibration)))
     offset_s = calibration.time_offset_s if calibration else snapshot.config.time_offset
     scale = calibration.scale if calibration else snapshot.config.scale
-    model = calibration.model if calibration else None
-    # Time-correlated errors of the noise model may be a fault of a stream, which the model then
-    # does not show; solved from fewer poses and without the result's clock, it does.
-    noise = calibration.noise if calibration and calibration.method == "adaptive" else None
-    may_hide_faults = noise is not None and (model is None or bool(noise.lasting))
     result = check_streams(
         *snapshot.streams,
         time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
         scale=1.0 if isinstance(scale, str) else scale,
         max_gap_s=snapshot.max_gap_s,
         correlation=snapshot.correlation,
-        model=None if may_hide_faults else model,
-        may_solve=calibration is None or may_hide_faults,
+        known=_known(calibration),
     )
     obsolete = set()
     if len(snapshot.kept):
@@ -75,6 +72,13 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         obsolete.add("one_axis")  # the result has shown otherwise
     findings = [found for found in result.findings if found.code not in obsolete]
     return replace(result, findings=gravest_first(answered(findings, snapshot.config)))
+
+
+def _known(calibration: Calibration | None) -> Known | None:
+    """X of a result that knows all of it, and its standard deviations."""
+    if calibration is None or calibration.unobservable():
+        return None
+    return calibration.T_parent_child, np.sqrt(np.diag(calibration.covariance))
 
 
 def _hides_a_translation(calibration: Calibration) -> bool:

@@ -379,7 +379,6 @@ def _adaptive_solution(
         pose_pairs.Ts_cw_c,
         [name for name in SYSTEMATIC if known.isdisjoint(name.split("+"))],
         is_clock_free=is_clock_free,
-        with_extras=True,
     )
 
 

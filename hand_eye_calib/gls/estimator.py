@@ -15,7 +15,6 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.extras import extras
 from hand_eye_calib.gls.increments import SYSTEMATIC, Streams
 from hand_eye_calib.gls.noise_model import ROTATION
 from hand_eye_calib.gls.normal import N_BLOCKS, answers_without
@@ -37,7 +36,6 @@ def solve(
     systematic: Sequence[str] = SYSTEMATIC,
     quick: bool = False,
     is_clock_free: bool = False,
-    with_extras: bool = False,
     without: Collection[str] = (),
     tuning: Tuning = TUNING,
 ) -> AdaptiveSolution:
@@ -55,8 +53,6 @@ def solve(
     is_clock_free : bool
         The clock offset was estimated from these poses, so that X is as uncertain as that makes it:
         the model has a time offset, unless the motion hardly tells it from X.
-    with_extras : bool
-        Estimate delays of positions, and how a world moves, too.
     without : collection of str
         Names of :data:`~hand_eye_calib.gls.stages.STAGES` to leave out.
     tuning : Tuning
@@ -69,7 +65,6 @@ def solve(
         streams=Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c),
         systematic=tuple(systematic),
         is_clock_free=is_clock_free,
-        with_extras=with_extras,
         without=frozenset(without) | (_SLOW if quick else frozenset()),
         tuning=tuning,
     )
@@ -83,7 +78,6 @@ def solve(
             systematic,
             quick,
             is_clock_free,
-            with_extras,
             without,
             tuning,
         )
@@ -168,7 +162,6 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         objective=0.5 * (posterior.precision.log_determinant + normal.cost),
         converged=fit.converged,
         iterations=fit.n_evaluations,
-        extras=extras(problem, fit, misfit) if problem.with_extras else None,
     )
 
 

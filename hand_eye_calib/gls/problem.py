@@ -38,8 +38,6 @@ class Problem:
         Systematic errors to choose from, the plainest first; the choice if there is only one.
     is_clock_free : bool
         Whether a time offset is in the model if the motion tells it from X.
-    with_extras : bool
-        Whether to estimate delays, and how a world moves, too.
     without : frozenset of str
         Names of the stages to leave out.
     tuning : Tuning
@@ -49,7 +47,6 @@ class Problem:
     streams: Streams
     systematic: tuple[str, ...]
     is_clock_free: bool = False
-    with_extras: bool = False
     without: frozenset[str] = frozenset()
     tuning: Tuning = TUNING
     workspace: Workspace = field(default_factory=lambda: Workspace())

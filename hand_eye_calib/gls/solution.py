@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.gls.extras import Extras
 from hand_eye_calib.gls.increments import BIAS, RATE, SCALE, SYSTEMATIC, TIME
 from hand_eye_calib.gls.noise_model import (
     JITTER,
@@ -144,8 +143,6 @@ class AdaptiveSolution:
         Path of the parent from pose to pose.
     part_products : (K, p + 1, p + 1) array
         What each part of the recording adds, see :mod:`~hand_eye_calib.gls.parts`.
-    extras : Extras or None
-        Delays and how a world moves, if they were estimated.
     objective : float
         Negative log likelihood.
     converged : bool
@@ -172,7 +169,6 @@ class AdaptiveSolution:
     converged: bool
     iterations: int
     is_drowned: bool = False
-    extras: Extras | None = None
 
     @cached_property
     def noise(self) -> NoiseLevels:
