@@ -113,9 +113,11 @@ setup(
     ],
     extras_require={
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
+        "camera": ["opencv-python-headless>=4.7"],
         "cluster": ["distributed>=2024.1"],
         "completion": ["argcomplete>=2.0"],
         "fleet": ["fsspec[http]>=2024.2"],
+        "lidar": ["small_gicp>=1.0"],
         "notebook": ["ipykernel>=6.29", "pandas>=2.1"],
         "px4": ["pyulog>=1.0"],
         "test": [

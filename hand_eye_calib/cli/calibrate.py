@@ -35,6 +35,7 @@ examples:
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
   hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
   hand_eye_calib calibrate samples.yaml --out arm
+  hand_eye_calib calibrate hand.tum images/ --target charuco:5x7:0.04:0.03 --camera camera.yaml
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
@@ -62,6 +63,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="time",
         help="none: the poses of two files are stops without an order, paired by their rows. So "
         "are the samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH",
+    )
+    images = parser.add_argument_group("images of a target, one for each pose of a hand")
+    images.add_argument(
+        "--target",
+        metavar="TARGET",
+        help="what the images of the folder show, the second PATH: such as "
+        "charuco:5x7:0.04:0.03:4X4_50 (squares, side of a square and of a marker in m, markers) or "
+        "aprilgrid:6x6:0.088:0.0264 (tags, side of a tag, gap)",
+    )
+    images.add_argument(
+        "--camera",
+        metavar="FILE",
+        type=Path,
+        help="its intrinsics: YAML of camera_info, of Kalibr or of OpenCV",
     )
     batch = parser.add_argument_group("many recordings")
     batch.add_argument(

@@ -29,6 +29,8 @@ DECLARED_AS = {
     "mcap": ("mcap", None),  # for damaged mcap files alone; there is no rosdep key
     "dask": ("distributed", None),  # optional, for replay --batch --dask alone
     "fsspec": ("fsspec", None),  # optional, for bags at URLs alone
+    "cv2": ("opencv-python-headless", None),  # optional, for images of a target alone
+    "small_gicp": ("small_gicp", None),  # optional, for points of a lidar alone
     "argcomplete": ("argcomplete", None),  # optional, for the command completion alone
     "casadi": ("casadi", "casadi-pip"),
     "jinja2": ("jinja2", "python3-jinja2"),

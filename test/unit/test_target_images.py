@@ -1,0 +1,146 @@
+"""Stops of a hand from images of a target, rendered here."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import hand_eye_calib as hec
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.target_images import Camera, Target, images_in, poses_of_target, read_camera
+from hand_eye_calib.io.trajectory_files.writing import write_trajectory
+
+cv2 = pytest.importorskip("cv2", reason="needs opencv-python-headless")
+
+MATRIX = np.array([[900.0, 0.0, 640.0], [0.0, 900.0, 480.0], [0.0, 0.0, 1.0]])
+SIZE, SUPER = (1280, 960), 3
+BOARD = (7, 5, 0.05, 0.037)
+PIXELS_PER_M = 4000
+CAMERA_INFO = """\
+camera_matrix: {rows: 3, cols: 3, data: [900, 0, 640, 0, 900, 480, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
+"""
+
+
+def rendered(picture, T_camera_picture, rng):
+    """A grey image of a flat picture, whose pixels are in metres along x and down along y."""
+    to_metres = np.diag([1 / PIXELS_PER_M, 1 / PIXELS_PER_M, 1.0])
+    to_metres[:2, 2] = 0.5 / PIXELS_PER_M
+    to_fine = np.array([[SUPER, 0, (SUPER - 1) / 2], [0, SUPER, (SUPER - 1) / 2], [0, 0, 1.0]])
+    columns = T_camera_picture[:3, [0, 1, 3]]
+    size = (SIZE[0] * SUPER, SIZE[1] * SUPER)
+    homography = to_fine @ MATRIX @ columns @ to_metres
+    fine = cv2.warpPerspective(picture, homography, size, flags=cv2.INTER_AREA, borderValue=200)
+    image = cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)
+    return np.clip(image + rng.normal(0.0, 3.0, image.shape), 0, 255).astype(np.uint8)
+
+
+def charuco_picture():
+    columns, rows, square, marker = BOARD
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    board = cv2.aruco.CharucoBoard((columns, rows), square, marker, dictionary)
+    return board.generateImage(
+        (round(columns * square * PIXELS_PER_M), round(rows * square * PIXELS_PER_M))
+    )
+
+
+def aprilgrid_picture(columns, rows, size, gap):
+    """As Kalibr prints it: from the lower left tag on, upright, with a border of two bits."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    side, step = round(size * PIXELS_PER_M), round((size + gap) * PIXELS_PER_M)
+    picture = np.full((rows * step, columns * step), 255, dtype=np.uint8)
+    for number in range(columns * rows):
+        # OpenCV draws the tags of this family upside down.
+        tag = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=2)[::-1, ::-1]
+        left = number % columns * step
+        bottom = picture.shape[0] - number // columns * step
+        picture[bottom - side : bottom, left : left + side] = tag
+    return picture
+
+
+def views(count, center, rng):
+    """Poses of the picture in the camera, some half a metre before it."""
+    turns = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, (count, 3))).as_matrix()
+    places = np.c_[rng.uniform(-0.08, 0.08, (count, 2)), rng.uniform(0.5, 0.7, count)]
+    return se3.from_rotation_translation(turns, places - turns @ center)
+
+
+def test_thirty_images_calibrate_a_hand(tmp_path, capsys):
+    rng = np.random.default_rng(4)
+    picture = charuco_picture()
+    Ts_camera_target = views(30, [0.175, 0.125, 0.0], rng)
+    X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
+    Z = se3.exp([0.7, 0.2, 0.1, 2.0, 0.5, -0.3])
+    hand = Z @ se3.inverse(Ts_camera_target) @ se3.inverse(X)
+    write_trajectory(tmp_path / "hand.tum", Trajectory(10**9 * np.arange(1, 31), hand))
+    (tmp_path / "camera.yaml").write_text(CAMERA_INFO)
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number, T in enumerate(Ts_camera_target):
+        cv2.imwrite(str(folder / f"{number}.png"), rendered(picture, T, rng))
+    paths = [str(tmp_path / "hand.tum"), str(folder), "--camera", str(tmp_path / "camera.yaml")]
+    target = ["--target", "charuco:7x5:0.05:0.037:5X5_100"]
+    assert main(["calibrate", *paths, *target, "--out", str(tmp_path / "out")]) == 0
+    assert "seen in 30 of 30 images" in capsys.readouterr().err
+    off = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
+    assert np.linalg.norm(off[:3]) < 1e-3
+    assert np.degrees(np.linalg.norm(off[3:])) < 0.1
+    (folder / "29.png").unlink()
+    assert main(["calibrate", *paths, *target]) == 1
+    assert "30 poses and" in capsys.readouterr().err
+
+
+def test_aprilgrid_has_the_frame_of_kalibr():
+    """Origin at the lower left corner of the first tag, x to the right and y up."""
+    rng = np.random.default_rng(5)
+    columns, rows, size, gap = 6, 4, 0.03, 0.009
+    picture = aprilgrid_picture(columns, rows, size, gap)
+    height_m = picture.shape[0] / PIXELS_PER_M
+    T_picture_target = se3.from_rotation_translation(np.diag([1.0, -1.0, -1.0]), [0, height_m, 0])
+    Ts = views(3, [0.1, 0.07, 0.0], rng)
+    target = Target.parse(f"aprilgrid:{columns}x{rows}:{size}:{gap}")
+    images = [rendered(picture, T, rng) for T in Ts]
+    found = poses_of_target(images, target, Camera(MATRIX, np.zeros(5), False))
+    off = se3.log(Ts[found.images] @ T_picture_target @ found.Ts_target_camera)
+    assert found.images == [0, 1, 2]
+    assert np.abs(off[:, :3]).max() < 5e-3
+    assert np.degrees(np.abs(off[:, 3:]).max()) < 0.4
+
+
+def test_images_without_the_target_are_left_out():
+    rng = np.random.default_rng(6)
+    (T,) = views(1, [0.175, 0.125, 0.0], rng)
+    empty = np.full((960, 1280), 200, dtype=np.uint8)
+    target = Target.parse("charuco:7x5:0.05:0.037:5X5_100")
+    camera = Camera(MATRIX, np.zeros(5), False)
+    found = poses_of_target([empty, rendered(charuco_picture(), T, rng)], target, camera)
+    assert found.images == [1]
+    with pytest.raises(InputError, match="none of 1 images"):
+        poses_of_target([empty], target, camera)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [CAMERA_INFO, "cam0: {intrinsics: [900, 900, 640, 480], distortion_coeffs: [0, 0, 0, 0]}"],
+)
+def test_intrinsics_of_ros_and_kalibr(tmp_path, text):
+    (tmp_path / "camera.yaml").write_text(text)
+    assert np.array_equal(read_camera(tmp_path / "camera.yaml").matrix, MATRIX)
+    (tmp_path / "camera.yaml").write_text("image_width: 3")
+    with pytest.raises(InputError, match="intrinsics"):
+        read_camera(tmp_path / "camera.yaml")
+
+
+@pytest.mark.parametrize("text", ["charuco:5x7", "charuco:5x7:0.03:0.04", "aprilgrid:6:1:1", "x"])
+def test_what_is_no_target(text):
+    with pytest.raises(ConfigError, match="expected a target"):
+        Target.parse(text)
+
+
+def test_numbers_in_names_count_by_their_value(tmp_path):
+    for name in ("10.png", "9.png", "notes.txt"):
+        (tmp_path / name).touch()
+    assert [path.name for path in images_in(tmp_path)] == ["9.png", "10.png"]
