@@ -225,6 +225,17 @@ _ROWS = {
         evidence=("offset_s", "sigma_s"),
         confidence=_CERTAIN,
     ),
+    "large_time_offset": _Row(
+        "the child's clock is {size_s:.2f} s {direction} the parent's, which nobody has said",
+        "check that both streams are of one vehicle; if the clocks differ so much, give time_offset "
+        "{total_s} or estimate",
+        "a clock of another time scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a "
+        "vehicle that follows",
+        evidence=("offset_s",),
+        severity=_WARNING,
+        confidence=_POSSIBLE,
+        code="time_offset",
+    ),
     "units": _Row(
         "{whose} lengths are {unit} while the {other}'s are metres (factor {scale:.5g} +/- "
         "{sigma:.2g})",

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 from hand_eye_calib.alignment.time_offset import refine_time_offset
 from hand_eye_calib.checks.check import CheckResult
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.checks.findings import Confidence, Finding, Severity, finding, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.estimation import fixed_time_offset
@@ -32,6 +32,9 @@ _CONVENTIONS = tuple(f"{each}_{kind}" for each in STREAMS for kind in ("invert",
 # A model's own time offset moves poses along their velocities. From this one (s) on, poses are
 # paired anew instead; positions alone later, as their model knows the offset better than speeds do.
 _MOST_MOVED_S, _MOST_MOVED_POSITIONS_S = 0.003, 0.05
+
+# A time offset (s) that is used, but not without a warning, unless somebody asked for it.
+_UNASKED_S = 1.0
 
 # Weighted squared residual per degree of freedom up to which a noise model fits: it is 1 if the
 # model holds, and less if there is no noise.
@@ -277,6 +280,16 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
     )
     warnings = tuple(dict.fromkeys((*told, *found.calibration.warnings)))
     calibration = replace(found.calibration, warnings=warnings)
+    if "time_offset" in options and abs(offset_s) > _UNASKED_S:
+        large = finding(
+            "large_time_offset",
+            "child",
+            offset_s=offset_s,
+            size_s=abs(offset_s),
+            total_s=round(offset_s, 4),
+            direction="behind" if offset_s > 0 else "ahead of",
+        )
+        calibration = replace(calibration, findings=gravest_first((*calibration.findings, large)))
     return replace(found, calibration=calibration, options=dict(options), told=told)
 
 

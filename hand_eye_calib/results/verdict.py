@@ -38,6 +38,8 @@ class Reason:
     sentence : str
         What was found, with its values.
     what_to_do : str
+    kind : {"physics", "suspicion"}
+        A limit of the motion, the recording or the sensors; or a sign that something is wrong.
     axes : tuple of str
         x, y, z, roll, pitch, yaw; empty if it is about the whole result.
     options : mapping
@@ -48,6 +50,7 @@ class Reason:
     verdict: Verdict
     sentence: str
     what_to_do: str
+    kind: str = "suspicion"
     axes: tuple[str, ...] = ()
     options: Mapping[str, float | str] = field(default_factory=dict)
 
@@ -77,6 +80,11 @@ class Rule:
     when: str
     find: "Callable[[Result], Iterator[_Found]]"
 
+    @property
+    def kind(self) -> str:
+        """What its reasons are, "physics" or "suspicion"."""
+        return "physics" if self.name in _PHYSICS else "suspicion"
+
 
 _Found: TypeAlias = tuple[str, str, tuple[str, ...], Mapping[str, float | str]]
 
@@ -90,6 +98,10 @@ HOPELESS_TARGETS = 10.0
 # Smallest share of the motion pairs that are inliers in a recording whose noise is understood; of
 # the poses, for a method that models the noise and need not reject what is merely noisy.
 FEWEST_INLIERS, FEWEST_OF_MODEL = 0.7, 0.9
+
+# Rules that state a limit of the recording; the others are signs that something is wrong.
+_PHYSICS = frozenset({"nothing_known", "unobservable", "target", "floor"})
+_NO_FAULT = " (a limit of the recording; no fault was found)"
 
 _OTHERS = {
     "model": "dnlo and adaptive, which assume different noise,",
@@ -113,7 +125,7 @@ def reasons(result: Result) -> tuple[Reason, ...]:
     result : Calibration
     """
     return tuple(
-        Reason(rule.name, rule.verdict, sentence, what_to_do, axes, options)
+        Reason(rule.name, rule.verdict, sentence, what_to_do, rule.kind, axes, options)
         for rule in RULES
         for sentence, what_to_do, axes, options in rule.find(result)
     )
@@ -142,6 +154,7 @@ def headline(result: Result, found: Sequence[Reason]) -> str:
     if not found:
         return f"{decided.value}: {_known(result)}"
     gravest = [reason for reason in found if reason.verdict is decided]
+    note = "" if any(reason.kind == "suspicion" for reason in found) else _NO_FAULT
     if decided is Verdict.USE_WITH_CARE and gravest[0].rule == "unobservable":
         hidden = listing(gravest[0].axes)
         it = hidden if len(gravest[0].axes) == 1 else "them"
@@ -150,7 +163,7 @@ def headline(result: Result, found: Sequence[Reason]) -> str:
         return f"{decided.value}: {'; '.join(texts)}"
     more = len(gravest) - 1
     rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
-    return f"{decided.value}: {gravest[0].sentence}{rest}"
+    return f"{decided.value}: {gravest[0].sentence}{rest}{note}"
 
 
 def target_of(axis: str, result: Result) -> float:

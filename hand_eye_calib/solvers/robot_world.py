@@ -105,6 +105,8 @@ class RobotWorld:
     covariance : (6 (C + W), 6 (C + W)) array
         Of the right perturbations (rho, phi) of all X, then all Z, in the frames of the children
         and of their worlds. Directions that the stops do not determine have large variances.
+    information : (6 (C + W), 6 (C + W)) array
+        Of the same, if the errors of each stop are independent and normal.
     weights : (N,) array
         Weight of each stop, 1 for the errors that the levels expect and less for larger ones.
     level_m, level_rad : float
@@ -119,6 +121,7 @@ class RobotWorld:
     Ts_parent_child: FloatArray
     Ts_world_world: FloatArray
     covariance: FloatArray
+    information: FloatArray
     weights: FloatArray
     level_m: float
     level_rad: float
@@ -128,11 +131,14 @@ class RobotWorld:
 
     def undetermined(self, child: int = 0) -> FloatArray:
         """Directions (6, k) of X, as right perturbations, that the stops do not determine."""
-        part = slice(6 * child, 6 * child + 6)
+        own = np.arange(len(self.information)) // 6 == child
+        to_others = self.information[np.ix_(own, ~own)]
+        others = np.linalg.pinv(self.information[np.ix_(~own, ~own)], hermitian=True)
         levels = np.repeat([self.level_m, self.level_rad], 3)
         # In units of the errors of a stop: the squared rotations between stops (rad^2).
-        information = np.linalg.inv(self.covariance[part, part]) * np.outer(levels, levels)
-        powers, directions = np.linalg.eigh(information / max(int(np.sum(self.weights > 0.0)), 1))
+        alone = self.information[np.ix_(own, own)] - to_others @ others @ to_others.T
+        alone = alone * np.outer(levels, levels) / max(int(np.sum(self.weights > 0.0)), 1)
+        powers, directions = np.linalg.eigh(alone)
         return directions[:, powers < _UNDETERMINED * self.level_rad**2]
 
 
@@ -353,6 +359,7 @@ def _fit(
         Xs,
         Zs,
         np.asarray(covariance * lasting, dtype=float),
+        fisher,
         np.asarray(np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0), dtype=float),
         level_m,
         level_rad,

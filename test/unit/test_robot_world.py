@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from hand_eye_calib.engine.stops import calibrate_stops
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import Verdict
 from hand_eye_calib.solvers.robot_world import Stops, solve
 
 LEVELS = np.repeat([0.002, 0.004], 3)  # m, rad
@@ -15,11 +17,11 @@ def poses(random, n, reach_m=0.3, turn_rad=0.5):
     return se3.exp(xi)
 
 
-def recording(random, n, noise=1.0, outliers=0.0, Ts_world_parent=None):
+def recording(random, n, noise=1.0, outliers=0.0, Ts_world_parent=None, levels=LEVELS):
     """X, Z and the stops of a target seen by a camera in a hand."""
     X, Z = poses(random, 2, turn_rad=1.5)
     A = poses(random, n) if Ts_world_parent is None else Ts_world_parent
-    B = se3.inverse(Z) @ A @ X @ se3.exp(noise * LEVELS * random.normal(size=(n, 6)))
+    B = se3.inverse(Z) @ A @ X @ se3.exp(noise * levels * random.normal(size=(n, 6)))
     wrong = random.random(n) < outliers
     B[wrong] = B[wrong] @ poses(random, int(wrong.sum()), 0.3, 0.5)
     return X, Z, Stops.of_one(A, B)
@@ -107,14 +109,27 @@ class TestUndetermined:
         _, _, stops = recording(random, 15)
         assert not self.unknown(stops).any()
 
-    def test_a_scara_does_not_show_the_height(self, random):
+    @pytest.mark.parametrize("seed", range(10))
+    @pytest.mark.parametrize("motion", ["one_axis", "no_rotation", "one_axis_unmoved"])
+    def test_degenerate_stops_are_refused_by_axis(self, motion, seed):
+        random = np.random.default_rng(seed)
+        axis = random.normal(size=3)
+        axis /= np.linalg.norm(axis)
         xi = np.zeros((25, 6))
-        xi[:, [0, 1, 2, 5]] = random.normal(size=(25, 4)) * [0.3, 0.3, 0.1, 1.0]
-        _, _, stops = recording(random, 25, Ts_world_parent=se3.exp(xi))
-        assert self.unknown(stops).tolist() == [False, False, True, False, False, False]
-
-    def test_without_rotation_no_translation_is_known(self, random):
-        A = np.tile(np.eye(4), (25, 1, 1))
-        A[:, :3, 3] = random.normal(size=(25, 3)) * 0.3
-        _, _, stops = recording(random, 25, Ts_world_parent=A)
-        assert self.unknown(stops)[:3].all()
+        if motion != "one_axis_unmoved":
+            xi[:, :3] = random.normal(size=(25, 3)) * 0.3
+        if motion != "no_rotation":
+            xi[:, 3:] = random.normal(size=(25, 1)) * axis
+        A = poses(random, 1, turn_rad=2.0) @ se3.exp(xi)
+        levels = LEVELS * random.uniform(0.3, 3.0)
+        X, _, stops = recording(random, 25, Ts_world_parent=A, levels=levels)
+        fit = solve(stops)
+        unknown = np.kron(np.eye(2), fit.Ts_parent_child[0][:3, :3]) @ fit.undetermined()
+        along = np.eye(3) if motion == "no_rotation" else axis[None]
+        along = np.eye(3) if motion == "no_rotation" else axis[None]
+        assert np.linalg.norm(along @ unknown[:3], axis=1).min() > 0.98
+        if motion == "one_axis":
+            assert unknown.shape == (6, 1)
+        result = calibrate_stops(stops.Ts_world_parent, stops.Ts_world_child)
+        assert result.verdict is not Verdict.USE
+        assert result.reasons[0].rule in ("unobservable", "nothing_known")

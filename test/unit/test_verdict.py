@@ -212,6 +212,7 @@ def test_a_file_keeps_what_the_verdict_comes_from():
     assert document["reasons"][0] == {
         "rule": "error_finding",
         "verdict": "DO NOT USE",
+        "kind": "suspicion",
         "axes": [],
         "sentence": "lengths are in mm",
         "what_to_do": "convert them",
