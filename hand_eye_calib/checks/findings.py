@@ -227,8 +227,8 @@ _ROWS = {
     ),
     "large_time_offset": _Row(
         "the child's clock is {size_s:.2f} s {direction} the parent's, which nobody has said",
-        "check that both streams are of one vehicle; if the clocks differ so much, give time_offset "
-        "{total_s} or estimate",
+        "check that both streams are of one vehicle; if the clocks differ so much, give "
+        "time_offset {total_s} or estimate",
         "a clock of another time scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a "
         "vehicle that follows",
         evidence=("offset_s",),

@@ -21,8 +21,7 @@ import numpy as np
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.checks.findings import Confidence, Finding, Severity, conventions, finding
 from hand_eye_calib.checks.streams import coarse_poses
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
@@ -97,20 +96,9 @@ class StreamPair:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake that can be undone.
-
-    Attributes
-    ----------
-    code : str
-        Code of its finding; empty for the plain hypothesis.
-    stream : str
-        The stream with the mistake: "parent", "child" or "both".
-    correct : callable
-        Gives the trajectory without the mistake.
-    complexity : int
-        Number of things that are wrong under it.
-    detail : str
-        For wrong axes, what (x, y, z) should be.
+    """A mistake that ``correct`` undoes in a trajectory of a stream, "parent", "child" or "both".
+    ``code`` is that of its finding, empty if nothing is wrong; ``complexity`` counts what is wrong;
+    ``detail`` says of wrong axes what (x, y, z) should be.
     """
 
     code: str
@@ -131,17 +119,8 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A hypothesis with its fit.
-
-    Attributes
-    ----------
-    hypothesis : Hypothesis
-    fit : SimilarityFit
-    findings : tuple of Finding
-    limit : float
-        Unexplained share below which it holds.
-    same_unit : bool
-        The scale was kept at 1.
+    """A hypothesis with its fit, which holds below the unexplained share ``limit``; with
+    ``same_unit`` its scale was kept at 1.
     """
 
     hypothesis: Hypothesis
@@ -154,6 +133,13 @@ class Explanation:
     def holds(self) -> bool:
         """Whether the streams agree under the hypothesis."""
         return self.fit.unexplained < self.limit
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """Number of things that would have to be wrong; for equal numbers, the child's first."""
+        odd_scale = abs(np.log(self.fit.scale)) > _ODD_SCALE
+        by_stream = ("child", "parent", "both").index(self.hypothesis.stream)
+        return self.hypothesis.complexity + int(odd_scale), by_stream
 
 
 def _misread(trajectory: Trajectory, **convention: str) -> Trajectory:
@@ -202,17 +188,16 @@ def _axis_hypotheses() -> list[Hypothesis]:
     simplest first.
     """
     hypotheses = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1, -1), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            n_changed = int(3 - np.isclose(matrix.diagonal(), 1.0).sum())
-            if n_changed == 0 or np.array_equal(matrix, _MIRROR):
-                continue
-            detail = " ".join(
-                f"{'-' * (sign < 0)}{'xyz'[column]}"
-                for column, sign in zip(order, signs, strict=True)
-            )
+    for order, signs in itertools.product(
+        itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
+    ):
+        matrix = np.zeros((3, 3))
+        matrix[range(3), order] = signs
+        n_changed = int(3 - np.isclose(matrix.diagonal(), 1.0).sum())
+        detail = " ".join(
+            f"{'-' * (sign < 0)}{'xyz'[k]}" for k, sign in zip(order, signs, strict=True)
+        )
+        if n_changed and not np.array_equal(matrix, _MIRROR):
             hypotheses += [
                 Hypothesis("axes", stream, functools.partial(_with_axes, matrix), n_changed, detail)
                 for stream in ("child", "parent")
@@ -262,11 +247,10 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
         attributed = _attribute(best, streams, lag_s)
-        findings = (*attributed.findings, wording.finding("noisy", share=unexplained))
+        findings = (*attributed.findings, finding("noisy", share=unexplained))
         return replace(attributed, findings=findings, limit=_NOISY)
-    return replace(
-        best, findings=(wording.finding("not_one_body", share=min(unexplained, 1.0), limit=HOLDS),)
-    )
+    unrelated = finding("not_one_body", share=min(unexplained, 1.0), limit=HOLDS)
+    return replace(best, findings=(unrelated,))
 
 
 def _plain_or_usual(streams: StreamPair, lag_s: float, limit: float) -> Explanation:
@@ -287,16 +271,18 @@ def _or_other_axes(plain: Explanation, streams: StreamPair, lag_s: float) -> Exp
     """The explanation by wrong axes, or by inverted orientations, if it is decisive, otherwise the
     given one.
     """
-    tried = []
-    rotation = _agreed_rotation(streams, lag_s)
-    if rotation is not None:
-        T = se3.from_rotation_translation(rotation, np.zeros(3))
-        start = replace(plain.fit, T_parent_child=T)
+    tried = [_fitted(hypothesis, streams, lag_s) for hypothesis in _ORIENTATIONS]
+    # Wrong axes of the positions do not affect the rotations: they agree alone.
+    pairs = streams.pairs(lag_s, MAX_PAIRS)
+    T_rotation = se3.from_rotation_translation(align_rotation_vectors(pairs), np.zeros(3))
+    errors = np.linalg.norm(pairs.rotation_residuals(T_rotation), axis=1)
+    angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
+    if median(errors) < 2 * HOLDS * np.sqrt(np.mean(angles**2)):
+        start = replace(plain.fit, T_parent_child=T_rotation)
         tried = [
             _fitted(hypothesis, streams, lag_s, _MAX_PAIRS_FOR_AXES, start)
             for hypothesis in _axis_hypotheses()
-        ]
-    tried += [_fitted(hypothesis, streams, lag_s) for hypothesis in _ORIENTATIONS]
+        ] + tried
     best = _simplest_of_the_best(tried)
     return best if _is_decisive(plain, best, HOLDS) else plain
 
@@ -314,31 +300,10 @@ def _fitted(
     return Explanation(hypothesis, fit, same_unit=same_unit)
 
 
-def _agreed_rotation(streams: StreamPair, lag_s: float) -> FloatArray | None:
-    """The rotation X on which the rotations alone agree, or None: wrong axes of the positions do
-    not affect them.
-    """
-    pairs = streams.pairs(lag_s, MAX_PAIRS)
-    rotation = align_rotation_vectors(pairs)
-    T_rotation = se3.from_rotation_translation(rotation, np.zeros(3))
-    errors = np.linalg.norm(pairs.rotation_residuals(T_rotation), axis=1)
-    angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
-    rms_rotation = np.sqrt(np.mean(angles**2))
-    return rotation if median(errors) < 2 * HOLDS * rms_rotation else None
-
-
 def _simplest_of_the_best(explanations: Sequence[Explanation]) -> Explanation:
     limit = _ABOUT_EQUAL * min(explanation.fit.unexplained for explanation in explanations)
     best = [explanation for explanation in explanations if explanation.fit.unexplained <= limit]
-    return min(best, key=_complexity)
-
-
-def _complexity(explanation: Explanation) -> tuple[int, int]:
-    """Number of things that would have to be wrong; for equal numbers, the child's come first."""
-    odd_scale = abs(np.log(explanation.fit.scale)) > _ODD_SCALE
-    hypothesis = explanation.hypothesis
-    by_stream = ("child", "parent", "both").index(hypothesis.stream)
-    return hypothesis.complexity + int(odd_scale), by_stream
+    return min(best, key=lambda explanation: explanation.complexity)
 
 
 def _is_decisive(plain: Explanation, rival: Explanation, limit: float) -> bool:
@@ -353,30 +318,33 @@ def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
     hypothesis = explanation.hypothesis
     if hypothesis.code not in ("", "inverse"):
         code, stream = hypothesis.code, hypothesis.stream
-        options = wording.conventions(code, stream)
+        options = conventions(code, stream)
+        found = finding(code, stream, options=options, detail=hypothesis.detail)
+        return replace(explanation, findings=(found,))
+    evidence, inverted_fit = _evidence_for_inverse(streams, explanation, lag_s)
+    if evidence < _INVERTED and not hypothesis.code:
+        return explanation
+    likely = abs(evidence) > (_INVERTED if hypothesis.code else _LIKELY_INVERTED)
+    if hypothesis.code:
+        stream, fit = hypothesis.stream, explanation.fit
+        if evidence >= _INVERTED:
+            stream, fit = ("parent" if stream == "child" else "child"), inverted_fit
+        else:
+            likely = -evidence > _INVERTED
+        confidence = Confidence.LIKELY if likely else Confidence.POSSIBLE
+        options = conventions("inverse", stream)
+        found = finding("inverse", stream, confidence=confidence, options=options)
         return replace(
             explanation,
-            findings=(wording.finding(code, stream, options=options, detail=hypothesis.detail),),
+            hypothesis=Hypothesis("inverse", stream, _inverted),
+            fit=fit,
+            findings=(found,),
         )
-    evidence, inverted_fit = _evidence_for_inverse(streams, explanation, lag_s)
-    if evidence < _INVERTED:
-        if not hypothesis.code:
-            return explanation
-        confidence = _confidence(-evidence, _INVERTED)
-        finding = _inverse(hypothesis.stream, confidence)
-        return replace(explanation, findings=(finding,))
-    if hypothesis.code:
-        other = "parent" if hypothesis.stream == "child" else "child"
-        confidence = _confidence(evidence, _INVERTED)
-        finding = _inverse(other, confidence)
-        return Explanation(Hypothesis("inverse", other, _inverted), inverted_fit, (finding,))
-    likely = np.inf if _may_be_an_arm(streams) else _LIKELY_INVERTED
-    confidence = _confidence(evidence, likely)
-    if confidence is Confidence.POSSIBLE:
-        finding = wording.finding("inverse_both", "both", Severity.WARNING, confidence)
-        return replace(explanation, findings=(finding,))
-    finding = wording.finding("inverse_both", options=wording.conventions("inverse", "both"))
-    return Explanation(_BOTH_INVERTED, inverted_fit, (finding,))
+    if not likely or _may_be_an_arm(streams):
+        found = finding("inverse_both", "both", Severity.WARNING, Confidence.POSSIBLE)
+        return replace(explanation, findings=(found,))
+    found = finding("inverse_both", options=conventions("inverse", "both"))
+    return Explanation(_BOTH_INVERTED, inverted_fit, (found,))
 
 
 def _may_be_an_arm(streams: StreamPair) -> bool:
@@ -389,15 +357,6 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
     )
 
 
-def _inverse(stream: str, confidence: Confidence) -> Finding:
-    options = wording.conventions("inverse", stream)
-    return wording.finding("inverse", stream, confidence=confidence, options=options)
-
-
-def _confidence(evidence: float, likely: float) -> Confidence:
-    return Confidence.LIKELY if evidence > likely else Confidence.POSSIBLE
-
-
 def _evidence_for_inverse(
     streams: StreamPair, explanation: Explanation, lag_s: float
 ) -> tuple[float, SimilarityFit]:
@@ -405,7 +364,15 @@ def _evidence_for_inverse(
     the fit then: the fit as they are if no other lever arm could make the sum matter.
     """
     streams, fit = explanation.hypothesis.undo(streams), explanation.fit
-    by_paths = sum(_log_of_paths(stream) for stream in (streams.parent, streams.child))
+    by_paths = 0.0
+    for stream in (streams.parent, streams.child):
+        # Steps are so coarse that noise does not add to the path.
+        coarse = coarse_poses(stream, _PATH_STEP_S)
+        path_m, inverse_m = (
+            float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()) + 1e-9
+            for poses in (coarse, se3.inverse(coarse))
+        )
+        by_paths += float(np.log(path_m / inverse_m))
     most = by_paths + 0.5 * float(np.log(_lever_arm(fit) / _LEAST_LEVER_ARM_M))
     if not explanation.hypothesis.code and most < _INVERTED:
         return most, fit
@@ -425,18 +392,6 @@ def _lever_arm(fit: SimilarityFit) -> float:
 def _is_identity(fit: SimilarityFit) -> bool:
     """Whether a fit's transform differs from the identity by no more than noise."""
     T = fit.T_parent_child
-    if np.linalg.norm(T[:3, 3]) > max(_SAME_FRAME_M, 3 * fit.sigma_translation):
-        return False
-    max_angle = max(_SAME_FRAME_RAD, 3 * fit.sigma_rotation)
-    return bool(se3.rotation_angle(T[:3, :3]) < max_angle)
-
-
-def _log_of_paths(trajectory: Trajectory) -> float:
-    """Logarithm of the path length over that of the inverted poses."""
-    poses = coarse_poses(trajectory, _PATH_STEP_S)
-    return float(np.log(_path_length(poses) / _path_length(se3.inverse(poses))))
-
-
-def _path_length(coarse: FloatArray) -> float:
-    """Path length, m, of poses in steps that are so coarse that noise does not add to it."""
-    return float(np.linalg.norm(np.diff(coarse[:, :3, 3], axis=0), axis=1).sum()) + 1e-9
+    is_near = np.linalg.norm(T[:3, 3]) <= max(_SAME_FRAME_M, 3 * fit.sigma_translation)
+    is_aligned = se3.rotation_angle(T[:3, :3]) < max(_SAME_FRAME_RAD, 3 * fit.sigma_rotation)
+    return bool(is_near and is_aligned)
