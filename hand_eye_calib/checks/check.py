@@ -10,6 +10,7 @@ wrong with them.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,14 +26,13 @@ from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
-from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.checks.agreement import (
     Known,
     check_agreement,
     check_independent,
     check_same,
 )
-from hand_eye_calib.checks.findings import Finding, Severity, gravest_first
+from hand_eye_calib.checks.findings import Finding, Severity, finding, gravest_first
 from hand_eye_calib.checks.hypotheses import (
     LAGS_S,
     MAX_PAIRS,
@@ -101,7 +101,7 @@ class CheckResult:
     @property
     def is_good(self) -> bool:
         """Whether nothing speaks against calibrating with these streams as they are."""
-        return all(finding.severity is Severity.NOTE for finding in self.findings)
+        return all(each.severity is Severity.NOTE for each in self.findings)
 
 
 def check_streams(
@@ -134,7 +134,7 @@ def check_streams(
     CheckResult
     """
     findings = _check_each(parent, child, max_gap_s, check_stream)
-    if any(finding.severity is Severity.ERROR for finding in findings):
+    if any(each.makes_unusable for each in findings):
         return CheckResult(gravest_first(findings))
     correlation = correlation or correlate_rates(parent, child, max_gap_s)
     streams, correlation = _on_one_clock(
@@ -149,29 +149,22 @@ def check_streams(
         return CheckResult(gravest_first([*findings, *flat]), correlation)
     try:
         explanation = explain(aligned, thorough=correlation.is_clear)
+        findings += explanation.findings if correlation.is_clear or explanation.holds else ()
     except NotEnoughDataError as error:
-        explanation, too_short = None, [wording.finding("too_short", text=str(error))]
+        explanation = None
+        findings += [finding("too_short", text=str(error))] if correlation.is_clear else []
     if explanation is None or not explanation.holds:
-        if not correlation.is_clear:
-            # Nothing is said about the rates of a frozen stream.
-            findings += [] if frozen else [_rates_disagree(correlation)]
-        else:
-            findings += explanation.findings if explanation else too_short
+        # Nothing is said about the rates of a frozen stream.
+        if not correlation.is_clear and not frozen:
+            is_still = correlation.variation < MIN_VARIATION
+            findings += [finding("no_turning") if is_still else unrelated_rates(correlation)]
         return CheckResult(gravest_first(findings), correlation)
     if not correlation.is_clear:
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
-    findings = _with_lengths([*findings, *explanation.findings], parent)
-    options = time_offset_s, scale
-    return _check_agreeing(streams, explanation, correlation, findings, options, known)
-
-
-def _offset(streams: StreamPair, correlation: Correlation, fit: SimilarityFit) -> TimeOffset:
-    """The time offset of streams that agree: the coarse one if they are too slow to refine it."""
-    if streams.are_slow:
-        return TimeOffset(correlation.offset_s, streams.interval_s, correlation, None)
-    return refine_time_offset(
-        streams.parent, streams.child, correlation, streams.max_gap_s, fit, least_s=_OFFSET_NOTE_S
+    findings = _with_lengths(findings, parent)
+    return _check_agreeing(
+        streams, explanation, correlation, findings, (time_offset_s, scale), known
     )
 
 
@@ -194,6 +187,58 @@ def _on_one_clock(
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
 
 
+def _check_agreeing(
+    streams: StreamPair,
+    explanation: Explanation,
+    correlation: Correlation,
+    findings: list[Finding],
+    options: tuple[float, float],
+    known: Known | None,
+) -> CheckResult:
+    """What else there is to say of streams that agree under a hypothesis, with a time offset and a
+    scale from the options, and X if it is known.
+    """
+    is_sound = not any(each.makes_unusable for each in findings)
+    corrected, fit = explanation.hypothesis.undo(streams), explanation.fit
+    if streams.are_slow:  # too slow to refine it
+        offset = TimeOffset(correlation.offset_s, streams.interval_s, correlation, None)
+    else:
+        offset = refine_time_offset(
+            corrected.parent,
+            corrected.child,
+            correlation,
+            streams.max_gap_s,
+            fit,
+            least_s=_OFFSET_NOTE_S,
+        )
+    pose_pairs = synchronise(
+        corrected.parent, corrected.child.shifted(correlation.offset_s), streams.max_gap_s
+    )
+    rotations = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3]
+    findings = [*findings, *check_offset(offset, options[0])]
+    if explanation.same_unit:
+        findings.append(finding("unit_unseen"))
+    else:
+        with suppress(NotEnoughDataError):
+            scale = estimate_scale(pose_pairs, start=fit)
+            findings += _check_scale(scale, options[1])
+            fit = scale.fit
+    findings += _check_axes(rotations, explanation.fit.sigma_rotation)
+    if is_sound:
+        of_fit = fit.T_parent_child, np.sqrt(np.diag(fit.covariance)[:6])
+        best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
+        if copied := check_independent(streams.parent, streams.child, offset.seconds):
+            findings += [*copied, *check_same(*best)]
+        else:
+            child = streams.child.shifted(offset.seconds).scaled(fit.scale)
+            pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
+            motions = _motions(pose_pairs, _MAX_MOTIONS)
+            findings += check_agreement(pose_pairs, motions, fit.T_parent_child, best)
+    rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
+    named = dict(zip("xyz", rms.tolist(), strict=True))
+    return CheckResult(gravest_first(findings), correlation, explanation.fit, named)
+
+
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
     """Findings about each of two streams, on one clock, of which one at least has only positions,
     rotations or rates: what there is to see before a solve.
@@ -201,9 +246,9 @@ def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list
     has_positions = parent.has_positions and child.has_positions
     check = check_positions if has_positions else check_sampling
     findings = _check_each(parent, child, max_gap_s, check)
-    if any(finding.severity is Severity.ERROR for finding in findings):
+    if any(each.makes_unusable for each in findings):
         return findings
-    if any(finding.code == "coarse_positions" for finding in findings):
+    if any(each.code == "coarse_positions" for each in findings):
         return findings  # rounded positions stay the same while the sensor moves
     findings = _with_lengths(findings, parent)
     if not has_positions:
@@ -230,7 +275,7 @@ def _with_lengths(findings: list[Finding], parent: Trajectory) -> list[Finding]:
     """With what there is to say of the unit of length; not if something else explains the motion,
     such as inverse poses.
     """
-    if not parent.has_positions or any(finding.makes_unusable for finding in findings):
+    if not parent.has_positions or any(each.makes_unusable for each in findings):
         return findings
     return findings + check_lengths(parent)
 
@@ -244,67 +289,6 @@ def unit_of(scale: float) -> tuple[float, str] | None:
             if abs(scale / each - 1.0) < _UNIT_TOLERANCE:
                 return each, name
     return None
-
-
-def _check_agreeing(
-    streams: StreamPair,
-    explanation: Explanation,
-    correlation: Correlation,
-    findings: list[Finding],
-    known: tuple[float, float],
-    known_X: Known | None,
-) -> CheckResult:
-    """What else there is to say of streams that agree under a hypothesis, with a known time offset
-    and scale.
-    """
-    is_sound = not any(finding.makes_unusable for finding in findings)
-    corrected = explanation.hypothesis.undo(streams)
-    offset = _offset(corrected, correlation, explanation.fit)
-    pose_pairs = synchronise(
-        corrected.parent, corrected.child.shifted(correlation.offset_s), corrected.max_gap_s
-    )
-    scale = None if explanation.same_unit else _scale(pose_pairs, explanation.fit)
-    fit = scale.fit if scale else explanation.fit
-    rotations = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3]
-    findings = [
-        *findings,
-        *check_offset(offset, known[0]),
-        *(_check_scale(scale, known[1]) if scale else []),
-        *([wording.finding("unit_unseen")] if explanation.same_unit else []),
-        *_check_axes(rotations, explanation.fit.sigma_rotation),
-        *(_check_agreement(streams, offset.seconds, fit, known_X) if is_sound else []),
-    ]
-    rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
-    return CheckResult(
-        gravest_first(findings),
-        correlation,
-        explanation.fit,
-        dict(zip("xyz", rms.tolist(), strict=True)),
-    )
-
-
-def _scale(pose_pairs: PosePairs, start: SimilarityFit) -> Scale | None:
-    """The scale; None if the poses are too few to tell."""
-    try:
-        return estimate_scale(pose_pairs, start=start)
-    except NotEnoughDataError:
-        return None
-
-
-def _check_agreement(
-    streams: StreamPair, offset_s: float, fit: SimilarityFit, known: Known | None
-) -> list[Finding]:
-    """Findings about streams that agree without any mistake undone; of one that was computed from
-    the other, no more than that.
-    """
-    of_fit = fit.T_parent_child, np.sqrt(np.diag(fit.covariance)[:6])
-    best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
-    if copied := check_independent(streams.parent, streams.child, offset_s):
-        return [*copied, *check_same(*best)]
-    child = streams.child.shifted(offset_s).scaled(fit.scale)
-    pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
-    motions = _motions(pose_pairs, _MAX_MOTIONS)
-    return check_agreement(pose_pairs, motions, fit.T_parent_child, best)
 
 
 def can_check(parent: Trajectory, child: Trajectory) -> bool:
@@ -321,13 +305,7 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
 def unrelated_rates(correlation: Correlation, quantity: str = "angular rates") -> Finding:
     """The finding that angular rates, or speeds, agree at no clock offset."""
     doubt = correlation.doubt().replace("angular rates", quantity)
-    return wording.finding("unrelated_rates", quantity=quantity, doubt=doubt)
-
-
-def _rates_disagree(correlation: Correlation) -> Finding:
-    if correlation.variation < MIN_VARIATION:
-        return wording.finding("no_turning")
-    return unrelated_rates(correlation)
+    return finding("unrelated_rates", quantity=quantity, doubt=doubt)
 
 
 def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
@@ -339,7 +317,7 @@ def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
         severity = Severity.ERROR if abs(found.seconds) > _OFFSET_ERROR_S else Severity.WARNING
     total_s = round(known_s + found.seconds, 4)
     return [
-        wording.finding(
+        finding(
             "time_offset",
             "child",
             severity,
@@ -362,9 +340,7 @@ def _check_scale(scale: Scale, known: float) -> list[Finding]:
     severity = Severity.ERROR if abs(scale.value - 1.0) > _SCALE_ERROR else Severity.WARNING
     options = {"scale": round(known * scale.value, 4)}
     return [
-        wording.finding(
-            "scale", "child", severity, options=options, scale=scale.value, sigma=scale.sigma
-        )
+        finding("scale", "child", severity, options=options, scale=scale.value, sigma=scale.sigma)
     ]
 
 
@@ -373,7 +349,7 @@ def in_other_units(scale: float, sigma: float, unit: str, factor: float) -> Find
     child's if it is below 1, otherwise the parent's.
     """
     is_child = scale < 1.0
-    return wording.finding(
+    return finding(
         "units",
         "child" if is_child else "parent",
         options={"scale": factor} if is_child else {"parent_scale": round(1.0 / factor, 9)},
@@ -401,7 +377,7 @@ def _check_axes(rotations: FloatArray, sigma_rotation: float) -> list[Finding]:
     main = int(np.argmax(np.abs(direction)))
     direction = direction * np.sign(direction[main])
     return [
-        wording.finding(
+        finding(
             "one_axis",
             options={f"prior.{'xyz'[main]}": "VALUE+/-SIGMA"},
             axis=", ".join(f"{component:.2f}" for component in direction),

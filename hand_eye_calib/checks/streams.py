@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -77,19 +76,8 @@ _STEP_S, _USUAL = 1.0, 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class StreamSummary:
-    """Size and motion of a stream.
-
-    Attributes
-    ----------
-    poses : int
-    duration_s : float
-    rate_hz : float
-        Of the median interval.
-    longest_interval_s : float
-    path_m : float or None
-        Path length; None without positions.
-    rotation_rad : float or None
-        Sum of all rotation angles; None without orientations.
+    """Size and motion of a stream: the rate is of the median interval; path length and the sum of
+    all rotation angles are None without positions, orientations.
     """
 
     poses: int
@@ -151,10 +139,10 @@ def tidy(
     sorted_ns, first = np.unique(stamps_ns, return_index=True)
     findings = []
     if n_repeated := len(stamps_ns) - len(sorted_ns):
-        found = wording.finding("duplicates", stream, repeated=n_repeated, poses=len(stamps_ns))
+        found = finding("duplicates", stream, repeated=n_repeated, poses=len(stamps_ns))
         findings.append(found)
     if n_backwards := int((np.diff(stamps_ns) < 0).sum()):
-        findings.append(wording.finding("disorder", stream, backwards=n_backwards))
+        findings.append(finding("disorder", stream, backwards=n_backwards))
     trajectory = Trajectory.from_quat_xyzw(
         sorted_ns, np.asarray(translations)[first], np.asarray(quats_xyzw)[first], **frames
     )
@@ -189,10 +177,11 @@ def check_stream(
     if any(finding.code != "gaps" for finding in findings):
         return findings
     if levels := _mixed(trajectory):
-        return [*findings, _takes_turns(stream, *levels)]
+        values = {"roughness_ratio": levels[0], "distance_m": levels[1]}
+        return [*findings, finding("interleaved", stream, **values)]
     share = float(_jumps(trajectory).mean())
     if share > _MIN_JUMPS:
-        findings.append(wording.finding("jumps", stream, options={"method": "dnlo"}, share=share))
+        findings.append(finding("jumps", stream, options={"method": "dnlo"}, share=share))
     return findings
 
 
@@ -202,18 +191,15 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
     if any(finding.severity is Severity.ERROR for finding in findings):
         return findings
     if levels := _interleaved(trajectory):
-        return [*findings, _takes_turns(stream, *levels)]
+        values = {"roughness_ratio": levels[0], "distance_m": levels[1]}
+        return [*findings, finding("interleaved", stream, **values)]
     if not trajectory.has_rotations and (times := _repeated(trajectory)) > 1:
-        return [*findings, wording.finding("repeated", stream, times=times)]
+        return [*findings, finding("repeated", stream, times=times)]
     coarse = _check_grid(trajectory.poses[:, :3, 3], stream)
     if coarse and coarse.makes_unusable and not trajectory.has_rotations:
         # Of positions alone, rounding is noise like any other.
         coarse = replace(coarse, severity=Severity.WARNING)
     return [*findings, coarse] if coarse else findings
-
-
-def _takes_turns(stream: str, ratio: float, distance_m: float) -> Finding:
-    return wording.finding("interleaved", stream, roughness_ratio=ratio, distance_m=distance_m)
 
 
 def _repeated(trajectory: Trajectory) -> int:
@@ -226,16 +212,16 @@ def _repeated(trajectory: Trajectory) -> int:
 def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
     """Findings about the stamps of one stream, whatever it measures: too few, a leap, gaps."""
     if len(trajectory) < 4:
-        return [wording.finding("too_few_poses", stream, poses=len(trajectory))]
+        return [finding("too_few_poses", stream, poses=len(trajectory))]
     if leap := find_leap(trajectory.stamps_ns):
-        return [wording.finding("leap", stream, text=leap.what, remedy=leap.advice)]
+        return [finding("leap", stream, text=leap.what, remedy=leap.advice)]
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     gaps = are_gaps(intervals_s, max_gap_s)
     if not gaps.any():
         return []
     share = float(intervals_s[gaps].sum() / intervals_s.sum())
     longest_s, n_gaps = float(intervals_s.max()), int(gaps.sum())
-    return [wording.finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
+    return [finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
 
 
 def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
@@ -255,70 +241,50 @@ def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
     if rough[0] < max(_ALTERNATES * smoothest, _LEAST_LEVELS_M):
         return None
     in_body = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], off[0])
-    if max(_share_of_levels(vectors, period) for vectors in (off[0], in_body)) < _STEADY_SHARE:
-        return None
-    return rough[0] / smoothest, rough[0]
-
-
-def _share_of_levels(vectors: FloatArray, period: int) -> float:
-    """Share of the mean square of vectors (M, 3) that repeats after ``period`` of them: the median
-    over some turns each.
-    """
-    n_turns = min(_TURNS, len(vectors) // period)
-    n_windows = len(vectors) // (n_turns * period)
-    windows = vectors[: n_windows * n_turns * period].reshape(n_windows, n_turns, period, 3)
-    levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
-    total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
-    return median(levels / np.maximum(total, 1e-300))
+    # Share of the mean square that repeats after a period: the median over some turns each.
+    n_turns = min(_TURNS, len(in_body) // period)
+    n_windows = len(in_body) // (n_turns * period)
+    shares = []
+    for vectors in (off[0], in_body):
+        windows = vectors[: n_windows * n_turns * period].reshape(n_windows, n_turns, period, 3)
+        levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
+        total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
+        shares.append(median(levels / np.maximum(total, 1e-300)))
+    return (rough[0] / smoothest, rough[0]) if max(shares) >= _STEADY_SHARE else None
 
 
 def _mixed(trajectory: Trajectory) -> tuple[float, float] | None:
     """Like :func:`_interleaved`, for two sensors in no order: seen from the sensor, a pose is off
     those around it along one direction, by one of few amounts.
     """
-    if len(trajectory) < _MIN_POSES_OF_MIX:
+    positions, rotations = trajectory.poses[:, :3, 3], trajectory.poses[:, :3, :3]
+    if len(positions) < _MIN_POSES_OF_MIX:
         return None
-    near, far = (_off_in_body(trajectory, lag) for lag in (1, 2))
+    near, far = (
+        np.einsum(
+            "kji,kj->ki",
+            rotations[lag:-lag],
+            positions[lag:-lag] - 0.5 * (positions[2 * lag :] + positions[: -2 * lag]),
+        )
+        for lag in (1, 2)
+    )
     sizes, directions = np.linalg.eigh(near.T @ near / len(near))
+    if sizes[2] <= max(_ONE_DIRECTION * sizes[1], _LEAST_LEVELS_M**2 / 4):
+        return None
     along = near @ directions[:, -1]
     peakedness = float(np.mean(along**4) / max(np.mean(along**2) ** 2, 1e-300))
-    growth = _rms(far) / max(_rms(near), 1e-300)
-    is_mixed = (
-        sizes[2] > max(_ONE_DIRECTION * sizes[1], _LEAST_LEVELS_M**2 / 4)
-        and peakedness < _FEW_AMOUNTS
-        and growth < _STEADY
-        and not _shakes(along)
-    )
-    # A quarter of the poses are off by the distance of the levels, half by a half of it.
-    return (1.0 / growth, float(np.sqrt(sizes[2] / 0.375))) if is_mixed else None
-
-
-def _shakes(off: FloatArray) -> bool:
-    """Whether deviations (M,) from the middle of both neighbours are those of an oscillation:
-    sensors in no order have all frequencies.
-    """
-    n_windows = len(off) // _SPECTRUM_POSES
-    windows = off[: n_windows * _SPECTRUM_POSES].reshape(n_windows, _SPECTRUM_POSES)
+    growth = float(np.sqrt(np.mean((far**2).sum(axis=1)) / np.mean((near**2).sum(axis=1))))
+    # Sensors in no order have all frequencies, an oscillation few: of the positions themselves,
+    # without the slow motion.
+    windows = along[: len(along) // _SPECTRUM_POSES * _SPECTRUM_POSES].reshape(-1, _SPECTRUM_POSES)
     power = (np.abs(np.fft.rfft(windows * np.hanning(_SPECTRUM_POSES), axis=1)) ** 2).mean(axis=0)
-    # Of the positions themselves, without the slow motion.
     cycles = np.arange(_SPECTRUM_POSES // 8, len(power))
     power = power[cycles] / (1.0 - np.cos(2 * np.pi * cycles / _SPECTRUM_POSES)) ** 2
-    return bool(np.convolve(power, np.ones(3), "valid").max() > _SHAKES * power.sum())
-
-
-def _off_in_body(trajectory: Trajectory, lag: int) -> FloatArray:
-    """How far (M, 3) each pose is off the middle of those ``lag`` poses before and after, in its
-    own axes.
-    """
-    poses = trajectory.poses
-    positions = poses[:, :3, 3]
-    middles = 0.5 * (positions[2 * lag :] + positions[: -2 * lag])
-    rotations = poses[lag:-lag, :3, :3]
-    return np.einsum("kji,kj->ki", rotations, positions[lag:-lag] - middles)
-
-
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt(np.mean((vectors**2).sum(axis=1))))
+    shakes = np.convolve(power, np.ones(3), "valid").max() > _SHAKES * power.sum()
+    if peakedness >= _FEW_AMOUNTS or growth >= _STEADY or shakes:
+        return None
+    # A quarter of the poses are off by the distance of the levels, half by a half of it.
+    return 1.0 / growth, float(np.sqrt(sizes[2] / 0.375))
 
 
 def _off_line(positions: FloatArray, stamps_ns: IntArray, lag: int) -> FloatArray:
@@ -332,22 +298,17 @@ def _off_line(positions: FloatArray, stamps_ns: IntArray, lag: int) -> FloatArra
 def _check_grid(positions: FloatArray, stream: str) -> Finding | None:
     """Finding about positions that are multiples of a step, or None."""
     steps = [_grid_step(column) for column in positions.T]
-    coarsest = int(np.argmax(steps))
-    step_m = steps[coarsest]
+    step_m, column = max(steps), positions[:, int(np.argmax(steps))]
     if step_m < _COARSE_NOTE_M:
         return None
-    severity = Severity.NOTE
-    if step_m > _COARSE_ERROR_M:
-        severity = Severity.ERROR
-    elif step_m > _COARSE_WARNING_M:
-        severity = Severity.WARNING
-    column = positions[:, coarsest]
-    is_float32 = bool((column == column.astype(np.float32)).all()) and step_m >= 0.5 * float(
+    severity = Severity.WARNING if step_m > _COARSE_WARNING_M else Severity.NOTE
+    severity = Severity.ERROR if step_m > _COARSE_ERROR_M else severity
+    is_float32 = (column == column.astype(np.float32)).all() and step_m >= 0.5 * float(
         np.spacing(np.float32(np.abs(column).max()))
     )
     far = "numbers of 32 bits far from the origin, such as map coordinates"
     why = far if is_float32 else "they were rounded"
-    return wording.finding("coarse_positions", stream, severity, step_m=step_m, why=why)
+    return finding("coarse_positions", stream, severity, step_m=step_m, why=why)
 
 
 def _grid_step(values: FloatArray) -> float:
@@ -370,33 +331,21 @@ def _grid_step(values: FloatArray) -> float:
 
 def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
     """Finding about a stream that has only x, y and yaw while the other tilts, or none."""
-    streams = {"parent": parent, "child": child}
-    for name, other in (("parent", "child"), ("child", "parent")):
-        rotations = streams[name].poses[:, :3, :3]
-        upright = np.abs(rotations[:, 2, 2] - rotations[0, 2, 2]).max() < _UPRIGHT
-        if not upright or np.ptp(streams[name].poses[:, 2, 3]) > _LEVEL_M:
+    for name, flat, other, whole in (
+        ("parent", parent, "child", child),
+        ("child", child, "parent", parent),
+    ):
+        vertical, heights = flat.poses[:, 2, 2], flat.poses[:, 2, 3]
+        if np.abs(vertical - vertical[0]).max() >= _UPRIGHT or np.ptp(heights) > _LEVEL_M:
             continue
-        tilt_rad = _tilt(streams[other].poses[:, :3, :3])
+        # The direction in the other sensor whose image in the world scatters least: its axis of
+        # rotation.
+        mean = whole.poses[::10, :3, :3].mean(axis=0)
+        tilt_rad = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
         if tilt_rad > _TILTS_RAD:
-            return [
-                wording.finding(
-                    "flat", name, other=other, tilt_rad=tilt_rad, tilt_deg=np.degrees(tilt_rad)
-                )
-            ]
+            values = {"tilt_rad": tilt_rad, "tilt_deg": np.degrees(tilt_rad)}
+            return [finding("flat", name, other=other, **values)]
     return []
-
-
-def _tilt(rotations: FloatArray) -> float:
-    """Root mean square angle (rad) by which a sensor's axis of rotation tilts: of the axis that
-    stays most nearly the same in the world.
-    """
-    vectors = np.concatenate([rotations[::10, :, axis] for axis in range(3)], axis=1)
-    blocks = vectors.reshape(len(vectors), 3, 3)
-    # The direction in the sensor whose image in the world scatters least.
-    moments = np.einsum("kai,kbi->ab", blocks, blocks) / len(blocks)
-    mean = blocks.mean(axis=0)
-    scatter = moments - mean @ mean.T
-    return float(np.sqrt(max(np.linalg.eigvalsh(scatter)[0], 0.0)))
 
 
 def _jumps(trajectory: Trajectory) -> BoolArray:
@@ -424,7 +373,7 @@ def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
     """Findings about streams that repeat their pose while the other moves, on one clock."""
     shares = {"parent": frozen_share(parent, child), "child": frozen_share(child, parent)}
     return [
-        wording.finding("frozen", name, share=share)
+        finding("frozen", name, share=share)
         for name, share in shares.items()
         if share > _MAX_FROZEN
     ]
@@ -474,7 +423,7 @@ def check_stamps(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> list[
             and stamps[late] > _DATE_NS
             and abs(np.log10(stamps[late] / (stamps[early] * factor))) < _SAME_TIME
         ):
-            return [wording.finding("stamp_unit", early, other=late, unit=unit, factor=factor)]
+            return [finding("stamp_unit", early, other=late, unit=unit, factor=factor)]
     return []
 
 
@@ -495,7 +444,7 @@ def check_lengths(parent: Trajectory) -> list[Finding]:
         return []
     of_millimetres: dict[str, float | str] = {"parent_scale": 0.001, "scale": 0.001}
     return [
-        wording.finding(
+        finding(
             "lengths",
             "parent",
             options=of_millimetres,
