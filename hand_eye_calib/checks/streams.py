@@ -1,6 +1,7 @@
 """Checks of a single stream, and of the stamps of two."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -177,8 +178,7 @@ def check_stream(
     if any(finding.code != "gaps" for finding in findings):
         return findings
     if levels := _mixed(trajectory):
-        values = {"roughness_ratio": levels[0], "distance_m": levels[1]}
-        return [*findings, finding("interleaved", stream, **values)]
+        return [*findings, finding("interleaved", stream, **levels)]
     share = float(_jumps(trajectory).mean())
     if share > _MIN_JUMPS:
         findings.append(finding("jumps", stream, options={"method": "dnlo"}, share=share))
@@ -191,8 +191,7 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
     if any(finding.severity is Severity.ERROR for finding in findings):
         return findings
     if levels := _interleaved(trajectory):
-        values = {"roughness_ratio": levels[0], "distance_m": levels[1]}
-        return [*findings, finding("interleaved", stream, **values)]
+        return [*findings, finding("interleaved", stream, **levels)]
     if not trajectory.has_rotations and (times := _repeated(trajectory)) > 1:
         return [*findings, finding("repeated", stream, times=times)]
     coarse = _check_grid(trajectory.poses[:, :3, 3], stream)
@@ -224,7 +223,7 @@ def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> lis
     return [finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
 
 
-def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
+def _interleaved(trajectory: Trajectory) -> dict[str, Any] | None:
     """How much rougher the positions are from one pose to the next than over several, and the
     distance of the two levels (m), if two sensors take turns in a stream; otherwise None.
     """
@@ -250,10 +249,12 @@ def _interleaved(trajectory: Trajectory) -> tuple[float, float] | None:
         levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
         total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
         shares.append(median(levels / np.maximum(total, 1e-300)))
-    return (rough[0] / smoothest, rough[0]) if max(shares) >= _STEADY_SHARE else None
+    if max(shares) < _STEADY_SHARE:
+        return None
+    return {"roughness_ratio": rough[0] / smoothest, "distance_m": rough[0]}
 
 
-def _mixed(trajectory: Trajectory) -> tuple[float, float] | None:
+def _mixed(trajectory: Trajectory) -> dict[str, Any] | None:
     """Like :func:`_interleaved`, for two sensors in no order: seen from the sensor, a pose is off
     those around it along one direction, by one of few amounts.
     """
@@ -284,7 +285,7 @@ def _mixed(trajectory: Trajectory) -> tuple[float, float] | None:
     if peakedness >= _FEW_AMOUNTS or growth >= _STEADY or shakes:
         return None
     # A quarter of the poses are off by the distance of the levels, half by a half of it.
-    return 1.0 / growth, float(np.sqrt(sizes[2] / 0.375))
+    return {"roughness_ratio": 1.0 / growth, "distance_m": float(np.sqrt(sizes[2] / 0.375))}
 
 
 def _off_line(positions: FloatArray, stamps_ns: IntArray, lag: int) -> FloatArray:
@@ -343,7 +344,7 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         mean = whole.poses[::10, :3, :3].mean(axis=0)
         tilt_rad = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
         if tilt_rad > _TILTS_RAD:
-            values = {"tilt_rad": tilt_rad, "tilt_deg": np.degrees(tilt_rad)}
+            values: dict[str, Any] = {"tilt_rad": tilt_rad, "tilt_deg": np.degrees(tilt_rad)}
             return [finding("flat", name, other=other, **values)]
     return []
 

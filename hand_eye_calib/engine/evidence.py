@@ -38,18 +38,9 @@ _ROTATION_SPAN_S = 2.0
 
 @dataclass(frozen=True)
 class ResidualView:
-    """Residual of each motion pair.
-
-    Attributes
-    ----------
-    times_s : (K,) array
-        End of each pair, from the first pose.
-    translation_m, rotation_rad : (K,) arrays
-        Lengths.
-    is_outlier : (K,) bool array
-        Pairs that the method rejected; of the adaptive estimator, jumps.
-    reference : str
-        Of the pairs.
+    """Residual of each of K motion pairs at the time of its end from the first pose, s: lengths in
+    m and rad, whether the method rejected it (of the adaptive estimator: jumps), and the reference
+    of the pairs.
     """
 
     times_s: FloatArray
@@ -61,16 +52,8 @@ class ResidualView:
 
 @dataclass(frozen=True)
 class Rotations:
-    """Rotations over equal times: of the parent sensor, or of the child if the parent has none.
-
-    Attributes
-    ----------
-    times_s : (N,) array
-        Start of each.
-    vectors : (N, 3) array
-        Rotation vectors in the sensor's own axes, rad.
-    span_s : float
-        Time that each takes.
+    """Rotations over equal times ``span_s``: rotation vectors (N, 3) of the parent sensor, in its
+    own axes, or of the child if the parent has none; from ``times_s`` on.
     """
 
     times_s: FloatArray
@@ -80,14 +63,8 @@ class Rotations:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Paths of the parent sensor in its world, or of the sensor that has positions alone in that
-    of its positions.
-
-    Attributes
-    ----------
-    times_s : (N,) array
-    parent, child : (N, 3) arrays
-        m. Of the sensor itself; and from the poses of the other one through the result.
+    """Paths (N, 3), m, of the parent sensor in its world, or of the sensor that has positions alone
+    in that of its positions: its own, and from the poses of the other one through the result.
     """
 
     times_s: FloatArray
@@ -105,7 +82,7 @@ class StreamView:
     quantity : {"angular rate", "speed"}
         What is shown over time: the speed if one sensor has positions alone.
     rates : 2 x (times_s, rates)
-        Angular rates, rad/s, or speeds, m/s; NaN in gaps.
+        rad/s or m/s; NaN in gaps.
     spans_s : 2 x (M, 2) arrays
         Start and end of the times in which each stream has poses, without longer gaps.
     lag_s : float
@@ -140,29 +117,11 @@ class StreamView:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Everything that the figures show beside the Calibration itself.
-
-    Attributes
-    ----------
-    pose_pairs : PosePairs
-        With the child's poses in the parent's unit of length.
-    residuals : ResidualView
-    tracks : Tracks
-    rotations : Rotations
-    excitation : Excitation
-    convergence : tuple of Answer
-        From growing parts of the recording.
-    comparison : tuple of Answer
-        From other methods and references.
-    halves : tuple of Answer
-        From the first and the second half alone.
-    cross_check : CrossCheck
-        Of the result with ``comparison`` and ``halves``.
-    streams : StreamView
-    has_positions_of_parent : bool
-        Whether the parent has positions alone.
-    as_read : mapping
-        "parent" and "child" to the Trajectory before synchronisation; may be empty.
+    """Everything that the figures show beside the Calibration itself: the poses with the child's in
+    the parent's unit of length; answers from growing parts of the recording (``convergence``), from
+    other methods and references (``comparison``) and from both halves alone, with the cross-check
+    of the result with them; whether the parent has positions alone; and both streams as they were
+    read, if they are known.
     """
 
     pose_pairs: PosePairs
@@ -205,13 +164,20 @@ def gather(
     answers = OtherAnswers(calibration, config, pose_pairs)
     scaled = child_scaled(pose_pairs, calibration.scale)
     comparison, halves = answers.other_methods(), answers.halves()
+    residuals = calibration.residuals()
     rotating = scaled
     of_parent = config.parent_measures == "positions"
     if of_parent:
         rotating = PosePairs(scaled.stamps_ns, scaled.Ts_cw_c, scaled.Ts_pw_p)
     return Evidence(
         pose_pairs=scaled,
-        residuals=_residuals(calibration, scaled),
+        residuals=ResidualView(
+            _seconds(scaled, residuals.end_ns),
+            residuals.translation_m,
+            residuals.rotation_rad,
+            ~residuals.is_inlier,
+            calibration.reference if METHODS[calibration.method].uses_reference else "B1",
+        ),
         tracks=_tracks(calibration, scaled, of_parent),
         rotations=_rotations(rotating),
         excitation=excitation(rotating),
@@ -268,46 +234,27 @@ def _seconds(pose_pairs: PosePairs, stamps_ns: IntArray) -> FloatArray:
     return (stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9
 
 
-def _residuals(calibration: Calibration, pose_pairs: PosePairs) -> ResidualView:
-    residuals = calibration.residuals()
-    return ResidualView(
-        _seconds(pose_pairs, residuals.end_ns),
-        residuals.translation_m,
-        residuals.rotation_rad,
-        ~residuals.is_inlier,
-        calibration.reference if METHODS[calibration.method].uses_reference else "B1",
-    )
-
-
 def _tracks(calibration: Calibration, pose_pairs: PosePairs, of_parent: bool) -> Tracks:
-    """Both paths, the child's world aligned with the parent's by the mean over all poses."""
+    """Both paths, the child's world aligned with the parent's: by the mean over all poses, or by
+    the paths if one sensor has positions alone.
+    """
+    times_s = _seconds(pose_pairs, pose_pairs.stamps_ns)
     if calibration.measured == "positions":
-        return _tracks_of_positions(calibration, pose_pairs, of_parent)
+        poses, measured = pose_pairs.Ts_pw_p @ calibration.T_parent_child, pose_pairs.Ts_cw_c
+        if of_parent:
+            poses, measured = pose_pairs.Ts_cw_c @ calibration.T_child_parent, pose_pairs.Ts_pw_p
+        path, positions = poses[:, :3, 3], measured[:, :3, 3]
+        path = path - path.mean(axis=0)
+        rotation = se3.nearest_rotation((positions - positions.mean(axis=0)).T @ path)
+        path = path @ rotation.T + positions.mean(axis=0)
+        parent, child = (positions, path) if of_parent else (path, positions)
+        return Tracks(times_s, parent - positions[0], child - positions[0])
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     rotations = pose_pairs.Ts_pw_p[:, :3, :3] @ np.swapaxes(Ts_cw_p[:, :3, :3], 1, 2)
-    rotation = se3.nearest_rotation(rotations.mean(axis=0))
     parent = pose_pairs.Ts_pw_p[:, :3, 3]
-    child = Ts_cw_p[:, :3, 3] @ rotation.T
+    child = Ts_cw_p[:, :3, 3] @ se3.nearest_rotation(rotations.mean(axis=0)).T
     child = child + np.median(parent - child, axis=0)
-    return Tracks(_seconds(pose_pairs, pose_pairs.stamps_ns), parent - parent[0], child - parent[0])
-
-
-def _tracks_of_positions(
-    calibration: Calibration, pose_pairs: PosePairs, of_parent: bool
-) -> Tracks:
-    """The positions of the child or of the parent, and the path of that point from the poses of
-    the other sensor, aligned with them.
-    """
-    poses, measured = pose_pairs.Ts_pw_p @ calibration.T_parent_child, pose_pairs.Ts_cw_c
-    if of_parent:
-        poses, measured = pose_pairs.Ts_cw_c @ calibration.T_child_parent, pose_pairs.Ts_pw_p
-    path, positions = poses[:, :3, 3], measured[:, :3, 3]
-    middle = path.mean(axis=0)
-    rotation = se3.nearest_rotation((positions - positions.mean(axis=0)).T @ (path - middle))
-    path = (path - middle) @ rotation.T + positions.mean(axis=0)
-    both = (positions, path) if of_parent else (path, positions)
-    parent, child = (each - positions[0] for each in both)
-    return Tracks(_seconds(pose_pairs, pose_pairs.stamps_ns), parent, child)
+    return Tracks(times_s, parent - parent[0], child - parent[0])
 
 
 def _streams(
