@@ -6,7 +6,6 @@ extrinsic, no common world, no common scale and no particular quaternion order: 
 inverted quaternions have the same angles.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +34,9 @@ _MIN_OVERLAP_SHARE, _MIN_OVERLAP_S = 0.25, 5.0
 # anyway.
 _PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS = 2.0, 5.0
 
+# So many offsets are named.
+_MOST_PEAKS = 4
+
 # Streams of one body are 5 to 12 times better correlated at their offset than at any other,
 # unrelated streams at most 1.3 times (measured on sixteen real recordings).
 DISTINCT = 2.0
@@ -62,6 +64,8 @@ class Correlation:
         Time that both streams have in common at that offset.
     variation : float
         Standard deviation of the angular rate, of the stream that varies less, rad/s.
+    others_s : tuple of float
+        The next best offsets.
     """
 
     offset_s: float
@@ -69,20 +73,18 @@ class Correlation:
     distinctness: float
     overlap_s: float
     variation: float
+    others_s: tuple[float, ...] = ()
 
     @property
     def is_clear(self) -> bool:
         """Whether the evidence suffices to trust the offset."""
-        return self._agrees and self.distinctness >= DISTINCT
+        return not self.doubt()
 
     @property
     def is_ambiguous(self) -> bool:
         """Whether the streams agree, but at other offsets almost as well."""
-        return self._agrees and self.distinctness < DISTINCT
-
-    @property
-    def _agrees(self) -> bool:
-        return self.correlation >= CORRELATED and self.variation >= MIN_VARIATION
+        is_same = self.correlation >= CORRELATED and self.variation >= MIN_VARIATION
+        return is_same and self.distinctness < DISTINCT
 
     def doubt(self) -> str:
         """What is wrong with the evidence, in words; empty if nothing is."""
@@ -132,7 +134,7 @@ def correlate_rates(
     parent: Trajectory,
     child: Trajectory,
     max_gap_s: float = CalibratorConfig.max_gap,
-    of: "Callable[[Trajectory, float, float, float], AngularRates] | None" = None,
+    of_speed: bool = False,
 ) -> Correlation:
     """Find the clock offset at which the angular rates of two streams agree best.
 
@@ -142,8 +144,8 @@ def correlate_rates(
         Their time ranges need not overlap.
     max_gap_s : float
         Windows that touch a longer gap between poses are left out, in seconds.
-    of : callable, optional
-        What is correlated; by default :func:`angular_rates`, otherwise :func:`speeds`.
+    of_speed : bool
+        Compare speeds instead, for sensors without an orientation.
 
     Returns
     -------
@@ -162,73 +164,56 @@ def correlate_rates(
     step_s = float(np.clip(max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S))
     step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES)
     window_s = max(_WINDOW_STEPS * step_s, _MIN_WINDOW_S)
-    sampled = of or angular_rates
-    of_parent = sampled(parent, window_s, step_s, max_gap_s)
-    of_child = sampled(child, window_s, step_s, max_gap_s)
+    of_parent, of_child = (
+        angular_rates(each, window_s, step_s, max_gap_s, of_speed) for each in (parent, child)
+    )
     if min(of_parent.covered_s, of_child.covered_s) < _MIN_OVERLAP_S:
         return NO_CORRELATION
-    return _best_correlation(of_parent, of_child, window_s)
-
-
-def _best_correlation(parent: AngularRates, child: AngularRates, window_s: float) -> Correlation:
-    step_s = parent.step_s
     lags, coefficients, overlaps = _masked_correlation(
-        _compressed(parent.values), _compressed(child.values)
+        *(_compressed(each.values) for each in (of_parent, of_child))
     )
     durations = overlaps * step_s
-    shorter_s = min(len(parent.values), len(child.values)) * step_s
+    shorter_s = min(len(of_parent.values), len(of_child.values)) * step_s
     enough = durations >= max(_MIN_OVERLAP_SHARE * shorter_s, _MIN_OVERLAP_S)
     # About one independent sample a second; three degrees of freedom go into the coefficient.
     fisher_z = np.arctanh(np.clip(coefficients, -_ALMOST_ONE, _ALMOST_ONE))
     significance = np.where(enough, fisher_z * np.sqrt(np.maximum(durations - 3, 0)), -np.inf)
-    best = int(np.argmax(significance))
     peak_s = max(_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s)
-    elsewhere = np.abs(lags - lags[best]) * step_s > peak_s
-    rival = max(float(np.max(significance, where=elsewhere, initial=0.0)), 1.0)
-    lag = lags[best] + _vertex(lags, coefficients, best)
+    left, peaks, heights = significance.copy(), [], []
+    for _ in range(_MOST_PEAKS):
+        peaks.append(int(np.argmax(left)))
+        heights.append(max(float(left[peaks[-1]]), 1.0))
+        left[np.abs(lags - lags[peaks[-1]]) * step_s <= peak_s] = -np.inf
+    start_s = (of_parent.start_ns - of_child.start_ns) * 1e-9
+    best, *others = (
+        float(start_s + (lags[peak] + _vertex(coefficients, peak)) * step_s) for peak in peaks
+    )
     return Correlation(
-        offset_s=float((parent.start_ns - child.start_ns) * 1e-9 + lag * step_s),
-        correlation=float(coefficients[best]),
-        distinctness=float(significance[best] / rival),
-        overlap_s=float(durations[best]),
-        variation=min(float(np.nanstd(rate.values)) for rate in (parent, child)),
+        offset_s=best,
+        correlation=float(coefficients[peaks[0]]),
+        distinctness=float(significance[peaks[0]] / heights[1]),
+        overlap_s=float(durations[peaks[0]]),
+        variation=min(float(np.nanstd(rate.values)) for rate in (of_parent, of_child)),
+        others_s=tuple(others),
     )
 
 
 def angular_rates(
-    trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float
+    trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float, of_speed: bool = False
 ) -> AngularRates:
-    """Angular rates over windows of ``window_s`` seconds that start every ``step_s`` seconds."""
-
-    def turned(before: FloatArray, after: FloatArray) -> FloatArray:
-        return se3.rotation_angle(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
-
-    return _sampled(trajectory, window_s, step_s, max_gap_s, turned)
-
-
-def speeds(
-    trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float
-) -> AngularRates:
-    """The same of the speed (m/s), for sensors without an orientation."""
-
-    def moved(before: FloatArray, after: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1))
-
-    return _sampled(trajectory, window_s, step_s, max_gap_s, moved)
-
-
-def _sampled(
-    trajectory: Trajectory,
-    window_s: float,
-    step_s: float,
-    max_gap_s: float,
-    distance: Callable[[FloatArray, FloatArray], FloatArray],
-) -> AngularRates:
+    """Angular rates, or speeds (m/s), over windows of ``window_s`` seconds that start every
+    ``step_s`` seconds.
+    """
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
     starts_ns = stamps_ns[0] + np.round(np.arange(n_windows) * step_s * 1e9).astype(np.int64)
     ends_ns = starts_ns + round(window_s * 1e9)
-    rates = distance(trajectory.at(starts_ns), trajectory.at(ends_ns)) / window_s
+    before, after = trajectory.at(starts_ns), trajectory.at(ends_ns)
+    if of_speed:
+        moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    else:
+        moved = se3.rotation_angle(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+    rates = moved / window_s
     gaps_before = np.r_[0, np.cumsum(np.diff(stamps_ns) > (max_gap_s + window_s) * 1e9)]
     first = np.searchsorted(stamps_ns, starts_ns, side="right") - 1
     last = np.minimum(np.searchsorted(stamps_ns, ends_ns), len(stamps_ns) - 1)
@@ -250,8 +235,13 @@ def _masked_correlation(
     second[i], NaNs left out.
     """
     size = 1 << (len(first) + len(second) - 1).bit_length()
-    one_a, a, aa = _spectra(first, size)
-    one_b, b, bb = (np.conj(part) for part in _spectra(second, size))
+    spectra = []
+    for signal in (first, second):
+        mask = np.isfinite(signal)
+        filled = np.where(mask, signal, 0.0)
+        spectra += [np.fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]
+    one_a, a, aa = spectra[:3]
+    one_b, b, bb = np.conj(spectra[3:])
     count = np.round(np.fft.irfft(one_a * one_b, size))
     divisor = np.maximum(count, 1.0)
     sum_a, sum_b = np.fft.irfft(a * one_b, size), np.fft.irfft(one_a * b, size)
@@ -266,17 +256,10 @@ def _masked_correlation(
     return lags, np.where(varied, covariance / scale, 0.0), count
 
 
-def _spectra(signal: FloatArray, size: int) -> list[np.ndarray]:
-    """Spectra of the mask of finite samples, of the samples and of their squares."""
-    mask = np.isfinite(signal)
-    filled = np.where(mask, signal, 0.0)
-    return [np.fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]
-
-
-def _vertex(lags: IntArray, coefficients: FloatArray, best: int) -> float:
+def _vertex(coefficients: FloatArray, best: int) -> float:
     """Distance, in lags, from the best lag to the vertex of the parabola through it and its
     neighbours.
     """
-    below, top, above = (float(coefficients[(best + step) % len(lags)]) for step in (-1, 0, 1))
+    below, top, above = coefficients[np.arange(best - 1, best + 2) % len(coefficients)]
     curvature = below - 2 * top + above
     return 0.0 if curvature >= 0 else float(np.clip(0.5 * (below - above) / curvature, -0.5, 0.5))

@@ -26,16 +26,14 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, quadratic_form
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
-_SUBSETS, _SUBSET_SIZES = 32, (12, 24, 48)
-_REFINED_STARTS = 3
-_MAX_RANKED_PAIRS = 300
+_SUBSETS, _SUBSET_SIZES, _REFINED_STARTS, _MAX_RANKED_PAIRS = 32, (12, 24, 48), 3, 300
 _MAX_STEPS, _STEP_TOLERANCE = 30, 1e-6
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING = 3.0
 
-# Blocks of the jackknife.
-_BLOCKS = 10
+# Blocks of time, for the jackknife and for a clock that drifts.
+N_BLOCKS = 10
 
 # A fit that leaves no more than this share of the motion unexplained ends the search for others.
 EXPLAINED = 0.03
@@ -71,6 +69,9 @@ class SimilarityFit:
         twists.
     sensitivity : (6, 2) array
         Derivative of (rho, phi) by log s and by d.
+    offsets_of_blocks : (2, B) array
+        By how much d would differ in each block of time, X and s as they are, and the weight of
+        that. Zero without twists.
     sigma_translation, sigma_rotation : float
         Robust standard deviations per axis of the residuals, m and rad.
     rms_translation, rms_rotation : float
@@ -85,6 +86,7 @@ class SimilarityFit:
     offset_s: float
     covariance: FloatArray
     sensitivity: FloatArray
+    offsets_of_blocks: FloatArray
     sigma_translation: float
     sigma_rotation: float
     rms_translation: float
@@ -127,8 +129,7 @@ class SimilarityFit:
 
 def fit_similarity(
     pairs: MotionPairs,
-    twists_i: FloatArray | None = None,
-    twists_j: FloatArray | None = None,
+    twists: tuple[FloatArray, FloatArray] | None = None,
     start: SimilarityFit | None = None,
     same_unit: bool = False,
 ) -> SimilarityFit:
@@ -138,7 +139,7 @@ def fit_similarity(
     ----------
     pairs : MotionPairs
         K pairs in order of time, K >= 4.
-    twists_i, twists_j : (K, 6) arrays, optional
+    twists : ((K, 6) array, (K, 6) array), optional
         Velocity of the child sensor in its own frame, (v in m/s, w in rad/s), at the start and the
         end of every pair.
     start : SimilarityFit, optional
@@ -151,30 +152,41 @@ def fit_similarity(
     -------
     SimilarityFit
     """
-    problem = _Problem(pairs, twists_i, twists_j, same_unit)
+    problem = _Problem(pairs, twists, same_unit)
     starts = [(start.T_parent_child, start.scale)] if start else _starts(pairs)
-    if same_unit:
-        starts = [(T, 1.0) for T, _ in starts]
     fits: list[SimilarityFit] = []
     for T, scale in starts:
-        fits.append(problem.describe(problem.refine(T, scale)))
+        fits.append(problem.describe(*problem.refine(T, 1.0 if same_unit else scale)))
         if fits[-1].unexplained < EXPLAINED:
             break
     return min(fits, key=lambda fit: fit.log_volume)
 
 
 def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
-    """The most promising (X, scale).
-
-    Each is the exact answer of a random subset of the pairs; one subset without outliers suffices.
+    """The most promising (X, scale): answers of random subsets of the pairs, one of which without
+    outliers suffices, and of all pairs with the start rotations of dnl.
     """
     ranked = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_RANKED_PAIRS)).astype(int)]
-    parent_unit, child_unit = (
-        max(_rms(Ts[:, :3, 3]), 1e-12)
-        for Ts in (ranked.Ts_parenti_parentj, ranked.Ts_childi_childj)
-    )
-    ranked = _in_units(ranked, parent_unit, child_unit)
-    candidates = _candidates(ranked)
+    parent, child = ranked.Ts_parenti_parentj.copy(), ranked.Ts_childi_childj.copy()
+    units = [max(_rms(Ts[:, :3, 3]), 1e-12) for Ts in (parent, child)]
+    parent[:, :3, 3] /= units[0]
+    child[:, :3, 3] /= units[1]
+    ranked = dataclasses.replace(ranked, Ts_parenti_parentj=parent, Ts_childi_childj=child)
+    random = np.random.default_rng(0)
+    subsets = np.zeros((1 + _SUBSETS, len(ranked)))
+    subsets[0] = 1.0
+    for row in range(_SUBSETS):
+        size = _SUBSET_SIZES[row % len(_SUBSET_SIZES)]
+        subsets[1 + row, random.permutation(len(ranked))[:size]] = 1.0
+    forms = quadratic_form.expand(subsets @ quadratic_form.condense(ranked))
+    # Rotations nearest to the matrices M that minimise the forms over (vec M, t, 1). In flat motion
+    # the smallest singular value is arbitrary; its sign is chosen so that they are rotations.
+    left = forms[:, :12, :12]
+    left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
+    matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
+    guesses = list(zip(forms, se3.nearest_rotation(matrices), strict=True))
+    guesses += [(forms[0], rotation) for rotation in dnl.start_rotations(ranked)]
+    candidates = [_with_translation(form, rotation) for form, rotation in guesses]
     coefficients = quadratic_form.coefficients(ranked)
     # In the smaller unit of length: otherwise a scale of zero would cost least.
     costs, of_child = [], coefficients.reshape(-1, 2, 3, 4)[:, 1, :, 3]
@@ -184,49 +196,11 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
         costs.append(median(quadratic_form.costs(coefficients, T)) / min(scale, 1.0) ** 2)
     return [
         (
-            se3.from_rotation_translation(T[:3, :3], T[:3, 3] * parent_unit),
-            scale * parent_unit / child_unit,
+            se3.from_rotation_translation(T[:3, :3], T[:3, 3] * units[0]),
+            scale * units[0] / units[1],
         )
         for T, scale in (candidates[index] for index in np.argsort(costs)[:_REFINED_STARTS])
     ]
-
-
-def _candidates(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
-    """(X, scale) of random subsets, and of all pairs with the start rotations of dnl."""
-    random = np.random.default_rng(0)
-    subsets = np.zeros((1 + _SUBSETS, len(pairs)))
-    subsets[0] = 1.0
-    for row in range(_SUBSETS):
-        size = _SUBSET_SIZES[row % len(_SUBSET_SIZES)]
-        subsets[1 + row, random.permutation(len(pairs))[:size]] = 1.0
-    forms = quadratic_form.expand(subsets @ quadratic_form.condense(pairs))
-    guesses = list(zip(forms, _relaxed_rotations(forms), strict=True))
-    guesses += [(forms[0], rotation) for rotation in dnl.start_rotations(pairs)]
-    return [_with_translation(form, rotation) for form, rotation in guesses]
-
-
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
-
-
-def _in_units(pairs: MotionPairs, parent_unit: float, child_unit: float) -> MotionPairs:
-    """Pairs with translations in other units of length."""
-    parent, child = pairs.Ts_parenti_parentj.copy(), pairs.Ts_childi_childj.copy()
-    parent[:, :3, 3] /= parent_unit
-    child[:, :3, 3] /= child_unit
-    return dataclasses.replace(pairs, Ts_parenti_parentj=parent, Ts_childi_childj=child)
-
-
-def _relaxed_rotations(forms: FloatArray) -> FloatArray:
-    """Rotations (B, 3, 3) nearest to the matrices M that minimise the forms over (vec M, t, 1).
-
-    In flat motion the smallest singular value is arbitrary; its sign is chosen so that the result
-    is a rotation.
-    """
-    left = forms[:, :12, :12]
-    left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
-    matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
-    return se3.nearest_rotation(matrices)
 
 
 def _with_translation(form: FloatArray, rotation: FloatArray) -> tuple[FloatArray, float]:
@@ -242,22 +216,15 @@ def _with_translation(form: FloatArray, rotation: FloatArray) -> tuple[FloatArra
     return se3.from_rotation_translation(rotation, translation), scale
 
 
-@dataclass(frozen=True)
-class _State:
-    T: FloatArray
-    scale: float
-    offset_s: float
+def _rms(vectors: FloatArray) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 class _Problem:
     """Residuals of all pairs, their derivatives, and the iteration."""
 
     def __init__(
-        self,
-        pairs: MotionPairs,
-        twists_i: FloatArray | None,
-        twists_j: FloatArray | None,
-        same_unit: bool,
+        self, pairs: MotionPairs, twists: tuple[FloatArray, FloatArray] | None, same_unit: bool
     ) -> None:
         A, B = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
         rotation_a, self.translation_a = A[:, :3, :3], A[:, :3, 3]
@@ -268,10 +235,8 @@ class _Problem:
         self.rms_a, self.rms_b = _rms(self.translation_a), _rms(self.translation_b)
         self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
         self.free = np.ones(_UNKNOWNS, dtype=bool)
-        self.free[_SCALE] = not same_unit
-        if twists_i is None or twists_j is None:
-            self.free[_OFFSET] = False
-            twists_i = twists_j = np.zeros((len(pairs), 6))
+        self.free[_SCALE], self.free[_OFFSET] = not same_unit, twists is not None
+        twists_i, twists_j = twists or (np.zeros((len(pairs), 6)),) * 2
         # Derivatives of B by d. Adding to the child's stamps moves its poses at given instants
         # back.
         rotated_i = np.einsum("kji,kj->ki", rotation_b, twists_i[:, 3:])
@@ -280,74 +245,57 @@ class _Problem:
         moved_j = np.einsum("kij,kj->ki", rotation_b, twists_j[:, :3])
         self.translation_by_offset = moved_i - moved_j
 
-    def residuals(self, state: _State) -> tuple[FloatArray, FloatArray]:
-        """Translation residuals (K, 3) in m and rotation residuals (K, 3) in rad, both in the
-        parent's axes.
+    def linearised(self, T: FloatArray, scale: float, offset_s: float) -> list[FloatArray]:
+        """Derivatives of the residuals of translation (m) and of rotation (rad), in the parent's
+        axes, by (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``; the residuals in the
+        last column. Two (K, 3, 9) arrays.
         """
-        rotation, translation = state.T[:3, :3], state.T[:3, 3]
-        moved_b = self.translation_b + self.translation_by_offset * state.offset_s
-        translations = (
-            self.chord_a @ translation + self.translation_a - state.scale * moved_b @ rotation.T
-        )
-        # R_A^T R R_B R^T, by quaternions.
-        va, wa = self.quats_a[:, :3], self.quats_a[:, 3:]
-        vb, wb = self.quats_b[:, :3] @ rotation.T, self.quats_b[:, 3:]
-        vector = wa * vb - wb * va + se3.cross(vb, va)
-        scalar = wa * wb + (va * vb).sum(axis=1, keepdims=True)
-        error = np.concatenate([vector, scalar], axis=1)
-        by_offset = (self.rotation_by_offset * state.offset_s) @ rotation.T
-        return translations, se3.quat_log(error) + by_offset
-
-    def linearised(self, state: _State) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of both residuals by (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R
-        rho``, and the residuals in the last column.
-
-        Two (K, 3, 9) arrays.
-        """
-        rotation = state.T[:3, :3]
+        rotation, back = T[:3, :3], T[:3, :3].T
         of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, _UNKNOWNS + 1))
         of_translation[:, :, :3] = _times(self.chord_a, rotation)
-        of_translation[:, :, 3:6] = -state.scale * np.swapaxes(
-            _times(self.skew_b, rotation.T), 1, 2
-        )
-        of_translation[:, :, _SCALE] = -state.scale * self.translation_b @ rotation.T
-        of_translation[:, :, _OFFSET] = -state.scale * self.translation_by_offset @ rotation.T
-        of_rotation[:, :, 3:6] = np.swapaxes(_times(self.chord_b, rotation.T), 1, 2)
-        of_rotation[:, :, _OFFSET] = self.rotation_by_offset @ rotation.T
-        of_translation[:, :, -1], of_rotation[:, :, -1] = self.residuals(state)
-        return of_translation, of_rotation
+        of_translation[:, :, 3:6] = -scale * np.swapaxes(_times(self.skew_b, back), 1, 2)
+        of_translation[:, :, _SCALE] = -scale * self.translation_b @ back
+        of_translation[:, :, _OFFSET] = -scale * self.translation_by_offset @ back
+        of_rotation[:, :, 3:6] = np.swapaxes(_times(self.chord_b, back), 1, 2)
+        of_rotation[:, :, _OFFSET] = self.rotation_by_offset @ back
+        # R_A^T R R_B R^T, by quaternions.
+        va, wa = self.quats_a[:, :3], self.quats_a[:, 3:]
+        vb, wb = self.quats_b[:, :3] @ back, self.quats_b[:, 3:]
+        vector = wa * vb - wb * va + se3.cross(vb, va)
+        scalar = wa * wb + (va * vb).sum(axis=1, keepdims=True)
+        moved_b = self.translation_b + self.translation_by_offset * offset_s
+        of_translation[:, :, -1] = self.chord_a @ T[:3, 3] + self.translation_a
+        of_translation[:, :, -1] -= scale * moved_b @ back
+        of_rotation[:, :, -1] = se3.quat_log(np.concatenate([vector, scalar], axis=1))
+        of_rotation[:, :, -1] += offset_s * of_rotation[:, :, _OFFSET]
+        return [of_translation, of_rotation]
 
-    def rms_translation(self, scale: float) -> float:
-        """Root mean square translation, m: of the stream that moves less, or with one unit of
-        length of the one that moves more.
-        """
-        lengths = (self.rms_a, scale * self.rms_b)
-        return min(lengths) if self.free[_SCALE] else max(lengths)
-
-    def refine(self, T: FloatArray, scale: float) -> _State:
-        """Gauss-Newton steps with robust weights from a start until they are small."""
-        state = _State(T, scale, 0.0)
+    def refine(self, T: FloatArray, scale: float) -> tuple[FloatArray, float, float]:
+        """X, scale and offset after Gauss-Newton steps with robust weights until they are small."""
+        offset_s = 0.0
         for _ in range(_MAX_STEPS):
-            rows = [part.reshape(-1, _UNKNOWNS + 1) for part in self.whitened(state)[0]]
+            rows = [
+                part.reshape(-1, _UNKNOWNS + 1) for part in self.whitened(T, scale, offset_s)[0]
+            ]
             moments = sum((part.T @ part for part in rows), np.zeros(2 * (_UNKNOWNS + 1,)))
             step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
-            rotation = state.T[:3, :3]
+            rotation = T[:3, :3]
             T = se3.from_rotation_translation(
-                rotation @ se3.rotation_exp(step[3:6]), state.T[:3, 3] + rotation @ step[:3]
+                rotation @ se3.rotation_exp(step[3:6]), T[:3, 3] + rotation @ step[:3]
             )
-            state = _State(
-                T, state.scale * float(np.exp(step[_SCALE])), state.offset_s + step[_OFFSET]
-            )
+            scale, offset_s = scale * float(np.exp(step[_SCALE])), offset_s + step[_OFFSET]
             if np.abs(np.r_[step[:3] / max(self.rms_a, 1e-9), step[3:]]).max() < _STEP_TOLERANCE:
                 break
-        return state
+        return T, scale, offset_s
 
-    def whitened(self, state: _State) -> tuple[tuple[FloatArray, FloatArray], tuple[float, float]]:
+    def whitened(
+        self, T: FloatArray, scale: float, offset_s: float
+    ) -> tuple[list[FloatArray], tuple[float, float]]:
         """Both arrays of :meth:`linearised` in standard deviations and times their robust weights,
         and these per axis (m, rad).
         """
-        parts = self.linearised(state)
+        parts = self.linearised(T, scale, offset_s)
         lengths = [np.linalg.norm(part[:, :, -1], axis=1) for part in parts]
         sigmas = (
             max(median(lengths[0]) / MEDIAN_LENGTH, _MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12),
@@ -359,25 +307,33 @@ class _Problem:
             part *= (root / sigma)[:, None, None]
         return parts, sigmas
 
-    def describe(self, state: _State) -> SimilarityFit:
-        """The state as a result, with its uncertainty."""
-        parts, (sigma_translation, sigma_rotation) = self.whitened(state)
+    def describe(self, T: FloatArray, scale: float, offset_s: float) -> SimilarityFit:
+        """The result, with its uncertainty."""
+        parts, (sigma_translation, sigma_rotation) = self.whitened(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
-        blocks = [
-            block.reshape(-1, _UNKNOWNS + 1)
-            for block in np.array_split(rows, min(_BLOCKS, len(rows)))
-        ]
-        moments = np.array([block.T @ block for block in blocks])
+        blocks = np.array_split(rows, min(N_BLOCKS, len(rows)))
+        moments = np.array([np.tensordot(each, each, axes=([0, 1], [0, 1])) for each in blocks])
         normal, gradient = moments[:, :-1, :-1], moments[:, :-1, -1]
+        total = normal.sum(axis=0)
+        # The jackknife: one-step answers without each block.
+        answers = _solve(total - normal, gradient - gradient.sum(axis=0), self.free)
+        answers -= answers.mean(axis=0)
+        extrinsic = np.arange(_UNKNOWNS) < 6
+        by = [_solve(total, -total[:, column], extrinsic)[:6] for column in (_SCALE, _OFFSET)]
+        weights = normal[:, _OFFSET, _OFFSET]
+        offsets = -gradient[:, _OFFSET] / np.where(weights > 0.0, weights, 1.0)
+        # Of the stream that moves less or, with one unit of length, of the one that moves more.
+        lengths = (self.rms_a, scale * self.rms_b)
         return SimilarityFit(
-            T_parent_child=state.T,
-            scale=state.scale,
-            offset_s=state.offset_s,
-            covariance=_jackknife(normal, gradient, self.free),
-            sensitivity=_sensitivity(normal.sum(axis=0)),
+            T_parent_child=T,
+            scale=scale,
+            offset_s=offset_s,
+            covariance=(len(blocks) - 1) / len(blocks) * answers.T @ answers,
+            sensitivity=np.column_stack(by),
+            offsets_of_blocks=np.stack([offsets, weights]),
             sigma_translation=sigma_translation,
             sigma_rotation=sigma_rotation,
-            rms_translation=self.rms_translation(state.scale),
+            rms_translation=min(lengths) if self.free[_SCALE] else max(lengths),
             rms_rotation=self.rms_rotation,
         )
 
@@ -400,16 +356,3 @@ def _solve(normal: FloatArray, right: FloatArray, free: BoolArray) -> FloatArray
     scaled = (units * right[..., free])[..., None]
     step[..., free] = units * np.linalg.solve(balanced, scaled)[..., 0]
     return step
-
-
-def _jackknife(normal: FloatArray, gradient: FloatArray, free: BoolArray) -> FloatArray:
-    """Covariance (8, 8) of one-step answers without each block of time."""
-    answers = _solve(normal.sum(axis=0) - normal, gradient - gradient.sum(axis=0), free)
-    answers -= answers.mean(axis=0)
-    return (len(answers) - 1) / len(answers) * answers.T @ answers
-
-
-def _sensitivity(normal: FloatArray) -> FloatArray:
-    extrinsic = np.arange(_UNKNOWNS) < 6
-    columns = [_solve(normal, -normal[:, column], extrinsic)[:6] for column in (_SCALE, _OFFSET)]
-    return np.column_stack(columns)

@@ -1,10 +1,12 @@
-"""The clock offset: seconds to add to the child's stamps to get the parent's clock."""
+"""The clock offset: seconds to add to the child's stamps to get the parent's clock, and by how much
+that changes from second to second.
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates, speeds
+from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
 from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
@@ -13,11 +15,15 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import pairs_over
 from hand_eye_calib.pairing.synchronise import find_leap, synchronise
+from hand_eye_calib.results.records import ClockRate
 
 # Motions over these times (s) are compared; the lag with the smallest standard deviation wins.
 # Short motions show the offset best.
 _LAGS_S = (1.0, 0.3, 3.0)
 _MIN_PAIRS = 20
+
+# Most motions that are compared, and if there is a rate to be measured.
+_PAIRS, _PAIRS_OF_RATE = 800, 4_000
 
 # Time on either side of a stamp (s) over which the child's velocity is taken: at least; at most; in
 # intervals of the child's stream, so that no pose is in the velocity and in the motion; and in
@@ -25,15 +31,19 @@ _MIN_PAIRS = 20
 # Noise in both, or much of it, draws the offset, and its standard deviation is too small.
 _LEAST_SPAN_S, _MOST_SPAN_S, _SPAN_INTERVALS, _SPAN_OF_NOISE = 0.05, 0.3, 2.0, 1.4
 
-_MAX_ROUNDS, _SETTLED_S = 4, 2e-5
+_MAX_ROUNDS, _SETTLED_S = 8, 2e-5
+
+# A rate of the clock is known to this beforehand (75 ppm are usual for USB devices); one beyond so
+# many standard deviations is used. Over this many blocks of time it is a line.
+_RATE_PRIOR, _PLAIN_RATE, _LEAST_BLOCKS = 1e-4, 4.0, 5
 
 # Most that the fine offset may differ from the coarse one: seconds, or intervals of the slower
 # stream if those are longer.
 _FINE_RANGE_S, _FINE_RANGE_INTERVALS = 0.25, 2.0
 
-# Largest share of the motion that an offset near zero leaves unexplained, if the angular rates
-# match at many.
-_EXPLAINED_NEAR = 0.12
+# Where the angular rates match at many offsets, largest share of the motion that the right one
+# leaves unexplained, and largest share of that of any other which is not near zero.
+_EXPLAINED_NEAR, _FAR_BETTER = 0.12, 0.5
 
 
 @dataclass(frozen=True)
@@ -53,6 +63,8 @@ class TimeOffset:
     spread_s : float
         Largest difference between the offsets from motions over different times; infinite unless
         there is a fit over each.
+    rate : ClockRate or None
+        By how much the offset changes with time; None if no fit held, or it was too short.
     """
 
     seconds: float
@@ -60,11 +72,16 @@ class TimeOffset:
     correlation: Correlation
     fit: SimilarityFit | None
     spread_s: float = np.inf
+    rate: ClockRate | None = None
 
-    @property
-    def is_agreed(self) -> bool:
-        """Whether motions over all times agree that there is an offset."""
-        return self.spread_s < 0.5 * abs(self.seconds)
+    def steadied(self, child: Trajectory) -> Trajectory:
+        """The child's poses at a constant offset: with stamps freed of a rate that is used."""
+        return child.shifted(0.0, self.rate.used, self.rate.at_ns) if self.rate else child
+
+    def largest_s(self, duration_s: float) -> float:
+        """Largest size of the offset in a recording, with a rate that is used."""
+        changed_s = 0.5 * self.rate.used * duration_s if self.rate else 0.0
+        return abs(self.seconds) + abs(changed_s)
 
 
 def estimate_time_offset(
@@ -100,9 +117,22 @@ def estimate_time_offset(
     if correlation.is_ambiguous:
         # Rhythmic motion matches at many offsets; clocks of one machine are hardly apart.
         near_s = correlation.offset_s if abs(correlation.offset_s) < _FINE_RANGE_S else 0.0
-        near = refine_time_offset(parent, child, replace(correlation, offset_s=near_s), max_gap_s)
-        if near.fit and near.fit.unexplained < _EXPLAINED_NEAR:
-            return near
+        tried = [
+            refine_time_offset(parent, child, replace(correlation, offset_s=at_s), max_gap_s)
+            for at_s in {near_s, correlation.offset_s, *correlation.others_s}
+        ]
+        left = np.array([each.fit.unexplained if each.fit else np.inf for each in tried])
+        order = np.argsort(left)
+        best = tried[order[0]]
+        rivals = [
+            share
+            for share, each in zip(left, tried, strict=True)
+            if abs(each.seconds - best.seconds) > _FINE_RANGE_S
+        ]
+        is_near = abs(best.seconds) < 2 * _FINE_RANGE_S
+        limit = _EXPLAINED_NEAR if is_near else min(_EXPLAINED_NEAR, _FAR_BETTER * min(rivals))
+        if left.min() < limit:
+            return best
     raise NotEnoughDataError(
         f"the time offset cannot be estimated: {correlation.doubt()}; "
         "drive more varied turns, or give time_offset in seconds"
@@ -120,7 +150,7 @@ def time_offset_of_speeds(
     NotEnoughDataError
         If the evidence is weak; the message says why.
     """
-    correlation = correlate_rates(parent, child, max_gap_s, of=speeds)
+    correlation = correlate_rates(parent, child, max_gap_s, of_speed=True)
     if not correlation.is_clear:
         raise NotEnoughDataError(
             "the time offset cannot be estimated from the speeds of both sensors: "
@@ -161,14 +191,14 @@ def refine_time_offset(
     best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation, None), start
     held: list[float] = []
     for lag_s in _LAGS_S:
-        offset_s, fit = _fine_offset(parent, child, correlation.offset_s, lag_s, max_gap_s, fit)
+        found, fit = _fine_offset(parent, child, correlation, lag_s, max_gap_s, fit)
         if fit is None:
             continue
-        holds = fit.explains_translation and abs(offset_s - correlation.offset_s) <= reach_s
-        held += [float(offset_s)] if holds else []
-        if holds and fit.offset_sigma_s < best.sigma_s:
-            best = TimeOffset(float(offset_s), fit.offset_sigma_s, correlation, fit)
-        if abs(offset_s) < least_s:
+        holds = fit.explains_translation and abs(found.seconds - correlation.offset_s) <= reach_s
+        held += [found.seconds] if holds else []
+        if holds and found.sigma_s < best.sigma_s:
+            best = found
+        if found.largest_s(child.duration_s) < least_s:
             break
     return replace(best, spread_s=np.ptp(held)) if len(held) == len(_LAGS_S) else best
 
@@ -176,34 +206,67 @@ def refine_time_offset(
 def _fine_offset(
     parent: Trajectory,
     child: Trajectory,
-    offset_s: float,
+    correlation: Correlation,
     lag_s: float,
     max_gap_s: float,
     fit: SimilarityFit | None,
-) -> tuple[float, SimilarityFit | None]:
+) -> tuple[TimeOffset, SimilarityFit | None]:
     """Offset and fit over motions of ``lag_s``; no fit if there are too few."""
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
+    middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
+    offset_s, rate = correlation.offset_s, ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
+    most_pairs = _PAIRS
     for _ in range(_MAX_ROUNDS):
-        shifted = child.shifted(offset_s)
+        shifted = child.shifted(offset_s, rate.used, rate.at_ns)
         pose_pairs = synchronise(parent, shifted, max_gap_s)
-        pairs = pairs_over(pose_pairs, lag_s)
+        pairs = pairs_over(pose_pairs, lag_s, most_pairs)
         if len(pairs) < _MIN_PAIRS:
-            return offset_s, None
+            return TimeOffset(offset_s, np.inf, correlation, None), None
         used, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
         twists = _twists(shifted, pose_pairs.stamps_ns[used], span_s)[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]
-        fit = fit_similarity(pairs, *of_child, start=fit)
+        fit = fit_similarity(pairs, of_child, start=fit)
         if not fit.explains_translation:
             # A body that rotates about one of its sensors shows no scale.
-            in_one_unit = fit_similarity(pairs, *of_child, same_unit=True)
+            in_one_unit = fit_similarity(pairs, of_child, same_unit=True)
             fit = in_one_unit if in_one_unit.explains_translation else fit
-        rate = float(np.sqrt(np.mean((twists[:, 3:] ** 2).sum(axis=1))))
-        of_noise_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(rate, 1e-9)
+        speed = float(np.sqrt(np.mean((twists[:, 3:] ** 2).sum(axis=1))))
+        of_noise_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(speed, 1e-9)
         span_s = max(span_s, min(of_noise_s, _MOST_SPAN_S))
-        offset_s += fit.offset_s
+        offset_s = float(offset_s + fit.offset_s)
         if abs(fit.offset_s) < _SETTLED_S:
-            break
-    return offset_s, fit
+            found = _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
+            is_settled = abs(found.used - rate.used) * child.duration_s < _SETTLED_S
+            rate = found
+            if is_settled and (most_pairs > _PAIRS or not rate.is_used):
+                break
+            most_pairs = _PAIRS_OF_RATE if rate.is_used else _PAIRS
+    known = rate if np.isfinite(rate.sigma_ppm) else None
+    assert fit is not None
+    return TimeOffset(offset_s, fit.offset_sigma_s, correlation, fit, rate=known), fit
+
+
+def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRate:
+    """The rate before, and what is left of it: the slope of a line through the offsets of blocks of
+    time, of which the stamps (K,) of the pairs are on the parent's clock.
+    """
+    offsets_s, weights = fit.offsets_of_blocks
+    if len(offsets_s) < _LEAST_BLOCKS or weights.min() <= 0.0:
+        return before
+    times_s = [
+        float(each.mean())
+        for each in np.array_split((stamps_ns - stamps_ns[0]) * 1e-9, len(offsets_s))
+    ]
+    away_s = times_s - np.average(times_s, weights=weights)
+    left_s = offsets_s - np.average(offsets_s, weights=weights)
+    spread = float(weights @ away_s**2)
+    slope = float(weights @ (away_s * left_s)) / spread
+    residuals_s = left_s - slope * away_s
+    variance = float(weights @ residuals_s**2) / (len(offsets_s) - 2) / spread
+    total = (before.used + slope) * _RATE_PRIOR**2 / (_RATE_PRIOR**2 + variance)
+    sigma = float(np.sqrt(variance))
+    is_used = abs(total) > _PLAIN_RATE * sigma
+    return replace(before, ppm=1e6 * total, sigma_ppm=1e6 * sigma, is_used=is_used)
 
 
 def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> FloatArray:

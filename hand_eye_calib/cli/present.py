@@ -336,3 +336,5 @@ def _solution(calibration: Calibration) -> Iterator[str]:
     offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
     scale = (calibration.scale, calibration.scale_sigma)
     yield f"time offset {given_or_estimated(*offset, 's')}; scale {given_or_estimated(*scale, '')}"
+    if (rate := calibration.clock_rate) and rate.is_used:
+        yield f"the child's clock is {rate}: the time offset holds at {rate.at_ns * 1e-9:.3f} s"

@@ -306,10 +306,11 @@ class Calibrator:
             return
         if self._paired_at is None:
             self._paired_at = slower_stream(parent.stamps_ns, child.stamps_ns)
+        of_child = child.poses(horizon_ns - offset_ns).trajectory
         made = pair_poses(
             config,
             parent.poses(horizon_ns).trajectory,
-            child.poses(horizon_ns - offset_ns).trajectory,
+            self._time_offset.steadied(of_child) if self._time_offset else of_child,
             self._paired_at,
             self._kept_parts[-1],
         )

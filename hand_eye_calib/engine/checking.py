@@ -13,9 +13,7 @@ import numpy as np
 from hand_eye_calib.alignment.angular_rates import (
     MIN_VARIATION,
     Correlation,
-    angular_rates,
     correlate_rates,
-    speeds,
 )
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.checks import findings as wording
@@ -109,8 +107,8 @@ def _correlated(snapshot: Snapshot, known_s: float) -> Correlation:
     speeds; the child's stamps are off by ``known_s``.
     """
     parent, child = snapshot.streams
-    of = speeds if snapshot.config.measured == "positions" else angular_rates
-    return correlate_rates(parent, child.shifted(known_s), snapshot.config.max_gap, of=of)
+    of_speed = snapshot.config.measured == "positions"
+    return correlate_rates(parent, child.shifted(known_s), snapshot.config.max_gap, of_speed)
 
 
 def check_partial(snapshot: Snapshot) -> CheckResult:

@@ -117,6 +117,7 @@ class Solved:
             result,
             time_offset_s=offset_s,
             time_offset_sigma_s=offset_sigma_s,
+            clock_rate=offset.rate if offset else None,
             scale=scale.value * found.scale if found else scale.value,
             scale_sigma=scale_sigma,
             warnings=scale.warnings + result.warnings,
@@ -373,6 +374,8 @@ def _adaptive_solution(
     """The adaptive estimator's answer, without a scale or a time offset that the user set."""
     options = {"scale": "scale", "time": "time_offset"}
     known = {name for name, option in options.items() if config.is_known(option)}
+    if is_clock_free:
+        known.discard("time")  # the user asked for an estimate, of which this is the last step
     return adaptive_estimator.solve(
         pose_pairs.stamps_ns,
         pose_pairs.Ts_pw_p,

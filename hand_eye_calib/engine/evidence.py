@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import angular_rates, speeds
+from hand_eye_calib.alignment.angular_rates import angular_rates
 from hand_eye_calib.alignment.scale import child_scaled
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
@@ -205,10 +205,10 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
     )
     has_rates = parent.has_rotations and child.has_rotations
     is_whole = has_rates and parent.has_positions and child.has_positions
-    sampled = angular_rates if has_rates else speeds
     rates, spans = [], []
     for stream in (parent, child):
-        found = sampled(stream, max(3 * step_s, _MIN_WINDOW_S), step_s, max_gap_s)
+        window_s = max(3 * step_s, _MIN_WINDOW_S)
+        found = angular_rates(stream, window_s, step_s, max_gap_s, of_speed=not has_rates)
         steps = np.arange(len(found.values)) * step_s
         rates.append(((found.start_ns - start_ns) * 1e-9 + steps, found.values))
         gaps = np.flatnonzero(are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s))

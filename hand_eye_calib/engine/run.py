@@ -167,7 +167,10 @@ def _of_clear_offset(first: Run, certain: Options) -> Run:
     that, or with what else is certain.
     """
     ahead = {"time_offset": "estimate"}
-    is_large = _is_large(first.calibration.time_offset_s, first.calibration)
+    clock, offset_s = first.snapshot.time_offset, first.calibration.time_offset_s
+    if clock and clock.rate and clock.rate.is_used:
+        offset_s = replace(clock, seconds=offset_s).largest_s(first.snapshot.child.duration_s)
+    is_large = _is_large(offset_s, first.calibration)
     if is_large and first._is_sound:
         return _telling(first, ahead, ())
     others = {name: value for name, value in certain.items() if name != "time_offset"}
@@ -242,7 +245,8 @@ def _at_clear_offset(snapshot: Snapshot) -> Snapshot:
     clock = refine_time_offset(
         snapshot.parent, snapshot.child, snapshot.correlation, config.max_gap, least_s=_MOST_MOVED_S
     )
-    if not clock.is_agreed or abs(clock.seconds) - 0.5 * clock.spread_s < _MOST_MOVED_S:
+    largest_s = clock.largest_s(snapshot.child.duration_s)
+    if not clock.spread_s < 0.5 * largest_s or largest_s - 0.5 * clock.spread_s < _MOST_MOVED_S:
         return snapshot
     moved = replace(snapshot, config=replace(config, time_offset="estimate"), time_offset=clock)
     can_solve = all(len(each.pose_pairs()) >= config.min_pairs for each in (snapshot, moved))
@@ -273,6 +277,8 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
         f"the child's clock is {abs(offset_s):.4f} +/- {found.calibration.time_offset_sigma_s:.4f} "
         f"s {'behind' if offset_s > 0 else 'ahead of'} the parent's"
     )
+    if (rate := found.calibration.clock_rate) and rate.is_used:
+        what["time_offset"] += f" and {rate}"
     told = tuple(
         f"{what[name]}: solved with {name} {value}; to take the stream as it is, give {name} "
         f"{getattr(CalibratorConfig, name)}"

@@ -80,8 +80,9 @@ class Snapshot:
 
     @property
     def child(self) -> Trajectory:
-        """Trajectory of the child's poses that are not paired yet, in its right convention."""
-        return _put_right(self.buffered_child, "child", self.config)
+        """The same of the child's, freed of a clock rate."""
+        child = _put_right(self.buffered_child, "child", self.config)
+        return self.time_offset.steadied(child) if self.time_offset else child
 
     def resolved(self) -> "Snapshot":
         """The snapshot with its time offset in seconds, estimated if the options ask for that: from

@@ -265,10 +265,15 @@ class Trajectory:
         """Median time between two poses in seconds, of at least two poses."""
         return median(np.diff(self.stamps_ns)) * 1e-9
 
-    def shifted(self, offset_s: float) -> Self:
-        """The same poses with ``offset_s`` seconds added to every stamp."""
+    def shifted(self, offset_s: float, rate: float = 0.0, about_ns: int = 0) -> Self:
+        """The same poses with ``offset_s`` seconds added to every stamp, and ``rate`` seconds more
+        for each second after a stamp.
+        """
         shifted = copy.copy(self)  # poses and order have been checked
-        object.__setattr__(shifted, "stamps_ns", self.stamps_ns + np.int64(round(offset_s * 1e9)))
+        stamps_ns = self.stamps_ns + np.int64(round(offset_s * 1e9))
+        if rate:
+            stamps_ns += np.round(rate * (self.stamps_ns - about_ns)).astype(np.int64)
+        object.__setattr__(shifted, "stamps_ns", stamps_ns)
         return shifted
 
     def scaled(self, scale: float) -> Self:

@@ -240,7 +240,8 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "Poses": f"{calibration.n_poses:,} synchronised pose pairs over {span}",
         "Motion pairs": f"{calibration.n_inliers:,} of {calibration.n_pairs:,} are inliers",
         "Objective": f"{calibration.objective:.6g}",
-        "Time offset": given_or_estimated(*offset, "s"),
+        "Time offset": given_or_estimated(*offset, "s")
+        + (f"; clock {rate}" if (rate := calibration.clock_rate) and rate.is_used else ""),
         "Scale": given_or_estimated(*scale, ""),
     }
     if noise := calibration.noise:

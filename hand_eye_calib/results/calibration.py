@@ -152,7 +152,8 @@ class Calibration(Result):
             Poses of the parent sensor in the child's world, at the child's stamps on the parent's
             clock.
         """
-        scaled = child.scaled(self.scale).shifted(self.time_offset_s)
+        rate = (self.clock_rate.used, self.clock_rate.at_ns) if self.clock_rate else ()
+        scaled = child.scaled(self.scale).shifted(self.time_offset_s, *rate)
         poses = scaled.poses @ self.T_child_parent
         return Trajectory(scaled.stamps_ns, poses, self.parent_frame, child.world_frame)
 

@@ -114,6 +114,37 @@ class RateBias:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ClockRate:
+    """By how much the time offset changes with time, in parts per million.
+
+    Attributes
+    ----------
+    ppm, sigma_ppm : float
+        Microseconds to add to the child's stamps for each second after ``at_ns``, and one standard
+        deviation. Positive if the child's clock is slow.
+    at_ns : int
+        Stamp of the child's clock at which the time offset holds.
+    is_used : bool
+        Whether the child's stamps were freed of it: it stands out of its standard deviation.
+    """
+
+    ppm: float
+    sigma_ppm: float
+    at_ns: int
+    is_used: bool = False
+
+    @property
+    def used(self) -> float:
+        """Seconds for each second that the child's stamps were freed of."""
+        return 1e-6 * self.ppm if self.is_used else 0.0
+
+    def __str__(self) -> str:
+        return (
+            f"{abs(self.ppm):.1f} +/- {self.sigma_ppm:.2g} ppm {'slow' if self.ppm > 0 else 'fast'}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class AxisScatter:
     """Scatter of other answers about a result on one axis, m or rad; None where it is not known.
 

@@ -13,6 +13,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import sigmas_rpy
 from hand_eye_calib.results.finding import Finding
 from hand_eye_calib.results.records import (
+    ClockRate,
     Comparison,
     CrossCheck,
     Noise,
@@ -57,6 +58,8 @@ class Result:
     time_offset_s, time_offset_sigma_s : float
         Seconds added to the child's stamps, and one standard deviation: 0 if the method took the
         offset as set by the user.
+    clock_rate : ClockRate or None
+        By how much the offset changes with time, if it was estimated.
     scale, scale_sigma : float
         Factor applied to the child's translations, in the same way.
     rate_bias : RateBias or None
@@ -142,6 +145,7 @@ class Result:
     reference_reason: str = ""
     time_offset_s: float = 0.0
     time_offset_sigma_s: float = 0.0
+    clock_rate: ClockRate | None = None
     scale: float = 1.0
     scale_sigma: float = 0.0
     rate_bias: RateBias | None = None

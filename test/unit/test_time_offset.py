@@ -75,12 +75,12 @@ def test_a_body_that_rotates_about_one_of_its_sensors():
     assert found.sigma_s < 0.002
 
 
-def test_rhythmic_motion_shows_a_small_offset():
+def test_rhythmic_motion_shows_an_offset_if_the_path_does():
     """Like a boat in steady waves: the angular rates match at many offsets."""
 
-    def rocking(n_poses, seed):
+    def rocking(n_poses, seed, drifts=True):
         phases = 2 * np.pi * 0.25 * np.arange(n_poses) / 10.0
-        drift = np.arange(n_poses) / n_poses
+        drift = drifts * np.arange(n_poses) / n_poses
         angles = np.stack([0.2 * np.sin(phases), 0.1 * np.sin(2 * phases + 1), drift], axis=1)
         steps = np.stack([3 * drift, drift**2, 0.3 * np.cos(phases)], axis=1)
         return se3.exp(np.concatenate([steps, angles], axis=1))
@@ -89,6 +89,9 @@ def test_rhythmic_motion_shows_a_small_offset():
     found = estimate_time_offset(parent, child)
     assert not found.correlation.is_clear
     assert found.seconds == pytest.approx(0.1234, abs=0.002)
+    far = estimate_time_offset(parent, child.shifted(-30.0))
+    assert far.seconds == pytest.approx(30.1234, abs=0.002)
+    parent, child = drive(noise=0.0002, wander=lambda *what: rocking(*what, drifts=False))
     with pytest.raises(NotEnoughDataError, match="more varied turns"):
         estimate_time_offset(parent, child.shifted(-30.0))
 
@@ -141,6 +144,28 @@ class TestWeakEvidenceIsRefused:
         parent, child = drive()
         with pytest.raises(NotEnoughDataError, match="give time_offset in seconds"):
             estimate_time_offset(parent[:40], child[:60])
+
+
+class TestClockRate:
+    def test_it_is_found_unasked_and_the_answer_is_as_without(self):
+        parent, child = drive(seconds=300, parent_hz=10.0, child_hz=10.0, noise=0.001)
+        middle_ns = int(child.stamps_ns[len(child) // 2])
+        slow = child.shifted(0.0, -75e-6, middle_ns)
+        found, plain = calibrate(parent, slow), calibrate(parent, child)
+        assert found.clock_rate.is_used
+        assert abs(found.clock_rate.ppm - 75.0) < min(5.0, 5.0 * found.clock_rate.sigma_ppm)
+        assert "ppm slow: solved with time_offset estimate" in found.warnings[0]
+        away = se3.log(se3.inverse(plain.T_parent_child) @ found.T_parent_child)
+        assert np.abs(away / np.sqrt(np.diag(plain.covariance))).max() < 0.3
+        again = type(found).from_dict(found.to_dict())
+        assert again.clock_rate == found.clock_rate
+        moved = found.child_as_parent(slow)
+        np.testing.assert_allclose(moved.stamps_ns, child.stamps_ns, atol=2_000_000)
+
+    def test_one_that_is_not_there_is_stated_and_not_used(self):
+        found = estimate_time_offset(*drive(shift_s=0.3, noise=0.001))
+        assert abs(found.rate.ppm) < 5.0 * found.rate.sigma_ppm
+        assert not found.rate.is_used
 
 
 class TestInTheEngine:
