@@ -3,7 +3,7 @@ who is still recording.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,6 +39,10 @@ _STEP_NS = 1_000_000_000
 # directions. Directions of the shorter steps, below this share of the median, are noise. (Road
 # vehicles: 0.95 to 1; handheld devices, drones and robot arms: 0.4 to 0.85.)
 _ALONG_ONE_AXIS, _LONG_STEP = 0.9, 0.3
+# Cosine from which on that axis is x.
+_ALONG_X = 0.9
+# What turns a vehicle about its x, y and z.
+_MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both sides")
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,8 @@ class Excitation:
         Seconds during which the sensor moved; a robot that stands still shows nothing.
     drives : bool
         The sensor moves as on a vehicle, along one axis of its own; also if it has not moved yet.
+    forward : (3,) array
+        Unit vector of the direction that it moves along most; 0 if it has not moved.
     """
 
     n_poses: int
@@ -68,6 +74,7 @@ class Excitation:
     distance: float
     motion_s: float = 0.0
     drives: bool = True
+    forward: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def gain(self) -> FloatArray:
@@ -85,6 +92,12 @@ class Excitation:
     def worst_gain(self) -> float:
         """Gain of that lever arm."""
         return float(np.sqrt(max(self.lever_arms.powers[0], 0.0)))
+
+    @property
+    def has_vehicle_axes(self) -> bool:
+        """Whether x is along the motion and z is what it turns about, as REP 103 has it."""
+        turns_about_z = self.rotation[2] >= max(self.rotation.max(), MIN_ROTATION)
+        return bool(self.drives and turns_about_z and abs(self.forward[0]) > _ALONG_X)
 
     def hidden_axes(self) -> tuple[str, ...]:
         """Axes x, y, z along which the motion cannot show the translation, whatever the noise."""
@@ -120,25 +133,22 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
             lever_arms = at_lag
         lag *= 2
     distance = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    return Excitation(
-        n_poses, rotation, lever_arms, distance, seconds_of_motion(pose_pairs), _drives(poses)
-    )
+    found = [_main_direction(poses, lag) for lag in (1, 2, 4) if lag < len(poses)]
+    share, forward = max(found, key=lambda each: each[0])
+    motion_s, drives = seconds_of_motion(pose_pairs), share >= _ALONG_ONE_AXIS
+    return Excitation(n_poses, rotation, lever_arms, distance, motion_s, drives, forward)
 
 
-def _drives(poses: FloatArray) -> bool:
-    """Whether poses (N, 4, 4) move along one axis of their own."""
-    shares = [_share_of_main_direction(poses, lag) for lag in (1, 2, 4) if lag < len(poses)]
-    return max(shares, default=1.0) >= _ALONG_ONE_AXIS
-
-
-def _share_of_main_direction(poses: FloatArray, lag: int) -> float:
+def _main_direction(poses: FloatArray, lag: int) -> tuple[float, FloatArray]:
+    """The axis of their own that poses (N, 4, 4) move along, and its share of all motion."""
     steps = poses[lag:, :3, 3] - poses[:-lag, :3, 3]
     lengths = np.linalg.norm(steps, axis=1)
     long = (lengths > _LONG_STEP * median(lengths)) & (lengths > 0)
     if not long.any():
-        return 1.0
+        return 1.0, np.zeros(3)
     own = np.einsum("nji,nj->ni", poses[:-lag, :3, :3], steps)[long] / lengths[long, None]
-    return float(np.linalg.eigvalsh(own.T @ own / len(own))[-1])
+    shares, axes = np.linalg.eigh(own.T @ own / len(own))
+    return float(shares[-1]), axes[:, -1]
 
 
 def seconds_of_motion(pose_pairs: PosePairs) -> float:
@@ -217,7 +227,8 @@ def _motion_for(axis: str, seen: Excitation) -> str:
     is_planar = int((rotation < MIN_ROTATION).sum()) == 2 and (seen.drives or along == main)
     if not is_planar:
         least = min((each for each in range(3) if each != along), key=lambda each: rotation[each])
-        return f"rotations about {'xyz'[least]} help most"
+        like = f" ({_MANOEUVRES[least]})" * seen.has_vehicle_axes
+        return f"rotations about {'xyz'[least]} help most{like}"
     if along != main:
         return "tighter curves to both sides help most"
     if axis in ROTATIONS:

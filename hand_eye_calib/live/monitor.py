@@ -331,10 +331,11 @@ class MountMonitor:
         if ratios[best] < (self.alarm.log_ratio if self.alarm else THRESHOLD):
             return None
         covariance = np.linalg.inv(H[best] + np.linalg.inv(shift_covariance(1.0, 1.0)))
+        stamps_ns = self._memory.stamps_ns
         is_new = self.alarm is None
         self.alarm = Alarm(
-            since_ns=int(self._memory.stamps_ns[lags[best] - 1]),
-            raised_ns=self.alarm.raised_ns if self.alarm else int(self._memory.stamps_ns[0]),
+            since_ns=self.alarm.since_ns if self.alarm else int(stamps_ns[lags[best] - 1]),
+            raised_ns=self.alarm.raised_ns if self.alarm else int(stamps_ns[0]),
             shift=self._to_parent @ covariance @ S[best],
             sigmas=self._sigmas(covariance),
             log_ratio=float(ratios[best]),

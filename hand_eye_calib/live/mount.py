@@ -111,6 +111,7 @@ class MountWatch:
             visible_1min=_visible(monitor.visible(_MINUTE_S)),
             visible_10min=_visible(visible),
             since_ns=alarm.since_ns if alarm else None,
+            newest_ns=self._last_ns,
         )
 
 

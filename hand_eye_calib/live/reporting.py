@@ -68,6 +68,8 @@ def extrinsic_state(
         last_failure=cycle.failure.what if cycle.failure else "",
         n_poses=seen.n_poses if seen else 0,
         path_m=seen.distance if seen else 0.0,
+        motion_s=seen.motion_s if seen else 0.0,
+        has_vehicle_axes=bool(seen and seen.has_vehicle_axes),
         rotation_deg=dict(zip("xyz", rotation, strict=False)),
         tf_static=tf_static[0],
         tf_static_reason=tf_static[1],

@@ -1,5 +1,6 @@
 """Saves the session's result: files at once, report and rig by a process of their own."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from hand_eye_calib.live.cycle import SolveCycle
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.processes import ReportProcess, SessionResult
 from hand_eye_calib.live.session import LiveSession, output_path
+from hand_eye_calib.live.state import SavedState
 from hand_eye_calib.results.calibration import Calibration
 
 
@@ -21,12 +23,18 @@ class Saver:
     session : LiveSession
     cycle : SolveCycle
     log : NodeLog
+
+    Attributes
+    ----------
+    state : SavedState or None
+        The newest save of this session.
     """
 
     def __init__(self, session: LiveSession, cycle: SolveCycle, log: NodeLog) -> None:
         self._session, self._cycle, self._log = session, cycle, log
         self._report = ReportProcess()
         self._earlier_kept_in = ""
+        self.state: SavedState | None = None
 
     def save(self, options: NodeConfig) -> tuple[bool, str]:
         """Write the result files; whether that worked, and one line about it, which is logged."""
@@ -41,6 +49,7 @@ class Saver:
     def restart(self) -> None:
         """Begin a new session."""
         self._report.forget()
+        self.state = None
 
     def _save(self, options: NodeConfig) -> tuple[bool, str]:
         directory = options.output_directory
@@ -60,7 +69,9 @@ class Saver:
             save_result(result, path, inputs)
         except (OSError, HandEyeCalibError) as error:
             return False, f"cannot save to {directory}: {error}"
-        text = f"result saved to {path.resolve()}: {result.headline}"
+        where = str(path.resolve())
+        text = f"result saved to {where}: {result.headline}"
+        self.state = SavedState(directory=where, at_s=time.time(), text=result.headline)
         others = {name: each.snapshot() for name, each in self._session.others.items()}
         if not (options.report or others):
             return True, text

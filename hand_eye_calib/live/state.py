@@ -77,7 +77,15 @@ class ResultState:
 
 @dataclass(frozen=True, kw_only=True)
 class ExtrinsicState(Part):
-    """The solver, what has been seen of the motion, and the result if there is one."""
+    """The solver, what has been seen of the motion, and the result if there is one.
+
+    Attributes
+    ----------
+    motion_s : float
+        Seconds during which the sensors moved.
+    has_vehicle_axes : bool
+        The parent sensor moves along its x and turns about its z, as on a vehicle (REP 103).
+    """
 
     accepts_poses: bool
     is_solving: bool
@@ -86,6 +94,8 @@ class ExtrinsicState(Part):
     last_failure: str
     n_poses: int
     path_m: float
+    motion_s: float = 0.0
+    has_vehicle_axes: bool = False
     rotation_deg: Mapping[str, float]
     tf_static: Broadcast
     tf_static_reason: str
@@ -169,8 +179,8 @@ class MountState(Part):
         The alarm's, if there is one.
     visible_1min, visible_10min : mapping by axis
         Shift that so much motion would show; None if none would.
-    since_ns : int or None
-        Stamp from which on it has been moved.
+    since_ns, newest_ns : int or None
+        Stamp from which on it has been moved, and that of the newest pose.
     """
 
     is_learning: bool = False
@@ -182,6 +192,16 @@ class MountState(Part):
     visible_1min: AxisValues = field(default_factory=dict)
     visible_10min: AxisValues = field(default_factory=dict)
     since_ns: int | None = None
+    newest_ns: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SavedState:
+    """Where the result was saved, when (seconds since 1970), and what was said of it."""
+
+    directory: str
+    at_s: float
+    text: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +215,10 @@ class NodeState:
         Fully qualified name.
     inputs : dict of str to InputState
         By name: parent, child, child2 and so on.
+    saved : SavedState or None
+        The newest save of this session.
+    has_ended : bool
+        The last that the node says.
     """
 
     node: str
@@ -204,6 +228,8 @@ class NodeState:
     inputs: Mapping[str, InputState] = field(default_factory=dict)
     checks: ChecksState | None = None
     journal: JournalState | None = None
+    saved: SavedState | None = None
+    has_ended: bool = False
 
     def parts(self) -> Iterator[tuple[str, Part]]:
         """The parts that there are, by the names that ``/diagnostics`` has for them."""

@@ -7,6 +7,7 @@ nothing here needs a lock.
 import time
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -124,6 +125,7 @@ class CalibratorNode(Node):
                 saved, _ = self._saver.save(self._options.node)
             else:
                 self._log.warning("the result is not saved: output_directory is not set")
+        self._publish_state(has_ended=True)
         self._session.stop_journal()
         return saved
 
@@ -201,13 +203,14 @@ class CalibratorNode(Node):
         if mounted:
             self._tf.add_others([each for each in mounted if not self._robot.lacks_base(each)])
 
-    def _publish_state(self) -> None:
+    def _publish_state(self, has_ended: bool = False) -> None:
         self._tf.look()
         self._publish_others(self._saver.take_others())
         if self._mount is not None:
             self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds
-        self._states.publish(self._state(time.monotonic(), clock_ns), clock_ns)
+        state = replace(self._state(time.monotonic(), clock_ns), has_ended=has_ended)
+        self._states.publish(state, clock_ns)
 
     def _state(self, steady_s: float, clock_ns: int) -> NodeState:
         options, cycle, name = self._options.node, self._cycle, self.get_fully_qualified_name()
@@ -230,6 +233,7 @@ class CalibratorNode(Node):
             inputs=inputs,
             checks=cycle.checks.state(steady_s),
             journal=self._session.journal_state(options),
+            saved=self._saver.state,
         )
 
     # --------------------------------------------------------------- session

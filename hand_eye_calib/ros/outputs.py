@@ -5,6 +5,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
@@ -22,6 +23,8 @@ from hand_eye_calib.ros.conversions import (
 from hand_eye_calib.text import in_words
 
 PROGRESS_TOPIC = "progress"
+# How long the end of the node waits for those who listen.
+_LAST_WORD = Duration(seconds=0.2)
 HARDWARE_ID = "hand_eye_calib"
 
 # Parts of the state that the names of values on /diagnostics leave out.
@@ -84,6 +87,8 @@ class StateTopics:
         """Publish the state; ``clock_ns`` is the node's clock, 0 if it does not run."""
         self._progress.publish(String(data=json_text(state)))
         self._diagnostics.publish(diagnostics(state, clock_ns))
+        if state.has_ended:
+            self._progress.wait_for_all_acked(_LAST_WORD)
 
 
 def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:

@@ -26,6 +26,9 @@ _RESULTS = 2
 # ... after so many seconds of motion, and so many correlation times of errors that last.
 _MIN_MOTION_S, _CORRELATION_TIMES = 30.0, 10.0
 
+# Times left (s) that a person is told: they only shrink, by one step at a result.
+_STEPS_S = np.array([0.0, 15.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 1200.0, np.inf])
+
 # Standard deviations are estimates too: a result with more motion replaces the best one unless its
 # own are larger by more than this factor.
 _AS_GOOD = 1.25
@@ -67,6 +70,7 @@ class Goal:
         self._points: deque[_Point] = deque(maxlen=10_000)
         self._best: Calibration | None = None
         self._best_information = 0.0
+        self._steps = np.full(6, len(_STEPS_S) - 1)
         self.progress = self._nothing_yet("No result yet: move the sensors, with rotations.")
 
     @property
@@ -116,6 +120,7 @@ class Goal:
         left_s = np.maximum(left_s, max(_least_motion_s(calibration) - motion_s, 0.0))
         is_done = self._best is not None
         stuck = not is_done and self._is_stuck(float(left_s[worst]))
+        left_s = self._told(left_s)
         sentence = self._sentence(calibration, seen, faults, AXES[worst], left_s[worst], stuck)
         self.progress = Progress(
             sentence=sentence,
@@ -150,6 +155,16 @@ class Goal:
         expected = newest.motion_s / before.motion_s - 1.0
         return newest.information < before.information * (1.0 + _STALL_GROWTH * expected)
 
+    def _told(self, left_s: FloatArray) -> FloatArray:
+        """The steps (6,) that are told of these times: estimates jump, and a person who is told 4
+        min, 5 s, 25 s believes none of them.
+        """
+        steps, before = np.searchsorted(_STEPS_S, 0.95 * left_s), self._steps
+        far = len(_STEPS_S) - 1
+        is_new = (before == far) | (before == 0) | (steps == far) | (steps == 0)
+        self._steps = np.where(is_new, steps, np.clip(steps, before - 1, before))
+        return np.asarray(_STEPS_S[self._steps])
+
     def _nothing_yet(self, sentence: str) -> Progress:
         unknown = np.full(6, np.inf)
         return Progress(sentence=sentence, axes=self._by_axis(unknown, unknown))
@@ -182,7 +197,7 @@ class Goal:
             return f"This motion will not determine {called} well enough: {motion}."
         if not np.isfinite(left_s):
             return f"{called} is not determined yet: {motion}."
-        left = duration(max(5 * round(left_s / 5), 5))
+        left = duration(max(left_s, _STEPS_S[1]))
         return f"Go on for about {left}: {called} takes longest, {motion}."
 
 

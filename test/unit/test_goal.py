@@ -94,7 +94,7 @@ def test_small_sigmas_are_not_believed_in_a_short_recording(noise, motion_s):
     for moved_s in (motion_s - 1.0, motion_s):
         early = goal.add(result(noise=noise), seen(moved_s))
         assert not early.done
-        assert max(seconds_left(early)) == pytest.approx(np.ceil(motion_s / 10) * 10 - moved_s)
+        assert max(seconds_left(early)) == 15.0
     goal.add(result(noise=noise), seen(motion_s + 1.0))
     assert goal.add(result(noise=noise), seen(motion_s + 2.0)).done
 
@@ -106,6 +106,15 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
     assert progress.sentence == (
         "Go on for about 2 min: y takes longest, rotations about x help most."
     )
+
+
+def test_the_time_left_only_shrinks_by_one_step_at_a_result():
+    goal, told = Goal(TARGETS), []
+    for motion_s, sigma_m in enumerate((0.03, 0.0142, 0.025, 0.025, 0.02, 0.004, 0.02), 40):
+        told.append(
+            seconds_left(goal.add(result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s)))
+        )
+    assert [each[1] for each in told] == [180.0, 120.0, 120.0, 120.0, 60.0, 0.0, 60.0]
 
 
 def test_faults_of_the_streams_and_failed_solves_are_no_success():
