@@ -116,6 +116,7 @@ setup(
         "camera": ["opencv-python-headless>=4.7"],
         "cluster": ["distributed>=2024.1"],
         "completion": ["argcomplete>=2.0"],
+        "qr": ["segno>=1.5"],
         "fleet": ["fsspec[http]>=2024.2"],
         "lidar": ["small_gicp>=1.0"],
         "notebook": ["ipykernel>=6.29", "pandas>=2.1"],

@@ -528,6 +528,5 @@ class NodeConfig(OptionSet):
     monitor: bool = option(
         False,
         "Watch the mount against installed, and raise an alarm when it has moved, instead of "
-        "calibrating.",
-        read_only=True,
+        "calibrating; false ends that, and calibrates anew.",
     )

@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from io import StringIO
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import note
@@ -29,7 +30,8 @@ examples:
 _PORT = 8765
 _LISTEN_S = 0.1
 _SURE_WITHIN_S = 5.0
-_KEYS = {"s": "solve", "w": "save", "r": "reset"}
+_KEYS = {"s": "solve", "w": "save", "r": "reset", "c": "recalibrate", "a": "acknowledge"}
+_SURE = {"r": "forgets all poses", "c": "stops watching and calibrates anew"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,14 +74,14 @@ def run(arguments: argparse.Namespace) -> int:
     with (
         Watcher(board) as watcher,
         _web(arguments, board, requests) as server,
-        _display(server) as show,
+        _display(server.addresses()[0] if server else "") as show,
     ):
         session = Session(board, requests, _keys)
         while not came and not session.is_over:
             watcher.spin(_LISTEN_S)
             while not requests.empty():
                 watcher.ask(requests.get())
-            show(session.view())
+            show(session.view(), session.shows_code)
     return 0
 
 
@@ -101,55 +103,82 @@ class Session:
         requests: "queue.SimpleQueue[str]",
         keys: Callable[[], str],
     ) -> None:
-        self.is_over = False
+        self.is_over = self.shows_code = False
         self._board, self._requests, self._keys = board, requests, keys
-        self._sure_until_s = 0.0
+        self._sure, self._sure_until_s = "", 0.0
 
     def view(self) -> "View":
         """Do what was typed, and make the view."""
         now_s = time.monotonic()
+        view = self._board.view(now_s)
         for key in self._keys():
-            self._press(key, now_s)
+            self._press(key, now_s, view.buttons)
         return self._board.view(now_s)
 
-    def _press(self, key: str, now_s: float) -> None:
+    def _press(self, key: str, now_s: float, buttons: tuple[str, ...]) -> None:
+        from hand_eye_calib.watch.web import BUTTONS
+
+        request = _KEYS.get(key, "")
         if key in ("q", "\x03", "\x04"):
             self.is_over = True
-        elif key == "r" and now_s > self._sure_until_s:
-            self._sure_until_s = now_s + _SURE_WITHIN_S
-            self._board.answer("reset", False, "forgets all poses: press r again", now_s)
-        elif key in _KEYS:
-            self._requests.put(_KEYS[key])
+        elif key == "p":
+            self.shows_code = not self.shows_code
+        elif request not in buttons:
+            return
+        elif key in _SURE and (key != self._sure or now_s > self._sure_until_s):
+            self._sure, self._sure_until_s = key, now_s + _SURE_WITHIN_S
+            self._board.answer(request, False, f"{_SURE[key]}: press {key} again", now_s)
+        elif request == "acknowledge":
+            self._board.acknowledge()
+        else:
+            self._requests.put(BUTTONS[request])
 
 
 @contextlib.contextmanager
-def _display(server: "WebServer | None") -> "Iterator[Callable[[View], None]]":
-    """Function that shows a view: on the screen of a terminal, or in lines for a file or a pipe."""
+def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
+    """Function that shows a view, or the code of the page's address: on the screen of a terminal,
+    or in lines for a file or a pipe.
+    """
     from rich.console import Console
     from rich.live import Live
+    from rich.text import Text
 
     from hand_eye_calib.watch.terminal import LineLog, screen
 
     if not sys.stdout.isatty():
         log, started_s = LineLog(), time.monotonic()
 
-        def write(view: "View") -> None:
+        def write(view: "View", shows_code: bool) -> None:
             for line in log.lines(view, time.monotonic() - started_s):
                 print(line, flush=True)
 
         yield write
         return
-    footer = f"phone: {server.addresses()[0]}" if server is not None else ""
+    code = qr_code(address)
+    footer = f"p QR code   phone: {address}" if code else f"phone: {address}" if address else ""
     console, shown = Console(), list[tuple[object, ...]]()
     with _single_keys(), Live(console=console, screen=True, auto_refresh=False) as live:
 
-        def show(view: "View") -> None:
+        def show(view: "View", shows_code: bool) -> None:
             width, height = console.size
-            if shown != [(view, width, height)]:
-                live.update(screen(view, width, height, footer), refresh=True)
-                shown[:] = [(view, width, height)]
+            if shown != [(view, width, height, shows_code)]:
+                of_view = screen(view, width, height, footer)
+                live.update(Text.from_ansi(code) if code and shows_code else of_view, refresh=True)
+                shown[:] = [(view, width, height, shows_code)]
 
         yield show
+
+
+def qr_code(address: str) -> str:
+    """The address as a QR code in characters; empty without the library for it."""
+    try:
+        import segno
+    except ModuleNotFoundError:
+        return ""
+    drawn = StringIO()
+    if address:
+        segno.make(address, micro=False, error="l").terminal(out=drawn, border=2, compact=True)
+    return drawn.getvalue()
 
 
 def _is_terminal() -> bool:

@@ -84,10 +84,12 @@ class LiveSession:
         own_stream, engine = takers(stream, self.engines)[0]
         return engine.statistics(own_stream)
 
-    def watch_only(self, limits: BufferLimits) -> None:
-        """Never solve, and keep few poses: somebody takes the pairs as they are made."""
-        self._is_solved = False
-        self.engines = {"child": Calibrator(self.calibrator.config, limits)}
+    def watch_only(self, limits: BufferLimits | None) -> None:
+        """Never solve, and keep few poses: somebody takes the pairs as they are made. With None,
+        calibrate again.
+        """
+        self._is_solved = limits is None
+        self.engines = {"child": Calibrator(self.calibrator.config, limits or BufferLimits())}
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
         """Take the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""

@@ -311,6 +311,10 @@ class CalibratorNode(Node):
             self._cycle.follow(config.targets)
         for each in self._inputs:
             each.configure(config, options.monitor)
+        if options.monitor != (self._mount is not None):
+            self._session.watch_only(None)
+            self._mount = self._watch_mount() if options.monitor else None
+            self._begin_session()
         self._session.follow_journal(options)
         self._tf.switch(options.publish_tf)
         period_ns = round(options.solve_period * 1e9)

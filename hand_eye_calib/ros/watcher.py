@@ -8,8 +8,11 @@ from types import TracebackType
 from typing import Any, Self
 
 import rclpy
+from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -18,12 +21,15 @@ from std_srvs.srv import Trigger
 from hand_eye_calib.errors import printable
 from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.plain import from_plain
-from hand_eye_calib.ros.conversions import LATCHED
+from hand_eye_calib.ros.conversions import LATCHED, MESSAGES
 from hand_eye_calib.ros.outputs import PROGRESS_TOPIC
+from hand_eye_calib.text import counted
 from hand_eye_calib.watch.board import Board
 
 # New nodes are looked for so often (s), and so many are listened to.
 _LOOK_S, _MOST_NODES = 1.0, 50
+# Most topics that are told of.
+_MOST_TOPICS = 12
 
 # A service that has not answered for so long will not (s): a solve takes seconds.
 _PATIENCE_S = 60.0
@@ -74,23 +80,41 @@ class Watcher:
             self._follow(asked)
 
     def ask(self, request: str) -> None:
-        """Call ``solve``, ``save`` or ``reset`` of the node that is shown; the answer goes to the
-        board.
+        """Call ``solve``, ``save`` or ``reset`` of the node that is shown, or set a parameter, as
+        in ``monitor:=false``; the answer goes to the board.
         """
         if self._board.node and request not in self._asked:
-            client = self._node.create_client(Trigger, f"{self._board.node}/{request}")
+            is_parameter = ":=" in request
+            kind, service = (
+                (SetParameters, "set_parameters") if is_parameter else (Trigger, request)
+            )
+            client = self._node.create_client(kind, f"{self._board.node}/{service}")
             self._asked[request] = client, None, time.monotonic()
             self._answer(request, None, "asked ...")
 
     def _look(self) -> None:
-        """Listen to nodes that are new: anybody may have a topic of that name."""
-        for topic, types in self._node.get_topic_names_and_types():
+        """Listen to nodes that are new: anybody may have a topic of that name. And note the topics
+        with poses, for a person whose input has none.
+        """
+        found = self._node.get_topic_names_and_types()
+        poses = [(topic, kind) for topic, kinds in found for kind in kinds if kind in MESSAGES]
+        told = tuple(self._told(*each) for each in poses[:_MOST_TOPICS])
+        self._board.topics = told or ("none is published here",)
+        for topic, types in found:
             name, _, last = topic.rpartition("/")
             is_one = last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
             if is_one and name not in self._heard and len(self._heard) < _MOST_NODES:
                 self._heard.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)
+
+    def _told(self, topic: str, kind: str) -> str:
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        best_effort = ReliabilityPolicy.BEST_EFFORT
+        qos = {each.qos_profile.reliability == best_effort for each in publishers}
+        reliability = " and ".join("best effort" if each else "reliable" for each in sorted(qos))
+        count = counted(len(publishers), "publisher")
+        return f"{topic} ({kind}, {count}{', ' * bool(qos)}{reliability})"
 
     def _take(self, name: str, message: String) -> None:
         state = state_of(message.data)
@@ -101,10 +125,14 @@ class Watcher:
         """Go on with a request: wait for the service, then for the answer."""
         client, future, asked_s = self._asked[request]
         if future is None and client.service_is_ready():
-            self._asked[request] = client, client.call_async(Trigger.Request()), asked_s
+            self._asked[request] = client, client.call_async(_message(request)), asked_s
         elif future is not None and future.done():
             response: Any = future.result()
-            self._end(request, response.success, printable(response.message))
+            if ":=" in request:
+                done, text = response.results[0].successful, response.results[0].reason
+            else:
+                done, text = response.success, response.message
+            self._end(request, done, printable(text) or "done")
         elif time.monotonic() - asked_s > _PATIENCE_S:
             self._end(request, False, f"no answer within {_PATIENCE_S:.0f} s")
 
@@ -114,6 +142,15 @@ class Watcher:
 
     def _answer(self, request: str, good: bool | None, text: str) -> None:
         self._board.answer(request, good, text, time.monotonic())
+
+
+def _message(request: str) -> Any:
+    """The message of a request to the node."""
+    name, is_parameter, value = request.partition(":=")
+    if not is_parameter:
+        return Trigger.Request()
+    given = {"true": True, "false": False}.get(value, value)
+    return SetParameters.Request(parameters=[Parameter(name, value=given).to_parameter_msg()])
 
 
 def state_of(text: str) -> NodeState | None:

@@ -6,37 +6,42 @@ Nothing here knows ROS, a terminal or a browser: states go in, a :class:`View` c
 import math
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime
 from enum import Enum
 
 from hand_eye_calib.live.state import (
-    AxisValues,
     Broadcast,
     InputState,
     Level,
     MountState,
     NodeState,
-    Part,
-    ProgressState,
-    ResultState,
 )
 from hand_eye_calib.results.records import AxisProgress, Comparison
-from hand_eye_calib.results.status import AXES
-from hand_eye_calib.text import amount, duration, two_digits
-
-_AXES_OF_ROTATIONS = {"roll": "x", "pitch": "y", "yaw": "z"}
+from hand_eye_calib.results.status import AXES, ROTATIONS
+from hand_eye_calib.text import amount, duration, listing, two_digits
 
 # A node that has said nothing for so long is silent; it reports once a second (s).
 SILENT_AFTER_S = 3.5
 
-# Words whose sentence counts seconds.
-SILENT, LEARNING = COUNTING = "SILENT", "LEARNING"
+# Words whose sentence has figures that change all the time.
+SILENT, LEARNING, MOVED = COUNTING = "SILENT", "LEARNING", "MOUNT MOVED"
 
 # A shift is told from this many standard deviations on.
 _CLEARLY = 3.0
 
 # The answer to a button is shown for so long (s).
 ANSWER_FOR_S = 20.0
+
+# What an axis of a vehicle means: x is forward, z is up.
+_ON_A_VEHICLE = {
+    "x": "forward",
+    "y": "sideways",
+    "z": "height",
+    "roll": "tilt to a side",
+    "pitch": "nose up or down",
+    "yaw": "turn",
+}
 
 
 class Tone(Enum):
@@ -64,32 +69,29 @@ class Bar:
 
     Attributes
     ----------
-    axis : str
-        x, y, z: the offset along it; roll, pitch, yaw: the rotation about x, y, z.
+    name : str
+        Such as ``along x`` or ``about z``.
+    meaning : str
+        Such as ``forward``; empty if the axes are not those of a vehicle.
     share : float
         0 to 1: the share of the information that the target needs. It grows evenly while the motion
         stays as it is.
     tone : Tone
     word : str
-        Such as ``enough`` or ``25 s left``.
+        Such as ``enough`` or ``30 s left``.
     against : str
         The standard deviation against the target, such as ``± 0.065 of 0.3 deg``.
     difference : str
         From what is installed, with units; empty if not known.
     """
 
-    axis: str
+    name: str
+    meaning: str
     share: float
     tone: Tone
     word: str
     against: str
     difference: str
-
-    @property
-    def meaning(self) -> str:
-        """Such as ``along x`` or ``about z``."""
-        along = _AXES_OF_ROTATIONS.get(self.axis)
-        return f"about {along}" if along else f"along {self.axis}"
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,9 @@ class View:
     """Everything a person is shown of one node.
 
     The pose (``values``: each axis with its value) has the angles as they are printed, with their
-    own standard deviations. The bars are about the axes of the parent sensor's frame.
+    own standard deviations. The bars are about the axes of the parent sensor's frame. ``buttons``
+    are the requests that make sense now, that to be pressed first; ``by_hand`` is the axis that
+    somebody may measure instead of driving on; ``saved_in`` is the directory of the files.
 
     A node that only watches the mount has no bars, verdict and comparison, but a line for each axis
     (``watched``): whether it has moved, or which change would be seen.
@@ -107,6 +111,7 @@ class View:
     tone: Tone
     word: str
     sentence: str
+    facts: str = ""
     title: str = ""
     values: tuple[tuple[str, str], ...] = ()
     bars: tuple[Bar, ...] = ()
@@ -114,6 +119,10 @@ class View:
     result: tuple[Line, ...] = ()
     reasons: tuple[str, ...] = ()
     health: tuple[Line, ...] = ()
+    topics: tuple[str, ...] = ()
+    buttons: tuple[str, ...] = ()
+    by_hand: str = ""
+    saved_in: str = ""
     answer: Line | None = None
 
 
@@ -125,13 +134,20 @@ class Board:
     wanted : str
         Fully qualified name of the node; empty for the first that is heard, and for another one
         when that is silent.
+
+    Attributes
+    ----------
+    topics : tuple of str
+        Lines about the topics with poses that exist.
     """
 
     def __init__(self, wanted: str = "") -> None:
+        self.topics: tuple[str, ...] = ()
         self._wanted = wanted
         self._state: NodeState | None = None
         self._heard_s = self._answered_s = -math.inf
         self._answer: Line | None = None
+        self._acknowledged: int | None = None
         self._lock = threading.Lock()
 
     @property
@@ -148,7 +164,7 @@ class Board:
             if state.node != shown and (self._wanted or not is_silent):
                 return
             if state.node != self.node:
-                self._answer = None
+                self._answer = self._acknowledged = None
             self._state, self._heard_s = state, now_s
 
     def answer(self, request: str, good: bool | None, text: str, now_s: float) -> None:
@@ -157,45 +173,74 @@ class Board:
         with self._lock:
             self._answer, self._answered_s = Line(tone, request, text), now_s
 
+    def acknowledge(self) -> None:
+        """Somebody knows that the mount has moved: it is said without alarm, until the next one."""
+        with self._lock:
+            mount = self._state.mount if self._state else None
+            self._acknowledged = mount.alarms if mount else None
+
     def view(self, now_s: float) -> View:
         """What to show; ``now_s`` is on the same clock as that of :meth:`take`."""
         with self._lock:
-            if self._state is None:
-                return _no_node(self._wanted)
+            state = self._state
+            if state is None:
+                who = f"of {self._wanted}" if self._wanted else "of a calibrator"
+                text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and "
+                return View(self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?")
+            view = _view(state, now_s - self._heard_s)
+            if view.word == MOVED and state.mount and state.mount.alarms == self._acknowledged:
+                view = replace(view, tone=Tone.ACT, buttons=("recalibrate",))
+                view = replace(view, facts=f"{view.facts}; acknowledged")
+            if view.word in ("CHECK INPUT", "BAD INPUT"):
+                view = replace(view, topics=self.topics)
             is_answered = now_s - self._answered_s < ANSWER_FOR_S
-            answer = self._answer if is_answered else None
-            return _view(self._state, now_s - self._heard_s, answer)
+            return replace(view, answer=self._answer if is_answered else None)
 
 
-def _no_node(name: str) -> View:
-    who = f"of {name}" if name else "of a calibrator"
-    text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and network?"
-    return View(name, Tone.UNKNOWN, "NO NODE", text)
-
-
-def _view(state: NodeState, silent_s: float, answer: Line | None) -> View:
-    is_silent = silent_s > SILENT_AFTER_S
+def _view(state: NodeState, silent_s: float) -> View:
     head = _headline(state)
-    if is_silent:
+    is_old = state.has_ended or silent_s > SILENT_AFTER_S
+    if state.has_ended:
+        head = _of_end(state)
+    elif is_old:
         text = f"The node has said nothing for {silent_s:.0f} s. What is below is older than that."
         head = Tone.BAD, SILENT, text
-    health = tuple(_health(state, is_silent))
-    if state.mount is not None:
-        watched = tuple(_watched(axis, state.mount) for axis in AXES)
-        return View(state.node, *head, watched=watched, health=health, answer=answer)
-    result = state.extrinsic.result if state.extrinsic else None
-    title = f"pose of {result.child_frame} in {result.parent_frame}" if result else ""
-    return View(
+    view = View(
         state.node,
         *head,
+        health=tuple(_health(state, is_old)),
+        saved_in=state.saved.directory if state.saved else "",
+    )
+    if state.mount is not None:
+        buttons = ("recalibrate", "acknowledge") if view.word == MOVED else ()
+        watched = tuple(_watched(axis, state.mount) for axis in AXES)
+        return replace(view, facts=_ago(state.mount), watched=watched, buttons=buttons)
+    result = state.extrinsic.result if state.extrinsic else None
+    is_done = view.word == "DONE" and not state.saved
+    title = f"pose of {result.child_frame} in {result.parent_frame}" if result else ""
+    at = state.progress
+    return replace(
+        view,
+        facts=_facts(state),
         title=title or "no extrinsic yet",
-        values=tuple(_values(result)) if result else (),
-        bars=tuple(_bar(axis, state.progress) for axis in AXES) if state.progress else (),
+        values=tuple(_values(state)),
+        bars=tuple(_bar(axis, state) for axis in AXES) if at else (),
         result=tuple(_result(state)),
         reasons=result.reasons if result else (),
-        health=health,
-        answer=answer,
+        buttons=()
+        if is_old
+        else ("save", "solve", "reset")
+        if is_done
+        else ("solve", "save", "reset"),
+        by_hand=at.progress.limiting_axis if at and at.progress.will_not_get_there else "",
     )
+
+
+def at_time(seconds: float) -> str:
+    """A time (seconds since 1970) as the clock on the wall has it, with the date if not today."""
+    then = datetime.fromtimestamp(seconds)
+    is_today = then.date() == datetime.now().date()
+    return then.strftime("%H:%M" if is_today else "%Y-%m-%d %H:%M")
 
 
 # -------------------------------------------------------------------- headline
@@ -204,64 +249,148 @@ def _view(state: NodeState, silent_s: float, answer: Line | None) -> View:
 def _headline(state: NodeState) -> tuple[Tone, str, str]:
     """Sign, word and sentence: what a person should know or do first."""
     inputs = [state.inputs[name] for name in ("parent", "child") if name in state.inputs]
-    broken: list[tuple[Part | None, str]] = [
-        (state.extrinsic, "BROKEN"),
-        (state.mount, "MOUNT MOVED"),
-        *((each, "BAD INPUT") for each in inputs),
-        (state.journal, "BROKEN"),
-    ]
-    for part, word in broken:
-        if part is not None and part.level is Level.ERROR:
-            return Tone.BAD, word, _sentence(part.text)
-    for each in inputs:
-        if each.level is Level.WARN:
-            return Tone.ACT, "CHECK INPUT", _sentence(each.text)
-    checks = state.checks
+    mount, at, checks = state.mount, state.progress, state.checks
+    if state.extrinsic and state.extrinsic.level is Level.ERROR:
+        return Tone.BAD, "BROKEN", _sentence(state.extrinsic.text)
+    if mount is not None and mount.level is Level.ERROR:
+        return Tone.BAD, MOVED, _of_alarm(mount)
+    for level, tone, word in (
+        (Level.ERROR, Tone.BAD, "BAD INPUT"),
+        (Level.WARN, Tone.ACT, "CHECK INPUT"),
+    ):
+        for each in inputs:
+            if each.level is level:
+                return tone, word, _sentence(each.text)
+        if level is Level.ERROR and state.journal and state.journal.level is level:
+            return Tone.BAD, "BROKEN", _sentence(state.journal.text)
     if checks is not None and checks.level is Level.WARN and checks.age_s is not None:
         return Tone.ACT, "CHECK THE STREAMS", _sentence(checks.text)
+    if mount is not None:
+        tone, word = Tone.GOOD, "WATCHING"
+        if mount.level is not Level.OK:
+            tone, word = Tone.ACT, "NOT WATCHING"
+        elif mount.is_learning:
+            tone, word = Tone.BUSY, LEARNING
+        return tone, word, _sentence(mount.text)
+    if at is None:
+        return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
+    tone, word, sentence = Tone.BUSY, "GO ON", _sentence(at.text)
+    if at.progress.is_faulty:  # the result was good, the streams no longer are
+        tone, word = Tone.ACT, "CHECK THE STREAMS"
+    elif at.progress.done:
+        moved = _moved(at.comparison)
+        tone, word = Tone.ACT if moved else Tone.GOOD, "DONE"
+        sentence = _of_done(state, moved, sentence)
+    elif not at.has_result:
+        word = "START"
+    elif at.level >= Level.WARN:
+        tone, word = Tone.ACT, "CHANGE THE MOTION"
+    return tone, word, sentence
+
+
+def _of_done(state: NodeState, moved: str, sentence: str) -> str:
+    """What has changed against what is installed, or how good it is; save, or where it is saved."""
+    if moved:
+        result = state.extrinsic.result if state.extrinsic else None
+        sentence = f"{result.child_frame if result else 'The sensor'} HAS MOVED: {moved}. Save."
+    if state.saved is None:
+        return sentence
+    told = sentence.removesuffix(" Save.").removesuffix(" Stop and save.")
+    return f"{told} Saved at {at_time(state.saved.at_s)} in {state.saved.directory}."
+
+
+def _moved(comparison: Comparison | None) -> str:
+    """The axes that have moved against what is installed, and by how much."""
+    if comparison is None or comparison.verdict != "moved" or not comparison.differences:
+        return ""
+    rows = comparison.differences[0].axes
+    axes = [axis for axis in AXES if axis in rows and rows[axis].verdict == "moved"]
+    return listing([f"{_name(axis)} {_signed(axis, rows[axis].difference)}" for axis in axes])
+
+
+def _of_alarm(mount: MountState) -> str:
+    shifts = {axis: _number(mount.shift.get(axis)) for axis in AXES}
+    moved = [
+        f"{_name(axis)} by {amount(axis, abs(shift))}"
+        for axis, shift in shifts.items()
+        if abs(shift) > _CLEARLY * _number(mount.shift_sigma.get(axis))
+    ]
+    since = f" since {at_time(mount.since_ns * 1e-9)}" if mount.since_ns else ""
+    told = f"The child sensor has moved {listing(moved)}{since}." if moved else mount.text
+    return f"{_sentence(told)} Look at its mount. Then recalibrate, or acknowledge."
+
+
+def _of_end(state: NodeState) -> tuple[Tone, str, str]:
+    """The last word of a node that was told to end."""
     if state.mount is not None:
-        return _of_mount(state.mount)
-    if state.progress is not None:
-        return _of_progress(state.progress)
-    return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
-
-
-def _of_progress(progress: ProgressState) -> tuple[Tone, str, str]:
-    sentence = _sentence(progress.text)
-    if progress.progress.is_faulty:  # the result was good, the streams no longer are
-        return Tone.ACT, "CHECK THE STREAMS", sentence
-    if progress.progress.done:
-        return Tone.GOOD, "DONE", sentence
-    if not progress.has_result:
-        return Tone.BUSY, "START", sentence
-    if progress.level >= Level.WARN:
-        return Tone.ACT, "CHANGE THE MOTION", sentence
-    return Tone.BUSY, "GO ON", sentence
-
-
-def _of_mount(mount: MountState) -> tuple[Tone, str, str]:
-    """Of a node that watches the mount, which has not moved."""
-    sentence = _sentence(mount.text)
-    if mount.level is not Level.OK:
-        return Tone.ACT, "NOT WATCHING", sentence
-    if mount.is_learning:
-        return Tone.BUSY, LEARNING, sentence
-    return Tone.GOOD, "WATCHING", sentence
+        return Tone.ACT, "ENDED", "The node has ended: nobody watches the mount."
+    if state.saved is not None:
+        when = at_time(state.saved.at_s)
+        text = f"The node has ended. The result was saved at {when} in {state.saved.directory}."
+        return Tone.GOOD, "ENDED", text
+    has_result = state.extrinsic is not None and state.extrinsic.result is not None
+    why = "is not saved: output_directory is not set" if has_result else "was not there yet"
+    return Tone.ACT, "ENDED", f"The node has ended. A result {why}."
 
 
 def _sentence(text: str) -> str:
     """With a capital and a full stop, unless it begins with a name such as ``/lidar``."""
+    text = text.replace("+/-", "±")
     return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith((".", "!", "?")) else ".")
 
 
-# ------------------------------------------------------------------------ bars
+def _facts(state: NodeState) -> str:
+    """How far and how long the sensors have moved, and how old the result is."""
+    seen = state.extrinsic
+    if seen is None or not seen.n_poses:
+        return ""
+    told = [f"{seen.path_m:,.0f} m", f"{_about(seen.motion_s)} of motion"]
+    told += [f"result {_about(seen.result.age_s)} old"] if seen.result else []
+    return ", ".join(told)
 
 
-def _bar(axis: str, part: ProgressState) -> Bar:
-    known = part.progress.axes[axis]
+def _ago(mount: MountState) -> str:
+    if not mount.since_ns or not mount.newest_ns:
+        return f"{_about(mount.seconds_of_motion)} of motion seen"
+    return f"{_about((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
+
+
+def _about(seconds: float) -> str:
+    return duration(seconds) if seconds >= 10 else f"{seconds:.0f} s"
+
+
+# ------------------------------------------------------------------------ axes
+
+
+def _name(axis: str) -> str:
+    """Such as ``along x`` or ``about z``."""
+    return f"about {'xyz'[ROTATIONS.index(axis)]}" if axis in ROTATIONS else f"along {axis}"
+
+
+def _signed(axis: str, value: float) -> str:
+    return f"{'+' * (value >= 0)}{amount(axis, value)}"
+
+
+def _bar(axis: str, state: NodeState) -> Bar:
+    assert state.progress is not None
+    at = state.progress
+    known = at.progress.axes[axis]
     share = min(1.0, (known.target / known.sigma) ** 2) if known.sigma > 0 else 1.0
-    tone, word = _state(known, is_behind=part.progress.limiting_axis == axis)
-    return Bar(axis, share, tone, word, _against(axis, known), _difference(axis, part.comparison))
+    tone, word = _state(known, is_behind=at.progress.limiting_axis == axis)
+    is_vehicle = state.extrinsic is not None and state.extrinsic.has_vehicle_axes
+    wanted = amount(axis, known.target)
+    against = f"wanted: {wanted}"
+    if math.isfinite(known.sigma):
+        number, _, unit = amount(axis, known.sigma).rpartition(" ")
+        own = number if wanted.endswith(f" {unit}") else f"{number} {unit}"
+        against = f"± {own} of {wanted}"
+    difference = ""
+    if at.comparison is not None and at.comparison.differences:
+        row = at.comparison.differences[0].axes[axis]
+        difference = f"{_signed(axis, row.difference)} ± {amount(axis, row.sigma)}"
+        difference = difference if math.isfinite(row.sigma) else "unknown"
+    meaning = _ON_A_VEHICLE[axis] if is_vehicle else ""
+    return Bar(_name(axis), meaning, share, tone, word, against, difference)
 
 
 def _state(known: AxisProgress, is_behind: bool) -> tuple[Tone, str]:
@@ -276,38 +405,37 @@ def _state(known: AxisProgress, is_behind: bool) -> tuple[Tone, str]:
     return (Tone.ACT if is_behind else Tone.BUSY), left
 
 
-def _against(axis: str, known: AxisProgress) -> str:
-    wanted = amount(axis, known.target)
-    if not math.isfinite(known.sigma):
-        return f"wanted: {wanted}"
-    number, _, unit = amount(axis, known.sigma).rpartition(" ")
-    return f"± {number if wanted.endswith(f' {unit}') else f'{number} {unit}'} of {wanted}"
-
-
-def _difference(axis: str, comparison: Comparison | None) -> str:
-    """Result minus what is installed, with its standard deviation; unknown without one."""
-    if comparison is None or not comparison.differences:
-        return ""
-    row = comparison.differences[0].axes[axis]
-    if not math.isfinite(row.sigma):
-        return "unknown"
-    sign = "+" * (row.difference >= 0)
-    return f"{sign}{amount(axis, row.difference)} ± {amount(axis, row.sigma)}"
-
-
-# ------------------------------------------------------------------------ pose
-
-
-def _values(result: ResultState) -> Iterator[tuple[str, str]]:
+def _values(state: NodeState) -> Iterator[tuple[str, str]]:
     """Each axis with its value and standard deviation; a question mark if it is not observed."""
+    result = state.extrinsic.result if state.extrinsic else None
+    if result is None:
+        return
     for axis in AXES:
         value, sigma = result.pose.get(axis), result.pose_sigma.get(axis)
         if value is None or sigma is None:
             yield axis, "? not observed"
-        elif axis in _AXES_OF_ROTATIONS:
+        elif axis in ROTATIONS:
             yield axis, f"{math.degrees(value):.2f} ± {two_digits(math.degrees(sigma))} deg"
         else:
             yield axis, f"{value:.3f} m ± {amount(axis, sigma)}"
+
+
+def _watched(axis: str, mount: MountState) -> Line:
+    """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
+    shift, sigma = _number(mount.shift.get(axis)), _number(mount.shift_sigma.get(axis))
+    if abs(shift) > _CLEARLY * sigma:
+        text = f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
+        return Line(Tone.BAD, _name(axis), text)
+    visible = _number(mount.visible_10min.get(axis))
+    if math.isfinite(visible):
+        text = f"not moved (would see {amount(axis, visible)})"
+        return Line(Tone.GOOD, _name(axis), text)
+    text = "not known yet" if mount.is_learning else "cannot be watched with this motion"
+    return Line(Tone.UNKNOWN, _name(axis), text)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 # ------------------------------------------------- health, verdict, comparison
@@ -341,26 +469,14 @@ def _result(state: NodeState) -> Iterator[Line]:
     comparison = state.progress.comparison if state.progress else None
     if comparison is None:
         text = "nothing to compare with (parameter installed)"
-        yield Line(Tone.UNKNOWN, "installed", text)
+        yield Line(Tone.UNKNOWN, "compared with what is installed", text)
     else:
         tone = _COMPARED.get(comparison.verdict, Tone.UNKNOWN)
-        yield Line(tone, "installed", comparison.sentence)
+        text = comparison.sentence.replace("+/-", "±")
+        yield Line(tone, "compared with what is installed", text)
     if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
         text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
         yield Line(_BROADCAST[broadcast], "on /tf_static", text)
-
-
-def _watched(axis: str, mount: MountState) -> Line:
-    """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
-    shift, sigma = _number(axis, mount.shift), _number(axis, mount.shift_sigma)
-    if abs(shift) > _CLEARLY * sigma:
-        return Line(Tone.BAD, axis, f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}")
-    visible = _number(axis, mount.visible_10min)
-    if math.isfinite(visible):
-        return Line(Tone.GOOD, axis, f"a change of {amount(axis, visible)} would be seen")
-    return Line(Tone.UNKNOWN, axis, "nothing yet")
-
-
-def _number(axis: str, values: AxisValues) -> float:
-    value = values.get(axis)
-    return math.nan if value is None else value
+    if state.saved is not None:
+        where = f"at {at_time(state.saved.at_s)} in {state.saved.directory}: {state.saved.text}"
+        yield Line(Tone.GOOD, "saved", where)

@@ -6,7 +6,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from hand_eye_calib.watch.board import COUNTING, Line, Tone, View
+from hand_eye_calib.watch.board import COUNTING, MOVED, Line, Tone, View
 
 _STYLES = {
     Tone.GOOD: "bold green",
@@ -17,10 +17,8 @@ _STYLES = {
 }
 _BAR_CELLS = 16
 
-# Narrower terminals do without the column of differences.
-_WIDE = 76
-# Lower ones do without empty lines.
-_HIGH = 30
+# Narrower terminals do without the column of differences; lower ones without empty lines.
+_WIDE, _HIGH = 76, 30
 
 KEYS, WATCHING_KEYS = "s solve   w save   r reset   q quit", "q quit"
 
@@ -38,19 +36,28 @@ def screen(view: View, width: int, height: int, footer: str = "") -> RenderableT
     """
     head = Text.assemble((f" {view.tone.value} {view.word} ", f"reverse {_STYLES[view.tone]}"))
     space = [Text()] * (height >= _HIGH)
-    parts: list[RenderableType] = [head, Text(view.sentence, style="bold"), *space]
+    parts: list[RenderableType] = [head, Text(view.sentence, style="bold")]
+    parts += [Text(view.facts, style="dim"), *space] if view.facts else space
     if view.answer is not None:
         parts += [_lines((view.answer,)), *space]
-    parts += [_bars(view, width), *space, *_pose(view), *space] if view.bars else []
+    parts += [Text(f"    {topic}") for topic in view.topics]
+    if view.bars:
+        values = Table.grid(padding=(0, 3))  # x, y, z above roll, pitch, yaw
+        texts = [Text.assemble((axis, "bold"), f" {text}") for axis, text in view.values]
+        for row in (texts[:3], texts[3:]):
+            values.add_row(*row)
+        parts += [_bars(view, width), *space, Text(view.title, style="dim")]
+        parts += [values, *space] if texts else space
     if view.watched:
-        title = Text("the mount: what ten minutes of motion would show", style="dim")
+        title = Text("the mount, after ten minutes of motion", style="dim")
         parts += [title, _lines(view.watched), *space]
     parts.append(_lines((*view.result, *view.health)))
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
-    keys = " " + "   ".join(filter(None, (KEYS if view.bars else WATCHING_KEYS, footer)))
+    keys = KEYS if view.bars else WATCHING_KEYS
+    keys = f"c recalibrate   a acknowledge   {keys}" if view.word == MOVED else keys
     title = Text(f"hand_eye_calib watch {view.node}".rstrip())
     body = Panel(Group(*parts), title=title, title_align="left")
-    return Group(Text(keys, style="dim"), body)
+    return Group(Text(f" {keys}   {footer}".rstrip(), style="dim"), body)
 
 
 def _bars(view: View, width: int) -> Table:
@@ -61,18 +68,10 @@ def _bars(view: View, width: int) -> Table:
         style = _STYLES[bar.tone]
         drawn = ProgressBar(1.0, bar.share, _BAR_CELLS, complete_style=style, finished_style=style)
         sign = Text(f"{bar.tone.value} {bar.word}", style=style)
-        difference = [Text(bar.difference)] * (is_wide and has_installed)
-        table.add_row(Text(bar.axis, style="bold"), drawn, sign, Text(bar.against), *difference)
+        more = [Text(bar.difference)] * (is_wide and has_installed)
+        more += [Text(bar.meaning)] * (is_wide and not has_installed)
+        table.add_row(Text(bar.name, style="bold"), drawn, sign, Text(bar.against), *more)
     return table
-
-
-def _pose(view: View) -> list[RenderableType]:
-    """Title, and three columns: x, y, z above roll, pitch, yaw."""
-    table = Table.grid(padding=(0, 3))
-    texts = [Text.assemble((axis, "bold"), f" {text}") for axis, text in view.values]
-    for row in (texts[:3], texts[3:]):
-        table.add_row(*row)
-    return [Text(view.title, style="dim"), *([table] if texts else [])]
 
 
 def _lines(lines: tuple[Line, ...]) -> Table:
@@ -97,7 +96,7 @@ class LineLog:
         lines = []
         if said != self._said:
             lines.append(f"{elapsed_s:6.1f} s  {view.tone.value} {view.word}: {view.sentence}")
-            axes = "  ".join(f"{bar.axis} {100 * bar.share:.0f} %" for bar in view.bars)
+            axes = "  ".join(f"{bar.name} {100 * bar.share:.0f} %" for bar in view.bars)
             more = [axes, *(f"{line.name}: {line.text}" for line in view.result)]
             lines += [f"{'':10}{'   '.join(more)}"] if view.bars else []
         if view.answer is not None and view.answer != self._answer:

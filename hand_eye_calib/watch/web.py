@@ -5,6 +5,7 @@ the key that is part of the address: a page of somebody else in the same browser
 """
 
 import hmac
+import os
 import secrets
 import socket
 import threading
@@ -17,11 +18,19 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.text import AXIS_UNITS, parse_prior
 from hand_eye_calib.watch.board import Board
 from hand_eye_calib.watch.html import fragment
 
 PORT = 8765
-REQUESTS = ("solve", "save", "reset")
+# Requests of the page. Those with := set a parameter of the node, the others call its services.
+BUTTONS = {
+    "solve": "solve",
+    "save": "save",
+    "reset": "reset",
+    "recalibrate": "monitor:=false",
+    "acknowledge": "",
+}
 
 # The view is looked at so often, and something is sent at least so often (s).
 _LOOK_S, _SEND_S = 0.25, 1.0
@@ -30,18 +39,20 @@ _LOOK_S, _SEND_S = 0.25, 1.0
 _PATIENCE_S = 10.0
 _MOST_CLIENTS = 32
 
-_FILES = {
-    "/": ("page.html", "text/html; charset=utf-8"),
-    "/page.css": ("page.css", "text/css; charset=utf-8"),
-    "/page.js": ("page.js", "text/javascript; charset=utf-8"),
-}
+_PAGE = {"/": "page.html", "/page.css": "page.css", "/page.js": "page.js"}
+_KINDS = {"css": "text/css", "js": "text/javascript", "html": "text/html", "yaml": "text/plain"}
+# Files of a saved result that the page links to.
+SAVED = ("report.html", "extrinsic.yaml")
 _HEADERS = {
     "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; connect-src 'self'; img-src data:; "
-    "script-src 'self'; style-src 'self'; frame-ancestors 'none'; base-uri 'none'",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
+_POLICY = (
+    "default-src 'none'; connect-src 'self'; img-src data:; script-src 'self'; style-src 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'"
+)
+_POLICY_OF_SAVED = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 
 
 class WebServer(ThreadingHTTPServer):
@@ -51,7 +62,8 @@ class WebServer(ThreadingHTTPServer):
     ----------
     board : Board
     ask : callable
-        Called with one of :data:`REQUESTS`, in another thread.
+        Called in another thread with what the node is asked for: a service, or a parameter and its
+        value as in ``prior.z:=1.85m+/-0.02m``.
     address : (str, int)
         Host and port to listen on; an empty host stands for all addresses of the computer, port 0
         for any that is free.
@@ -127,72 +139,77 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _PATIENCE_S
 
     def do_GET(self) -> None:
-        path, query = self._parts()
-        if path in ("/page.css", "/page.js"):  # no secrets, and asked for without the key
-            self._send_file(path)
-        elif not self._has_key(query):
-            self._refuse()
+        path = self._path()
+        if path in _PAGE and (path != "/" or self._has_key()):  # the others have no secrets
+            content = files("hand_eye_calib.watch").joinpath("page", _PAGE[path]).read_bytes()
+            self._send(HTTPStatus.OK, content, _PAGE[path])
+        elif not self._has_key():
+            text = "Open the whole address that the terminal with `hand_eye_calib watch` shows."
+            self._send(HTTPStatus.FORBIDDEN, text)
         elif path == "/events":
             self._send_events()
-        elif path in _FILES:
-            self._send_file(path)
+        elif path[1:] in SAVED and (saved := _saved(self.server.board, path[1:])):
+            self._send(HTTPStatus.OK, saved, path, _POLICY_OF_SAVED)
         else:
-            self._send(HTTPStatus.NOT_FOUND, b"there is no such page", "text/plain")
+            self._send(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def do_POST(self) -> None:
         self.close_connection = True  # a body, if there is one, is not read
-        path, query = self._parts()
-        request = path.removeprefix("/")
-        if not self._has_key(query):
-            self._refuse()
-        elif request in REQUESTS:
-            self.server.ask(request)
-            self._send(HTTPStatus.OK, b"", "text/plain")
+        request = self._path()[1:]
+        status, text = HTTPStatus.OK, ""
+        if not self._has_key():
+            status, text = HTTPStatus.FORBIDDEN, "the key is missing"
+        elif request == "acknowledge":
+            self.server.board.acknowledge()
+        elif request in BUTTONS:
+            self.server.ask(BUTTONS[request])
+        elif request == "prior":
+            try:
+                self.server.ask(_prior(*map(self._given, ("axis", "value", "sigma"))))
+            except ConfigError as error:
+                status, text = HTTPStatus.BAD_REQUEST, str(error)
         else:
-            self._send(HTTPStatus.NOT_FOUND, b"there is no such request", "text/plain")
+            status, text = HTTPStatus.NOT_FOUND, "there is no such request"
+        self._send(status, text)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Keep the terminal to the view."""
 
-    def _parts(self) -> tuple[str, dict[str, str]]:
-        url = urlsplit(self.path)
-        return url.path, {name: values[-1] for name, values in parse_qs(url.query).items()}
+    def _path(self) -> str:
+        return urlsplit(self.path).path
 
-    def _has_key(self, query: dict[str, str]) -> bool:
-        given = query.get("key", "").encode(errors="replace")
+    def _given(self, name: str) -> str:
+        return parse_qs(urlsplit(self.path).query).get(name, [""])[-1]
+
+    def _has_key(self) -> bool:
+        given = self._given("key").encode(errors="replace")
         return hmac.compare_digest(given, self.server.key.encode())
 
-    def _refuse(self) -> None:
-        text = b"Open the whole address that the terminal with `hand_eye_calib watch` shows."
-        self._send(HTTPStatus.FORBIDDEN, text, "text/plain")
-
-    def _send_file(self, path: str) -> None:
-        name, kind = _FILES[path]
-        content = files("hand_eye_calib.watch").joinpath("page", name).read_bytes()
-        self._send(HTTPStatus.OK, content, kind)
-
-    def _send(self, status: HTTPStatus, content: bytes, kind: str) -> None:
-        self._begin(status, kind)
-        self.send_header("Content-Length", str(len(content)))
+    def _send(
+        self, status: HTTPStatus, content: str | bytes, name: str = "", policy: str = _POLICY
+    ) -> None:
+        made = content.encode() if isinstance(content, str) else content
+        self._begin(status, _KINDS.get(name.rpartition(".")[2], "text/plain"), policy)
+        self.send_header("Content-Length", str(len(made)))
         self.end_headers()
-        self.wfile.write(content)
+        self.wfile.write(made)
 
-    def _begin(self, status: HTTPStatus, kind: str) -> None:
+    def _begin(self, status: HTTPStatus, kind: str, policy: str = _POLICY) -> None:
         self.send_response(status)
-        self.send_header("Content-Type", kind)
-        for name, value in _HEADERS.items():
+        headers = {"Content-Type": f"{kind}; charset=utf-8", "Content-Security-Policy": policy}
+        for name, value in (_HEADERS | headers).items():
             self.send_header(name, value)
 
     def _send_events(self) -> None:
         if not self.server.clients.acquire(blocking=False):
-            self._send(HTTPStatus.SERVICE_UNAVAILABLE, b"too many browsers", "text/plain")
+            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "too many browsers")
             return
         self.close_connection = True
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: a phone out of reach is noticed soon
             patience_ms = round(1000 * _PATIENCE_S)
             self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
         try:
-            self._begin(HTTPStatus.OK, "text/event-stream; charset=utf-8")
+            self._begin(HTTPStatus.OK, "text/event-stream")
             self.end_headers()
             for event in self._events():
                 self.wfile.write(event)
@@ -203,10 +220,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _events(self) -> Iterator[bytes]:
         """The view whenever it has changed; an empty event every second in between."""
-        sent, sent_s = "", -_SEND_S
+        sent, sent_s, board = "", -_SEND_S, self.server.board
         while not self.server.stopping.wait(_LOOK_S if sent else 0.0):
             now_s = time.monotonic()
-            made = fragment(self.server.board.view(now_s))
+            view = board.view(now_s)
+            there = [name for name in SAVED if os.path.isfile(os.path.join(view.saved_in, name))]
+            made = fragment(view, there if view.saved_in else ())
             if made != sent:
                 one_line = made.replace("\r", " ").replace("\n", " ")
                 yield f"data: {one_line}\n\n".encode()
@@ -214,3 +233,31 @@ class _Handler(BaseHTTPRequestHandler):
             elif now_s - sent_s >= _SEND_S:
                 yield b"data:\n\n"
                 sent_s = now_s
+
+
+def _saved(board: Board, name: str) -> bytes:
+    """A file of the saved result, if it is on this computer; links are not followed."""
+    directory = board.view(time.monotonic()).saved_in
+    try:
+        file = os.open(os.path.join(directory, name), os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return b""
+    with os.fdopen(file, "rb") as opened:
+        return opened.read() if directory else b""
+
+
+def _prior(axis: str, value: str, sigma: str) -> str:
+    """The parameter for an axis that was measured by hand, in m or degrees.
+
+    Raises
+    ------
+    ConfigError
+        If these are no numbers.
+    """
+    if axis not in AXIS_UNITS:
+        raise ConfigError(f"an axis is one of {', '.join(AXIS_UNITS)}")
+    unit = "m" if AXIS_UNITS[axis] == "m" else "deg"
+    value, sigma = (each.strip().replace(",", ".") for each in (value, sigma))
+    text = f"{value}{unit}+/-{sigma}{unit}"
+    parse_prior(f"prior.{axis}", text)
+    return f"prior.{axis}:={text}"

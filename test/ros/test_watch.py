@@ -78,7 +78,7 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     peer.solve(publishers, *parts[1])  # and one result is none
     peer.solve(publishers, *parts[2])
     watch.wait_for("✓ DONE: ")
-    watch.wait_for(r"x 100 %  y 100 %  z 100 %  roll 100 %  pitch 100 %  yaw 100 %")
+    watch.wait_for(r"along x 100 %  along y 100 %  along z 100 %  about x 100 %")
 
     port = int(watch.wait_for(r"http://127.0.0.1:(\d+)/\?key=word", watch.notes)[1])
     page = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
@@ -93,7 +93,7 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     assert "DONE" in shown
 
     node.stop()
-    watch.wait_for("✗ SILENT: ")
+    watch.wait_for("✓ ENDED: The node has ended. The result was saved at")
     watch.process.send_signal(signal.SIGINT)
     assert watch.process.wait(PATIENCE_S) == 0
     assert "Traceback" not in watch.notes.read_text()

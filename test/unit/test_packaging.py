@@ -32,6 +32,7 @@ DECLARED_AS = {
     "cv2": ("opencv-python-headless", None),  # optional, for images of a target alone
     "small_gicp": ("small_gicp", None),  # optional, for points of a lidar alone
     "argcomplete": ("argcomplete", None),  # optional, for the command completion alone
+    "segno": ("segno", None),  # optional, for the QR code of watch --web alone
     "casadi": ("casadi", "casadi-pip"),
     "jinja2": ("jinja2", "python3-jinja2"),
     "matplotlib": ("matplotlib", "python3-matplotlib"),

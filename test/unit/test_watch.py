@@ -4,6 +4,7 @@ import http.client
 import io
 import queue
 import re
+import sys
 import time
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -12,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.cli.watch import Session
+from hand_eye_calib.cli.watch import Session, qr_code
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.live.state import (
     Broadcast,
@@ -24,6 +25,7 @@ from hand_eye_calib.live.state import (
     NodeState,
     ProgressState,
     ResultState,
+    SavedState,
 )
 from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.records import (
@@ -65,6 +67,9 @@ AT = Progress(
 )
 CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, correlation=0.9, findings=())
 MOUNT = MountState(level=Level.OK, text="it has not", seconds_of_motion=200)
+
+
+SAVED = SavedState(directory="/home/live", at_s=time.time(), text="USE: all six axes")
 
 
 def inputs(parent=Level.OK, child=Level.OK):
@@ -139,11 +144,23 @@ ERROR = {"level": Level.ERROR}
             state(checks=replace(CHECKS, level=Level.WARN, age_s=None)),
             *(0.5, Tone.BUSY, "GO ON", "Go on for"),
         ),
-        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved."),
+        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved. Look at its"),
         (mount(), 0.5, Tone.GOOD, "WATCHING", "It has not."),
         (mount(is_learning=True), 0.5, Tone.BUSY, "LEARNING", "It has not."),
         (mount(level=Level.WARN, text="no URDF"), 0.5, Tone.ACT, "NOT WATCHING", "No URDF."),
         (state(extrinsic=replace(EXTRINSIC, **ERROR)), 0.5, Tone.BAD, "BROKEN", "Known."),
+        (
+            replace(state(), has_ended=True),
+            9.0,
+            Tone.ACT,
+            "ENDED",
+            "The node has ended. A result is",
+        ),
+        (replace(mount(), has_ended=True), 0.5, Tone.ACT, "ENDED", "The node has ended: nobody"),
+        (
+            replace(state(), has_ended=True, saved=SAVED),
+            *(9.0, Tone.GOOD, "ENDED", "The node has ended. The result was saved at "),
+        ),
     ],
 )
 def test_the_headline_is_what_a_person_should_do_first(each, now_s, tone, word, sentence):
@@ -153,10 +170,13 @@ def test_the_headline_is_what_a_person_should_do_first(each, now_s, tone, word, 
 
 
 def test_bars_show_the_share_of_the_information_and_the_time_left():
-    bars = {bar.axis: bar for bar in view_of(state()).bars}
-    assert list(bars) == list(AXES)
+    bars = dict(zip(AXES, view_of(state()).bars, strict=True))
     assert (bars["x"].share, bars["x"].tone, bars["x"].word) == (1.0, Tone.GOOD, "enough")
-    assert [bar.meaning for bar in bars.values()][2:4] == ["along z", "about x"]
+    assert [bar.name for bar in bars.values()][2:4] == ["along z", "about x"]
+    assert {bar.meaning for bar in bars.values()} == {""}
+    on_wheels = view_of(state(extrinsic=replace(EXTRINSIC, has_vehicle_axes=True)))
+    assert [bar.meaning for bar in on_wheels.bars][2:4] == ["height", "tilt to a side"]
+    assert ["sketch" in fragment(each) for each in (on_wheels, view_of(state()))] == [True, False]
     assert bars["z"].share == pytest.approx(0.25)  # twice the target: a quarter of the information
     assert (bars["z"].tone, bars["z"].word) == (Tone.ACT, "25 s left")
     assert (bars["z"].against, bars["yaw"].against) == ("± 4 of 2 cm", "± 0.057 of 0.3 deg")
@@ -197,7 +217,16 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     comparison = Comparison(
         sentence="z has moved by 3 cm", verdict="moved", differences=(difference,)
     )
-    view = view_of(state(comparison=comparison))
+    done = {"at": {"done": True, "sentence": "Done: known. Stop and save."}}
+    view = view_of(state(comparison=comparison, **done))
+    assert (view.word, view.tone, view.buttons[0]) == ("DONE", Tone.ACT, "save")
+    assert view.sentence.startswith("camera HAS MOVED: along x +3.1 cm, along y")
+    assert view.sentence.endswith("Save.")
+    saved = view_of(replace(state(**done), saved=SAVED))
+    assert saved.sentence.startswith("Done: known. Saved at ")
+    assert saved.sentence.endswith(" in /home/live.")
+    assert (saved.tone, saved.buttons[0], saved.saved_in) == (Tone.GOOD, "solve", "/home/live")
+    assert (saved.result[-1].name, saved.result[-1].tone) == ("saved", Tone.GOOD)
     assert (view.result[0].tone, view.result[0].text) == (Tone.ACT, "USE WITH CARE")
     assert view.reasons == ("a: b", "c: d")
     assert (view.result[1].tone, view.result[1].text) == (Tone.ACT, "z has moved by 3 cm")
@@ -220,17 +249,23 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
         mount(
             **ERROR,
             text="the mount has moved",
+            alarms=1,
+            since_ns=10**18,
+            newest_ns=10**18 + 130 * 10**9,
             visible_10min=dict.fromkeys(AXES, 0.004) | {"z": None},
             shift={"yaw": 0.0175, "x": 0.001},
             shift_sigma={"yaw": 0.001, "x": 0.001},
         )
     )
     lines = {line.name: (line.tone, line.text) for line in view.watched}
-    assert lines["yaw"] == (Tone.BAD, "moved by 1 deg ± 0.057 deg")
-    assert lines["x"] == (Tone.GOOD, "a change of 4 mm would be seen")
-    assert lines["z"] == (Tone.UNKNOWN, "nothing yet")
+    assert lines["about z"] == (Tone.BAD, "moved by 1 deg ± 0.057 deg")
+    assert lines["along x"] == (Tone.GOOD, "not moved (would see 4 mm)")
+    assert lines["along z"] == (Tone.UNKNOWN, "cannot be watched with this motion")
     assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
-    assert "the mount: what ten minutes" in fragment(view)
+    assert view.sentence.startswith("The child sensor has moved about z by 1 deg since 2001-09-09 ")
+    assert view.sentence.endswith("Then recalibrate, or acknowledge.")
+    assert (view.facts, view.buttons) == ("2 min ago", ("recalibrate", "acknowledge"))
+    assert "the mount, after ten minutes" in fragment(view)
     assert "precision" not in fragment(view)
     assert "moved by 1 deg" in drawn(view, 80)
     assert "s solve" not in drawn(view, 80)
@@ -248,6 +283,27 @@ def test_of_several_nodes_the_first_that_speaks_is_shown_or_the_one_that_is_want
     other = Board("/x")
     other.take(state("/a"), 0.0)
     assert (other.node, other.view(0.0).word) == ("", "NO NODE")
+
+
+def test_an_alarm_that_somebody_knows_of_is_quiet_until_the_next():
+    board = Board()
+    board.take(mount(**ERROR, text="moved", alarms=1), 0.0)
+    board.acknowledge()
+    view = board.view(0.5)
+    assert (view.word, view.tone, view.buttons) == ("MOUNT MOVED", Tone.ACT, ("recalibrate",))
+    assert view.facts.endswith("; acknowledged")
+    board.take(mount(**ERROR, text="moved", alarms=2), 1.0)
+    assert board.view(1.0).tone is Tone.BAD
+
+
+def test_topics_with_poses_are_listed_where_an_input_lacks_them():
+    board = Board()
+    board.topics = ("/lidar (nav_msgs/msg/Odometry, 1 publisher)",)
+    board.take(state(inputs=inputs(child=Level.WARN)), 0.0)
+    assert board.view(0.0).topics == board.topics
+    assert "/lidar (nav_msgs" in drawn(board.view(0.0), 80)
+    board.take(state(), 0.0)
+    assert board.view(0.0).topics == ()
 
 
 def test_an_answer_is_shown_for_a_while():
@@ -286,7 +342,7 @@ def test_lines_are_printed_when_something_new_is_said():
 
     first = lines(state(), 1.0)
     assert first[0] == "   1.0 s  ▶ GO ON: Go on for about 25 s: z is behind."
-    assert "z 25 %" in first[1]
+    assert "along z 25 %" in first[1]
     assert lines(state(axes={"x": replace(KNOWN, sigma=0.003)}), 2.0) == []
     assert lines(state(at={"done": True}), 3.0)
     assert log.lines(board.view(9.0), 9.0)
@@ -308,7 +364,7 @@ def typed():
         keys.append(text)
         return session.view()
 
-    type_keys.session, type_keys.requests = session, requests
+    type_keys.session, type_keys.requests, type_keys.board = session, requests, board
     return type_keys
 
 
@@ -316,10 +372,19 @@ def test_keys_ask_and_a_reset_takes_two(typed):
     typed("sx9w")
     assert [typed.requests.get(), typed.requests.get()] == ["solve", "save"]
     assert typed("r").answer.text == "forgets all poses: press r again"
+    typed("ca")  # no mount has moved
     assert typed.requests.empty()
     typed("r")
     assert typed.requests.get() == "reset"
-    assert not typed.session.is_over
+    typed.board.take(mount(**ERROR, text="moved", alarms=1), time.monotonic())
+    typed("c")
+    assert "acknowledged" in typed("a").facts
+    assert typed.requests.empty()
+    typed("c")
+    assert typed.requests.get() == "monitor:=false"
+    assert (typed.session.is_over, typed.session.shows_code) == (False, False)
+    typed("p")
+    assert typed.session.shows_code
     typed("q")
     assert typed.session.is_over
 
@@ -351,7 +416,8 @@ def test_the_fragment_is_well_formed_and_escapes_what_nodes_say():
     text = fragment(view_of(each))
     assert "<script" not in text
     root = ElementTree.fromstring(f"<main>{text}</main>")
-    assert [each.get("aria-label") for each in root.iter("progress")] == list(AXES)
+    assert [each.get("aria-label") for each in root.iter("progress")][2:4] == ["along z", "about x"]
+    assert root.find("*[@id='state']").get("data-buttons") == "solve save reset"
     assert "".join(root.find(".//h1").itertext()) == "▶ GO ON"
 
 
@@ -375,19 +441,20 @@ def test_the_page_needs_nothing_from_elsewhere(server):
     page = fetch(server, "GET", "/?key=word")
     text = page.read().decode()
     names = re.findall(r'(?:src|href)="([^"]+)"', text)
-    assert names == ["page.css", "data:,", "page.js"]
+    assert sorted(names) == ["data:,", "page.css", "page.js"]
     assert "default-src 'none'" in page.getheader("Content-Security-Policy")
     for name in ("/page.css", "/page.js"):
         answer = fetch(server, "GET", name)
         assert answer.status == 200
-        assert "//" not in answer.read().decode().replace("// ", "")
+        text = answer.read().decode().replace("// ", "").replace("http://www.w3.org/2000/svg", "")
+        assert "//" not in text
 
 
 def test_events_bring_the_view_at_once_and_again_when_it_changes(server):
     events = fetch(server, "GET", "/events?key=word")
     assert events.getheader("Content-Type").startswith("text/event-stream")
     first = events.readline().decode()
-    assert first.startswith("data: <p")
+    assert first.startswith('data: <div id="state"')
     assert "GO ON" in first
     server.board.take(state(at={"done": True}), time.monotonic())
     changed = next(line for line in iter(events.readline, b"") if b"<" in line)
@@ -405,12 +472,49 @@ def test_nothing_is_seen_or_asked_without_the_key(server):
     assert server.requests.empty()
 
 
+def test_an_axis_measured_by_hand_becomes_a_parameter(server):
+    good = fetch(server, "POST", "/prior?key=word&axis=z&value=1,85&sigma=0.02")
+    assert good.status == 200
+    assert server.requests.get(timeout=PATIENCE_S) == "prior.z:=1.85m+/-0.02m"
+    fetch(server, "POST", "/prior?key=word&axis=yaw&value=-90&sigma=2")
+    assert server.requests.get(timeout=PATIENCE_S) == "prior.yaw:=-90deg+/-2deg"
+    for wrong in ("axis=q&value=1&sigma=1", "axis=z&value=1&sigma=0", "axis=z&value=1;rm&sigma=1"):
+        assert fetch(server, "POST", f"/prior?key=word&{wrong}").status == 400
+    assert server.requests.empty()
+    stuck = state(at={"will_not_get_there": True}, level=Level.WARN)
+    assert 'data-by-hand="z"' in fragment(view_of(stuck))
+
+
+def test_saved_files_are_served_and_nothing_else(server, tmp_path):
+    assert fetch(server, "GET", "/report.html?key=word").status == 404
+    (tmp_path / "report.html").write_text("<p>report")
+    (tmp_path / "extrinsic.yaml").symlink_to("/etc/passwd")
+    saved = replace(SAVED, directory=str(tmp_path))
+    server.board.take(replace(state(), saved=saved), time.monotonic())
+    found = fetch(server, "GET", "/report.html?key=word")
+    assert (found.status, found.read()) == (200, b"<p>report")
+    assert "script" not in found.getheader("Content-Security-Policy")
+    assert fetch(server, "GET", "/report.html").status == 403
+    for name in ("extrinsic.yaml", "../report.html", "journal"):
+        assert fetch(server, "GET", f"/{name}?key=word").status == 404
+    events = fetch(server, "GET", "/events?key=word")
+    assert 'data-file="report.html"' in events.readline().decode()
+
+
+def test_the_address_is_drawn_as_a_code(monkeypatch):
+    monkeypatch.setitem(sys.modules, "segno", None)
+    assert qr_code("http://x") == ""
+    monkeypatch.undo()
+    pytest.importorskip("segno", reason="segno is not installed: '.[qr]'")
+    assert len(qr_code("http://192.168.178.43:8765/?key=Ab3dE_-9").splitlines()) > 14
+
+
 def test_a_browser_that_leaves_makes_room_for_another(monkeypatch):
     monkeypatch.setattr(web, "_MOST_CLIENTS", 1)
     server = WebServer(Board(), print, ("127.0.0.1", 0), key="word")
     try:
         events = fetch(server, "GET", "/events?key=word")
-        assert events.readline().startswith(b"data: <p")
+        assert events.readline().startswith(b"data: <div")
         assert fetch(server, "GET", "/events?key=word").status == 503
         events.close()
         end = time.monotonic() + PATIENCE_S

@@ -19,24 +19,30 @@ PAGE = (FOLDER / "page.html").read_text(encoding="utf-8")
 BROWSER = """
 let now = 0, tick = null; const log = {posts: [], opened: [], shaken: 0};
 Date.now = () => now;
-const element = (more) => ({
+const element = (more) => withClasses({
   dataset: {}, hidden: false, disabled: false, textContent: "", heard: {}, classes: new Set(),
-  classList: {toggle(name, on) { on ? part.connection.classes.add(name)
-                                    : part.connection.classes.delete(name); }},
+  setAttribute() {},
   addEventListener(name, run) { this.heard[name] = run; }, ...more});
-const part = {connection: element(), footer: element(), view: element({
-  innerHTML: "",
-  querySelector(what) {
-    if (what === "progress") return this.innerHTML.includes("<progress") ? {} : null;
+const withClasses = (one) => { one.classList = {toggle(name, on) {
+  on ? one.classes.add(name) : one.classes.delete(name); }}; return one; };
+const nodes = {connection: element(), footer: element(), view: element({
+  innerHTML: "", links: [], querySelectorAll() { return this.links; },
+  querySelector() {
     return {textContent: this.innerHTML.match(/<h1>(.*?)<.h1>/)[1].replace(/<[^>]*>/g, "")};
   }})};
+for (const id of ["by-hand", "sound", "asked", "unit", "refused", "icon"]) nodes[id] = element();
+const shown = {buttons: "solve save reset", byHand: ""};
+nodes.state = {className: "busy", dataset: shown};
 const keys = ["solve", "save", "reset"].map((request) => element(
   {dataset: request === "reset" ? {request, sure: "Forget all poses?"} : {request}}));
-globalThis.document = {title: "", getElementById: (id) => part[id],
-  querySelector: () => part.footer, querySelectorAll: () => keys};
+globalThis.document = {title: "", getElementById: (id) => nodes[id], visibilityState: "visible",
+  addEventListener() {}, querySelector: () => nodes.footer, querySelectorAll: () => keys};
+globalThis.FormData = class {
+  *[Symbol.iterator]() { yield ["value", "1.85"]; yield ["sigma", "0.02"]; }
+};
 globalThis.location = {search: "?key=word"};
 Object.defineProperty(globalThis, "navigator", {value: {vibrate() { log.shaken += 1; }}});
-let sure = false, answer = {ok: true};
+let sure = false, answer = {ok: true, text: async () => ""};
 globalThis.confirm = () => sure;
 globalThis.fetch = (address, {method}) => {
   log.posts.push(`${method} ${address}`); return Promise.resolve(answer); };
@@ -49,8 +55,11 @@ globalThis.EventSource = class {
 let events = null;
 const state = () => ({...log, posts: [...log.posts],
   opened: log.opened.length, last: log.opened.at(-1),
-  title: document.title, said: part.connection.textContent,
-  lost: part.connection.classes.has("lost"), footer: part.footer.hidden,
+  title: document.title, said: nodes.connection.textContent,
+  lost: nodes.connection.classes.has("lost"), footer: nodes.footer.hidden,
+  form: nodes["by-hand"].hidden, hidden: keys.map((key) => key.hidden),
+  main: keys.map((key) => key.classes.has("main")), link: nodes.view.links[0]?.href,
+  refused: nodes.refused.textContent,
   disabled: keys.every((button) => button.disabled)});
 """
 
@@ -74,11 +83,11 @@ class Found(HTMLParser):
 
 def test_the_script_finds_what_it_looks_for():
     page = Found(PAGE)
-    assert set(re.findall(r'getElementById\("(\w+)"\)', SCRIPT)) <= page.ids
+    assert set(re.findall(r'part\("([\w-]+)"\)', SCRIPT)) - {"state"} <= page.ids
     assert set(re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)) <= set(page.tags)
-    assert tuple(page.data["data-request"]) == web.REQUESTS
+    assert sorted(page.data["data-request"]) == sorted(web.BUTTONS)
     assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
-    assert page.data["data-sure"] == ["Forget all poses?"]
+    assert len(page.data["data-sure"]) == 2
 
 
 def played(steps):
@@ -100,7 +109,7 @@ def test_the_page_shows_what_comes_and_says_when_nothing_comes():
         [
             "",
             f"now = 100; events.onmessage({{data: {go_on}}});",
-            "now = 200; events.onmessage({data: '<h1>MOUNT MOVED</h1>'});",
+            "shown.buttons = ''; now = 200; events.onmessage({data: '<h1>MOUNT MOVED</h1>'});",
             "now = 3000; events.onmessage({data: ''}); tick();",
             "now = 7500; tick();",
             "now = 9500; tick();",
@@ -132,10 +141,30 @@ def test_buttons_are_asked_for_by_their_addresses():
             click(0) + click(1),
             click(2),
             "sure = true;" + click(2),
-            "answer = {ok: false};" + click(1),
+            "answer = {ok: false, text: async () => ''};" + click(1),
         ]
     )
     asked = [f"POST {name}?key=word" for name in ("solve", "save", "reset")]
     assert [each["posts"] for each in states[:3]] == [asked[:2], asked[:2], asked]
     assert states[3]["posts"][-1] == "POST save?key=word"
     assert states[3]["lost"]
+
+
+def test_what_is_to_be_pressed_first_stands_out_and_an_axis_can_be_given_by_hand():
+    go_on = "events.onmessage({data: '<h1>GO ON</h1>'});"
+    linked = "nodes.view.links = [{dataset: {file: 'a'}}];"
+    states = played(
+        [
+            go_on,
+            f"shown.buttons = 'save solve'; {linked}{go_on}",
+            f"shown.byHand = 'z'; {go_on}",
+            "answer = {ok: false, status: 400, text: async () => 'no'};"
+            "nodes['by-hand'].heard.submit({preventDefault() {}});" + 3 * "await null;",
+        ]
+    )
+    assert [each["main"] for each in states[:2]] == [[False] * 3, [False, True, False]]
+    assert [each["hidden"] for each in states[:2]] == [[False] * 3, [False, False, True]]
+    assert states[1]["link"] == "a?key=word"
+    assert [each["form"] for each in states] == [True, True, False, False]
+    assert states[3]["posts"] == ["POST prior?key=word&value=1.85&sigma=0.02&axis=z"]
+    assert (states[3]["refused"], states[3]["lost"]) == ("no", False)

@@ -2,15 +2,18 @@
 
 // The key comes with the address that the terminal shows.
 const address = new URLSearchParams(location.search);
-const view = document.getElementById("view");
-const connection = document.getElementById("connection");
+const part = (id) => document.getElementById(id);
+const view = part("view"), connection = part("connection"), form = part("by-hand");
+const sound = part("sound");
 const footer = document.querySelector("footer");
-const buttons = document.querySelectorAll("button");
+const buttons = document.querySelectorAll("button[data-request]");
 
 // The server sends something every second. A connection that is silent for longer is opened anew:
 // a phone that was asleep or out of reach does not notice by itself.
 const SILENT_MS = 4000, RETRY_MS = 1000;
-let source = null, heardAt = 0, lostAt = null;
+let source = null, heardAt = 0, lostAt = null, tones = null;
+
+const ICONS = {good: "#11703a", busy: "#0b5cad", act: "#c77700", bad: "#b3211c", unknown: "#6b4a8a"};
 
 function show(isLive) {
   if (!isLive && lostAt === null) lostAt = Date.now();
@@ -22,14 +25,40 @@ function show(isLive) {
   for (const button of buttons) button.disabled = !isLive;
 }
 
+// Who drives does not look at the page: let the phone shake, and sound, when it says something
+// else; high for what is good, low for what is bad.
+function call(tone) {
+  if (navigator.vibrate) navigator.vibrate([200, 100, 200]);
+  if (tones === null) return;
+  const beep = tones.createOscillator();
+  beep.frequency.value = {good: 1047, bad: 262, act: 392}[tone] || 659;
+  beep.connect(tones.destination);
+  beep.start();
+  beep.stop(tones.currentTime + (tone === "bad" ? 1.2 : 0.3));
+}
+
 function put(html) {
   view.innerHTML = html;
-  // A node that only watches the mount has no bars, and nothing to solve, save or reset.
-  footer.hidden = view.querySelector("progress") === null;
+  const state = part("state"), shown = state.dataset.buttons.split(" ");
+  for (const button of buttons) {
+    button.hidden = !shown.includes(button.dataset.request);
+    button.classList.toggle("main", button.dataset.request === shown[0] && shown[0] !== "solve");
+  }
+  footer.hidden = shown[0] === "";
+  form.hidden = state.dataset.byHand === "";
+  if (!form.hidden) {
+    part("asked").textContent = state.dataset.byHand;
+    part("unit").textContent = "xyz".includes(state.dataset.byHand) ? "m" : "deg";
+  }
+  for (const link of view.querySelectorAll("a[data-file]")) {
+    link.href = link.dataset.file + "?" + address;
+  }
   const word = view.querySelector("h1").textContent;
-  // Who drives does not look at the page: let the phone shake when it says something else.
-  if (word !== document.title && navigator.vibrate) navigator.vibrate([200, 100, 200]);
+  if (word !== document.title) call(state.className);
   document.title = word;
+  const colour = encodeURIComponent(ICONS[state.className]);
+  part("icon").href = "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' "
+    + `viewBox='0 0 9 9'><circle cx='4.5' cy='4.5' r='4' fill='${colour}'/></svg>`;
 }
 
 function connect() {
@@ -49,12 +78,41 @@ setInterval(() => {
   if (isClosed || Date.now() - heardAt > SILENT_MS) { show(false); connect(); }
 }, RETRY_MS);
 
+async function post(request, more = "") {
+  try {
+    const answer = await fetch(request + "?" + address + more, {method: "POST"});
+    if (!answer.ok && answer.status !== 400) show(false);
+    return answer.ok ? "" : await answer.text();
+  } catch (error) { show(false); return ""; }
+}
+
 for (const button of buttons) {
   button.addEventListener("click", () => {
     if (button.dataset.sure && !confirm(button.dataset.sure)) return;
-    fetch(button.dataset.request + "?" + address, {method: "POST"})
-      .then((answer) => { if (!answer.ok) show(false); }, () => show(false));
+    post(button.dataset.request);
   });
 }
 
+form.addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const given = new URLSearchParams(new FormData(form));
+  given.set("axis", part("asked").textContent);
+  part("refused").textContent = await post("prior", "&" + given);
+});
+
+// Browsers allow sound only after a touch, and a screen that stays on only to pages that come over
+// https or from the same computer.
+sound.addEventListener("click", () => {
+  tones = tones === null ? new AudioContext() : null;
+  sound.textContent = tones ? "Sound on" : "Sound off";
+  sound.setAttribute("aria-pressed", String(tones !== null));
+});
+
+function stayOn() {
+  if (navigator.wakeLock && document.visibilityState === "visible") {
+    navigator.wakeLock.request("screen").catch(() => {});
+  }
+}
+document.addEventListener("visibilitychange", stayOn);
+stayOn();
 connect();
