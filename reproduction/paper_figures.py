@@ -7,32 +7,43 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from matplotlib.lines import Line2D
 
 from hand_eye_calib.report import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from reproduction.results import Summary
 
+# Okabe, Ito 2008, without the yellow that vanishes on white.
+_BLACK, _SKY, _GREEN, _BLUE = "#000000", "#56B4E9", "#009E73", "#0072B2"
+_VERMILION, _PURPLE, _GREY = "#D55E00", "#CC79A7", "#666666"
+_SMALL = ("font_size", "axes_labelsize", "xtick_labelsize", "ytick_labelsize", "axes_titlesize")
+_WHITE = dict.fromkeys(("figure_facecolor", "savefig_facecolor"), "white")
+_STYLE = dict.fromkeys(_SMALL, 7.0) | _WHITE | {"savefig_dpi": 200, "lines_linewidth": 1.1}
+
 REFERENCE_LOOKS = {
-    "A": (style.BLACK, "D", "-"),
-    "B1": (style.VERMILION, "o", "-"),
-    "B5": (style.SKY, "o", "-"),
-    "B10": (style.BLUE, "o", "-"),
-    "C5": (style.PURPLE, "s", "--"),
-    "C10": (style.GREEN, "s", "--"),
+    "A": (_BLACK, "D", "-"),
+    "B1": (_VERMILION, "o", "-"),
+    "B5": (_SKY, "o", "-"),
+    "B10": (_BLUE, "o", "-"),
+    "C5": (_PURPLE, "s", "--"),
+    "C10": (_GREEN, "s", "--"),
 }
 METHOD_LOOKS = {
-    "ali": (style.BLACK, "v", ":"),
-    "ali_as_published": (style.GREY, "^", "--"),
-    "dnl": (style.SKY, "o", "-"),
-    "dnlo": (style.VERMILION, "D", "-"),
-    "park": (style.GREEN, "s", "-"),
-    "taylor": (style.BLUE, "x", "-"),
-    "zhuang": (style.PURPLE, "P", "--"),
+    "ali": (_BLACK, "v", ":"),
+    "ali_as_published": (_GREY, "^", "--"),
+    "dnl": (_SKY, "o", "-"),
+    "dnlo": (_VERMILION, "D", "-"),
+    "park": (_GREEN, "s", "-"),
+    "taylor": (_BLUE, "x", "-"),
+    "zhuang": (_PURPLE, "P", "--"),
 }
 
 METRIC_TITLES = {
@@ -89,8 +100,8 @@ def draw_errors(
     the paths.
     """
     datasets = [name for name in _DATASET_TITLES if any(key[0] == name for key in panels)]
-    with style.house_style():
-        figure = style.new_page(2.05 * len(datasets) + 0.7, title, note)
+    with style.page_style(**_STYLE):
+        figure = _new_page(2.05 * len(datasets) + 0.7, title, note)
         axes = figure.subplots(len(datasets), len(METRIC_TITLES), squeeze=False)
         for row, dataset in zip(axes, datasets, strict=True):
             for ax, metric in zip(row, METRIC_TITLES, strict=True):
@@ -102,11 +113,31 @@ def draw_errors(
             named = [line for line in panels[dataset, "e_at"] if line.name]
             if named:
                 named.sort(key=lambda line: line.summaries[-1].centre, reverse=True)
-                handles = [style.handle(line.name, *line.look) for line in named]
+                handles = [_handle(line.name, *line.look) for line in named]
                 row[-1].legend(handles=handles, **_LEGEND)
         for ax, metric in zip(axes[0], METRIC_TITLES, strict=True):
             ax.set_title(METRIC_TITLES[metric], fontsize=6.8)
-        return style.save(figure, stem)
+        return _save(figure, stem)
+
+
+def _new_page(height: float, title: str, note: str) -> Figure:
+    figure = style.new_figure(7.2, height)
+    figure.suptitle(title, fontsize=9, fontweight="bold", x=0.01, ha="left")
+    figure.supxlabel(note, fontsize=6.5, x=0.01, ha="left", color=_GREY)
+    return figure
+
+
+def _handle(label: str, colour: str, marker: str, dashes: str) -> Line2D:
+    return Line2D([], [], color=colour, marker=marker, ls=dashes, mew=0.8, label=label)
+
+
+def _save(figure: Figure, stem: Path) -> list[Path]:
+    """Write ``stem``.png and ``stem``.svg; returns both paths."""
+    paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
+    figure.savefig(paths[0], metadata={"Software": None})
+    figure.set_layout_engine("none")  # that of the first file serves for the second
+    figure.savefig(paths[1], metadata={"Date": None})
+    return paths
 
 
 def _scale(ax: Axes, lines: Sequence[Line], metric: str) -> None:
@@ -138,7 +169,7 @@ def _draw_lines(ax: Axes, lines: Sequence[Line]) -> None:
         ax.errorbar(at, centres, yerr=[below, above], **look, **_BARS)
     largest = max(summary.high for line in lines for summary in line.summaries)
     if largest < _ZERO:
-        ax.text(0.5, 0.5, "all zero", transform=ax.transAxes, ha="center", color=style.GREY)
+        ax.text(0.5, 0.5, "all zero", transform=ax.transAxes, ha="center", color=_GREY)
     ax.set_ylim(0.0, None if largest >= _ZERO else 1.0)
     room = _LABEL_ROOM + _LETTER * max(len(line.label) for line in lines)
     ax.set_xlim(first - 0.06 * span, last + room * span)
@@ -152,7 +183,9 @@ def _label_ends(ax: Axes, lines: Sequence[Line], span: float) -> None:
     to_fraction = ax.transData + ax.transAxes.inverted()
     last = lines[0].levels[-1]
     heights = [to_fraction.transform((last, line.summaries[-1].centre))[1] for line in lines]
-    placed = style.spread(heights, _LABEL_GAP)
+    placed, order = list(heights), sorted(range(len(heights)), key=lambda index: heights[index])
+    for before, after in pairwise(order):
+        placed[after] = max(placed[after], placed[before] + _LABEL_GAP)
     shift = max(0.0, 0.02 - min(placed)) - max(0.0, max(placed) - 0.98)
     right, text = (to_fraction.transform((last + x * span, 0.0))[0] for x in (0.04, 0.09))
     for line, height, place in zip(lines, heights, placed, strict=True):
@@ -201,8 +234,8 @@ def draw_components(
     """Box plots of the components of the relative motions, by component with its unit and by
     reference; gives the paths.
     """
-    with style.house_style():
-        figure = style.new_page(4.0, title, note)
+    with style.page_style(**_STYLE):
+        figure = _new_page(4.0, title, note)
         axes = figure.subplots(2, 3, sharey="row")
         for ax, (name, summaries) in zip(axes.flat, components.items(), strict=True):
             colours = [REFERENCE_LOOKS[reference][0] for reference in summaries]
@@ -217,4 +250,4 @@ def draw_components(
             row[0].set_yscale("log")
             style.plain_decades(row[0].yaxis)
             row[0].set_ylim(bottom=least)
-        return style.save(figure, stem)
+        return _save(figure, stem)

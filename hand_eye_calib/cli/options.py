@@ -304,8 +304,15 @@ def add_topics_argument(parser: argparse.ArgumentParser) -> None:
     offer(several, _topics_of)
 
 
+def _label(text: str) -> tuple[str, str]:
+    name, sign, value = text.partition("=")
+    if not (name and sign and value):
+        raise ConfigError(f"expected NAME=VALUE, such as vehicle=7; got {text!r}")
+    return name, value
+
+
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--out``, ``--json`` and ``--verbose``."""
+    """Add ``--out``, ``--label``, ``--json`` and ``--verbose``."""
     group = parser.add_argument_group("output")
     group.add_argument(
         "--out",
@@ -313,6 +320,15 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
         "static_transform.launch.py and report.html",
+    )
+    group.add_argument(
+        "--label",
+        metavar="NAME=VALUE",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=argument_type(_label),
+        help="what the report and the files say of the recording, such as vehicle=7 operator=Kim",
     )
     add_json_argument(group)
     add_verbose_argument(group)

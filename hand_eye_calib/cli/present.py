@@ -69,6 +69,8 @@ def deliver(
         writes the report. None for stops.
     """
     calibration = with_robot(calibration, arguments)
+    if arguments.label:
+        inputs = inputs | {"labels": dict(arguments.label)}
     evidence: Evidence | None = None
     if arguments.out and snapshot:
         with waiting_for("cross-checks with other methods and halves of the recording"):

@@ -252,6 +252,7 @@ def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorCon
     of_child = {each.name for each in fields(config) if each.name.startswith(("prior_", "child_"))}
     numbers = ("time_offset", "scale")
     of_child |= {name for name in numbers if not isinstance(getattr(config, name), str)}
+    of_child -= {"child_measures"}
     defaults = {name: getattr(CalibratorConfig, name) for name in of_child}
     return replace(config, child_measures=measures, given=config.given - of_child, **defaults)
 

@@ -1,4 +1,8 @@
-"""What there is to see in each figure of the report, in words and numbers."""
+"""What there is to see in each figure of the report, in words and numbers.
+
+The verdict judges, by rules of its own; a caption says how large something is, and gives advice
+only where the verdict is not USE.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -9,10 +13,12 @@ from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.answers import Answer
 from hand_eye_calib.engine.evidence import Evidence, StreamView
-from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.report.plot import said_of_views
+from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.text import amount, angle, counted, length, listing, share
 
 TITLES = {
+    "views": "Both sensors in space",
     "trajectories": "Both trajectories, aligned",
     "residuals": "Residuals over time",
     "convergence": "Convergence",
@@ -52,6 +58,7 @@ def known_axes(calibration: Calibration) -> BoolArray:
 def captions(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
     """A caption for each figure that a result of its kind has, by the names in :data:`TITLES`."""
     makers: dict[str, Callable[[Calibration, Evidence], str]] = {
+        "views": lambda calibration, _: said_of_views(calibration),
         "trajectories": _of_trajectories,
         "residuals": _of_residuals,
         "convergence": _of_convergence,
@@ -59,7 +66,7 @@ def captions(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "answers": _of_answers,
     }
     if calibration.measured == "rotations":
-        del makers["trajectories"]
+        del makers["trajectories"], makers["views"]
     texts = {name: make(calibration, evidence) for name, make in makers.items()}
     return texts | {"streams": of_streams(evidence.streams)}
 
@@ -134,11 +141,9 @@ def _of_convergence(calibration: Calibration, evidence: Evidence) -> str:
         f"{_largest(moved[late], known)}. Shaded: one standard deviation.{_downsampled(estimates)}"
     )
     if first == len(estimates) - 1:
-        names = [name for name, is_known in zip(AXES, known, strict=True) if is_known]
-        return (
-            "The result had not settled within its own uncertainty before the end "
-            f"({listing(names)}): record longer. {last}"
-        )
+        if calibration.verdict is Verdict.USE:
+            return last
+        return f"The result had not settled before the end: record longer. {last}"
     since = _at(estimates[first].until_s, evidence).replace("at", "From")
     return (
         f"{since} on, the result stays within {_DISAGREE:g} of its standard deviations of the "
@@ -198,12 +203,9 @@ def _halves(calibration: Calibration, evidence: Evidence) -> str:
     ratio = np.where(known, np.abs(apart) / np.hypot(first.sigmas, second.sigmas), 0.0)
     worst = int(np.argmax(ratio))
     judged = f"the largest, {AXES[worst]}, is {ratio[worst]:.1f} standard deviations"
-    text = f"The two halves alone differ by {_largest(apart, known)}, which may be chance: {judged}"
-    if ratio[worst] > _DISAGREE:
-        text = (
-            f"The two halves alone differ by {_largest(apart, known)}, which is more than chance: "
-            f"{judged}. Do not trust the result beyond that difference"
-        )
+    text = f"The two halves alone differ by {_largest(apart, known)}; {judged}"
+    if ratio[worst] > _DISAGREE and calibration.verdict is not Verdict.USE:
+        text += ", more than chance. Do not trust the result beyond that difference"
     hidden = known_axes(calibration) & ~known
     less = [name for name, is_hidden in zip(AXES, hidden, strict=True) if is_hidden]
     missing = f" Half of the recording does not determine {listing(less)}." if less else ""

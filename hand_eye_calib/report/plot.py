@@ -1,26 +1,33 @@
-"""The figure of a result for notebooks: its residuals, and how well each axis is known."""
+"""Both sensors in space from three sides, with the uncertainty of the child's position."""
 
 import io
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.report.style import (
-    BLUE,
-    LIGHT_GREY,
-    PAGE_WIDTH,
-    VERMILION,
-    house_style,
-    plain_decades,
+    BAD,
+    CHILD,
+    GREEN,
+    INK,
+    MUTED,
+    PARENT,
+    WIDTH,
+    page_style,
+    plain_label,
 )
 from hand_eye_calib.results.calibration import Calibration
 
-_CM_DEG = (100.0, float(np.degrees(1.0)))
-# Smallest residual that is drawn (cm, deg): a logarithm has no zero.
-_SMALLEST = 1e-4
+# The three views: which axes of the parent go across and up, and what that is on a vehicle.
+_VIEWS = ((0, 1, "from above"), (0, 2, "from the side"), (1, 2, "from behind"))
+# Of the distance between the sensors: axes of a sensor, the smallest ellipse that can be seen. And
+# the least distance (m).
+_AXIS, _SEEN, _LEAST = 0.22, 0.06, 0.05
+_SIGMAS = 3.0
 
 
 class ShownFigure(Figure):
@@ -33,67 +40,84 @@ class ShownFigure(Figure):
 
 
 def plot(calibration: Calibration) -> Figure:
-    """Draw a result: residuals of its motion pairs over time, and the standard deviation of every
-    axis.
+    """Draw where both sensors are and how they are turned, in three views of the parent sensor's
+    frame, with three standard deviations of the child's position.
 
     Parameters
     ----------
     calibration : Calibration
-        As it was solved: a result read from a file has no residuals.
 
     Returns
     -------
     matplotlib.figure.Figure
         Notebooks show it; ``savefig`` writes it to a file.
-
-    Raises
-    ------
-    InputError
-        If the result was read from a file.
     """
-    residuals = calibration.residuals()
-    times_s = (residuals.end_ns - residuals.start_ns.min(initial=residuals.end_ns[0])) * 1e-9
-    with house_style():
-        figure = ShownFigure(figsize=(PAGE_WIDTH, 3.4), layout="constrained")
+    with page_style(figure_facecolor="white", savefig_facecolor="white"):
+        figure = ShownFigure(figsize=(WIDTH, 3.3), layout="constrained")
         FigureCanvasAgg(figure)
-        panels = figure.subplots(2, 2, width_ratios=(3, 1))
-        panels[0, 0].sharex(panels[1, 0])
-        panels[0, 0].tick_params(labelbottom=False)
-        panels[0, 0].set_title("residuals of the motion pairs")
-        sizes = (residuals.translation_m, residuals.rotation_rad)
-        names = ("translation (cm)", "rotation (deg)")
-        for row, size, factor, name in zip(panels, sizes, _CM_DEG, names, strict=True):
-            _draw_residuals(row[0], times_s, size * factor, residuals.is_inlier)
-            row[0].set_ylabel(name)
-        panels[1, 0].set_xlabel("time (s)")
-        panels[1, 0].legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2, frameon=False)
-        for index, unit in enumerate(("cm", "deg")):
-            _draw_axes(panels[index, 1], calibration, index, unit)
-        figure.suptitle(calibration.headline, fontsize=8, fontweight="bold")
+        draw_views(figure.subplots(1, 3), calibration)
+        figure.suptitle(calibration.headline, fontsize=8, fontweight="bold", wrap=True)
+        figure.supxlabel(said_of_views(calibration), fontsize=7.5, wrap=True)
     return figure
 
 
-def _draw_residuals(panel: Axes, times_s: FloatArray, values: FloatArray, used: BoolArray) -> None:
-    values = np.maximum(values, _SMALLEST)
-    panel.set_yscale("log")
-    panel.plot(times_s[used], values[used], ".", color=BLUE, ms=2.5, label="inlier")
-    panel.plot(times_s[~used], values[~used], "x", color=VERMILION, ms=4, label="outlier")
-    plain_decades(panel.yaxis)
+def said_of_views(calibration: Calibration) -> str:
+    """What the three views show, in words."""
+    sigmas = calibration.sigmas_with_floor[:3]
+    unknown = [axis for axis, sigma in zip("xyz", sigmas, strict=True) if not np.isfinite(sigma)]
+    larger = _enlarged(calibration)
+    text = "Axes of both sensors: x red, y green, z blue."
+    if len(unknown) < 3:
+        text += f" Ellipse: {_SIGMAS:g} standard deviations of the position"
+        text += f", drawn {larger:,.0f} times as large." if larger > 1 else "."
+    if unknown:
+        text += f" Unknown along {' and '.join(unknown)}: the dashed line."
+    return text
 
 
-def _draw_axes(panel: Axes, calibration: Calibration, index: int, unit: str) -> None:
-    """Standard deviations of three axes; an unknown one is a grey bar across the panel."""
-    names = [dof.name for dof in calibration.observability][3 * index : 3 * index + 3]
-    sigmas = [row["sigma"] for row in calibration.rows().values()][3 * index : 3 * index + 3]
-    values = np.array(sigmas) * _CM_DEG[index]
-    known = np.isfinite(values)
-    longest = values[known].max(initial=_SMALLEST)
-    colours = [BLUE if is_known else LIGHT_GREY for is_known in known]
-    panel.barh(range(3), np.where(known, values, longest), color=colours, height=0.6)
-    for row, (value, is_known) in enumerate(zip(values, known, strict=True)):
-        at, text = (value, f"{value:.2g}") if is_known else (0.0, "unknown")
-        panel.text(at + 0.04 * longest, row, text, va="center")
-    limits = (0, 1.5 * longest)
-    panel.set(yticks=range(3), yticklabels=names, xlim=limits, title=f"sigma ({unit})")
-    panel.set_xticks([])
-    panel.invert_yaxis()
+def draw_views(panels: Sequence[Axes], calibration: Calibration) -> None:
+    """Draw the three views into three panels."""
+    T, extent = calibration.T_parent_child, _extent(calibration)
+    sigmas = calibration.sigmas_with_floor[:3]
+    R = T[:3, :3]
+    covariance = R @ calibration.covariance_with_floor[:3, :3] @ R.T
+    for panel, (across, up, title) in zip(panels, _VIEWS, strict=True):
+        seen = [across, up]
+        panel.plot(*T[seen, 3][:, None] * [[0.0, 1.0]], color=MUTED, lw=0.8, ls=":", zorder=1)
+        for pose, name, colour in (
+            (np.eye(4), calibration.parent_frame, PARENT),
+            (T, calibration.child_frame, CHILD),
+        ):
+            at = pose[seen, 3]
+            for axis, of_axis in zip(pose[seen, :3].T, (BAD, GREEN, PARENT), strict=True):
+                panel.plot(*np.stack([at, at + _AXIS * extent * axis], axis=1), color=of_axis)
+            panel.plot(*at, "o", color=colour, ms=5)
+            panel.annotate(
+                plain_label(name), (at[0], at[1]), (5, 6), textcoords="offset points", color=INK
+            )
+        if np.isfinite(sigmas[seen]).all():
+            values, vectors = np.linalg.eigh(covariance[np.ix_(seen, seen)])
+            wide, high = 2 * _SIGMAS * _enlarged(calibration) * np.sqrt(np.maximum(values, 0.0))
+            turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
+            panel.add_patch(
+                Ellipse((T[across, 3], T[up, 3]), wide, high, angle=turned, color=CHILD, alpha=0.3)
+            )
+        for axis, line in ((across, panel.axhline), (up, panel.axvline)):
+            if not np.isfinite(sigmas[axis]):
+                line(T[up if axis == across else across, 3], color=CHILD, ls="--", lw=1.0)
+        panel.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", title=title)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.margins(0.3)
+
+
+def _extent(calibration: Calibration) -> float:
+    return max(float(np.linalg.norm(calibration.translation)), _LEAST)
+
+
+def _enlarged(calibration: Calibration) -> float:
+    """How many times as large the ellipses are drawn, to be seen: 1, 2, 5, 10 ..."""
+    sigmas = calibration.sigmas_with_floor[:3]
+    widest = _SIGMAS * float(np.max(sigmas[np.isfinite(sigmas)], initial=0.0))
+    wanted = _SEEN * _extent(calibration) / max(widest, 1e-9)
+    steps = [step * 10**power for power in range(6) for step in (1, 2, 5)]
+    return float(next((step for step in steps if step >= wanted), steps[-1]))

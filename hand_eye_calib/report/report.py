@@ -3,6 +3,7 @@
 import math
 import platform
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -16,6 +17,7 @@ from hand_eye_calib.checks.streams import summarise
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import Evidence
 from hand_eye_calib.errors import printable
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, captions
 from hand_eye_calib.report.report_figures import draw_all
@@ -55,6 +57,12 @@ _AXIS_NAMES = {"roll": "about x (roll)", "pitch": "about y (pitch)", "yaw": "abo
 
 # A bar reaches from a thousandth of the target to ten times the target, by its logarithm.
 _BAR_DECADES, _BAR_ABOVE = 4.0, 1.0
+
+# Names of sensors that came without one.
+_NAMELESS = ("parent_sensor", "child_sensor")
+_DISTANCE_M = 10.0
+# Figures for whoever uses the result; the others are evidence for whoever doubts it.
+_SHOWN_FIRST = ("views", "trajectories")
 
 _REFUSED = {"refused_duplicate": "with a repeated stamp", "refused_late": "late arrivals"}
 
@@ -112,6 +120,11 @@ def render(
     str
     """
     inputs = inputs or {}
+    calibration = replace(
+        calibration,
+        parent_frame=_named(calibration.parent_frame, inputs.get("parent", {})),
+        child_frame=_named(calibration.child_frame, inputs.get("child", {})),
+    )
     parent, child = printable(calibration.parent_frame), printable(calibration.child_frame)
     verdict, _, said = calibration.headline.partition(": ")
     document, numbers = calibration.to_dict(), calibration.usable_numbers()
@@ -124,6 +137,8 @@ def render(
         verdict,
         said,
         calibration=calibration,
+        at_distance=_at_distance(calibration),
+        labels=inputs.get("labels", {}),
         document=document,
         parent=parent,
         child=child,
@@ -143,11 +158,36 @@ def render(
             {"name": name, "title": TITLES[name], "said": text, "svg": svgs.get(name)}
             for name, text in captions(calibration, evidence).items()
         ],
+        shown_first=_SHOWN_FIRST,
         findings=calibration.findings,
         summary=_summary(calibration, evidence),
         streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
         provenance=list(_provenance(inputs)),
         options={name: value for name, value in config.to_options().items() if value != ""},
+    )
+
+
+def _named(frame: str, known: Plain) -> str:
+    """The name of a sensor: its frame, or where its poses came from if they name none."""
+    source = str(known.get("topic") or Path(str(known.get("file", ""))).stem)
+    return source if frame in _NAMELESS and source else frame
+
+
+def _at_distance(calibration: Calibration) -> str:
+    """What the standard deviations do to an object at a distance; empty if angles are unknown."""
+    covariance = calibration.covariance_with_floor
+    if not np.isfinite(calibration.sigmas[3:]).all():
+        return ""
+    errors = {}
+    for axis, point in zip("xyz", _DISTANCE_M * np.eye(3), strict=True):
+        J = np.hstack([np.eye(3), -se3.skew(point)])
+        if not np.isfinite(calibration.sigmas[:3]).all():
+            J[:, :3] = 0.0  # the rotation alone
+        errors[axis] = float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.T)[-1]))
+    because = "" if J[:, :3].any() else ", by the rotation alone"
+    return (
+        f"An object {_DISTANCE_M:.0f} m from {printable(calibration.child_frame)} is misplaced by "
+        f"up to {length(max(errors.values()))} (one standard deviation{because})."
     )
 
 
@@ -304,7 +344,7 @@ def _provenance(inputs: Plain) -> Iterable[tuple[str, str]]:
     yield "Versions", in_words(versions)
     # Without folders, which are nobody's business who gets this page; extrinsic.yaml has them.
     for name, value in inputs.items():
-        if name not in ("parent", "child", "options", "files"):
+        if name not in ("parent", "child", "options", "files", "labels"):
             yield name.capitalize(), in_words(_without_folders(value))
     for file in inputs.get("files", ()):
         said = f"{file['bytes']:,} bytes, SHA-256 {file['sha256']}"

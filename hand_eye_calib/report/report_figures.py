@@ -12,6 +12,7 @@ from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import MIN_ROTATION
 from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.report.captions import measured_axes, relative_to, residual_sizes, time_axis
+from hand_eye_calib.report.plot import draw_views
 from hand_eye_calib.report.style import (
     BAD,
     BAND,
@@ -45,6 +46,7 @@ _SMALLEST = 1e-5
 def draw_all(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
     """SVG of every figure, by name; without those for which there is too little data."""
     makers: dict[str, Callable[[Calibration, Evidence], Figure | None]] = {
+        "views": _views,
         "trajectories": _trajectories,
         "residuals": _residuals,
         "convergence": _convergence,
@@ -52,7 +54,7 @@ def draw_all(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "answers": _answers,
     }
     if calibration.measured == "rotations":
-        del makers["trajectories"]
+        del makers["trajectories"], makers["views"]
     with page_style():
         drawn = {name: make(calibration, evidence) for name, make in makers.items()}
         names = (calibration.parent_frame, calibration.child_frame)
@@ -107,6 +109,12 @@ def _figure(
 def _legend(figure: Figure, panel: Axes) -> None:
     handles = panel.get_legend_handles_labels()
     figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
+
+
+def _views(calibration: Calibration, evidence: Evidence) -> Figure:
+    figure, (panels,) = _figure(3.1, 1, 3, left=0.7, gap=0.75)
+    draw_views(panels, calibration)
+    return figure
 
 
 def _trajectories(calibration: Calibration, evidence: Evidence) -> Figure:

@@ -35,7 +35,7 @@ from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import REALISTIC
 from hand_eye_calib.text import amount, with_sigma
 
-FIGURES = ("trajectories", "residuals", "convergence", "excitation", "answers", "streams")
+FIGURES = ("views", "trajectories", "residuals", "convergence", "excitation", "answers", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 
 
@@ -188,7 +188,7 @@ def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
     _, calibration, _, page = planar
     assert calibration.status is SolveStatus.UNOBSERVABLE
     assert calibration.unobservable() == ["z"]
-    verdict = page.text[: page.text.index("Pose of camera in lidar Maps")]
+    verdict = page.text[: page.text.index("Pose of lidar in camera Maps")]
     assert "USE WITH CARE All but z; measure z by hand" in verdict
     assert "z cannot be determined from this motion" in verdict
     assert re.search(r"Motion: .*z cannot be determined", verdict)
@@ -219,7 +219,7 @@ def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, n
     assert page.errors == []
     assert len(page.ids) == len(set(page.ids))
     shown = [*FIGURES]
-    shown.remove("trajectories") if name == "rates" else None
+    shown = [each for each in shown if name != "rates" or each not in ("views", "trajectories")]
     assert [attributes["id"] for attributes in page.all("figure")] == [
         f"figure-{figure}" for figure in shown
     ]
@@ -398,7 +398,7 @@ def test_warnings_are_part_of_the_verdict(hilly):
     snapshot, calibration, *_ = hilly
     warned = dataclasses.replace(calibration, warnings=("look \x1b[2J here",))
     _, page = page_of(snapshot, warned)
-    verdict = page.text[: page.text.index("Pose of camera in lidar Maps")]
+    verdict = page.text[: page.text.index("Pose of lidar in camera Maps")]
     assert "look \\x1b[2J here" in verdict
     for reason in warned.reasons:
         assert reason.sentence in verdict
@@ -416,7 +416,7 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     compared = with_comparison(calibration, installed)
     text, page = page_of(snapshot, compared)
     assert "installed" in [attributes["aria-labelledby"] for attributes in page.all("section")]
-    shown = page.text[page.text.index("axis of lidar difference") : page.text.index("Evidence")]
+    shown = page.text[page.text.index("axis of lidar difference") : page.text.rindex("Evidence")]
     (difference,) = hec.compare([calibration], installed).differences
     assert compared.comparison.sentence in page.text
     sigma, visible = (amount("x", size[0]) for size in (difference.sigmas, difference.visible))
@@ -467,3 +467,53 @@ def test_no_page_names_folders(hilly):
     assert page.text.count("File poses.txt") == 2
     header = page.text[: page.text.index("Contents") if "Contents" in page.text else 600]
     assert "Parent: lidar, from test_report.py; Child: camera, from /camera/odometry." in header
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_labels_names_of_files_and_what_it_means_at_a_distance(hilly):
+    snapshot, calibration, *_ = hilly
+    nameless = dataclasses.replace(
+        calibration, parent_frame="parent_sensor", child_frame="child_sensor"
+    )
+    inputs = {"parent": {"file": "/a/roof.tum"}, "child": {"topic": "/camera/odometry"}}
+    _, page = page_of(snapshot, nameless, inputs=inputs | {"labels": {"vehicle": "7 <b>"}})
+    assert "Pose of /camera/odometry in roof" in page.text
+    assert "Maps coordinates of /camera/odometry into roof." in page.text
+    assert "vehicle: 7 <b>" in page.text[: page.text.index("Verdict")]
+    found = re.search(r"10 m from /camera/odometry is misplaced by up to ([\d.]+) cm", page.text)
+    J = np.hstack([np.eye(3), -se3.skew(np.array([10.0, 0.0, 0.0]))])
+    one = J @ calibration.covariance_with_floor @ J.T
+    assert float(found[1]) >= 95 * np.sqrt(np.linalg.eigvalsh(one)[-1])
+
+
+# What no page may say below the verdict USE.
+AGAINST = r"do not trust|not settled|record longer|more than chance|disagree|cannot be determined"
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_no_sentence_speaks_against_a_green_verdict():
+    """Over recordings whose other answers and halves scatter as they like."""
+    green = 0
+    for seed, poses in ((1, 120), (3, 200), (4, 160)):
+        drive = simulate_drive(seed, dataclasses.replace(DRIVE, poses=poses), REALISTIC)
+        snapshot = whole_snapshot(
+            offline_config(drive.parent, drive.child, {}), drive.parent, drive.child
+        )
+        calibration, found = with_cross_check(snapshot.estimate(), snapshot)
+        # However far its halves lie apart, and however late it settled: the rules judge.
+        far = dataclasses.replace(found.halves[0], calibration=moved(found.halves[0].calibration))
+        *before, last = found.convergence
+        before[-1] = dataclasses.replace(before[-1], calibration=far.calibration)
+        late = dataclasses.replace(found, convergence=(*before, last))
+        for shown in (found, dataclasses.replace(late, halves=(far, found.halves[1]))):
+            text = Page(render(calibration, snapshot.config, shown)).text.lower()
+            if calibration.verdict is Verdict.USE:
+                green += 1
+                assert not re.findall(AGAINST, text)
+    assert green >= 2
+
+
+def moved(calibration):
+    """A result that is 30 of its own standard deviations away."""
+    T = calibration.T_parent_child @ se3.exp(30 * np.sqrt(np.diag(calibration.covariance)))
+    return dataclasses.replace(calibration, T_parent_child=T)

@@ -1,5 +1,6 @@
 """Trajectories from and for other libraries: pandas, NumPy, bags."""
 
+import dataclasses
 from fractions import Fraction
 
 import numpy as np
@@ -149,18 +150,24 @@ class TestShowing:
     def result(self):
         return hec.calibrate(as_trajectory(POSES), as_trajectory(child_of(POSES)), reference="B1")
 
-    def test_a_figure_shows_every_pair(self):
+    def test_a_figure_shows_both_sensors_from_three_sides(self):
         result = self.result()
-        figure = hec.plot(result)
-        (drawn, _) = figure.axes[0].lines
-        assert len(drawn.get_xdata()) == result.n_inliers
-        assert [text.get_text() for text in figure.axes[1].get_yticklabels()] == ["x", "y", "z"]
-        assert figure._repr_png_().startswith(b"\x89PNG")
-
-    def test_a_result_from_a_file_has_no_figure(self):
-        loaded = hec.Calibration.from_dict(self.result().to_dict())
-        with pytest.raises(InputError, match="has no residuals"):
-            hec.plot(loaded)
+        for each in (result, hec.Calibration.from_dict(result.to_dict())):
+            figure = hec.plot(each)
+            seen = [(panel.get_xlabel(), panel.get_ylabel()) for panel in figure.axes]
+            assert seen == [("x (m)", "y (m)"), ("x (m)", "z (m)"), ("y (m)", "z (m)")]
+            x, y = figure.axes[0].lines[0].get_data()
+            np.testing.assert_allclose((x[1], y[1]), result.translation[:2], atol=1e-9)
+            (ellipse,) = figure.axes[0].patches
+            np.testing.assert_allclose(ellipse.get_center(), result.translation[:2], atol=1e-9)
+            assert figure._repr_png_().startswith(b"\x89PNG")
+        hidden = tuple(
+            dataclasses.replace(dof, sigma=np.inf) if dof.name == "z" else dof
+            for dof in result.observability
+        )
+        figure = hec.plot(dataclasses.replace(result, observability=hidden))
+        assert [len(panel.patches) for panel in figure.axes] == [1, 0, 0]
+        assert "Unknown along z: the dashed line." in figure.get_supxlabel()
 
     def test_a_notebook_shows_a_table(self):
         shown = self.result()._repr_html_()
