@@ -181,6 +181,61 @@ CrossCheck: TypeAlias = Mapping[str, AxisScatter]
 
 
 @dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """One of several recordings, as it stands by itself and beside the others.
+
+    Attributes
+    ----------
+    name, verdict, headline : str
+    left_out : str
+        Why it is no part of the result; empty if it is.
+    deviations, sigmas : mapping of str to float
+        By axis, m or rad: from the common result, and their standard deviations with the usual
+        scatter of recordings; NaN (None in files) if it does not know the axis.
+    time_offset_s, scale, n_poses, stamp_ns
+        As of its own result.
+    """
+
+    name: str
+    verdict: str
+    headline: str
+    left_out: str = ""
+    deviations: Mapping[str, float] = field(default_factory=dict)
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+    time_offset_s: float = 0.0
+    scale: float = 1.0
+    n_poses: int = 0
+    stamp_ns: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together:
+    """What several recordings of one rig say together.
+
+    Attributes
+    ----------
+    kind : str
+        single, agree, scatter (more than recordings of one rig do), one off, moved (between two of
+        them), or differ (two do, and nobody knows which is wrong).
+    sentence : str
+    chi2, dof, p_value : float, int, float
+        Of the hypothesis that all are of one mount.
+    scatter : mapping of str to float
+        By axis, m or rad: what differs from recording to recording, beyond what each states.
+    recordings : tuple of Recorded
+        In the order of time.
+    """
+
+    kind: str
+    sentence: str
+    chi2: float
+    dof: int
+    p_value: float
+    scatter: Mapping[str, float]
+    recordings: tuple[Recorded, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class AxisProgress:
     """One axis against its target, m or rad, and the seconds of motion like that so far until it is
     known: infinite if it is unobservable.

@@ -20,6 +20,7 @@ from hand_eye_calib.results.records import (
     Progress,
     RateBias,
     Residuals,
+    Together,
 )
 from hand_eye_calib.results.status import (
     ROTATIONS,
@@ -131,6 +132,8 @@ class Result:
         With what is installed.
     goal : Progress or None
         How far the session was from its goal when the result was saved.
+    together : Together or None
+        The recordings, if the result is of several.
     """
 
     T_parent_child: FloatArray
@@ -186,6 +189,7 @@ class Result:
     target_axes: Mapping[str, float] = field(default_factory=dict)
     comparison: Comparison | None = None
     goal: Progress | None = None
+    together: Together | None = None
 
     @property
     def rotation(self) -> "Rotation":

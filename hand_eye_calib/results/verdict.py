@@ -305,6 +305,25 @@ def _floor(result: Result) -> Iterator[_Found]:
         yield text, "check the scale of both odometries on a known distance", tuple(rough), {}
 
 
+_OF_RECORDINGS = {
+    "differ": "record a third time: then the one that is off shows",
+    "moved": "calibrate from the recordings since then alone",
+    "one off": "find out what was different in that recording; it is left out",
+    "scatter": "look for what changes from recording to recording; the standard deviations contain "
+    "the scatter",
+}
+
+
+def _recordings(*kinds: str) -> Callable[[Result], Iterator[_Found]]:
+    """Several recordings that belong together in one of these ways."""
+
+    def find(result: Result) -> Iterator[_Found]:
+        if result.together and result.together.kind in kinds:
+            yield result.together.sentence, _OF_RECORDINGS[result.together.kind], (), {}
+
+    return find
+
+
 def _unobservable(result: Result) -> tuple[str, ...]:
     """Axes that this motion does not determine, of those that the streams can determine."""
     return tuple(
@@ -380,8 +399,21 @@ RULES = (
         )
         for kind in _OTHERS
     ),
+    Rule(
+        "recordings_differ",
+        _NEVER,
+        "of several recordings two differ and there is no third, or the mount has moved between "
+        "them",
+        _recordings("differ", "moved"),
+    ),
     Rule("unobservable", _CARE, "an axis cannot be determined from the motion", _hidden),
     Rule("warning_finding", _CARE, "a stream check gave a warning", _findings_of(Severity.WARNING)),
+    Rule(
+        "recordings",
+        _CARE,
+        "of several recordings one is off and left out, or all scatter more than usual",
+        _recordings("one off", "scatter"),
+    ),
     *(
         Rule(
             kind,

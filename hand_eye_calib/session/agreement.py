@@ -1,34 +1,41 @@
-"""Whether the results of several recordings of one rig agree, and which of them do not.
+"""One extrinsic from the results of several recordings of one rig, and which of them do not belong.
 
-Each result has a covariance, and recordings of one rig scatter beside it. So the sum of squared
-distances from the common extrinsic has a chi-square distribution. Directions that a recording did
-not reveal count neither as agreement nor as contradiction.
+Result i is ``X Exp(u_i) Exp(e_i)``: e_i has the covariance that the result states, u_i is what
+differs from recording to recording and shows in none of them. Its standard deviations per axis are
+usual ones (:func:`~hand_eye_calib.assessment.moved.scatter_of_recordings`) times a factor for the
+translation and one for the rotation. Neither is known: a half-Cauchy prior of scale 1, the
+restricted likelihood of the results, and a mean over both factors (Röver, *Bayesian random-effects
+meta-analysis using the bayesmeta R package*, 2020). Information is added, so that an axis which one
+recording does not reveal comes from another.
 
-Two explanations of a contradiction are tried: one recording is off, or the mount has moved at some
-time. The better one is accepted if chance rarely makes one as good; if the others still scatter
-more than stated, by an F test against their own scatter.
+Before that, two explanations of a contradiction are tried: one recording is off, or the mount has
+moved at some time. The better one is accepted if chance rarely makes one as good; if the others
+still scatter more than usual, by an F test against their own scatter.
 
 Everything is along and about the axes of the parent. What motion on a plane does not reveal is the
 same direction there in every recording.
 """
 
+import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.text import amount, axes_in_words, listing
 
-# A direction with a larger standard deviation (m, rad) is unknown.
-_UNKNOWN = 0.3
-_ROUNDS = 4
+# A direction with a larger standard deviation (m, rad) is unknown; its variance then.
+_UNKNOWN, _UNKNOWN_VARIANCE = 0.3, 1e4
+_ROUNDS = 3
 # Probability of a false alarm; and of a scatter that is no more than stated.
 _LEVEL, _ORDINARY = 0.01, 0.05
+# Factors of the usual scatter.
+_FACTORS = np.geomspace(1 / 16, 16, 9)
 
 
 class Kind(str, Enum):
@@ -36,7 +43,7 @@ class Kind(str, Enum):
 
     SINGLE = "single"  # there is nothing to compare with
     AGREE = "agree"
-    SCATTER = "scatter"  # more than stated, but none stands out
+    SCATTER = "scatter"  # more than usual, but none stands out
     ONE_OFF = "one off"
     MOVED = "moved"
     DIFFER = "differ"  # two recordings: nobody knows which
@@ -55,50 +62,53 @@ class Agreement:
     T_parent_child : (4, 4) array
         Common extrinsic of the others.
     covariance : (6, 6) array
-        Of that, along and about the parent's axes; wider if they scatter more than stated. Unknown
-        directions have a standard deviation of 3.
+        Of that, along and about the parent's axes. Unknown directions have a standard deviation
+        of many metres.
+    scatter : (6,) array
+        Standard deviation of u_i along (m) and about (rad) the axes, root mean square.
     chi2, dof, p_value : float, int, float
-        Of the hypothesis that all results are of one extrinsic.
-    scatter : float
-        How many times larger than stated the scatter is, without those apart.
+        Of the hypothesis that all results are of one extrinsic and scatter as usual.
+    excess : float
+        How many times larger than that the scatter is, without those apart.
     deviations : (N, 6) array
         Of each result from the common extrinsic: x, y, z (m) along the parent's axes and the
         rotation vector (rad) about them. NaN if it does not know the axis.
     sigmas : (N, 6) array
-        Standard deviations of each, with the scatter of recordings.
+        Standard deviations of each, with the usual scatter.
     """
 
     kind: Kind
     apart: tuple[int, ...]
     T_parent_child: FloatArray
     covariance: FloatArray
+    scatter: FloatArray
     chi2: float
     dof: int
     p_value: float
-    scatter: float
+    excess: float
     deviations: FloatArray
     sigmas: FloatArray
 
     def sentence(self, names: Sequence[str]) -> str:
         """What the comparison of results with these names found."""
-        if self.kind is Kind.SINGLE:
-            return "One recording: nothing to compare with"
-        test = (
-            f"chi-square {self.chi2:.1f} with {self.dof} degrees of freedom, p {self.p_value:.2g}"
-        )
         match self.kind:
+            case Kind.SINGLE:
+                return "One recording: nothing to compare with"
             case Kind.AGREE:
                 found = f"The {len(names)} recordings agree within their standard deviations"
             case Kind.DIFFER:
                 found = f"{names[0]} and {names[1]} differ; a third recording shows which is off"
             case Kind.SCATTER:
-                found = f"The {len(names)} recordings scatter {self.scatter:.1f} times as much as "
-                found += "their standard deviations say; none stands out"
+                found = f"The {len(names)} recordings scatter {self.excess:.1f} times as much as "
+                found += "recordings of one rig do; none stands out"
             case Kind.ONE_OFF:
                 found = f"{names[self.apart[0]]} differs from the others: {self._moves()}"
             case Kind.MOVED:
                 found = f"The mount has moved before {names[self.apart[0]]}: {self._moves()}"
-        return f"{found} ({test})"
+        return (
+            f"{found} (chi-square {self.chi2:.1f} with {self.dof} degrees of freedom, "
+            f"p {self.p_value:.2g})"
+        )
 
     def _moves(self) -> str:
         """By how much those apart differ, by more than two standard deviations; at least one."""
@@ -116,137 +126,154 @@ class Agreement:
         )
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """One extrinsic for a group of results, and what is left of their scatter about it."""
-
-    T: FloatArray
-    information: FloatArray
-    chi2: float
-    dof: int
-
-
-def agreement_of(Ts_parent_child: FloatArray, covariances: FloatArray) -> Agreement:
-    """Compare results of one rig.
+def agreement_of(
+    Ts_parent_child: FloatArray,
+    covariances: FloatArray,
+    usual: FloatArray | None = None,
+    level: float = _LEVEL,
+) -> Agreement:
+    """Compare results of one rig, and put them together.
 
     Parameters
     ----------
     Ts_parent_child : (N, 4, 4) array
         In the order of time.
     covariances : (N, 6, 6) array
-        Along and about the parent's axes, with the scatter of recordings.
+        Along and about the parent's axes.
+    usual : (6,) array, optional
+        Usual standard deviations of u_i along (m) and about (rad) the axes. Left out: there is no
+        scatter but what the covariances say.
+    level : float
+        Probability to accuse one of results that belong together.
     """
-    from scipy.special import chdtrc
-
     Ts = np.asarray(Ts_parent_child, dtype=float)
-    weights = np.array([_information(covariance) for covariance in covariances])
-    nothing = np.zeros(len(Ts), dtype=bool)
-    whole = _fit(Ts, weights, ~nothing)
-    p_value = float(chdtrc(whole.dof, whole.chi2)) if whole.dof else 1.0
-    kind, apart = _explanation(Ts, weights, whole, p_value < _LEVEL)
-    kept = _fit(Ts, weights, ~apart)
-    scatter = math.sqrt(kept.chi2 / kept.dof) if kept.dof else 1.0
-    widened = max(scatter, 1.0) ** 2 if kind is not Kind.AGREE else 1.0
-    sigmas = np.sqrt([np.diag(_covariance(weight)) for weight in weights])
+    tau = np.zeros(6) if usual is None else np.asarray(usual, dtype=float)
+    stated = np.array([_without_unknown(each) for each in covariances])
+    weights = np.linalg.inv(stated + np.diag(tau**2))
+    best = int(np.argmax(np.trace(weights, axis1=1, axis2=2)))
+    start = common_of(Ts, stated, tau, Ts[best])[0]
+    errors = errors_of(Ts, start)
+    kind, apart, chi2, dof, p_value = _explanation(errors, weights, level)
+    T, covariance, scatter = common_of(Ts[~apart], stated[~apart], tau, start)
+    _, _, left, free, _ = _explanation(errors[~apart], weights[~apart], 0.0)
+    sigmas = np.sqrt(np.diagonal(stated + np.diag(tau**2), axis1=1, axis2=2))
     sigmas = np.where(sigmas < _UNKNOWN, sigmas, np.nan)
     return Agreement(
         kind=kind,
         apart=tuple(np.flatnonzero(apart).tolist()),
-        T_parent_child=kept.T,
-        covariance=_covariance(kept.information) * widened,
-        chi2=whole.chi2,
-        dof=whole.dof,
-        p_value=p_value,
+        T_parent_child=T,
+        covariance=covariance,
         scatter=scatter,
-        deviations=np.where(np.isfinite(sigmas), _errors(Ts, kept.T), np.nan),
+        chi2=chi2,
+        dof=dof,
+        p_value=p_value,
+        excess=math.sqrt(left / free) if free else 1.0,
+        deviations=np.where(np.isfinite(sigmas), errors_of(Ts, T), np.nan),
         sigmas=sigmas,
     )
 
 
-def _explanation(
-    Ts: FloatArray, weights: FloatArray, whole: _Fit, is_large: bool
-) -> tuple[Kind, BoolArray]:
-    """How the results belong together, and which of them are apart.
-
-    ``is_large`` says whether they scatter more than stated.
+def common_of(
+    Ts: FloatArray, covariances: FloatArray, usual: FloatArray, start: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The common extrinsic (4, 4) of N results that belong together, its covariance (6, 6), and
+    their scatter (6,); see the top of the file.
     """
-    nothing = np.zeros(len(Ts), dtype=bool)
-    if len(Ts) == 1:
-        return Kind.SINGLE, nothing
-    if len(Ts) == 2:
-        return Kind.DIFFER if is_large else Kind.AGREE, nothing
-    candidates, errors = list(_candidates(len(Ts))), _errors(Ts, whole.T)
-    p_values = [_p_of_split(errors, weights, whole, apart) for _, apart in candidates]
-    best = int(np.argmin(p_values))
-    if len(candidates) * p_values[best] < _LEVEL:
-        return candidates[best]
-    return Kind.SCATTER if is_large else Kind.AGREE, nothing
-
-
-def _candidates(count: int) -> Iterator[tuple[Kind, BoolArray]]:
-    """Each result alone, and all since each time; what both explain is one that is off."""
-    number = np.arange(count)
-    for one in range(count):
-        yield Kind.ONE_OFF, number == one
-    for first in range(2, count - 1):
-        yield Kind.MOVED, number >= first
-
-
-def _p_of_split(errors: FloatArray, weights: FloatArray, whole: _Fit, apart: BoolArray) -> float:
-    """Probability of as good a split into two groups, if there is only one."""
-    from scipy.special import chdtrc, fdtrc
-
-    left = [_left(errors[group], weights[group]) for group in (apart, ~apart)]
-    chi2, dof = sum(one[0] for one in left), sum(one[1] for one in left)
-    gained, spent = whole.chi2 - chi2, whole.dof - dof
-    if spent <= 0:
-        return 1.0
-    if dof == 0 or chdtrc(dof, chi2) > _ORDINARY:
-        return float(chdtrc(spent, gained))
-    return float(fdtrc(spent, dof, gained / spent / (chi2 / dof)))
-
-
-def _information(covariance: FloatArray) -> FloatArray:
-    """Inverse of a covariance (6, 6) in its known directions; none in the others."""
-    if not np.isfinite(covariance).all():
-        return np.zeros((6, 6))
-    values, vectors = np.linalg.eigh(covariance)
-    weights = np.where(values < _UNKNOWN**2, 1.0 / np.maximum(values, 1e-12), 0.0)
-    return (vectors * weights) @ vectors.T
-
-
-def _covariance(information: FloatArray, unknown: float = 9.0) -> FloatArray:
-    """Inverse of an information; directions without any have this variance."""
-    values, vectors = np.linalg.eigh(information)
-    variances = np.where(values > 1 / _UNKNOWN**2, 1 / np.maximum(values, 1e-9), unknown)
-    return (vectors * variances) @ vectors.T
-
-
-def _fit(Ts: FloatArray, weights: FloatArray, group: BoolArray) -> _Fit:
-    """The extrinsic that fits a group of results best, by least squares."""
-    Ts, weights = Ts[group], weights[group]
-    total = weights.sum(axis=0)
-    T = Ts[int(np.argmax(np.trace(weights, axis1=1, axis2=2)))]
+    factors = list(itertools.product(_FACTORS, repeat=2)) if usual.any() else [(1.0, 1.0)]
+    variances = (np.repeat(factors, 3, axis=1) * usual) ** 2
+    T = start
     for _ in range(_ROUNDS):
-        weighted = np.einsum("nij,nj->i", weights, _errors(Ts, T))
-        step = _covariance(total, unknown=0.0) @ weighted
-        T = se3.from_rotation_translation(
-            se3.rotation_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3]
-        )
-    return _Fit(T, total, *_left(_errors(Ts, T), weights))
+        errors = errors_of(Ts, T)
+        log_shares, means, each = [], [], []
+        for factor, variance in zip(factors, variances, strict=True):
+            spread = covariances + np.diag(variance)
+            weights = np.linalg.inv(spread)
+            each.append(np.linalg.inv(weights.sum(axis=0)))
+            means.append(each[-1] @ np.einsum("nij,nj->i", weights, errors))
+            rest = errors - means[-1]
+            squared = np.einsum("ni,nij,nj->", rest, weights, rest)
+            volumes = np.linalg.slogdet(spread)[1].sum() - np.linalg.slogdet(each[-1])[1]
+            # Half-Cauchy, on a grid of logarithms.
+            prior = sum(math.log(one / (1.0 + one**2)) for one in factor)
+            log_shares.append(prior - 0.5 * (volumes + squared))
+        shares = np.exp(np.array(log_shares) - max(log_shares))
+        shares /= shares.sum()
+        step = shares @ np.array(means)
+        about = np.array(means) - step
+        covariance = np.einsum("g,gij->ij", shares, each) + (shares * about.T) @ about
+        rotation = se3.rotation_exp(step[3:]) @ T[:3, :3]
+        T = se3.from_rotation_translation(rotation, T[:3, 3] + step[:3])
+    return T, covariance, np.sqrt(shares @ variances)
 
 
-def _errors(Ts: FloatArray, T: FloatArray) -> FloatArray:
+def errors_of(Ts: FloatArray, T: FloatArray) -> FloatArray:
     """Deviations (N, 6) of transforms from one, along and about the parent's axes."""
     rotations = se3.rotation_log(Ts[:, :3, :3] @ T[:3, :3].T)
     return np.concatenate([Ts[:, :3, 3] - T[:3, 3], rotations], axis=1)
 
 
-def _left(errors: FloatArray, weights: FloatArray) -> tuple[float, int]:
-    """Chi-square and degrees of freedom that are left of errors (N, 6) after their common part."""
-    total = weights.sum(axis=0)
-    weighted = np.einsum("nij,nj->i", weights, errors)
-    chi2 = np.einsum("ni,nij,nj->", errors, weights, errors)
-    chi2 -= weighted @ _covariance(total, unknown=0.0) @ weighted
-    ranks = (np.linalg.eigvalsh([*weights, total]) > 1 / _UNKNOWN**2).sum(axis=1)
-    return float(max(chi2, 0.0)), int(ranks[:-1].sum() - ranks[-1])
+def unknown_directions(covariance: FloatArray) -> FloatArray:
+    """Orthonormal directions (6, U) in which a covariance (6, 6) says that nothing is known."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors[:, values > _UNKNOWN**2])
+
+
+def _without_unknown(covariance: FloatArray) -> FloatArray:
+    """A covariance (6, 6) in whose unknown directions many results together know nothing."""
+    if not np.isfinite(covariance).all():
+        return _UNKNOWN_VARIANCE * np.eye(6)
+    values, vectors = np.linalg.eigh(covariance)
+    values = np.where(values < _UNKNOWN**2, np.maximum(values, 1e-12), _UNKNOWN_VARIANCE)
+    return (vectors * values) @ vectors.T
+
+
+def _explanation(
+    errors: FloatArray, weights: FloatArray, level: float
+) -> tuple[Kind, BoolArray, float, int, float]:
+    """How the results belong together, and which of them are apart; chi-square, its degrees of
+    freedom and p-value of all together.
+
+    Each result alone is tried, and all since each time; what both explain is one that is off.
+    """
+    from scipy.special import chdtrc, fdtrc
+
+    number = np.arange(len(errors))
+    design = np.concatenate([np.broadcast_to(np.eye(6), weights.shape), errors[:, :, None]], axis=2)
+    each = np.swapaxes(design, 1, 2) @ weights @ design, _ranks(weights)
+    all_chi2, all_dof = _left(*(one.sum(axis=0) for one in each))
+    p_value = float(chdtrc(all_dof, all_chi2)) if all_dof else 1.0
+    kind, apart = Kind.DIFFER if p_value < _LEVEL else Kind.AGREE, number < 0
+    if len(number) < 3:
+        kind = kind if len(number) == 2 else Kind.SINGLE
+        return kind, apart, float(all_chi2), int(all_dof), p_value
+    alone_since = [np.concatenate([one, np.cumsum(one[::-1], axis=0)[::-1][2:-1]]) for one in each]
+    others = [one.sum(axis=0) - some for one, some in zip(each, alone_since, strict=True)]
+    chi2, dof = np.add(_left(*alone_since), _left(*others))
+    gained, spent = all_chi2 - chi2, all_dof - dof
+    with np.errstate(divide="ignore", invalid="ignore"):
+        p_values = fdtrc(spent, dof, gained / spent / (chi2 / dof))
+    is_ordinary = (dof == 0) | (chdtrc(dof, chi2) > _ORDINARY)
+    p_values = np.where(is_ordinary, chdtrc(spent, gained), p_values)
+    p_values[spent <= 0] = 1.0
+    best = int(np.argmin(p_values))
+    if len(p_values) * p_values[best] < level:
+        is_one = best < len(number)
+        kind = Kind.ONE_OFF if is_one else Kind.MOVED
+        apart = number == best if is_one else number >= best - len(number) + 2
+    elif kind is Kind.DIFFER:
+        kind = Kind.SCATTER
+    return kind, apart, float(all_chi2), int(all_dof), p_value
+
+
+def _left(products: FloatArray, ranks: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Chi-square and degrees of freedom that are left of groups of errors after the common part of
+    each, from sums of ``(1 e)' W (1 e)`` (..., 7, 7) and of the ranks of W.
+    """
+    weights, weighted = products[..., :6, :6], products[..., :6, 6]
+    common = np.linalg.solve(weights, weighted[..., None])[..., 0]
+    chi2 = products[..., 6, 6] - (weighted * common).sum(axis=-1)
+    return np.maximum(chi2, 0.0), np.asarray(ranks - _ranks(weights), dtype=float)
+
+
+def _ranks(weights: FloatArray) -> IntArray:
+    return np.asarray((np.linalg.eigvalsh(weights) > 1 / _UNKNOWN**2).sum(axis=-1))

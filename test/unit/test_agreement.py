@@ -59,7 +59,7 @@ def test_results_that_all_scatter_more_than_stated_accuse_none():
     found = [agreement_of(*results(seed, 12, factor=0.25)) for seed in range(20)]
     scattered = [one for one in found if one.kind is Kind.SCATTER]
     assert len(scattered) >= 19
-    assert all(1.5 < one.scatter < 2.5 for one in scattered)
+    assert all(1.5 < one.excess < 2.5 for one in scattered)
 
 
 def test_of_two_that_differ_none_is_accused():

@@ -1,0 +1,297 @@
+"""Several recordings: of one rig, for one result together, or of many, for a row each."""
+
+import math
+import multiprocessing
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from itertools import count
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.covariance import AXES, combined
+from hand_eye_calib.assessment.moved import scatter_of_recordings
+from hand_eye_calib.engine.offline import calibrate
+from hand_eye_calib.errors import HandEyeCalibError, InputError
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.results.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
+from hand_eye_calib.results.records import Recorded, Together
+from hand_eye_calib.results.tables import data_frame
+from hand_eye_calib.session.agreement import Agreement, agreement_of, unknown_directions
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Values of a result that are in its row as they are.
+TAKEN = (
+    *("verdict", "headline", "status", "parent_frame", "child_frame"),
+    *("method", "reference", "n_poses", "n_pairs", "n_inliers"),
+    *("time_offset_s", "time_offset_sigma_s", "scale", "scale_sigma"),
+)
+_LENGTHS, _ANGLES = AXES[:3], AXES[3:]
+
+
+def calibrate_together(
+    recordings: Iterable[tuple[Trajectory, Trajectory]],
+    names: Sequence[str] | None = None,
+    **options: Any,
+) -> Calibration:
+    """Estimate one extrinsic from several recordings of one rig.
+
+    Each recording is calibrated by itself, with a clock offset and a scale of its own. What they
+    say is added, with the scatter between recordings: an axis that one does not reveal comes from
+    another, and a recording that does not belong to the others is named and left out.
+
+    Parameters
+    ----------
+    recordings : iterable of (Trajectory, Trajectory)
+        Poses of parent and child in each.
+    names : sequence of str, optional
+        What to call the recordings; numbered by default.
+    **options
+        Those of :func:`~hand_eye_calib.engine.offline.calibrate`.
+
+    Returns
+    -------
+    Calibration
+        With :attr:`~Calibration.together`: each recording's own result, and the scatter.
+
+    Raises
+    ------
+    InputError
+        If no recording can be used, or they are of different frames.
+    HandEyeCalibError
+        As ``calibrate`` does, with the name of the recording.
+    """
+    results: dict[str, Calibration] = {}
+    for name, (parent, child) in zip(_named(names), recordings, strict=False):
+        try:
+            results[name] = calibrate(parent, child, **options)
+        except HandEyeCalibError as error:
+            raise type(error)(f"{name}: {error}") from None
+    return together(results)
+
+
+def calibrate_many(
+    recordings: Iterable[tuple[Trajectory, Trajectory]],
+    names: Sequence[str] | None = None,
+    *,
+    jobs: int = 1,
+    **options: Any,
+) -> "pd.DataFrame":
+    """Calibrate many recordings, each by itself.
+
+    Parameters
+    ----------
+    recordings, names, **options
+        As of :func:`calibrate_together`.
+    jobs : int
+        Number of processes.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A row for each recording by its name: verdict, headline, x, y and z (m), roll, pitch and yaw
+        (deg), their standard deviations, whether each is observed; an ``error`` if it failed.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without pandas.
+    """
+    work = partial(_row_of_pair, options=options)
+    if jobs == 1:
+        rows = list(map(work, recordings))
+    else:
+        spawning = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, spawning) as processes:
+            rows = list(processes.map(work, recordings))
+    named = zip(_named(names), rows, strict=False)
+    return data_frame([{"name": name, **row} for name, row in named], "name")
+
+
+def _named(names: Sequence[str] | None) -> Iterator[str]:
+    if names is not None and len(set(names)) < len(names):
+        raise InputError(f"expected different names, found {', '.join(names)}")
+    return iter(names) if names is not None else map(str, count(1))
+
+
+def _row_of_pair(pair: tuple[Trajectory, Trajectory], options: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        return row_of_result(calibrate(*pair, **options).to_dict()) | {"error": None}
+    except HandEyeCalibError as error:
+        return {"error": str(error)}
+
+
+def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of a result, from what its ``to_dict`` gave; what is not known is None."""
+    transform = calibration["T_parent_child"]
+    row: dict[str, Any] = {name: calibration[name] for name in TAKEN[:5]}
+    for names, values, sigmas, unit in (
+        (_LENGTHS, transform["translation"], transform["sigma_translation"], "m"),
+        (_ANGLES, transform["rpy_deg"], transform["sigma_rpy_deg"], "deg"),
+    ):
+        for name, value, sigma in zip(names, values, sigmas, strict=True):
+            is_known = sigma is not None and math.isfinite(sigma)
+            row |= {f"{name}_{unit}": value, f"sigma_{name}_{unit}": sigma if is_known else None}
+    row |= {f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]}
+    return row | {name: calibration[name] for name in TAKEN[5:]}
+
+
+def together(results: Mapping[str, Calibration]) -> Calibration:
+    """One result from the results of recordings of one rig.
+
+    Parameters
+    ----------
+    results : mapping of str to Calibration
+        By the names of the recordings.
+
+    Returns
+    -------
+    Calibration
+        Method, frames and targets are those of the recordings. So are the clock offset and the
+        scale if all have the same; otherwise each has its own.
+
+    Raises
+    ------
+    InputError
+        If no recording can be used, or they are of different frames.
+    """
+    results = dict(sorted(results.items(), key=lambda one: one[1].stamp_ns))
+    require_same_frames(results.values())
+    unfit = {name: why for name, each in results.items() if (why := _unfit(each))}
+    fit = {name: each for name, each in results.items() if name not in unfit}
+    if not fit:
+        told = "; ".join(f"{name}: {why}" for name, why in unfit.items())
+        raise InputError(f"no recording can be used: {told or 'there is none'}")
+    found = agreement_of_results([*fit.values()])
+    names = [*fit]
+    apart = {names[index] for index in found.apart}
+    sentence = found.sentence(names)
+    unfit |= dict.fromkeys(apart, "it does not belong to the others")
+    used = [each for name, each in fit.items() if name not in apart]
+    of_axes = dict(zip(names, zip(found.deviations, found.sigmas, strict=True), strict=True))
+    nothing = np.full((2, 6), np.nan)
+    records = tuple(
+        _recorded(name, each, unfit.get(name, ""), *of_axes.get(name, nothing))
+        for name, each in results.items()
+    )
+    return _joint(
+        used,
+        found,
+        Together(
+            kind=found.kind.value,
+            sentence=sentence,
+            chi2=found.chi2,
+            dof=found.dof,
+            p_value=found.p_value,
+            scatter=dict(zip(AXES, found.scatter.tolist(), strict=True)),
+            recordings=records,
+        ),
+    )
+
+
+def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) -> Agreement:
+    """How the results of several recordings of one rig, in the order of time, belong together; the
+    level is that of :func:`agreement_of`.
+    """
+    Ts = np.array([each.T_parent_child for each in results])
+    to_parent = np.kron(np.eye(2), Ts[:, :3, :3])
+    covariances = np.array([each.covariance for each in results])
+    covariances = to_parent @ covariances @ np.swapaxes(to_parent, 1, 2)
+    usual = [np.diag(scatter_of_recordings(each)) for each in covariances]
+    return agreement_of(Ts, covariances, np.sqrt(np.median(usual, axis=0)), level)
+
+
+def require_same_frames(results: Iterable[Calibration]) -> None:
+    """Raise InputError unless all results are of one pair of frames."""
+    frames = {f"{each.child_frame} in {each.parent_frame}" for each in results}
+    if len(frames) > 1:
+        raise InputError(
+            f"expected results of one pair of frames; found {' and '.join(sorted(frames))}"
+        )
+
+
+def _unfit(result: Calibration) -> str:
+    """Why a recording says nothing of the mount; empty if it does."""
+    grave = [each for each in result.reasons if each.verdict is Verdict.DO_NOT_USE]
+    return result.headline if any(each.rule != "nothing_known" for each in grave) else ""
+
+
+def _recorded(
+    name: str, result: Calibration, left_out: str, deviations: FloatArray, sigmas: FloatArray
+) -> Recorded:
+    return Recorded(
+        name=name,
+        verdict=result.verdict.value,
+        headline=result.headline,
+        left_out=left_out,
+        deviations=dict(zip(AXES, deviations.tolist(), strict=True)),
+        sigmas=dict(zip(AXES, sigmas.tolist(), strict=True)),
+        time_offset_s=result.time_offset_s,
+        scale=result.scale,
+        n_poses=result.n_poses,
+        stamp_ns=result.stamp_ns,
+    )
+
+
+def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> Calibration:
+    """The result of recordings that belong together."""
+    T = found.T_parent_child
+    to_child = np.kron(np.eye(2), T[:3, :3].T)
+    covariance, by_prior = found.covariance.copy(), set()
+    for axis, name in enumerate(AXES):
+        known = [one.observability[axis] for one in used if math.isfinite(one.sigmas[axis])]
+        if known and all(dof.verdict is DofVerdict.PRIOR for dof in known):
+            # All have it from one measurement by hand.
+            by_prior.add(name)
+            variance = min(dof.sigma for dof in known) ** 2
+            covariance[axis, axis] = max(covariance[axis, axis], variance)
+    covariance = to_child @ covariance @ to_child.T
+    assessed = combined(T, covariance, None, unknown_directions(covariance))
+    newest = used[-1]
+    own_clock = {(one.time_offset_s, one.scale) for one in used}
+    offset_s, scale = own_clock.pop() if len(own_clock) == 1 else (0.0, 1.0)
+    floors = [np.zeros((6, 6)) if one.floor is None else one.floor for one in used]
+    return Calibration(
+        T_parent_child=T,
+        covariance=assessed.cov_parent_child_in_child,
+        observability=tuple(
+            DofObservability(dof.name, DofVerdict.PRIOR, dof.sigma) if dof.name in by_prior else dof
+            for dof in assessed.observability
+        ),
+        floor=np.mean(floors, axis=0),
+        status=SolveStatus.UNOBSERVABLE
+        if any(math.isinf(dof.sigma) for dof in assessed.observability)
+        else SolveStatus.OK,
+        objective=found.chi2,
+        method=Counter(one.method for one in used).most_common(1)[0][0],
+        reference=newest.reference,
+        backend=newest.backend,
+        method_reason="",
+        time_offset_s=offset_s,
+        scale=scale,
+        measured=newest.measured,
+        findings=tuple({each.code: each for one in used for each in one.findings}.values()),
+        n_poses=sum(one.n_poses for one in used),
+        n_pairs=sum(one.n_pairs for one in used),
+        n_inliers=sum(one.n_inliers for one in used),
+        stamp_ns=newest.stamp_ns,
+        **{name: getattr(newest, name) for name in _OF_RIG},
+        together=record,
+    )
+
+
+_OF_RIG = (
+    *("parent_frame", "child_frame", "base_frame", "T_base_parent"),
+    *("target_translation", "target_rotation", "target_axes"),
+)
