@@ -25,8 +25,10 @@ _HOMES = {
     "Verdict": "results.verdict",
     "calibrate": "engine.offline",
     "calibrate_arm": "engine.stops",
+    "calibrate_many": "session.together",
     "calibrate_rig": "rig.calibrate",
     "calibrate_stops": "engine.stops",
+    "calibrate_together": "session.together",
     "compare": "session.compare",
     "cross_check": "engine.offline",
     "load": "io.results",
@@ -52,8 +54,10 @@ __all__ = [
     "Verdict",
     "calibrate",
     "calibrate_arm",
+    "calibrate_many",
     "calibrate_rig",
     "calibrate_stops",
+    "calibrate_together",
     "compare",
     "cross_check",
     "load",
@@ -85,6 +89,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.rig.calibrate import calibrate_rig
     from hand_eye_calib.rig.result import RigCalibration
     from hand_eye_calib.session.compare import compare
+    from hand_eye_calib.session.together import calibrate_many, calibrate_together
 
     __version__: str
 else:

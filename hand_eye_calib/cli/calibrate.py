@@ -1,13 +1,12 @@
 """``calibrate PATH ...``: two trajectory files, a bag or the parts of one, or the journal of a
-session; the stops of an arm; three sensors or more; many recordings. ``replay`` is its other name,
-for bags and journals alone.
+session; several recordings; the stops of an arm; three sensors or more. ``replay`` is its other
+name, for bags and journals alone.
 """
 
 import argparse
 import dataclasses
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, print_table, waiting_for
@@ -34,6 +33,8 @@ examples:
   hand_eye_calib calibrate my_bag --parent-tf odom:lidar --child-topic /vio --out result
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
   hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
+  hand_eye_calib calibrate monday/bag tuesday/bag wednesday/bag --out together
+  hand_eye_calib calibrate --batch 'fleet/**' --vehicle 'fleet/{vehicle}/' --out results
   hand_eye_calib calibrate samples.yaml --out arm
   hand_eye_calib calibrate hand.tum images/ --target charuco:5x7:0.04:0.03 --camera camera.yaml
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
@@ -82,8 +83,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     batch.add_argument(
         "--batch",
         metavar="FILE",
-        type=Path,
-        help="YAML file with a list of bags, each with its own options",
+        nargs="+",
+        help="YAML file with a list of bags, each with its own options; or bags, or patterns of "
+        "bags in quotes, such as 'fleet/**'",
+    )
+    batch.add_argument(
+        "--vehicle",
+        metavar="PATTERN",
+        help="the vehicle's name, or its place in the paths of --batch, such as "
+        "'fleet/{vehicle}/*': recordings of one vehicle are put together",
+    )
+    batch.add_argument(
+        "--pairs",
+        action="store_true",
+        help="the PATHs are trajectory files, parent and child by turns, of several recordings",
+    )
+    batch.add_argument(
+        "--no-report", action="store_true", help="no page for each recording: they take most time"
     )
     batch.add_argument(
         "--jobs",
@@ -108,8 +124,14 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.cli.batch.run import run_batch
 
         return run_batch(arguments)
+    from hand_eye_calib.cli.batch.tasks import matching
     from hand_eye_calib.io.remote import local_copies
 
+    arguments.paths = [
+        found
+        for path in arguments.paths
+        for found in map(type(path), matching(str(path)) or [path])
+    ]
     with local_copies(arguments.paths) as (arguments.paths, as_given):
         return _run_here(arguments, as_given)
 
@@ -117,8 +139,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _check_usage(arguments: argparse.Namespace) -> None:
     if arguments.batch and (arguments.paths or arguments.list):
         raise ConfigError("--batch cannot be combined with PATH or --list")
-    if not arguments.batch and (arguments.jobs or arguments.dask):
-        raise ConfigError("--jobs and --dask are for --batch")
+    if not arguments.batch and (arguments.dask or arguments.vehicle):
+        raise ConfigError("--dask and --vehicle are for --batch")
+    if arguments.pairs and len(arguments.paths) % 2:
+        raise ConfigError("--pairs takes the files of parent and child by turns: one is missing")
     if arguments.topics:
         named = [f"{each}_{kind}" for each in ("parent", "child") for kind in ("topic", "tf")]
         others = [name for name in (*named, "batch", "list") if getattr(arguments, name)]
@@ -136,17 +160,28 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     if arguments.list:
         return _list_topics(arguments, as_given)
     from hand_eye_calib.cli import rig, stops
+    from hand_eye_calib.cli.batch.run import run_together
+    from hand_eye_calib.cli.parts import SeveralRecordings
     from hand_eye_calib.cli.present import deliver
-    from hand_eye_calib.cli.reading import are_bags, read_recording
+    from hand_eye_calib.cli.reading import are_bags, journal_in, read_recording
 
     if arguments.topics:
         return rig.calibrate_bag(arguments, as_given)
     if stops.are_stops(arguments):
         return deliver(*stops.solved(arguments), None)
+    if arguments.pairs:
+        pairs = list(zip(arguments.paths[::2], arguments.paths[1::2], strict=True))
+        return run_together(arguments, pairs, are_files=True)
+    if len(arguments.paths) > 1 and any(journal_in([path]) for path in arguments.paths):
+        return run_together(arguments, [[path] for path in arguments.paths], are_files=False)
     arguments.is_of_bags = arguments.command == "replay" or are_bags(arguments.paths)
     if len(arguments.paths) > 2 and not arguments.is_of_bags:
         return rig.calibrate_files(arguments)
-    recording = read_recording(arguments)
+    try:
+        recording = read_recording(arguments)
+    except SeveralRecordings as several:
+        note(f"{several.reason}; they give one result, as recordings of one rig")
+        return run_together(arguments, several.groups, are_files=False)
     calibration = recording.solved()
     if arguments.out:
         recording.with_fingerprints()

@@ -1,11 +1,12 @@
 """Parts of one recording, or several recordings? They look alike on the command line."""
 
-from itertools import combinations
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 
@@ -28,12 +29,23 @@ class _Part(NamedTuple):
     # corrected as it grows; positions and rates begin anew in each bag.
     is_fixed: bool
 
+    def first_ns(self) -> int:
+        return int(self.poses.stamps_ns[0])
+
     def last_ns(self) -> int:
         return int(self.poses.stamps_ns[-1])
 
 
+class SeveralRecordings(InputError):
+    """Bags that are not parts of one recording; ``groups`` are the bags of each."""
+
+    def __init__(self, reason: str, groups: list[list[Path]]) -> None:
+        super().__init__(f"{reason}; calibrate each by itself, or all of one rig together")
+        self.reason, self.groups = reason, groups
+
+
 def refuse_recordings(
-    bag: "PoseBag", source: "Source", max_gap_s: float, measures: str = "auto"
+    bag: "PoseBag", sources: "Mapping[Source, str]", max_gap_s: float = CalibratorConfig.max_gap
 ) -> None:
     """Refuse bags that are not parts of one recording, after they were read together.
 
@@ -43,41 +55,80 @@ def refuse_recordings(
     Parameters
     ----------
     bag : PoseBag
-    source : str or TfSource
-        A topic or a pair of frames.
+    sources : mapping of Source to str
+        Topics or pairs of frames, and what the poses of each are read as.
     max_gap_s : float
         Poses of two parts may be out of order for so long.
-    measures : str
-        What the poses are read as.
 
     Raises
     ------
-    InputError
-        If two bags are recordings of their own; the message names them and says why.
+    SeveralRecordings
+        The message names two of them and says why.
     """
     if len(bag.paths) < 2:
         return
+    read = [_read(bag, source, measures) for source, measures in sources.items()]
+    starts = {
+        path: min(parts[path].first_ns() for parts in read if path in parts)
+        for path in map(Path, bag.paths)
+        if any(path in parts for parts in read)
+    }
+    groups: list[list[Path]] = []
+    message = ""
+    for path in sorted(starts, key=lambda each: starts[each]):
+        for group in groups:
+            told = _difference(path, group, zip(sources, read, strict=True), max_gap_s)
+            message = message or told
+            if not told:
+                group.append(path)
+                break
+        else:
+            groups.append([path])
+    if len(groups) > 1:
+        raise SeveralRecordings(message, groups)
+
+
+def _read(bag: "PoseBag", source: "Source", measures: str) -> dict[Path, _Part]:
+    """The poses of a source in each bag that has some."""
     if isinstance(source, str) and bag.expected(source) is not None:
         is_fixed = bag.measured(source, measures) == "poses"
-        read = [_Part(*each, is_fixed) for each in bag.parts(source)]
+        found = [_Part(*each, is_fixed) for each in bag.parts(source)]
     else:  # a path or transforms, which are put together from all bags
         alone = (_part(path, source, measures) for path in bag.paths)
-        read = [part for part in alone if part is not None]
-    parts = sorted(read, key=lambda part: int(part.poses.stamps_ns[0]))
-    differences = [
-        (first, second, _overlap(first, second, max_gap_s))
-        for first, second in combinations(parts, 2)
-    ]
-    for number, part in enumerate(parts[1:], start=1):
-        latest = max(parts[:number], key=_Part.last_ns)
-        differences.append((latest, part, _break(latest, part)))
-    for first, second, difference in differences:
-        if difference:
-            raise InputError(
-                f"{first.path} and {second.path} are two recordings, not parts of one: {source} "
-                f"{difference}; calibrate each by itself, or all with --batch FILE, which lists "
-                "them"
-            )
+        found = [part for part in alone if part is not None]
+    return {Path(part.path): part for part in found}
+
+
+def _difference(
+    path: Path,
+    group: list[Path],
+    read: "Iterable[tuple[Source, dict[Path, _Part]]]",
+    max_gap_s: float,
+) -> str:
+    """What tells that a bag is no part of the recording of others that begin before it; empty for
+    nothing.
+    """
+    for source, parts in read:
+        before = [parts[each] for each in group if each in parts]
+        if path not in parts or not before:
+            continue
+        part = parts[path]
+        in_order = sorted([*before, part], key=_Part.first_ns)
+        at = in_order.index(part)
+        differences = [
+            (each, _overlap(*sorted((each, part), key=_Part.first_ns), max_gap_s))
+            for each in before
+        ]
+        if at:
+            latest = max(in_order[:at], key=_Part.last_ns)
+            differences.append((latest, _break(latest, part)))
+        for each in in_order[at + 1 : at + 2]:
+            differences.append((each, _break(part, each)))
+        for other, told in differences:
+            if told:
+                both = f"{other.path} and {part.path} are two recordings, not parts of one"
+                return f"{both}: {source} {told}"
+    return ""
 
 
 def _part(path: Path, source: "Source", measures: str) -> _Part | None:

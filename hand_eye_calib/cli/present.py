@@ -311,7 +311,12 @@ def _floor(calibration: Calibration) -> Iterator[str]:
 
 
 def _comparisons(calibration: Calibration) -> Iterator[str]:
-    """The goal of the session, and the comparison with what is installed."""
+    """The recordings, the goal of the session, and the comparison with what is installed."""
+    if calibration.together:
+        yield calibration.together.sentence
+        for one in calibration.together.recordings:
+            told = f"left out, {one.left_out}" if one.left_out else one.headline
+            yield f"{one.name}: {told}"
     if calibration.goal:
         yield f"the session: {calibration.goal.sentence}"
     if calibration.comparison:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import flag, note, waiting_for, with_progress
-from hand_eye_calib.cli.options import FILE_OPTIONS, STREAMS, config_from, options_from
+from hand_eye_calib.cli.options import FILE_OPTIONS, STREAMS, options_from
 from hand_eye_calib.cli.parts import refuse_recordings
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -113,16 +113,37 @@ def read_recording(arguments: Namespace) -> Recording:
     """
     if not arguments.is_of_bags:
         return _read_pair(arguments)
-    sources = sources_from(arguments)
-    journal = journal_in(arguments.paths)
+    return read_paths(arguments.paths, sources_from(arguments), options_from(arguments))
+
+
+def read_paths(
+    paths: Sequence[Path | str],
+    sources: Mapping[str, Any],
+    options: Mapping[str, Any],
+    are_files: bool = False,
+) -> Recording:
+    """The recording of a journal, of a bag or the parts of one, or of two trajectory files.
+
+    Raises
+    ------
+    HandEyeCalibError
+        If it cannot be read, or something does not go together.
+    """
+    if are_files:
+        settings = [
+            {"format": "auto", "measures": options.get(f"{stream}_measures", "auto")}
+            for stream in STREAMS
+        ]
+        return _recording(paths, *_read(list(map(Path, paths)), settings, ["", ""]), options)
+    journal = journal_in(paths)
     if journal is None:
-        return read_bags(arguments.paths, sources, config_from(arguments))
+        return read_bags(paths, sources, CalibratorConfig.from_options(dict(options)))
     if any(sources.values()):
         raise ConfigError(
             f"{journal} is the journal of a session, which has two streams; it cannot be combined "
             "with topics or frames"
         )
-    return read_journal_of(journal, options_from(arguments))
+    return read_journal_of(journal, options)
 
 
 def sources_from(arguments: Namespace) -> dict[str, Any]:
@@ -138,18 +159,30 @@ def sources_from(arguments: Namespace) -> dict[str, Any]:
 
 def _read_pair(arguments: Namespace) -> Recording:
     trajectories, repairs = read_files(arguments)
+    times = (arguments.times, arguments.parent_times, arguments.child_times)
+    options = options_from(arguments)
+    found = _recording(arguments.paths, [*trajectories.values()], repairs, options)
+    found.files += filter(None, times)
+    return found
+
+
+def _recording(
+    paths: Sequence[Path | str],
+    trajectories: Sequence[Trajectory],
+    repairs: Sequence[str],
+    options: Mapping[str, Any],
+) -> Recording:
+    """The recording of the trajectories of two files."""
     for text in repairs:
         note(text)
-    parent, child = trajectories.values()
-    config = offline_config(parent, child, options_from(arguments))
-    snapshot = whole_snapshot(config, parent, child)
+    parent, child = trajectories
+    config = offline_config(parent, child, options)
     inputs: dict[str, Any] = {}
-    for path, (stream, poses) in zip(arguments.paths, trajectories.items(), strict=True):
+    for path, stream, poses in zip(paths, STREAMS, trajectories, strict=True):
         first_ns, last_ns = poses.stamps_ns[[0, -1]].tolist()
         inputs[stream] = {"file": str(path), "poses": len(poses)}
         inputs[stream] |= {"first_stamp_ns": first_ns, "last_stamp_ns": last_ns}
-    times = (arguments.times, arguments.parent_times, arguments.child_times)
-    return Recording(snapshot, inputs, [*map(Path, arguments.paths), *filter(None, times)])
+    return Recording(whole_snapshot(config, parent, child), inputs, [*map(Path, paths)])
 
 
 def read_files(arguments: Namespace) -> tuple[dict[str, Trajectory], list[str]]:
@@ -309,8 +342,8 @@ def read_bags(
         shown = with_progress(chain(first, blocks), expected, f"reading {bag}", len)
         found = feed(calibrator, shown, sources) + bag.n_left_out
         with waiting_for("comparing the bags"):
-            for stream, source in sources.items():
-                refuse_recordings(bag, source, config.max_gap, measures[stream])
+            kinds = {source: measures[stream] for stream, source in sources.items()}
+            refuse_recordings(bag, kinds, config.max_gap)
         warnings = list(bag.warnings)
         files = bag.files()
     if expected is not None and found != expected:

@@ -10,7 +10,6 @@ from hand_eye_calib.cli.parts import refuse_recordings
 from hand_eye_calib.cli.present import exit_code, show, transform_lines, wrapped
 from hand_eye_calib.cli.reading import add_sensor, read_rig_files
 from hand_eye_calib.cli.reporting import REPORT, write_page
-from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ def calibrate_bag(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
             source = TfSource.parse(topic) if ":" in topic else topic
             with waiting_for(f"reading {topic}"):
                 trajectory, notes = trajectory_of(bag, source)
-            refuse_recordings(bag, source, CalibratorConfig.max_gap)
+            refuse_recordings(bag, {source: "auto"})
             for text in notes:
                 note(text)
             add_sensor(found, trajectory.sensor_frame or topic, trajectory)

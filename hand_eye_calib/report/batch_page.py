@@ -12,8 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import sigmas_rpy
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.report.style import (
     BAD,
@@ -26,7 +24,8 @@ from hand_eye_calib.report.style import (
     new_figure,
     page_style,
 )
-from hand_eye_calib.session.agreement import Agreement, Kind
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import counted, listing, with_sigma
 
 Plain = Mapping[str, Any]
@@ -37,26 +36,26 @@ _TO_SHOWN = np.repeat([1000.0, np.degrees(1.0)], 3)
 # A band of the common value in its own standard deviations.
 _BAND = 2.0
 _GRAVITY = ("bad", "warn", "good")
-_TONES = {Kind.AGREE: "good", Kind.SINGLE: "warn", Kind.SCATTER: "warn"}
 # More would make the page too large for a browser; rows.csv has all.
 _MOST_ROWS, _MOST_FIGURES = 2000, 40
-# Standard deviations (m, deg) from which on a common value is unknown.
-_UNKNOWN = {"m": 1.0, "deg": 60.0}
 
 
 def render_batch(
-    batch: str, rows: Sequence[Plain], vehicles: Sequence[Plain], with_report: Collection[str]
+    title: str,
+    rows: Sequence[Plain],
+    vehicles: Mapping[str, Calibration],
+    with_report: Collection[str],
 ) -> str:
     """The page as HTML.
 
     Parameters
     ----------
-    batch : str
-        Name of the batch file.
+    title : str
+        What the recordings are of.
     rows : sequence of dict
         One for each recording.
-    vehicles : sequence of dict
-        ``name``, ``frames``, ``rows``, ``agreement``, ``sentence``, ``of_newest`` of each.
+    vehicles : mapping of str to Calibration
+        The result of each vehicle of several recordings.
     with_report : collection of str
         Names of the recordings that have a report.
 
@@ -68,75 +67,62 @@ def render_batch(
     cells = [_cells(row, row["name"] in with_report) for row in rows]
     counts = Counter(cell["verdict"] for cell in cells)
     cells.sort(key=lambda cell: _GRAVITY.index(cell["tone"]))
-    ordered = sorted(vehicles, key=lambda one: _GRAVITY.index(_tone_of(one)))
-    tone = cells[0]["tone"]
+    ordered = sorted(vehicles.items(), key=lambda one: _GRAVITY.index(TONES[one[1].verdict.value]))
     return page(
         "batch.html",
-        tone,
+        cells[0]["tone"],
         counted(len(rows), "recording"),
         listing([f"{count} {verdict}" for verdict, count in counts.most_common()]),
-        batch=batch.rpartition("/")[2],
+        batch=title.rpartition("/")[2],
         left_out=max(0, len(rows) - _MOST_ROWS),
-        vehicles=[_vehicle(one, number) for number, one in enumerate(ordered, start=1)],
+        vehicles_left_out=max(0, len(ordered) - _MOST_FIGURES),
+        vehicles=[_vehicle(*one, n) for n, one in enumerate(ordered[:_MOST_FIGURES], start=1)],
         rows=cells[:_MOST_ROWS],
-        with_vehicles=any(row["vehicle"] for row in rows),
+        with_vehicles=len({row["vehicle"] for row in rows}) > 1,
         headings=[f"{name} {unit}" for name, unit in _AXES.items()],
     )
 
 
-def _tone_of(vehicle: Plain) -> str:
-    return _TONES.get(vehicle["agreement"].kind, "bad")
-
-
-def _vehicle(vehicle: Plain, number: int) -> dict[str, Any]:
-    rows = vehicle["rows"]
-    found: Agreement = vehicle["agreement"]
-    is_drawn = len(rows) > 1 and number <= _MOST_FIGURES
-    starts_ns = [row["start_ns"] for row in rows]
+def _vehicle(name: str, result: Calibration, number: int) -> dict[str, Any]:
+    assert result.together is not None, "the result of a vehicle is of several recordings"
+    row = row_of_result(result.to_dict())
     figure = {
         "name": f"vehicle-{number}",
         "title": "Each recording against the common extrinsic",
         "said": "Difference of each recording from the common value along and about the parent's "
         "axes, with its standard deviation. The band is two standard deviations of the common "
         "value. Squares do not belong to the others.",
-        "svg": draw_trend(found, starts_ns, number) if is_drawn else None,
+        "svg": draw_trend(result, number),
     }
     return {
-        "title": vehicle["name"],
-        "frames": " in ".join(reversed(vehicle["frames"])),
-        "count": counted(len(rows), "recording"),
-        "sentence": vehicle["sentence"],
-        "newest": vehicle["of_newest"],
-        "tone": _tone_of(vehicle),
-        "values": _common(found),
-        "figures": [figure] if is_drawn else [],
+        "title": name,
+        "frames": f"{result.child_frame} in {result.parent_frame}",
+        "count": counted(len(result.together.recordings), "recording"),
+        "headline": result.headline,
+        "sentence": result.together.sentence,
+        "left_out": [
+            f"{each.name} is left out: {each.left_out}"
+            for each in result.together.recordings
+            if each.left_out
+        ],
+        "tone": TONES[result.verdict.value],
+        "values": list(
+            zip([f"{axis}, {unit}" for axis, unit in _AXES.items()], _values(row), strict=True)
+        ),
+        "figures": [figure],
     }
 
 
-def _common(found: Agreement) -> list[tuple[str, str]]:
-    """The common extrinsic, value by value."""
-    T = found.T_parent_child
-    to_child = np.kron(np.eye(2), T[:3, :3].T)
-    sigmas_deg = np.degrees(sigmas_rpy(T, to_child @ found.covariance @ to_child.T))
-    values = [*T[:3, 3], *np.degrees(se3.rotation_to_rpy(T[:3, :3]))]
-    sigmas = [*np.sqrt(np.diag(found.covariance)[:3]), *sigmas_deg]
+def _values(row: Plain) -> list[str]:
     return [
-        (
-            f"{name}, {unit}",
-            with_sigma(value, sigma if sigma < _UNKNOWN[unit] else None, 3 if unit == "m" else 2),
-        )
-        for (name, unit), value, sigma in zip(_AXES.items(), values, sigmas, strict=True)
+        with_sigma(row[f"{name}_{unit}"], row[f"sigma_{name}_{unit}"], 3 if unit == "m" else 2)
+        for name, unit in _AXES.items()
     ]
 
 
 def _cells(row: Plain, is_linked: bool) -> dict[str, Any]:
     """A recording's row of the table."""
     verdict = "failed" if row["error"] else row["verdict"]
-    values = [
-        with_sigma(row[f"{name}_{unit}"], row[f"sigma_{name}_{unit}"], 3 if unit == "m" else 2)
-        for name, unit in _AXES.items()
-        if row["verdict"] is not None
-    ]
     return {
         "name": row["name"],
         "vehicle": row["vehicle"],
@@ -145,28 +131,30 @@ def _cells(row: Plain, is_linked: bool) -> dict[str, Any]:
         "verdict": verdict,
         "tone": TONES.get(verdict, "bad"),
         "why": row["error"] or row["headline"] or "",
-        "values": values,
+        "values": _values(row) if row["verdict"] is not None else [],
     }
 
 
-def draw_trend(found: Agreement, starts_ns: Sequence[int | None], number: int) -> str:
-    """SVG of how the results of a vehicle lie about their common extrinsic, axis by axis, over the
-    starts of the recordings; ``number`` is that of the vehicle on the page.
+def draw_trend(result: Calibration, number: int) -> str:
+    """SVG of how the recordings of a vehicle lie about their common extrinsic, axis by axis, over
+    time; ``number`` is that of the vehicle on the page.
     """
-    known = [start for start in starts_ns if start is not None]
-    is_date = len(known) == len(starts_ns) and len(set(known)) > 1
-    at = np.arange(1.0, len(starts_ns) + 1)
+    recordings = result.together.recordings if result.together else ()
+    stamps_s = [each.stamp_ns * 1e-9 for each in recordings]
+    is_date = len(set(stamps_s)) > 1
+    at = np.arange(1.0, len(stamps_s) + 1)
     if is_date:
-        at = np.array(date2num([datetime.fromtimestamp(start * 1e-9, UTC) for start in known]))
-    apart = np.isin(np.arange(len(at)), found.apart)
-    bands = _BAND * np.sqrt(np.diag(found.covariance))
+        at = np.array(date2num([datetime.fromtimestamp(each, UTC) for each in stamps_s]))
+    apart = np.array([bool(each.left_out) for each in recordings])
     with page_style():
         figure = new_figure(WIDTH, 3.9)
         panels = figure.subplots(2, 3, sharex=True).ravel()
-        for axis, (panel, title) in enumerate(zip(panels, _PANELS, strict=True)):
+        columns = zip(_AXES, panels, _PANELS, _BAND * result.sigmas, _TO_SHOWN, strict=True)
+        for axis, panel, title, band, factor in columns:
             panel.set_title(title, loc="left")
-            values, sigmas = found.deviations[:, axis], found.sigmas[:, axis]
-            _draw_axis(panel, at, np.array([values, sigmas]), bands[axis], _TO_SHOWN[axis], apart)
+            points = [(each.deviations[axis], each.sigmas[axis]) for each in recordings]
+            values = np.where(np.isfinite(points), points, np.nan).T
+            _draw_axis(panel, at, values, band, factor, apart)
             if is_date:
                 locator = AutoDateLocator(minticks=2, maxticks=4)
                 panel.xaxis.set_major_locator(locator)
@@ -184,7 +172,7 @@ def _draw_axis(
 ) -> None:
     """Deviations of one axis with their standard deviations, and the band of the common value."""
     values, sigmas = factor * values_sigmas
-    if np.isnan(values).all():
+    if np.isnan(values).all() or np.isinf(band):
         panel.text(0.5, 0.5, "not determined", transform=panel.transAxes, ha="center", color=MUTED)
         panel.set_yticks([])
         return

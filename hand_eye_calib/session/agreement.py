@@ -151,7 +151,7 @@ def agreement_of(
     stated = np.array([_without_unknown(each) for each in covariances])
     weights = np.linalg.inv(stated + np.diag(tau**2))
     best = int(np.argmax(np.trace(weights, axis1=1, axis2=2)))
-    start = common_of(Ts, stated, tau, Ts[best])[0]
+    start = common_of(Ts, np.linalg.inv(weights), np.zeros(6), Ts[best])[0]
     errors = errors_of(Ts, start)
     kind, apart, chi2, dof, p_value = _explanation(errors, weights, level)
     T, covariance, scatter = common_of(Ts[~apart], stated[~apart], tau, start)
@@ -179,31 +179,42 @@ def common_of(
     """The common extrinsic (4, 4) of N results that belong together, its covariance (6, 6), and
     their scatter (6,); see the top of the file.
     """
-    factors = list(itertools.product(_FACTORS, repeat=2)) if usual.any() else [(1.0, 1.0)]
+    factors = np.array(list(itertools.product(_FACTORS, repeat=2)) if usual.any() else [(1.0, 1.0)])
     variances = (np.repeat(factors, 3, axis=1) * usual) ** 2
+    # Half-Cauchy, on a grid of logarithms.
+    log_prior = np.log(factors / (1.0 + factors**2)).sum(axis=1)
+    # Many recordings at a few factors at a time: the matrices of all would fill the memory.
+    chunks = np.array_split(np.arange(len(factors)), max(1, len(factors) * len(Ts) // 5000))
     T = start
     for _ in range(_ROUNDS):
         errors = errors_of(Ts, T)
-        log_shares, means, each = [], [], []
-        for factor, variance in zip(factors, variances, strict=True):
-            spread = covariances + np.diag(variance)
-            weights = np.linalg.inv(spread)
-            each.append(np.linalg.inv(weights.sum(axis=0)))
-            means.append(each[-1] @ np.einsum("nij,nj->i", weights, errors))
-            rest = errors - means[-1]
-            squared = np.einsum("ni,nij,nj->", rest, weights, rest)
-            volumes = np.linalg.slogdet(spread)[1].sum() - np.linalg.slogdet(each[-1])[1]
-            # Half-Cauchy, on a grid of logarithms.
-            prior = sum(math.log(one / (1.0 + one**2)) for one in factor)
-            log_shares.append(prior - 0.5 * (volumes + squared))
-        shares = np.exp(np.array(log_shares) - max(log_shares))
+        found = [_at_scatter(errors, covariances, variances[chunk]) for chunk in chunks]
+        means, each, likelihoods = map(np.concatenate, zip(*found, strict=True))
+        shares = log_prior + likelihoods
+        shares = np.exp(shares - shares.max())
         shares /= shares.sum()
-        step = shares @ np.array(means)
-        about = np.array(means) - step
-        covariance = np.einsum("g,gij->ij", shares, each) + (shares * about.T) @ about
+        step = shares @ means
+        covariance = np.einsum("g,gij->ij", shares, each)
+        covariance += (shares * (means - step).T) @ (means - step)
         rotation = se3.rotation_exp(step[3:]) @ T[:3, :3]
         T = se3.from_rotation_translation(rotation, T[:3, 3] + step[:3])
     return T, covariance, np.sqrt(shares @ variances)
+
+
+def _at_scatter(
+    errors: FloatArray, covariances: FloatArray, variances: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Means (G, 6) of errors at variances (G, 6) of u_i, their covariances (G, 6, 6), and the
+    restricted log likelihoods (G,).
+    """
+    spread = covariances + (variances[:, :, None] * np.eye(6))[:, None]
+    weights = np.linalg.inv(spread)
+    each = np.linalg.inv(weights.sum(axis=1))
+    means = np.einsum("gij,gnjk,nk->gi", each, weights, errors, optimize=True)
+    rest = errors - means[:, None]
+    squared = (rest * np.einsum("gnij,gnj->gni", weights, rest)).sum(axis=(1, 2))
+    volumes = np.linalg.slogdet(spread)[1].sum(axis=1) - np.linalg.slogdet(each)[1]
+    return means, each, -0.5 * (volumes + squared)
 
 
 def errors_of(Ts: FloatArray, T: FloatArray) -> FloatArray:

@@ -132,7 +132,7 @@ def batches(chaos, folder):
     (folder / "bag.mcap").touch()
     path.write_bytes(text_inputs.yaml_text(chaos, "batch"))
     try:
-        tasks = read_batch(path, {}, {})
+        tasks = read_batch([path], {}, {})
     except HandEyeCalibError as error:
         if "\n" in str(error):
             raise Finding(f"an error of several lines: {error}") from None

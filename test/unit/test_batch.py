@@ -19,14 +19,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from fleet_making import always_dies, dies_once, outcome, recordings_of
+from fleet_making import always_dies, calibration_of, dies_once, outcome, recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 
 from hand_eye_calib.cli.batch import run as batch_run
 from hand_eye_calib.cli.batch import workers
 from hand_eye_calib.cli.batch.results import COLUMNS, content_hash, row_of, write_rows
 from hand_eye_calib.cli.batch.tasks import Task, read_batch
-from hand_eye_calib.cli.batch.vehicles import vehicles_of
 from hand_eye_calib.cli.batch.workers import on_cores, on_dask, work
 from hand_eye_calib.cli.reporting import REPORT
 from hand_eye_calib.errors import InputError
@@ -34,6 +33,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io import remote
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result
+from hand_eye_calib.session.together import together
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -175,8 +175,8 @@ def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
 
 
 def test_a_defect_in_one_bag_leaves_the_others_alone(fleet, monkeypatch):
-    tasks = read_batch(fleet, {}, {})
-    monkeypatch.setattr(workers, "read_bags", lambda *_, **__: 1 / 0)
+    tasks = read_batch([fleet], {}, {})
+    monkeypatch.setattr(workers, "read_paths", lambda *_, **__: 1 / 0)
     outcome = work(tasks[0])
     assert outcome["error"] == "unexpected ZeroDivisionError: division by zero"
     assert "ZeroDivisionError" in outcome["traceback"]
@@ -211,7 +211,7 @@ def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
         "parent_topic: /p, options: {reference: A}}]}"
     )
     first, second = read_batch(
-        path, {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"}
+        [path], {"method": "park", "max_gap": 0.3}, {"parent_topic": "/cli", "child_topic": "/c"}
     )
     assert first.options == {"method": "dnl", "max_gap": 0.3}
     assert first.sources == {"parent_tf": "odom:lidar", "child_topic": "/c"}
@@ -226,7 +226,7 @@ def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
         (tmp_path / folder / "bag").mkdir(parents=True)
     path = tmp_path / "fleet.yaml"
     path.write_text("bags: ['*/bag', other, other, {bag: monday/bag, name: first}]")
-    names = [task.name for task in read_batch(path, {}, {})]
+    names = [task.name for task in read_batch([path], {}, {})]
     assert names == ["monday", "tuesday", "other", "other_2", "first"]
 
 
@@ -244,7 +244,7 @@ def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
 def test_names_come_from_the_folders_that_differ(tmp_path, bags, names):
     path = tmp_path / "fleet.yaml"
     path.write_text(yaml.safe_dump({"bags": bags}))
-    assert [task.name for task in read_batch(path, {}, {})] == names
+    assert [task.name for task in read_batch([path], {}, {})] == names
 
 
 # ---- workers
@@ -344,6 +344,7 @@ def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path, monkeypatc
     page = (tmp_path / "1" / "index.html").read_text(encoding="utf-8")
     assert "report.html" not in page
     assert "The 4 recordings agree within their standard deviations" in page
+    assert (tmp_path / "1" / "vehicles" / "truck" / "extrinsic.yaml").exists()
     assert not list(tmp_path.rglob("*.parquet"))
 
 
@@ -359,7 +360,7 @@ def test_the_digest_of_a_recording_is_that_of_sha256sum():
 @pytest.mark.parametrize("name", ["=cmd()", " +1", "＝1+1", "a;=cmd()"])
 def test_a_cell_cannot_become_a_formula(tmp_path, name):
     (one,) = fleet_outcomes("truck", 1, 1)
-    write_rows(tmp_path / "rows.csv", [{**one, "name": name}])
+    write_rows(tmp_path / "rows.csv", [row_of({**one, "name": name})])
     text = (tmp_path / "rows.csv").read_text()
     (row,) = csv.DictReader(text.splitlines())
     assert row["name"] == (name if name[0] == "a" else f"'{name}")
@@ -377,7 +378,7 @@ def outcomes_of(path, bags, **common):
     path.write_text(
         yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": bags, **common})
     )
-    tasks = read_batch(path, {"reference": "B5"}, {}, with_fingerprints=True)
+    tasks = read_batch([path], {"reference": "B5"}, {}, with_fingerprints=True)
     return tasks, [work(task) for task in tasks]
 
 
@@ -494,37 +495,7 @@ def fleet_outcomes(vehicle, count, seed, shift=(), by=0.02):
     ]
 
 
-def test_recordings_are_compared_with_those_of_their_vehicle():
-    outcomes = [
-        *fleet_outcomes("b", 6, 1, shift=(4, 5)),
-        *fleet_outcomes("a", 5, 2),
-        *fleet_outcomes("c", 5, 3, shift=(1,)),
-        *fleet_outcomes("d", 1, 4),
-        *fleet_outcomes("e", 6, 1, shift=(5,), by=0.1),
-        {**outcome("x", "a", *(one[0] for one in recordings_of(9, 1))), "calibration": None},
-    ]
-    random = np.random.default_rng(0)
-    found = {one.name: one for one in vehicles_of(random.permutation(outcomes).tolist())}
-    assert [(name, one.agreement.kind.value) for name, one in found.items()] == [
-        ("a", "agree"),
-        ("b", "moved"),
-        ("c", "one off"),
-        ("d", "single"),
-        ("e", "one off"),
-    ]
-    assert found["b"].sentence.startswith("The mount has moved before b_4: ")
-    assert "the rotation about z by " in found["b"].sentence
-    assert found["c"].sentence.startswith("c_1 differs from the others: ")
-    assert found["e"].newest.sentence.startswith("moved: ")
-    assert "moved" not in found["a"].newest.sentence
-    assert found["d"].newest is None
-    document = json.loads(json.dumps(found["b"].to_dict(), allow_nan=False))
-    assert document["apart"] == ["b_4", "b_5"]
-
-
 def test_recordings_without_a_vehicle_are_not_judged_together(run, fleet, tmp_path, monkeypatch):
-    many = [one for seed in range(30) for one in fleet_outcomes("", 1, seed, shift=(0,), by=seed)]
-    assert vehicles_of(many) == []
     monkeypatch.setattr(batch_run, "can_draw", lambda page: page != REPORT)  # they take long
     document = yaml.safe_load(fleet.read_text())
     fleet.write_text(yaml.safe_dump(document | {"bags": ["bags/drive0", "bags/drive1", "absent"]}))
@@ -532,9 +503,10 @@ def test_recordings_without_a_vehicle_are_not_judged_together(run, fleet, tmp_pa
     assert "2 of 3 bags calibrated, 1 failed" in out
     assert "agree" not in out
     assert (
-        "note: 2 recordings are not compared with each other: name their vehicles with 'vehicle:' "
-        f"in {fleet}"
+        "note: 2 recordings are not compared with each other: give --vehicle with the place of the "
+        "vehicle in their paths, such as 'fleet/{vehicle}/*'"
     ) in err
+    assert re.search(r"note: [12] of 3: drive[01]: USE", err)  # a line for each in a pipe
 
 
 def test_the_index_page_shows_each_vehicle(tmp_path):
@@ -543,15 +515,34 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
     outcomes = [*fleet_outcomes("<b>", 6, 1, shift=(4, 5)), *fleet_outcomes("a", 2, 2)]
     outcomes.append({**outcomes[0], "name": "lost", "calibration": None, "error": "no <bag>"})
     rows = [row_of(one) for one in outcomes]
-    vehicles = [vars(one) for one in vehicles_of(outcomes)]
+    vehicles = {
+        name: together({one["name"]: calibration_of(one) for one in outcomes[part]})
+        for name, part in (("<b>", slice(0, 6)), ("a", slice(6, 8)))
+    }
     with_report = {row["name"] for row in rows[:-1]}
     page = render_batch("path/fleet.yaml", rows, vehicles, with_report)
     assert "<b>" not in page
     assert "no &lt;bag&gt;" in page
     assert page.count("<svg") == 2
-    assert page.count(" against the earlier ones: ") == 2
+    assert page.count("is left out: it does not belong to the others") == 2
     assert "path/fleet.yaml" not in page
     assert page.count("/report.html") == 8
     for address in re.findall(r'(?:href|src)="([^"]*)"', page):
         assert not re.match(r"\w+:|//", address), f"not on this disk: {address}"
     assert page == render_batch("path/fleet.yaml", rows, vehicles, with_report)
+
+
+def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
+    for place in ("truck_1/monday", "truck_1/tuesday", "truck_2/monday", "notes"):
+        (tmp_path / "fleet" / place).mkdir(parents=True, exist_ok=True)
+        if place != "notes":
+            (tmp_path / "fleet" / place / "metadata.yaml").touch()
+            (tmp_path / "fleet" / place / "a.mcap").touch()
+    pattern = f"{tmp_path}/fleet/**"
+    tasks = read_batch([pattern], {}, {}, "fleet/{vehicle}/*")
+    assert [(task.name, task.vehicle) for task in tasks] == [
+        ("truck_1", "truck_1"),
+        ("tuesday", "truck_1"),
+        ("truck_2", "truck_2"),
+    ]
+    assert {task.vehicle for task in read_batch([pattern], {}, {}, "other/{vehicle}/*")} == {""}

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 from bag_making import TF, path_message, tf_message, write_messages
-from motions import as_trajectory, child_of, disturbed, wandering_poses
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 
 from hand_eye_calib.cli.reading import read_journal_of
 from hand_eye_calib.geometry import se3
@@ -152,8 +152,9 @@ def test_a_topic_and_frames_together(run, bag, tmp_path):
             "argument --parent-tf: expected two frames as WORLD:SENSOR",
         ),
         (["bag", "--parent-tf", "a:b", "--parent-topic", "/a"], "not allowed with argument"),
-        (["bag", "--jobs", "2"], "--jobs and --dask are for --batch"),
-        (["--batch", "fleet.yaml", "bag"], "--batch cannot be combined with PATH or --list"),
+        (["bag", "--vehicle", "a"], "--dask and --vehicle are for --batch"),
+        (["bag", "--batch", "fleet.yaml"], "--batch cannot be combined with PATH or --list"),
+        (["--batch", "fleet.yaml", "bag"], "--batch takes one file, or bags: fleet.yaml is a file"),
         ([], "the following arguments are required: PATH, or --batch FILE"),
     ],
 )
@@ -221,15 +222,20 @@ def test_parts_that_continue_each_other_or_repeat_poses_are_one_recording_in_any
         (elsewhere, slice(52, 100), "m away after 0.3 s, as if it had started again"),
     ],
 )
-def test_recordings_are_not_joined(run, tmp_path, change, part, reason):
+def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, change, part, reason):
     first = slice(0, 100) if part.start == 0 else slice(0, 50)
     paths = parts_of(tmp_path, [first, part], part_1=change)
     for order in (paths, paths[::-1]):
-        code, out, err = run(*order, *STREAMS)
-        assert (code, out) == (1, "")
+        code, out, err = run(*order, *STREAMS, "--json", "--jobs", "1")
         assert "are two recordings, not parts of one: /a" in err
         assert reason in err
-        assert "--batch FILE" in err
+        found = json.loads(out)["together"]
+        names = {each["name"] for each in found["recordings"]}
+        if "pauses" in reason:  # the streams of the second have no time in common
+            assert (code, names) == (1, {"part_0"})
+        else:
+            assert (code, names, found["kind"]) == (0, {"part_0", "part_1"}, "agree")
+        np.testing.assert_allclose(matrix(out), T_PARENT_CHILD, atol=5e-3)
     code, out, err = run(*paths, "--topics", "/a", "/b", "/a")
     assert (code, out) == (1, "")
     assert reason in err

@@ -95,7 +95,7 @@ def test_a_date_is_read_as_text_and_a_name_with_slashes_is_one_folder(tmp_path, 
     """Impossible dates included, which YAML takes for dates."""
     path = tmp_path / "fleet.yaml"
     path.write_text(f"[{{bag: absent, name: {name}}}]")
-    assert [task.name for task in read_batch(path, {}, {})] == [read]
+    assert [task.name for task in read_batch([path], {}, {})] == [read]
 
 
 INF, NAN = float("inf"), float("nan")

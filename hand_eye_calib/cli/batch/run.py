@@ -1,160 +1,288 @@
-"""The command ``calibrate --batch``: tasks, workers, results, and what is printed of them."""
+"""The commands ``calibrate --batch`` and ``calibrate RECORDING RECORDING ...``: tasks, workers,
+results, and what is printed of them.
+"""
 
 import argparse
+import contextlib
+import json
 import os
+import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from hand_eye_calib.cli.batch.results import row_of, store, stored_outcomes, write_rows
-from hand_eye_calib.cli.batch.tasks import INDEX, SOURCES, SUMMARY, TABLE, Task, read_batch
-from hand_eye_calib.cli.batch.vehicles import Vehicle, vehicles_of
+from hand_eye_calib.cli.batch.results import Row, row_of, store, stored, write_rows
+from hand_eye_calib.cli.batch.tasks import (
+    INDEX,
+    SOURCES,
+    SUMMARY,
+    TABLE,
+    VEHICLES,
+    Task,
+    read_batch,
+)
 from hand_eye_calib.cli.batch.workers import Outcome, on_cores, on_dask
 from hand_eye_calib.cli.console import note, print_table, waiting_for, with_progress
 from hand_eye_calib.cli.options import options_from
-from hand_eye_calib.cli.present import exit_code, wrapped
+from hand_eye_calib.cli.present import deliver, wrapped
 from hand_eye_calib.cli.reporting import REPORT, can_draw, save_text
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.plain import json_text
-from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.text import listing, with_sigma
+from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.session.together import together
+from hand_eye_calib.text import counted, listing, with_sigma
 
 _HEADINGS = (" x m", " y m", " z m", " roll deg", " pitch deg", " yaw deg", " poses", " warnings")
+# The worst come first on the terminal; rows.csv has all.
+_MOST_LINES = 200
+_GRAVITY = ("failed", *(each.value for each in reversed(Verdict)))
+_EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
+
+
+class _Done(NamedTuple):
+    """A recording that is done: its row, and its outcome as text, which takes little memory."""
+
+    row: Row
+    text: str
+    code: int
+
+    @property
+    def outcome(self) -> Outcome:
+        return dict(json.loads(self.text))
+
+    @property
+    def verdict(self) -> str:
+        return "failed" if self.row["error"] else str(self.row["verdict"])
+
+    @property
+    def rig(self) -> tuple[str, ...]:
+        """Vehicle and frames: recordings of other frames are another rig."""
+        return tuple(self.row[name] for name in ("vehicle", "parent_frame", "child_frame"))
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
-    """Calibrate from all bags of the file; returns the exit code.
+    """Calibrate from many recordings; returns the exit code.
 
     Raises
     ------
     HandEyeCalibError
-        If the file cannot be used; a bag that fails is a row in the result.
+        If a batch file cannot be used; a bag that fails is a row in the result.
     """
     out: Path | None = arguments.out
-    given = {name: getattr(arguments, name) for name in SOURCES}
-    sources = {
-        name: value if isinstance(value, str) else ":".join(value)
-        for name, value in given.items()
-        if value
-    }
-    with waiting_for(f"reading {arguments.batch}"):
-        tasks = read_batch(
-            arguments.batch,
-            options_from(arguments),
-            sources,
-            with_fingerprints=bool(out),
-            with_report=bool(out) and can_draw(REPORT),
-        )
-    found = _outcomes(tasks, arguments)
-    outcomes = [found[task.name] for task in tasks]
-    vehicles = vehicles_of(outcomes)
-    written = write_summary(out, str(arguments.batch), outcomes, vehicles) if out else []
+    title = " ".join(map(str, arguments.batch))
+    with waiting_for(f"reading {title}"):
+        tasks = _tasks(arguments, arguments.batch, arguments.vehicle or "")
+    done = _all_done(tasks, arguments)
+    rigs: dict[tuple[str, ...], list[_Done]] = {}
+    for one in done:
+        if one.row["vehicle"] and one.row["verdict"]:
+            rigs.setdefault(one.rig, []).append(one)
+    vehicles = {}
+    for rig, group in sorted(rigs.items()):
+        name = rig[0] if rig[0] not in vehicles else " ".join(rig)
+        with contextlib.suppress(InputError):  # no recording of it can be used
+            if len(group) > 1:
+                vehicles[name] = _together(group)
+    if out:
+        _write_summary(out, title, done, vehicles)
     if arguments.json:
-        print(json_text(_document(str(arguments.batch), outcomes, vehicles)))
+        _print_document(title, done, vehicles)
     else:
-        _print_results(outcomes, vehicles)
-    alone = sum(bool(one["calibration"] and not one["vehicle"]) for one in outcomes)
+        _print_results(done, vehicles)
+    alone = sum(bool(one.row["verdict"] and not one.row["vehicle"]) for one in done)
     if alone > 1:
         note(
-            f"{alone} recordings are not compared with each other: name their vehicles with "
-            f"'vehicle:' in {arguments.batch}"
+            f"{alone} recordings are not compared with each other: give --vehicle with the place "
+            "of the vehicle in their paths, such as 'fleet/{vehicle}/*'"
         )
-    errors = {one["name"]: one["error"] for one in outcomes if one["error"]}
-    for name, error in errors.items():
-        note(f"{name} failed: {error}")
-    for path in written:
-        note(f"wrote {path}")
-    if errors:
-        return 1
-    return max(exit_code(Calibration.from_dict(outcome["calibration"])) for outcome in outcomes)
+    return _exit_code(done)
 
 
-def _outcomes(tasks: Sequence[Task], arguments: argparse.Namespace) -> dict[str, Outcome]:
-    """Outcome of each task by its name: of an earlier run, or of this one."""
+def run_together(
+    arguments: argparse.Namespace, groups: Sequence[Sequence[Path | str]], are_files: bool
+) -> int:
+    """Calibrate from several recordings of one rig, each given by its bags or files, for one
+    result; returns the exit code.
+
+    Raises
+    ------
+    HandEyeCalibError
+        If no recording can be used.
+    """
     out: Path | None = arguments.out
-    with waiting_for("looking for earlier results"):
-        found = stored_outcomes(tasks, out) if out else {}
+    entries = [{"bag": list(map(str, group))} for group in groups]
+    done = _all_done(_tasks(arguments, entries, "rig", are_files=are_files), arguments)
+    if not any(one.row["verdict"] for one in done):
+        raise InputError("; ".join(f"{one.row['name']}: {one.row['error']}" for one in done))
+    found = _together([one for one in done if one.row["verdict"]])
+    if out:
+        _write_rows_and_page(out, "recordings of one rig", done, {"rig": found}, REPORT)
+    inputs = {"recordings": {one.row["name"]: one.outcome["inputs"] for one in done}}
+    code = deliver(found, arguments, inputs, None)
+    failed = any(one.row["error"] for one in done)
+    _note_errors(done)
+    return _EXIT_FAILED if failed else code
+
+
+def _tasks(arguments: argparse.Namespace, given: Any, vehicle: str, **flags: bool) -> list[Task]:
+    sources = {
+        name: value if isinstance(value, str) else ":".join(value)
+        for name in SOURCES
+        if (value := getattr(arguments, name))
+    }
+    with_report = bool(arguments.out) and not arguments.no_report and can_draw(REPORT)
+    flags |= {"with_fingerprints": bool(arguments.out), "with_report": with_report}
+    return read_batch(given, options_from(arguments), sources, vehicle, **flags)
+
+
+def _all_done(tasks: Sequence[Task], arguments: argparse.Namespace) -> list[_Done]:
+    """The recordings of an earlier run, and of this one, in the order of the tasks."""
+    out: Path | None = arguments.out
+    found: dict[str, _Done] = {}
+    if out:
+        for task in with_progress(tasks, len(tasks), "looking for earlier results"):
+            if outcome := stored(task, out):
+                found[task.name] = _done(outcome)
     if found:
         note(f"{len(found)} of {len(tasks)} bags are done already; their results are in {out}")
     waiting = [task for task in tasks if task.name not in found]
-    jobs = arguments.jobs or os.cpu_count() or 1
+    jobs = min(arguments.jobs or os.cpu_count() or 1, max(len(waiting), 1))
     with on_dask(arguments.dask) if arguments.dask else on_cores(jobs) as do:
         for task, outcome in with_progress(do(waiting), len(waiting), "calibrating"):
             page = outcome.pop("page", None)
-            found[task.name] = outcome
+            found[task.name] = one = _done(outcome)
             if out:
                 store(task, outcome, page, out)
-    return found
+            if not sys.stderr.isatty():
+                told = one.row["error"] or one.row["headline"]
+                note(f"{len(found)} of {len(tasks)}: {task.name}: {told}")
+    return [found[task.name] for task in tasks]
 
 
-def _document(
-    batch: str, outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]
-) -> dict[str, object]:
-    """Everything as plain values."""
+def _done(outcome: Outcome) -> _Done:
+    calibration, code = outcome["calibration"], 0
+    if outcome["error"] or not calibration:
+        code = _EXIT_FAILED
+    else:
+        silent = {"rotations": "xyz", "positions": "rollpitchyaw"}.get(calibration["measured"], "")
+        hidden = any(
+            dof["verdict"] == "unobservable" and dof["name"] not in silent
+            for dof in calibration["observability"]
+        )
+        is_poor = calibration["verdict"] == Verdict.DO_NOT_USE.value
+        code = _EXIT_NOT_ALL if hidden or is_poor else 0
+    return _Done(row_of(outcome), json.dumps(outcome, separators=(",", ":")), code)
+
+
+def _together(group: Sequence[_Done]) -> Calibration:
+    return together(
+        {one.row["name"]: Calibration.from_dict(one.outcome["calibration"]) for one in group}
+    )
+
+
+def _exit_code(done: Sequence[_Done]) -> int:
+    _note_errors(done)
+    codes = {one.code for one in done}
+    return _EXIT_FAILED if _EXIT_FAILED in codes else max(codes)
+
+
+def _note_errors(done: Sequence[_Done]) -> None:
+    failed = [one.row for one in done if one.row["error"]]
+    for row in failed[:_MOST_LINES]:
+        note(f"{row['name']} failed: {row['error']}")
+
+
+def _document(title: str, done: Sequence[_Done], vehicles: Mapping[str, Calibration]) -> Row:
+    """What there is to say of all together, as plain values."""
     return {
-        "batch": batch,
-        "results": list(outcomes),
-        "failures": [outcome["name"] for outcome in outcomes if outcome["error"]],
-        "vehicles": [vehicle.to_dict() for vehicle in vehicles],
+        "batch": title,
+        "counts": dict(Counter(one.verdict for one in done)),
+        "failures": [one.row["name"] for one in done if one.row["error"]],
+        "vehicles": {name: each.to_dict() for name, each in vehicles.items()},
     }
 
 
-def write_summary(
-    directory: Path, batch: str, outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]
-) -> list[Path]:
-    """Write everything as JSON, the rows as a table, and the index page; returns the paths of the
-    last two.
+def _print_document(title: str, done: Sequence[_Done], vehicles: Mapping[str, Calibration]) -> None:
+    """Print the document with the outcome of every recording, one by one: they may be many."""
+    print(json_text(_document(title, done, vehicles)).rstrip().removesuffix("}").rstrip() + ",")
+    print('  "results": [')
+    for number, one in enumerate(done, start=1):
+        print(f"    {one.text}{',' if number < len(done) else ''}")
+    print("  ]\n}")
+
+
+def _write_summary(
+    directory: Path, title: str, done: Sequence[_Done], vehicles: Mapping[str, Calibration]
+) -> None:
+    """Write everything that is said of all together, and the result of each vehicle.
 
     Raises
     ------
     InputError
-        If they cannot be written.
+        If something cannot be written.
     """
+    from hand_eye_calib.io.results import save_result
+
     with waiting_for("writing the summary"):
-        text = json_text(_document(batch, outcomes, vehicles))
-        save_text(directory / SUMMARY, text + "\n")
-        paths = [directory / TABLE]
-        write_rows(paths[0], outcomes)
-        if can_draw(INDEX):
-            from hand_eye_calib.report.batch_page import render_batch
-
-            rows = [row_of(outcome) for outcome in outcomes]
-            with_report = {
-                row["name"] for row in rows if (directory / row["name"] / REPORT).exists()
-            }
-            paths.append(directory / INDEX)
-            save_text(paths[1], render_batch(batch, rows, [*map(vars, vehicles)], with_report))
-    return paths
+        text = json_text(_document(title, done, vehicles)) + "\n"
+        save_text(directory / SUMMARY, text)
+        for name, each in vehicles.items():
+            save_result(each, directory / VEHICLES / name.replace("/", "_"))
+        _write_rows_and_page(directory, title, done, vehicles, INDEX)
 
 
-def _print_results(outcomes: Sequence[Outcome], vehicles: Sequence[Vehicle]) -> None:
-    """Print a row for each recording, and what those of each vehicle say together."""
-    of_vehicle = ["vehicle"] if any(outcome["vehicle"] for outcome in outcomes) else []
+def _write_rows_and_page(
+    directory: Path,
+    title: str,
+    done: Sequence[_Done],
+    vehicles: Mapping[str, Calibration],
+    page: str,
+) -> None:
+    paths = [directory / TABLE]
+    rows = [one.row for one in done]
+    write_rows(paths[0], rows)
+    if can_draw(page):
+        from hand_eye_calib.report.batch_page import render_batch
+
+        linked = {row["name"] for row in rows if (directory / row["name"] / REPORT).exists()}
+        paths.append(directory / page)
+        save_text(paths[1], render_batch(title, rows, vehicles, linked))
+    for path in paths:
+        note(f"wrote {path}")
+
+
+def _print_results(done: Sequence[_Done], vehicles: Mapping[str, Calibration]) -> None:
+    """Print a row for each recording, the worst first if they are many, and what those of each
+    vehicle say together.
+    """
+    shown = list(done)
+    if len(done) > _MOST_LINES:
+        shown = sorted(done, key=lambda one: _GRAVITY.index(one.verdict))[:_MOST_LINES]
+    of_vehicle = ["vehicle"] if any(one.row["vehicle"] for one in done) else []
     headings = ("recording", *of_vehicle, "verdict", *_HEADINGS)
-    print_table("", headings, (_cells(outcome, of_vehicle) for outcome in outcomes))
-    verdicts = Counter(
-        "failed" if one["error"] else one["calibration"]["verdict"] for one in outcomes
-    )
-    solved = len(outcomes) - verdicts["failed"]
-    print(f"{solved} of {len(outcomes)} bags calibrated, {verdicts.pop('failed', 0)} failed")
-    if verdicts:
-        print(listing([f"{count} {verdict}" for verdict, count in verdicts.most_common()]))
-    for vehicle in vehicles:
-        if len(vehicle.rows) > 1:
-            text = f"{vehicle.name}: {vehicle.sentence} {vehicle.of_newest}"
-            print("\n".join(wrapped(text, "", "  ")))
+    print_table("", headings, (_cells(one, of_vehicle) for one in shown))
+    if len(shown) < len(done):
+        print(f"{len(done) - len(shown)} more, none with a worse verdict")
+    counts = Counter(one.verdict for one in done)
+    failed = counts.pop("failed", 0)
+    print(f"{len(done) - failed} of {counted(len(done), 'bag')} calibrated, {failed} failed")
+    if counts:
+        print(listing([f"{count} {verdict}" for verdict, count in counts.most_common()]))
+    for name, each in vehicles.items():
+        sentence = each.together.sentence if each.together else ""
+        print("\n".join(wrapped(f"{name}: {each.headline}. {sentence}", "", "  ")))
 
 
-def _cells(outcome: Outcome, of_vehicle: Sequence[str]) -> Iterator[str]:
+def _cells(one: _Done, of_vehicle: Sequence[str]) -> Iterator[str]:
     """Names, verdict, numbers with their standard deviations, counts."""
-    calibration = outcome["calibration"]
-    yield from (outcome[name] for name in ("name", *of_vehicle))
-    if outcome["error"] or not calibration:
-        yield "failed"
+    row = one.row
+    yield from (row[name] for name in ("name", *of_vehicle))
+    yield one.verdict
+    if one.verdict == "failed":
         return
-    transform = calibration["T_parent_child"]
-    yield calibration["verdict"]
-    for kind, sigma, decimals in (("translation", "translation", 3), ("rpy_deg", "rpy_deg", 2)):
-        numbers = zip(transform[kind], transform[f"sigma_{sigma}"], strict=True)
-        yield from (with_sigma(*each, decimals) for each in numbers)
-    yield str(calibration["n_poses"])
-    yield str(len(calibration["warnings"]))
+    for axis in ("x", "y", "z", "roll", "pitch", "yaw"):
+        unit, decimals = ("m", 3) if axis in "xyz" else ("deg", 2)
+        yield with_sigma(row[f"{axis}_{unit}"], row[f"sigma_{axis}_{unit}"], decimals)
+    yield str(row["n_poses"])
+    yield str(len(row["warnings"].split("; ")) if row["warnings"] else 0)

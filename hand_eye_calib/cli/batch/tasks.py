@@ -1,7 +1,8 @@
-"""Reading a batch file: which recordings, with which options, under which names."""
+"""Which recordings a batch has, with which options, under which names."""
 
 import hashlib
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -19,11 +20,14 @@ from hand_eye_calib.text import split_frames
 SOURCES = ("parent_topic", "child_topic", "parent_tf", "child_tf")
 _KEYS = ("bag", "name", "vehicle", "options", *SOURCES)
 STATE = "batch.json"
-SUMMARY, TABLE, INDEX = "summary.json", "rows.csv", "index.html"
-# Names of files in the folder of the results, which a recording cannot have.
-_TAKEN = (SUMMARY, STATE, TABLE, INDEX)
+SUMMARY, TABLE, INDEX, VEHICLES = "summary.json", "rows.csv", "index.html", "vehicles"
+# Names in the folder of the results, which a recording cannot have.
+_TAKEN = (SUMMARY, STATE, TABLE, INDEX, VEHICLES)
 # Bytes of the name of a folder.
 _LONGEST_NAME = 200
+_BAGS = (".bag", ".mcap", ".db3")
+# The place of the vehicle in a pattern of paths.
+_PLACE = "{vehicle}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +39,13 @@ class Task:
     name : str
         Of its row and its folder.
     bags : tuple of str
-        Paths or URLs.
+        Paths or URLs of its parts, the directory of a journal, or the files of parent and child.
     vehicle : str
-        The rig; recordings of one are compared with each other. Empty if it is not known.
+        The rig; recordings of one are put together. Empty if it is not known.
     options, sources : dict
     with_fingerprints, with_report : bool
+    are_files : bool
+        They are trajectory files.
     """
 
     name: str
@@ -49,10 +55,11 @@ class Task:
     sources: dict[str, str] = field(default_factory=dict)
     with_fingerprints: bool = False
     with_report: bool = False
+    are_files: bool = False
 
     def key(self) -> str:
-        """Digest of the task, its options and its bags, so that no older result is taken for this
-        one's.
+        """Digest of the task, its options, and names, sizes and times of its files, so that no
+        older result is taken for this one's.
 
         Raises
         ------
@@ -66,7 +73,6 @@ class Task:
 
 
 def _state(bag: str) -> list[Any]:
-    """What changes if a bag does: names, sizes and times of its files."""
     if remote.is_url(bag):
         return remote.states(bag)
     path = Path(bag)
@@ -75,28 +81,22 @@ def _state(bag: str) -> list[Any]:
 
 
 def read_batch(
-    path: Path,
+    given: Sequence[Path | str | dict[str, Any]],
     options: Options,
     sources: Mapping[str, str],
-    *,
-    with_fingerprints: bool = False,
-    with_report: bool = False,
+    vehicle: str = "",
+    **flags: Any,
 ) -> list[Task]:
-    """The tasks of a batch file.
+    """The tasks of a batch file; or of bags, patterns of bags, and entries as in such a file.
 
     Parameters
     ----------
-    path : pathlib.Path
-    options, sources : dict
+    given : list of path-like or dict
+        One YAML file, or what can stand in its list.
+    options, sources, vehicle
         What holds if the file says nothing else.
-    with_fingerprints : bool
-        Whether the results shall say which bytes were read.
-    with_report : bool
-        Whether they shall come with a report.
-
-    Returns
-    -------
-    list of Task
+    **flags
+        Of every Task.
 
     Raises
     ------
@@ -105,31 +105,33 @@ def read_batch(
     ConfigError
         If it says something that cannot be.
     """
-    from hand_eye_calib.io.yaml_files import read_yaml
+    document: Any = [each if isinstance(each, dict) else str(each) for each in given]
+    shown, folder = "recordings", Path()
+    files = [each for each in given if str(each).endswith((".yaml", ".yml"))]
+    if files and len(given) > 1:
+        raise ConfigError(f"--batch takes one file, or bags: {files[0]} is a file")
+    if files:
+        from hand_eye_calib.io.yaml_files import read_yaml
 
-    document = read_yaml(path)
+        shown = str(given[0])
+        folder = Path(shown).parent
+        document = read_yaml(Path(shown))
     if isinstance(document, list):
         document = {"bags": document}
     bags = document.get("bags") if isinstance(document, dict) else None
     if not isinstance(bags, list) or not bags:
-        raise ConfigError(f"{path}: expected a list of bags, or a mapping with one under 'bags'")
+        raise ConfigError(f"{shown}: expected a list of bags, or a mapping with one under 'bags'")
     common = {name: value for name, value in document.items() if name != "bags"}
-    given = {"options": options} | dict(sources)
-    defaults = _merged(given, _checked(f"{path}, beside 'bags'", common))
+    base = {"options": options, "vehicle": vehicle} | dict(sources)
+    defaults = _merged(base, _checked(f"{shown}, beside 'bags'", common))
     recordings: list[_Recording] = []
     for number, entry in enumerate(bags, start=1):
-        where = f"{path}, entry {number}"
+        where = f"{shown}, entry {number}"
         entry = _checked(where, entry if isinstance(entry, dict) else {"bag": entry})
         merged = _merged(defaults, entry)
-        recordings += [(where, found, merged) for found in _expanded(path, entry, where)]
+        recordings += [(where, found, merged) for found in _expanded(folder, entry, where)]
     return [
-        Task(
-            name=name,
-            bags=tuple(found),
-            with_fingerprints=with_fingerprints,
-            with_report=with_report,
-            **_settings(where, entry),
-        )
+        Task(name=name, bags=tuple(found), **_settings(where, entry, found[0]), **flags)
         for name, (where, found, entry) in zip(_names(recordings), recordings, strict=True)
     ]
 
@@ -159,7 +161,7 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged | {"options": base.get("options", {}) | over.get("options", {})}
 
 
-def _expanded(path: Path, entry: Mapping[str, Any], where: str) -> Iterator[list[str]]:
+def _expanded(folder: Path, entry: Mapping[str, Any], where: str) -> Iterator[list[str]]:
     """Bags of each recording: one recording, or several if a pattern stands for many."""
     bags = entry.get("bag")
     named: list[Any] = bags if isinstance(bags, list) else [bags]
@@ -167,13 +169,8 @@ def _expanded(path: Path, entry: Mapping[str, Any], where: str) -> Iterator[list
         raise ConfigError(f"{where}: expected a bag's path or a list of paths; got {bags!r}")
     if any("\0" in bag for bag in named):
         raise ConfigError(f"{where}: a bag's path has a zero byte")
-    places = [bag if remote.is_url(bag) else str(path.parent / bag) for bag in named]
-    pattern = places[0]
-    if remote.is_url(pattern):  # a question mark begins its query
-        found = remote.expanded(pattern) if "*" in pattern else None
-    else:
-        is_pattern = has_magic(pattern) and not Path(pattern).exists()
-        found = sorted(glob(pattern, recursive=True)) if is_pattern else None
+    places = [bag if remote.is_url(bag) else str(folder / bag) for bag in named]
+    found = matching(places[0])
     if len(places) > 1 or found is None:
         yield places
     elif not found:
@@ -182,13 +179,35 @@ def _expanded(path: Path, entry: Mapping[str, Any], where: str) -> Iterator[list
         yield from ([place] for place in found)
 
 
-def _settings(where: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+def matching(pattern: str) -> list[str] | None:
+    """The bags that a pattern stands for; None if it is a path. ``**`` finds bags alone."""
+    if remote.is_url(pattern):  # a question mark begins its query
+        return remote.expanded(pattern) if "*" in pattern else None
+    if not has_magic(pattern) or Path(pattern).exists():
+        return None
+    found = sorted(glob(pattern, recursive=True))
+    return [each for each in found if "**" not in pattern or _is_recording(Path(each))]
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether a path is a bag, and not a file of one."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists()
+    return path.suffix in _BAGS and not (path.parent / "metadata.yaml").exists()
+
+
+def _settings(where: str, entry: Mapping[str, Any], place: str) -> dict[str, Any]:
     """Vehicle, options and sources of a recording."""
     sources = {source: str(entry[source]) for source in SOURCES if source in entry}
     given = entry.get("vehicle", "")
     if isinstance(given, bool) or not isinstance(given, (str, int, float)):
         raise ConfigError(f"{where}: expected the name of a vehicle; got {given!r}")
     vehicle = str(given)
+    if _PLACE in vehicle:
+        pattern = re.escape(vehicle).replace(re.escape(_PLACE), "([^/]+)")
+        pattern = pattern.replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
+        match = re.search(pattern, place)
+        vehicle = match[1] if match else ""
     if not vehicle.isprintable() or len(vehicle.encode()) > _LONGEST_NAME:
         raise ConfigError(f"{where}: {vehicle[:_LONGEST_NAME]!r} cannot name a vehicle")
     try:
@@ -210,13 +229,20 @@ def _names(recordings: Sequence[_Recording]) -> list[str]:
     places = list(dict.fromkeys(unnamed))
     stems = Counter(place[-1] for place in places)
     alike = [place for place in places if stems[place[-1]] > 1]
+    first = last = 0
+    if alike:  # the parts in which they differ
+        first = next(k for k in count() if len({one[k : k + 1] for one in alike}) > 1)
+        last = next(k for k in count(1) if len({one[-k : len(one) - k + 1] for one in alike}) > 1)
     names: dict[str, None] = {}
+    numbers: Counter[str] = Counter()
     for where, paths, entry in recordings:
         place = _place(paths[0])
-        usual = "_".join(_distinct(place, alike) if place in alike else place[-1:])
-        name = _folder(where, entry.get("name") or usual)
-        numbered = chain([name], (f"{name}_{number}" for number in count(2)))
-        names[next(one for one in numbered if one not in names)] = None
+        distinct = place[first : len(place) - last + 1] if stems[place[-1]] > 1 else ()
+        name = _folder(where, entry.get("name") or "_".join(distinct or place[-1:]))
+        numbered = chain([name], (f"{name}_{number}" for number in count(max(numbers[name], 2))))
+        unique = next(one for one in numbered if one not in names)
+        numbers[name] = int(unique.rpartition("_")[2]) if unique != name else 0
+        names[unique] = None
     return [*names]
 
 
@@ -224,13 +250,6 @@ def _place(bag: str) -> tuple[str, ...]:
     """Folders and name of a bag, the latter without its suffix."""
     path = PurePosixPath(bag.partition("?")[0])
     return (*path.parts[:-1], path.stem)
-
-
-def _distinct(place: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    """The parts of a place in which several places differ; the last part if it has none."""
-    first = next(k for k in count() if len({one[k : k + 1] for one in others}) > 1)
-    last = next(k for k in count(1) if len({one[-k : len(one) - k + 1] for one in others}) > 1)
-    return place[first : len(place) - last + 1] or place[-1:]
 
 
 def _folder(where: str, given: Any) -> str:

@@ -11,15 +11,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
 from hand_eye_calib.cli.batch.tasks import Task
 from hand_eye_calib.cli.console import silence
 from hand_eye_calib.cli.options import STREAMS
-from hand_eye_calib.cli.reading import read_bags
+from hand_eye_calib.cli.reading import read_paths
 from hand_eye_calib.cli.reporting import rendered, with_cross_check
-from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io.limits import ReadingMemory
 from hand_eye_calib.io.remote import local_copies, public
@@ -80,22 +80,21 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
         or None
         for stream in STREAMS
     }
-    recording = read_bags(paths, sources, CalibratorConfig.from_options(task.options))
+    recording = read_paths(list(map(Path, paths)), sources, task.options, task.are_files)
     calibration = recording.solved()
     if task.with_fingerprints:
         recording.with_fingerprints()
-    calibration, evidence = with_cross_check(calibration, recording.snapshot)
-    found: Outcome = {
-        "calibration": calibration.to_dict(),
-        "findings": plain(calibration.findings),
-        "inputs": recording.inputs,
-    }
-    if calibration.status.failure:
-        found["error"] = calibration.status.failure
+    found: Outcome = {"inputs": recording.inputs}
     if task.with_report:
+        calibration, evidence = with_cross_check(calibration, recording.snapshot)
         config = recording.snapshot.config
         found["page"] = rendered(calibration, evidence, config, recording.inputs)
-    return found
+    if calibration.status.failure:
+        found["error"] = calibration.status.failure
+    return found | {
+        "calibration": calibration.to_dict(),
+        "findings": plain(calibration.findings),
+    }
 
 
 @contextmanager
