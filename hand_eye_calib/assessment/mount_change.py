@@ -2,14 +2,11 @@
 
 At an extrinsic X0 a motion pair has the residual ``e = Log(B^-1 X0^-1 A X0)`` (6,). If the mount
 has moved by xi, ``X0 exp(xi)``, then ``e = -J xi + noise`` with ``J = I - Ad(B^-1)``. With C the
-covariance of the noise, each block of time has
-
-    H = sum J' C^-1 J,      S = -sum J' C^-1 e,
-
-so that ``H^-1 S`` is the shift that the block shows. Both add over blocks. Large residuals have
-less weight, so that a large shift comes out too small: take the information again at the extrinsic
-that it leads to. The noise of motions that follow each other is correlated: f, the long-run
-variance of S in units of H, says how much. The likelihood ratio of a shift is that of
+covariance of the noise, each second has ``H = sum J' C^-1 J`` and ``S = -sum J' C^-1 e``, so that
+``H^-1 S`` is the shift that it shows; both add over time. Large residuals have less weight, so that
+a large shift comes out too small: take the information again at the extrinsic that it leads to. The
+noise of motions that follow each other is correlated: f, the long-run variance of S in units of H,
+says how much. The likelihood ratio of a shift is that of
 :mod:`~hand_eye_calib.assessment.moved`.
 
 Errors that wander over minutes, of a map that bends or a bias, give a large ratio, too. A shift is
@@ -39,7 +36,7 @@ from hand_eye_calib.stats import median, robust_sigma, student_weights
 from hand_eye_calib.text import angle, length
 
 # Motions over this time (s) are compared, so many a second at most; what they show is added up over
-# blocks of a second (ns).
+# seconds (ns).
 _LAG_S, _MOTIONS_PER_S, _BLOCK_NS = 1.0, 20.0, 1_000_000_000
 
 _ROUNDS = 4
@@ -65,10 +62,8 @@ class MountChange:
 
     Attributes
     ----------
-    at_ns : int
-        When, parent clock.
-    earliest_ns, latest_ns : int
-        The times between which it took place, nine times out of ten.
+    at_ns, earliest_ns, latest_ns : int
+        When, parent clock; and the times between which it took place, nine times out of ten.
     xi : (6,) array
         Shift: afterwards the extrinsic is ``X exp(xi)``, with X from before, (rho, phi) in the
         child sensor's frame, m and rad.
@@ -76,8 +71,8 @@ class MountChange:
         Of ``xi``, with the long-run variance.
     log_ratio : float
         Logarithm of the likelihood ratio of this shift against none.
-    step : float
-        Squared step, in its covariance, between the answers of both sides if they may drift.
+    is_step : bool
+        It happened at once, beyond what answers that drift linearly on both sides explain.
     """
 
     at_ns: int
@@ -86,17 +81,12 @@ class MountChange:
     xi: FloatArray
     covariance: FloatArray
     log_ratio: float
-    step: float
+    is_step: bool
 
     @property
     def is_significant(self) -> bool:
         """Whether the recording shows it beyond doubt."""
         return self.log_ratio > SIGNIFICANT
-
-    @property
-    def is_step(self) -> bool:
-        """Whether it happened at once; otherwise something may as well drift."""
-        return self.step > _LEAST_STEP
 
 
 def residuals_and_jacobians(
@@ -124,55 +114,6 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     return covariance, weights
 
 
-@dataclass(frozen=True)
-class _Blocks:
-    """Information about a shift from the extrinsic, block by block of time."""
-
-    starts_ns: IntArray
-    H: FloatArray
-    S: FloatArray
-
-    def centred(self) -> _Blocks:
-        """The information about shifts from the answer of all blocks, to first order."""
-        xi = _inverse(self.H.sum(axis=0)) @ self.S.sum(axis=0)
-        return _Blocks(self.starts_ns, self.H, self.S - self.H @ xi)
-
-    def __getitem__(self, which: slice) -> _Blocks:
-        return _Blocks(self.starts_ns[which], self.H[which], self.S[which])
-
-    def in_windows(self, n_windows: int) -> _Blocks:
-        """The information in so many windows of about equal duration."""
-        edges = np.arange(n_windows) * len(self.starts_ns) // n_windows
-        H, S = np.add.reduceat(self.H, edges), np.add.reduceat(self.S, edges)
-        return _Blocks(self.starts_ns[edges], H, S)
-
-    def long_run_variance(self, n_parameters: int) -> float:
-        """Long-run variance f of the scores in units of the information, at least 1: mean of
-        ``S' H^-1 S`` per degree of freedom, if so many parameters were fitted.
-        """
-        informative = np.trace(self.H, axis1=1, axis2=2) > 0
-        H, S = self.H[informative], self.S[informative]
-        squared = squared_shift(H, S, 1e-6)
-        return max(float(squared.sum()) / max(6 * len(S) - n_parameters, 1), 1.0)
-
-
-def _blocks(pose_pairs: PosePairs, T_parent_child: FloatArray) -> _Blocks:
-    stamps_ns = pose_pairs.stamps_ns
-    duration_s = (stamps_ns[-1] - stamps_ns[0]) * 1e-9
-    lag_s = max(_LAG_S, median(np.diff(stamps_ns)) * 1e-9)
-    pairs = pairs_over(pose_pairs, lag_s, max(int(duration_s * _MOTIONS_PER_S), 2))
-    residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
-    covariance, weights = noise_covariance(residuals)
-    whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(covariance) * weights[:, None, None]
-    middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
-    blocks = (middles_ns - stamps_ns[0]) // _BLOCK_NS
-    n_blocks = int((stamps_ns[-1] - stamps_ns[0]) // _BLOCK_NS) + 1
-    H, S = np.zeros((n_blocks, 6, 6)), np.zeros((n_blocks, 6))
-    np.add.at(H, blocks, whitened @ jacobians)
-    np.add.at(S, blocks, -np.einsum("kij,kj->ki", whitened, residuals))
-    return _Blocks(stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS, H, S)
-
-
 def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChange | None:
     """The most likely shift of the mount within a recording; None if it is too short to tell.
 
@@ -187,72 +128,110 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     T_parent_child : (4, 4) array
         X0, near the extrinsic.
     """
-    found = _blocks(pose_pairs, T_parent_child).centred()
-    n_blocks = len(found.starts_ns)
-    windows = [found.in_windows(n) for n in _WINDOWS if n_blocks >= n * _LEAST_WINDOW_S]
-    if not windows:
+    starts_ns, H, S = _by_second(pose_pairs, T_parent_child)
+    S = _about_answer(H, S)
+    cuts = [_edges(len(S), n) for n in _WINDOWS if len(S) >= n * _LEAST_WINDOW_S]
+    if not cuts:
         return None
-    long_run = max(_least_within(each) for each in windows)
-    H, S = found.H.sum(axis=0), found.S.sum(axis=0)
-    before_H, before_S = np.cumsum(found.H, axis=0)[:-1], np.cumsum(found.S, axis=0)[:-1]
-    contrast = before_H - before_H @ _inverse(H) @ before_H  # the common answer is free
+    long_run = 1.0
+    for edges in cuts:  # the least of all splits, about the answers of their sides
+        of_windows = np.add.reduceat(H, edges), np.add.reduceat(S, edges)
+        splits = range(_LEAST_WINDOWS, len(edges) - _LEAST_WINDOWS + 1)
+        rests = [
+            np.concatenate(
+                [_about_answer(*(each[side] for each in of_windows)) for side in _sides(split)]
+            )
+            for split in splits
+        ]
+        long_run = max(long_run, min(_long_run(of_windows[0], rest, 12) for rest in rests))
+    before_H, before_S = np.cumsum(H, axis=0)[:-1], np.cumsum(S, axis=0)[:-1]
+    after_H, after_S = H.sum(axis=0) - before_H, S.sum(axis=0) - before_S
+    # The common answer is free.
+    contrast = before_H - before_H @ _inverse(H.sum(axis=0)) @ before_H
     ratios = log_ratio(contrast, before_S, long_run)
-    n_edge = max(int(n_blocks * _LEAST_WINDOWS / max(_WINDOWS)), 1)
+    n_edge = max(int(len(S) * _LEAST_WINDOWS / max(_WINDOWS)), 1)
     ratios[: n_edge - 1] = ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
-    cov_before, cov_after = _inverse(before_H[best]), _inverse(H - before_H[best])
+    cov_before, cov_after = _inverse(before_H[best]), _inverse(after_H[best])
     likely = np.cumsum(np.exp(ratios - ratios[best]))
     first, last = np.searchsorted(likely / likely[-1], [0.05, 0.95])
-    edges_ns = found.starts_ns[1:]
     return MountChange(
-        at_ns=int(edges_ns[best]),
-        earliest_ns=int(edges_ns[first]),
-        latest_ns=int(edges_ns[min(last, len(edges_ns) - 1)]),
-        xi=cov_after @ (S - before_S[best]) - cov_before @ before_S[best],
+        at_ns=int(starts_ns[best + 1]),
+        earliest_ns=int(starts_ns[first + 1]),
+        latest_ns=int(starts_ns[min(last + 1, len(starts_ns) - 1)]),
+        xi=cov_after @ after_S[best] - cov_before @ before_S[best],
         covariance=long_run * (cov_before + cov_after),
         log_ratio=float(ratios[best]),
-        step=_step(found, best + 1),
+        is_step=_step(starts_ns, H, S, best + 1) > _LEAST_STEP,
     )
 
 
-def _least_within(windows: _Blocks) -> float:
-    """Smallest long-run variance about the answers of the windows before and after a split."""
-    n_windows = len(windows.starts_ns)
-    variances = []
-    for split in range(_LEAST_WINDOWS, n_windows - _LEAST_WINDOWS + 1):
-        sides = windows[:split].centred(), windows[split:].centred()
-        S = np.concatenate([side.S for side in sides])
-        variances.append(_Blocks(windows.starts_ns, windows.H, S).long_run_variance(12))
-    return min(variances)
+def _by_second(
+    pose_pairs: PosePairs, T_parent_child: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Starts (N,) of the seconds of a recording, H (N, 6, 6) and S (N, 6) of each."""
+    stamps_ns = pose_pairs.stamps_ns
+    duration_s = (stamps_ns[-1] - stamps_ns[0]) * 1e-9
+    lag_s = max(_LAG_S, median(np.diff(stamps_ns)) * 1e-9)
+    pairs = pairs_over(pose_pairs, lag_s, max(int(duration_s * _MOTIONS_PER_S), 2))
+    residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
+    covariance, weights = noise_covariance(residuals)
+    whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(covariance) * weights[:, None, None]
+    middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
+    blocks = (middles_ns - stamps_ns[0]) // _BLOCK_NS
+    n_blocks = int((stamps_ns[-1] - stamps_ns[0]) // _BLOCK_NS) + 1
+    H, S = np.zeros((n_blocks, 6, 6)), np.zeros((n_blocks, 6))
+    np.add.at(H, blocks, whitened @ jacobians)
+    np.add.at(S, blocks, -np.einsum("kij,kj->ki", whitened, residuals))
+    return stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS, H, S
 
 
-def _step(found: _Blocks, first_after: int) -> float:
-    """Squared step before a block, in its covariance, if the answer before and the one after may
+def _edges(count: int, n_windows: int) -> IntArray:
+    return np.arange(n_windows) * count // n_windows
+
+
+def _sides(split: int) -> tuple[slice, slice]:
+    return slice(0, split), slice(split, None)
+
+
+def _about_answer(H: FloatArray, S: FloatArray) -> FloatArray:
+    """Scores of shifts from the answer of all of them, to first order."""
+    return np.asarray(S - H @ (_inverse(H.sum(axis=0)) @ S.sum(axis=0)))
+
+
+def _long_run(H: FloatArray, S: FloatArray, n_parameters: int) -> float:
+    """Long-run variance f of scores in units of the information, at least 1: mean of ``S' H^-1 S``
+    per degree of freedom, if so many parameters were fitted.
+    """
+    informative = np.trace(H, axis1=1, axis2=2) > 0
+    squared = squared_shift(H[informative], S[informative], 1e-6)
+    return max(float(squared.sum()) / max(6 * len(squared) - n_parameters, 1), 1.0)
+
+
+def _step(starts_ns: IntArray, H: FloatArray, S: FloatArray, first_after: int) -> float:
+    """Squared step before a second, in its covariance, if the answers before and after it may
     drift linearly.
     """
-    at_ns = int(found.starts_ns[first_after])
-    (before, cov_before, rest_before), (after, cov_after, rest_after) = (
-        _drifting(side, at_ns) for side in (found[:first_after], found[first_after:])
+    answers, covariances, rests = [], [], []
+    for side in _sides(first_after):
+        times = (starts_ns[side] - starts_ns[first_after]).astype(float)
+        times /= max(np.abs(times).max(), 1.0)
+        powers = np.stack([np.ones_like(times), times])
+        information = np.einsum("ak,bk,kij->aibj", powers, powers, H[side]).reshape(12, 12)
+        prior = np.kron(np.eye(2), np.linalg.inv(shift_covariance()))
+        covariance = np.linalg.inv(information + 0.01 * prior)
+        answer, drift = np.split(covariance @ (powers @ S[side]).ravel(), 2)
+        drifting = answer + times[:, None] * drift
+        rests.append(S[side] - np.einsum("kij,kj->ki", H[side], drifting))
+        answers.append(answer)
+        covariances.append(covariance[:6, :6])
+    rest = np.concatenate(rests)
+    long_run = max(
+        _long_run(np.add.reduceat(H, edges), np.add.reduceat(rest, edges), 24)
+        for edges in (_edges(len(H), n) for n in _WINDOWS)
     )
-    rest = _Blocks(found.starts_ns, found.H, np.concatenate([rest_before, rest_after]))
-    long_run = max(rest.in_windows(n).long_run_variance(24) for n in _WINDOWS)
-    step = after - before
-    return float(step @ np.linalg.solve(cov_before + cov_after, step)) / long_run
-
-
-def _drifting(side: _Blocks, at_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Answer at a time if it drifts linearly over these blocks, its covariance without the long-run
-    variance, and the scores (M, 6) about the drifting answer.
-    """
-    times = (side.starts_ns - at_ns).astype(float)
-    times /= max(np.abs(times).max(), 1.0)
-    powers = np.stack([np.ones_like(times), times])
-    H = np.einsum("ak,bk,kij->aibj", powers, powers, side.H).reshape(12, 12)
-    prior = np.linalg.inv(shift_covariance())
-    covariance = np.linalg.inv(H + 0.01 * np.kron(np.eye(2), prior))
-    answer, drift = np.split(covariance @ (powers @ side.S).ravel(), 2)
-    rest = side.S - np.einsum("kij,kj->ki", side.H, answer + times[:, None] * drift)
-    return answer, covariance[:6, :6], rest
+    step = answers[1] - answers[0]
+    return float(step @ np.linalg.solve(sum(covariances), step)) / long_run
 
 
 def _inverse(H: FloatArray) -> FloatArray:

@@ -115,15 +115,13 @@ def _difference(
         part = parts[path]
         in_order = sorted([*before, part], key=_Part.first_ns)
         at = in_order.index(part)
-        differences = [
-            (each, _overlap(*sorted((each, part), key=_Part.first_ns), max_gap_s))
-            for each in before
-        ]
-        if at:
-            latest = max(in_order[:at], key=_Part.last_ns)
+        earlier, later = in_order[:at], in_order[at + 1 :]
+        differences = [(each, _overlap(each, part, max_gap_s)) for each in earlier]
+        differences += [(each, _overlap(part, each, max_gap_s)) for each in later]
+        if earlier:
+            latest = max(earlier, key=_Part.last_ns)
             differences.append((latest, _break(latest, part)))
-        for each in in_order[at + 1 : at + 2]:
-            differences.append((each, _break(part, each)))
+        differences += [(each, _break(part, each)) for each in later[:1]]
         for other, told in differences:
             if told:
                 both = f"{other.path} and {part.path} are two recordings, not parts of one"
