@@ -6,7 +6,7 @@ name, for bags and journals alone.
 import argparse
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, print_table, waiting_for
@@ -124,14 +124,16 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.cli.batch.run import run_batch
 
         return run_batch(arguments)
-    from hand_eye_calib.cli.batch.tasks import matching
     from hand_eye_calib.io.remote import local_copies
 
-    arguments.paths = [
-        found
-        for path in arguments.paths
-        for found in map(type(path), matching(str(path)) or [path])
-    ]
+    if any("*" in str(path) for path in arguments.paths):
+        from hand_eye_calib.cli.batch.tasks import matching
+
+        arguments.paths = [
+            type(path)(found)
+            for path in arguments.paths
+            for found in matching(str(path)) or [str(path)]
+        ]
     with local_copies(arguments.paths) as (arguments.paths, as_given):
         return _run_here(arguments, as_given)
 
@@ -160,7 +162,6 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     if arguments.list:
         return _list_topics(arguments, as_given)
     from hand_eye_calib.cli import rig, stops
-    from hand_eye_calib.cli.batch.run import run_together
     from hand_eye_calib.cli.parts import SeveralRecordings
     from hand_eye_calib.cli.present import deliver
     from hand_eye_calib.cli.reading import are_bags, journal_in, read_recording
@@ -171,9 +172,9 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         return deliver(*stops.solved(arguments), None)
     if arguments.pairs:
         pairs = list(zip(arguments.paths[::2], arguments.paths[1::2], strict=True))
-        return run_together(arguments, pairs, are_files=True)
+        return _together(arguments, pairs, are_files=True)
     if len(arguments.paths) > 1 and any(journal_in([path]) for path in arguments.paths):
-        return run_together(arguments, [[path] for path in arguments.paths], are_files=False)
+        return _together(arguments, [[path] for path in arguments.paths])
     arguments.is_of_bags = arguments.command == "replay" or are_bags(arguments.paths)
     if len(arguments.paths) > 2 and not arguments.is_of_bags:
         return rig.calibrate_files(arguments)
@@ -181,12 +182,20 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         recording = read_recording(arguments)
     except SeveralRecordings as several:
         note(f"{several.reason}; they give one result, as recordings of one rig")
-        return run_together(arguments, several.groups, are_files=False)
+        return _together(arguments, several.groups)
     calibration = recording.solved()
     if arguments.out:
         recording.with_fingerprints()
     calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
     return deliver(calibration, arguments, as_given(recording.inputs), recording.snapshot)
+
+
+def _together(
+    arguments: argparse.Namespace, groups: Sequence[Sequence[Any]], are_files: bool = False
+) -> int:
+    from hand_eye_calib.cli.batch.run import run_together
+
+    return run_together(arguments, groups, are_files)
 
 
 def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:

@@ -72,7 +72,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "pyulog": "io/trajectory_files/foreign.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
-    "pandas": ("results/calibration.py", "results/tables.py"),
+    "pandas": ("results/calibration.py", "results/tables.py", "session/together.py"),
     "jinja2": "report/",
 }
 
