@@ -7,6 +7,7 @@ import argparse
 import dataclasses
 import json
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, print_table, waiting_for

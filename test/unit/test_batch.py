@@ -52,7 +52,7 @@ def write_drive(path, n_poses, seed):
     streams = {
         "/a": (as_trajectory(poses, sensor_frame="lidar"), ODOMETRY),
         "/b": (
-            as_trajectory(disturbed(child_of(poses), 1, 5e-5, 5e-5), sensor_frame="camera"),
+            as_trajectory(disturbed(child_of(poses), 1, 2e-4, 2e-4), sensor_frame="camera"),
             ODOMETRY,
         ),
     }
