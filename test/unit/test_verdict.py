@@ -20,7 +20,7 @@ from hand_eye_calib.results.calibration import (
     Verdict,
 )
 from hand_eye_calib.results.finding import Finding, Severity
-from hand_eye_calib.results.records import AxisScatter
+from hand_eye_calib.results.records import AxisScatter, Together
 from hand_eye_calib.results.verdict import RULES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "verdict.md"
@@ -71,6 +71,13 @@ FINDING = Finding(
 )
 FLOOR = np.diag([0.03, 0, 0, 0, 0, 0]) ** 2
 
+
+def several(kind):
+    return Together(
+        kind=kind, sentence=kind, chi2=1.0, dof=6, p_value=0.9, scatter={}, recordings=()
+    )
+
+
 # Rule to a result in which it alone applies.
 CASES = {
     "not_converged": dict(status=SolveStatus.NOT_CONVERGED),
@@ -80,8 +87,10 @@ CASES = {
     "model_far": dict(cross_check=checked("yaw", 0.2, 9.0, "model")),
     "halves_far": dict(cross_check=checked("yaw", 0.2, 9.0, "halves")),
     "methods_far": dict(cross_check=checked("x", 0.5, 9.0, "methods")),
+    "recordings_differ": dict(together=several("differ")),
     "unobservable": dict(observability=observed(z=np.inf)),
     "warning_finding": dict(findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)),
+    "recordings": dict(together=several("one off")),
     "model": dict(cross_check=checked("x", 0.02, 3.5, "model")),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
     "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),
