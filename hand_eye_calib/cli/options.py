@@ -273,7 +273,7 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         topic = source.add_argument(
             f"--{stream}-topic",
             metavar="TOPIC",
-            help=f"poses of the {stream} sensor, of any type",
+            help=f"poses of the {stream} sensor, of any type, or FIX+IMU of two topics",
         )
         offer(topic, _topics_of)
         source.add_argument(
@@ -281,6 +281,13 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
             metavar="WORLD:SENSOR",
             type=_tf_source,
             help="the same from /tf and /tf_static: fixed frame and the sensor's, as odom:lidar",
+        )
+        parser.add_argument(
+            f"--{stream}-fields",
+            metavar="NAME=PATH,...",
+            default="",
+            help=f"where the poses are in messages of any type on --{stream}-topic: "
+            "t=header.stamp,x=pose.position.x,...",
         )
     group = parser.add_argument_group(
         "trajectory files", "each also as --parent-... and --child-... for one of the two files"

@@ -148,6 +148,12 @@ def read_paths(
 
 def sources_from(arguments: Namespace) -> dict[str, Any]:
     """Topic or frames of "parent" and "child"; None for what is not given."""
+    for stream in STREAMS:
+        if fields := getattr(arguments, f"{stream}_fields"):
+            if not (topic := getattr(arguments, f"{stream}_topic")):
+                raise ConfigError(f"--{stream}-fields is of messages: give --{stream}-topic, too")
+            setattr(arguments, f"{stream}_topic", f"{topic}?{fields}")
+            setattr(arguments, f"{stream}_fields", "")
     return {
         stream: getattr(arguments, f"{stream}_topic") or getattr(arguments, f"{stream}_tf")
         for stream in STREAMS

@@ -17,7 +17,9 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import RateIntegrator
+from hand_eye_calib.io.bags.fields import FIELDS
 from hand_eye_calib.io.bags.poses import PoseColumns
 from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin, wrong_latitude
 from hand_eye_calib.io.limits import LONGEST_NAME
@@ -137,6 +139,14 @@ class _Cursor:
         values = self.doubles(3)
         return values if status >= 0 else [math.nan] * 3
 
+    def geo_pose(self) -> list[float]:
+        """Read latitude, longitude (deg), height (m) and quaternion."""
+        return self.doubles(7)
+
+    def twist(self) -> list[float]:
+        """Read velocity (m/s) and angular velocity (rad/s)."""
+        return self.doubles(6)
+
     def point(self) -> list[float]:
         """Read a position (m)."""
         return self.doubles(3)
@@ -161,6 +171,8 @@ class MessageType(NamedTuple):
         Whether the header's frame is the sensor's, not that of the world.
     is_geodetic : bool
         Whether positions are latitude and longitude (deg) and height (m).
+    is_twist : bool
+        Whether poses are integrated from velocities in the sensor's frame.
     """
 
     name: str
@@ -169,11 +181,13 @@ class MessageType(NamedTuple):
     unpack: Callable[[_Cursor], list[float]]
     is_sensors: bool = False
     is_geodetic: bool = False
+    is_twist: bool = False
 
 
 _OF_POSES = {"poses": slice(7), "positions": slice(3), "rotations": slice(3, 7)}
 _OF_IMU = {"rates": slice(4, 7), "rotations": slice(4)}
 _OF_POINTS = {"positions": slice(3)}
+_OF_TWIST = {"poses": slice(6), "rotations": slice(3, 6)}
 
 # The likeliest first.
 _ROWS = (
@@ -184,15 +198,27 @@ _ROWS = (
     MessageType("sensor_msgs/msg/Imu", _OF_IMU, False, _Cursor.imu, is_sensors=True),
     MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, False, _Cursor.fix, True, True),
     MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, False, _Cursor.point),
+    MessageType(
+        "geographic_msgs/msg/GeoPoseStamped", _OF_POSES, False, _Cursor.geo_pose, is_geodetic=True
+    ),
+    *(
+        MessageType(f"geometry_msgs/msg/{name}", _OF_TWIST, False, _Cursor.twist, True, False, True)
+        for name in ("TwistStamped", "TwistWithCovarianceStamped")
+    ),
 )
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Those that carry whole poses.
-POSE_TYPES = tuple(row.name for row in _ROWS if "poses" in row.measures)
+POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is _Cursor.pose)
 # Arrays of PoseStamped and of TransformStamped.
 PATH_TYPE = "nav_msgs/msg/Path"
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 #: Types of topics that can be one of the two sensors.
-SENSOR_TYPES = (*POSE_TYPES, PATH_TYPE, *(name for name in MESSAGE_TYPES if name not in POSE_TYPES))
+SENSOR_TYPES = (
+    *POSE_TYPES,
+    PATH_TYPE,
+    *(name for name in MESSAGE_TYPES if name not in POSE_TYPES),
+    *FIELDS,
+)
 
 
 def measured_as(message_type: str, wanted: str, source: object) -> str:
@@ -367,8 +393,36 @@ def frames_in(data: Buffer, message_type: str, is_ros1: bool) -> set[str]:
 
 # ---- what the messages of a topic measure
 
+
+class TwistIntegrator:
+    """Integrates velocities of one sensor in its own frame, in parts of any length."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, FloatArray] | None = None
+        self._pose = np.eye(4)
+
+    def poses(self, stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
+        """Poses (N, 7) of x y z qx qy qz qw at the stamps (N,) of the next twists (N, 6): m/s and
+        rad/s.
+        """
+        last_ns, last = self._last or (int(stamps_ns[0]), twists[0])
+        before = np.concatenate([[last], twists[:-1]])
+        seconds = np.diff(np.concatenate([[last_ns], stamps_ns])) * 1e-9
+        poses = np.empty((len(twists), 4, 4))
+        for row, step in enumerate(se3.exp((twists + before) / 2 * seconds[:, None])):
+            poses[row] = self._pose = self._pose @ step
+        self._pose[:3, :3] = se3.nearest_rotation(self._pose[:3, :3])
+        self._last = int(stamps_ns[-1]), twists[-1]
+        return np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]
+
+
 # What a row that is not finite lacks.
-_LACKS = {"positions": "fix", "rotations": "orientation", "rates": "angular rates"}
+_LACKS = {
+    "poses": "finite values",
+    "positions": "fix",
+    "rotations": "orientation",
+    "rates": "angular rates",
+}
 
 
 class MessageReader:
@@ -390,7 +444,8 @@ class MessageReader:
 
     def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
         self._row, self._measures = MESSAGE_TYPES[message_type], measures
-        self._integrator, self._origin = RateIntegrator(), origin or LocalOrigin()
+        self._integrator, self._twists = RateIntegrator(), TwistIntegrator()
+        self._origin = origin or LocalOrigin()
         self.n_left_out = 0
 
     def columns(self, messages: Sequence[Buffer], is_ros1: bool) -> tuple[PoseColumns, BoolArray]:
@@ -404,14 +459,16 @@ class MessageReader:
             At the first latitude beyond 90 deg; its attribute ``index`` has the row.
         """
         columns = unpack_poses(messages, self._row.name, is_ros1)
-        if self._measures == "poses":
+        is_pose = self._measures == "poses" and not self._row.is_twist
+        if is_pose and not self._row.is_geodetic:
             return columns, np.ones(len(messages), dtype=bool)
         values = columns.poses[:, self._row.measures[self._measures]]
         is_usable = np.asarray(np.isfinite(values).all(axis=1), dtype=bool)
         self.n_left_out += int((~is_usable).sum())
         poses = np.tile(_NOTHING, (len(values), 1))
         if is_usable.any():
-            part = slice(3) if self._measures == "positions" else slice(3, 7)
+            parts = {"positions": slice(3), "poses": slice(7)}
+            part = parts.get(self._measures, slice(3, 7))
             poses[is_usable, part] = self._measured(columns.stamps_ns, values, is_usable)
         poses[~is_usable] = np.nan
         columns = columns._replace(poses=poses)
@@ -421,10 +478,14 @@ class MessageReader:
         return columns, is_usable
 
     def _measured(self, stamps_ns: IntArray, values: FloatArray, rows: BoolArray) -> FloatArray:
-        """Positions (N, 3) or quaternions (N, 4) of what was read in some rows."""
+        """Positions (N, 3), quaternions (N, 4) or both (N, 7) of what was read in some rows."""
+        if self._row.is_twist:
+            if self._measures == "poses":
+                return self._twists.poses(stamps_ns[rows], values[rows])
+            return self._integrator.quats_xyzw(stamps_ns[rows], values[rows])
         if self._measures == "rates":
             return self._integrator.quats_xyzw(stamps_ns[rows], values[rows])
-        if not self._row.is_geodetic:
+        if not self._row.is_geodetic or self._measures == "rotations":
             return values[rows]
         beyond = np.flatnonzero(rows & (np.abs(values[:, 0]) > POLE_DEG))
         if len(beyond):
@@ -432,7 +493,8 @@ class MessageReader:
             error.index = int(beyond[0])  # type: ignore[attr-defined]
             raise error
         lat, lon = np.radians(values[rows, :2]).T
-        return self._origin.local(lat, lon, values[rows, 2])
+        positions = self._origin.local(lat, lon, values[rows, 2])
+        return np.c_[positions, values[rows, 3:]]
 
     def __call__(self, data: Buffer) -> PoseFields:
         """The next message, in CDR, as it arrives.
@@ -443,7 +505,7 @@ class MessageReader:
             If it cannot be unpacked, or lacks what is measured.
         """
         try:
-            if self._measures == "poses":
+            if self._row.name in POSE_TYPES and self._measures == "poses":
                 stamp_ns, world, sensor, of_pose = _unpack(_Cursor(data, False), self._row)
                 return PoseFields(stamp_ns, world, sensor, of_pose[:3], of_pose[3:])
             columns, is_usable = self.columns([data], is_ros1=False)

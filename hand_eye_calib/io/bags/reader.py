@@ -2,12 +2,12 @@
 
 import heapq
 from collections import defaultdict
-from collections.abc import Collection, Container, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterator, Mapping
 from dataclasses import replace
 from itertools import chain, compress, pairwise
 from operator import itemgetter
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags.fields import FIELDS, decoder, rows_of_messages, split_fields
 from hand_eye_calib.io.bags.messages import (
     MALFORMED,
     MESSAGE_TYPES,
@@ -33,12 +34,7 @@ from hand_eye_calib.io.bags.messages import (
 from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns
 from hand_eye_calib.io.bags.recovery import Message
 from hand_eye_calib.io.bags.storage import BLOCK_SIZE, BagFiles, message_blocks
-from hand_eye_calib.io.bags.topics import (
-    Part,
-    Source,
-    joined,
-    unreadable,
-)
+from hand_eye_calib.io.bags.topics import Part, Source, joined, joined_parts, unreadable
 from hand_eye_calib.io.plausibility import PoseWatch
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
 
@@ -220,12 +216,12 @@ class PoseBag:
                 direct[source] = stream
                 measured = self.measured(source, (measures or {}).get(stream, "auto"))
                 self._readers[source] = MessageReader(type_, measured)
-            elif source is not None and type_ == PATH_TYPE:
+            elif source and (type_ in (PATH_TYPE, *FIELDS) or {*"?+"} & {*source}):
                 paths[stream] = source
         blocks = self._direct_blocks(direct) if direct else iter(())
         if paths or transforms:
             of_others = self._transformed_poses(transforms, max_gap_s) if transforms else []
-            of_others += [self._path_poses(*each) for each in paths.items()]
+            of_others += [self._other_poses(*each) for each in paths.items()]
             whole = PoseBlock.concatenate([*blocks, *of_others])
             whole = whole[np.argsort(whole.bag_ns, kind="stable")]
             blocks = (whole[k : k + BLOCK_SIZE] for k in range(0, len(whole), BLOCK_SIZE))
@@ -273,6 +269,59 @@ class PoseBag:
         numbers = 1 + np.arange(len(bag_ns))
         block = self._watched(name, PoseBlock.of_columns(stream, numbers, columns, bag_ns))
         return block[np.argsort(bag_ns, kind="stable")]
+
+    def _other_poses(self, stream: str, source: str) -> PoseBlock:
+        """Poses of a path, of two topics that are joined, or of fields of messages."""
+        type_, (topic, fields) = self.topics.type_of(source), split_fields(source)
+        if type_ == PATH_TYPE:
+            return self._path_poses(stream, source)
+        parts = joined_parts(topic)
+        if topic not in self.topics and len(parts) == 2:
+            return self._joined_poses(stream, source, *parts)
+        fields = fields or FIELDS[type_]
+        decode: dict[str, Callable[[bytes], Any]] = {}
+        bag_ns: list[int] = []
+
+        def messages() -> Iterator[Any]:
+            for number, (kind, message_ns, data) in enumerate(self._messages([topic]), start=1):
+                if kind.type not in decode:
+                    found = (each.definition(topic) for each in self._files.storages)
+                    definition = next(filter(None, found), None)
+                    decode[kind.type] = decoder(kind.type, kind.encoding, definition)
+                try:
+                    message = decode[kind.type](data)
+                except Exception as error:  # the library's, of many kinds
+                    raise unreadable(kind, number, error) from error
+                bag_ns.append(message_ns)
+                yield message
+
+        stamps_ns, poses, notes = rows_of_messages(topic, fields, messages())
+        self._gaps += notes
+        count = len(stamps_ns)
+        columns = PoseColumns(stamps_ns, [""] * count, [None] * count, poses)
+        return self._whole(source, stream, columns, np.array(bag_ns))
+
+    def _joined_poses(self, stream: str, source: str, fix: str, imu: str) -> PoseBlock:
+        """Positions of one topic with the orientations of another, interpolated."""
+        found = []
+        for topic, measured in ((fix, "positions"), (imu, "rotations")):
+            self._watches.setdefault(topic, PoseWatch())
+            self._readers[topic] = MessageReader(self.topics[topic].type, measured)
+            found.append(PoseBlock.concatenate(self._direct_blocks({topic: stream})))
+        positions, orientations = found
+        if not len(positions) or not len(orientations):
+            raise InputError(f"{source}: no positions with a fix, or no orientations")
+        turning = orientations.trajectory()
+        inside = (positions.stamps_ns >= turning.stamps_ns[0]) & (
+            positions.stamps_ns <= turning.stamps_ns[-1]
+        )
+        positions, quats = positions[inside], positions.poses[inside, 3:]
+        if len(turning) > 1 and len(positions):
+            quats = se3.to_quat_xyzw(turning.at(positions.stamps_ns))
+        frames = [orientations.sensor_frames[0]] * len(positions)
+        poses = np.c_[positions.poses[:, :3], quats]
+        columns = PoseColumns(positions.stamps_ns, [""] * len(frames), frames, poses)
+        return self._whole(source, stream, columns, positions.bag_ns)
 
     def _path_poses(self, stream: str, topic: str) -> PoseBlock:
         """Poses of a path that is published again and again as it grows, perhaps with all poses

@@ -42,7 +42,7 @@ _REPAIRS = {
     ".db3": "sqlite3's '.recover'",
     ".bag": "'rosbag reindex'",
 }
-_ENCODINGS = ("cdr", "ros1")
+_ENCODINGS = ("cdr", "ros1", "json")
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE_BYTES = 1 << 20
 _MOST_LOSSES = 10
@@ -148,6 +148,11 @@ class Storage:
             raise ValueError("it has times that cannot be right")
         self.start_ns = bag_ns if self.start_ns is None else min(bag_ns, self.start_ns)
         self.end_ns = bag_ns if self.end_ns is None else max(bag_ns, self.end_ns)
+
+    def definition(self, topic: str) -> Any:
+        """How the messages of a topic are built, as rosbags has it; None if it is not known."""
+        connections = self._reader.connections if self._reader is not None else ()
+        return next((each.msgdef for each in connections if each.topic == topic), None)
 
     def _lose(self, text: str) -> None:
         if text not in self.losses and len(self.losses) < _MOST_LOSSES:

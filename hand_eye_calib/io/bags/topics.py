@@ -6,11 +6,13 @@ from typing import NamedTuple
 
 from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.io.bags.fields import split_fields
 from hand_eye_calib.io.bags.messages import (
     PATH_TYPE,
     POSE_TYPES,
     SENSOR_TYPES,
     TF_TYPES,
+    measured_as,
 )
 from hand_eye_calib.io.bags.recovery import MessageKind
 from hand_eye_calib.io.transforms import TfSource
@@ -71,15 +73,27 @@ class Topics(dict[str, TopicInfo]):
             if not any(topic.type in TF_TYPES for topic in self.values()):
                 raise InputError(f"no transforms in {self.bag}. {self}")
             return
-        if source not in self:
-            raise InputError(f"no topic {source} in {self.bag}. {self}")
+        topic, fields = split_fields(source)
+        parts = joined_parts(topic) if topic not in self else (topic,)
+        for part in parts:
+            if part not in self:
+                raise InputError(f"no topic {part} in {self.bag}. {self}")
+        if len(parts) > 1:
+            for part, wanted in zip(parts, ("positions", "rotations"), strict=True):
+                measured_as(self[part].type, wanted, part)
+        if len(parts) > 1 or fields:
+            return
         found = self[source].type
         if found not in SENSOR_TYPES:
             is_tf = found in TF_TYPES
-            frames = "; name two of its frames with --parent-tf and --child-tf" if is_tf else ""
+            hint = (
+                "name two of its frames with --parent-tf and --child-tf"
+                if is_tf
+                else "read others by their fields, TOPIC?t=header.stamp,x=..."
+            )
             raise InputError(
                 f"topic {source} of {self.bag} is of type {found or 'several types'}; accepted are "
-                f"{', '.join(SENSOR_TYPES)}{frames}. {self}"
+                f"{', '.join(SENSOR_TYPES)}; {hint}. {self}"
             )
 
     def select(
@@ -115,6 +129,12 @@ class Topics(dict[str, TopicInfo]):
             )
         chosen = sorted(choices[0], key=_parent_first)[::-1] if wanted else []
         return parent or chosen.pop(), child or chosen.pop()
+
+
+def joined_parts(source: str) -> tuple[str, ...]:
+    """The topics of positions and of orientations of ``/fix+/imu``; otherwise the source."""
+    parts = tuple(source.split("+"))
+    return parts if len(parts) == 2 and all(parts) else (source,)
 
 
 def joined(parts: Mapping[str, list[tuple[str, int]]], bag: str) -> Topics:
