@@ -49,8 +49,7 @@ def expanded(pattern: str) -> list[str]:
     MissingDependencyError
         If fsspec, or what it needs for the store, is not installed.
     """
-    with _reaching(pattern):
-        system, path = _opened(pattern)
+    with _reached(pattern) as (system, path):
         return sorted(system.unstrip_protocol(found) for found in system.glob(path.rstrip("/")))
 
 
@@ -63,8 +62,7 @@ def states(url: str) -> list[str]:
     InputError
         If the store cannot be reached, or there is no bag.
     """
-    with _reaching(url):
-        system, path = _opened(url)
+    with _reached(url) as (system, path):
         return [str(sorted(system.info(name).items())) for name in _files(system, path)]
 
 
@@ -88,45 +86,39 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
         yield list(paths), lambda value: value
         return
     with tempfile.TemporaryDirectory(prefix="hand_eye_calib_") as folder:
-        local = [
-            _copied(str(path), Path(folder, str(number))) if is_url(path) else path
-            for number, path in enumerate(paths)
-        ]
-        names = {
-            str(copy): public(str(path)).rstrip("/")
-            for copy, path in zip(local, paths, strict=True)
-            if is_url(path)
-        }
+        names: dict[str, str] = {}
+        local = []
+        for number, path in enumerate(paths):
+            if is_url(path):
+                local.append(_copied(str(path), Path(folder, str(number))))
+                names[str(local[-1])] = public(str(path)).rstrip("/")
+            else:
+                local.append(path)
+
+        def renamed(value: Any) -> Any:
+            text = json.dumps(value)
+            for copy, url in names.items():
+                text = text.replace(json.dumps(copy)[1:-1], json.dumps(url)[1:-1])
+            return json.loads(text)
+
         try:
-            yield local, lambda value: _renamed(value, names)
+            yield local, renamed
         except HandEyeCalibError as error:
-            error.args = tuple(_renamed(list(error.args), names))
+            error.args = tuple(renamed(list(error.args)))
             raise
 
 
 def _copied(url: str, folder: Path) -> Path:
     """Copy the files of a bag into a new folder; returns where it is."""
-    with _reaching(url):
-        system, path = _opened(url)
-        files = _files(system, path)
-        folder.mkdir()
-        room = _room(folder)
-        for file in files:
-            # The name's last part only: a store does not choose where things go.
-            system.get_file(file, str(folder / _name(file)), callback=room)
-        return folder / _name(path) if files == [path] else folder
-
-
-def _room(folder: Path) -> Any:
-    """A callback that ends a copy which is too large, whatever size the store gave for it.
-
-    Half of the free space is left to the copies of other processes.
-    """
     from fsspec.callbacks import Callback
 
+    folder.mkdir()
+    # Half of the free space is left to the copies of other processes.
     largest = shutil.disk_usage(folder).free // 2
 
     class Room(Callback):
+        """Ends a copy that is too large, whatever size the store gave for it."""
+
         def relative_update(self, inc: int = 1) -> None:
             super().relative_update(inc)
             if self.value > largest:
@@ -135,31 +127,19 @@ def _room(folder: Path) -> Any:
                     f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
                 )
 
-    return Room()
-
-
-def _opened(url: str) -> tuple[Any, str]:
-    """The file system of a URL, and the path in it."""
-    try:
-        from fsspec.core import url_to_fs
-    except ModuleNotFoundError:
-        raise MissingDependencyError(
-            f"{public(url)} needs the package fsspec, which is not installed: "
-            "pip install 'hand_eye_calib[fleet]'"
-        ) from None
-    try:
-        system, path = url_to_fs(url)
-    except ImportError as error:
-        raise MissingDependencyError(f"cannot read {public(url)}: {error}") from None
-    return system, str(path)
+    with _reached(url) as (system, path):
+        files, room = _files(system, path), Room()
+        for file in files:
+            # The name's last part only: a store does not choose where things go.
+            system.get_file(file, str(folder / _name(file)), callback=room)
+        return folder / _name(path) if files == [path] else folder
 
 
 def _files(system: Any, path: str) -> list[str]:
     """Paths of the files of a bag."""
     if PurePosixPath(_name(path)).suffix in _SUFFIXES:
         return [path]
-    listed = system.ls(path, detail=True)
-    names = [entry["name"] for entry in listed if entry.get("type") == "file"]
+    names = [each["name"] for each in system.ls(path, detail=True) if each.get("type") == "file"]
     files = sorted(name for name in names if PurePosixPath(_name(name)).suffix in _SUFFIXES)
     if not files:
         raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
@@ -174,16 +154,21 @@ def _name(path: str) -> str:
 
 
 @contextmanager
-def _reaching(url: str) -> Iterator[None]:
-    """Turn whatever a store answers into one line.
-
-    Each kind of store has errors of its own. Only code of fsspec runs inside, so no defect of the
-    rest is hidden.
+def _reached(url: str) -> Iterator[tuple[Any, str]]:
+    """The file system of a URL, and the path in it. Whatever a store answers becomes one line: each
+    kind has errors of its own, and only code of fsspec runs inside.
     """
     try:
-        yield
-    except MissingDependencyError:
-        raise
+        from fsspec.core import url_to_fs
+    except ModuleNotFoundError:
+        raise MissingDependencyError(
+            f"{public(url)} needs the package fsspec, which is not installed: "
+            "pip install 'hand_eye_calib[fleet]'"
+        ) from None
+    try:
+        yield url_to_fs(url)
+    except ImportError as error:
+        raise MissingDependencyError(f"cannot read {public(url)}: {error}") from None
     except HandEyeCalibError as error:
         raise InputError(f"cannot read {public(url)}: {error}") from None
     except Exception as error:
@@ -191,11 +176,3 @@ def _reaching(url: str) -> Iterator[None]:
         raise InputError(
             f"cannot read {public(url)}: {reason}; check the address and the permission to read it"
         ) from error
-
-
-def _renamed(value: Any, names: dict[str, str]) -> Any:
-    """Plain values with some texts in them replaced."""
-    text = json.dumps(value)
-    for old, new in names.items():
-        text = text.replace(json.dumps(old)[1:-1], json.dumps(new)[1:-1])
-    return json.loads(text)

@@ -109,21 +109,17 @@ def test_cut_off_anywhere(bag, capsys):
     for number, size in enumerate(places(len(data), seed=1)):
         path.write_bytes(data[:size])
         poses, warnings = read(path)
-        # A database may be opened and fail later, which is said too.
-        assert len(warnings) in ((1, 2) if path.suffix == ".db3" else (1,)), size
+        assert len(warnings) == 1, size
         outcomes.add("refused" if poses is None else "recovered")
         if poses is not None:
-            if path.suffix == ".db3":  # rows of other pages may be missing
-                assert set(stamped(poses)) <= set(stamped(whole))
-            else:
-                assert poses == whole[: len(poses)]
+            assert poses == whole[: len(poses)]
         document = replay(path, capsys) if number % 20 == 0 else None
         if document is not None:
             assert any("lost" in warning for warning in document["warnings"])
             if document["verdict"] != "DO NOT USE":
                 found = document["T_parent_child"]["matrix"]
                 np.testing.assert_allclose(found, T_PARENT_CHILD, atol=1e-6)
-    assert outcomes == {"refused", "recovered"}
+    assert outcomes == ({"refused", "recovered"} if path.suffix == ".mcap" else {"refused"})
 
 
 @pytest.mark.slow
@@ -157,7 +153,7 @@ LONG = Trajectory(STAMPS_NS, se3.exp(np.random.default_rng(1).normal(size=(4000,
 LONG = dict.fromkeys(STREAMS, (LONG, ODOMETRY))
 
 
-@pytest.mark.parametrize("kind", [*STORAGES, "zstd"])
+@pytest.mark.parametrize("kind", ["mcap", "zstd"])
 def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
     """The recorder lost power: no index, the last chunk incomplete, no metadata.yaml."""
     path = bag_path(tmp_path, kind)
@@ -166,15 +162,11 @@ def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
     else:
         write_bag(path, LONG, kind)
     whole, file = all_poses(path), storage_file(path)
-    if path.is_dir():
-        (path / "metadata.yaml").unlink()
+    (path / "metadata.yaml").unlink()
     size = file.stat().st_size
     for share in (0.9, 0.5, 0.3):
         os.truncate(file, int(size * share))
         recovered, (warning,) = read(path)
-        if kind == "sqlite3" and recovered is None:
-            assert share == 0.3  # the list of topics is not there
-            return
         assert share - 0.35 < len(recovered) / len(whole) < share + 0.1
         assert recovered == whole[: len(recovered)]
         assert re.search(r"cut off or damaged .* lost", warning)
@@ -407,5 +399,5 @@ def test_rows_that_are_computed_are_refused(tmp_path):
         " ALL SELECT k + 1 FROM n) SELECT 1 AS topic_id, k AS timestamp, zeroblob(1000) AS data"
         " FROM n;"
     )
-    with pytest.raises(InputError, match="it has no tables 'topics' and 'messages'"):
+    with pytest.raises(InputError, match="database missing tables"):
         PoseBag(database(tmp_path / "bag.db3", [], computed))

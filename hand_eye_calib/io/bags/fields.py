@@ -11,6 +11,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.io.bags.poses import TwistIntegrator
 
 _POSITION, _ORIENTATION = "x={0}.x,y={0}.y,z={0}.z", "qx={0}.x,qy={0}.y,qz={0}.z,qw={0}.w"
 
@@ -123,8 +124,6 @@ def rows_of_messages(
         raise InputError(f"no messages on {topic}")
     stamps_ns = stamps_in_ns(table, None)
     if is_twist:
-        from hand_eye_calib.io.bags.messages import TwistIntegrator
-
         twists = np.asarray(table.numbers).reshape(-1, len(_VELOCITIES))
         return stamps_ns, TwistIntegrator().poses(stamps_ns, twists), []
     positions, quats_xyzw = poses_of(table)

@@ -1,4 +1,4 @@
-"""Messages of whole storage files where the index of the library rosbags says that they are.
+"""Messages of whole mcap files where the index of the library rosbags says that they are.
 
 Its own iteration over the messages of a chunk takes up to twice as long.
 """
@@ -6,17 +6,14 @@ Its own iteration over the messages of a chunk takes up to twice as long.
 import struct
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
-from itertools import chain, repeat, zip_longest
+from itertools import zip_longest
 from operator import attrgetter, itemgetter
 from typing import Any, BinaryIO
 
 from hand_eye_calib.io.bags.recovery import Message, MessageKind
 from hand_eye_calib.io.limits import LARGEST_RATIO, SMALLEST_UNPACKED
 
-_UINT32 = struct.Struct("<I")
-# In the header of a record of rosbag1.
-_IS_MESSAGE = b"op=\x02"
-# Of mcap: opcode and length of a record; of a chunk's, also times, size and checksum.
+# Opcode and length of a record; of a chunk's, also times, size and checksum.
 _RECORD, _CHUNK_HEAD = struct.Struct("<BQ"), struct.Struct("<BQQQQI")
 # Channel and log time of a message; with its number and time of publication, 22 bytes.
 _MESSAGE, _MESSAGE_HEAD, _MESSAGE_SIZE = 5, struct.Struct("<H4xQ"), 22
@@ -24,9 +21,7 @@ _MESSAGE, _MESSAGE_HEAD, _MESSAGE_SIZE = 5, struct.Struct("<H4xQ"), 22
 
 def messages_of(reader: Any, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
     """Messages of some connections, by their number, in the order of time."""
-    if hasattr(reader, "indexes"):
-        return _rosbag1_messages(reader, kinds)
-    if hasattr(reader.storage, "chunks"):
+    if hasattr(getattr(reader, "storage", None), "chunks"):
         return _mcap_messages(reader.storage, kinds)
     wanted = [each for each in reader.connections if each.id in kinds]
     found = reader.messages(wanted) if wanted else ()
@@ -71,23 +66,3 @@ def _messages_of_chunk(
             key, bag_ns = _MESSAGE_HEAD.unpack_from(content, start)
             if key in kinds:
                 yield kinds[key], bag_ns, content[start + _MESSAGE_SIZE : position]
-
-
-def _rosbag1_messages(reader: Any, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
-    """Messages where the index says that they are."""
-    entries = [zip(reader.indexes[key], repeat(kind)) for key, kind in kinds.items()]
-    before, content, unpack = None, b"", _UINT32.unpack_from
-    for (bag_ns, position, start), kind in sorted(chain(*entries), key=lambda each: each[0][0]):
-        if position != before:
-            chunk, before = reader.chunks[position], position
-            reader.bio.seek(chunk.datapos)
-            content = chunk.decompressor(reader.bio.read(chunk.datasize))
-        while True:
-            body = start + 4 + unpack(content, start)[0]
-            end = body + 4 + unpack(content, body)[0]
-            if content.find(_IS_MESSAGE, start, body) >= 0:
-                break
-            start = end  # a record of the connection precedes it
-        if end > len(content):
-            raise EOFError("a chunk ends in the middle of a message")
-        yield kind, bag_ns, content[body + 4 : end]

@@ -17,10 +17,9 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import RateIntegrator
 from hand_eye_calib.io.bags.fields import FIELDS
-from hand_eye_calib.io.bags.poses import PoseColumns
+from hand_eye_calib.io.bags.poses import PoseColumns, TwistIntegrator
 from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin, wrong_latitude
 from hand_eye_calib.io.limits import LONGEST_NAME
 from hand_eye_calib.io.transforms import PoseFields
@@ -392,28 +391,6 @@ def frames_in(data: Buffer, message_type: str, is_ros1: bool) -> set[str]:
 
 
 # ---- what the messages of a topic measure
-
-
-class TwistIntegrator:
-    """Integrates velocities of one sensor in its own frame, in parts of any length."""
-
-    def __init__(self) -> None:
-        self._last: tuple[int, FloatArray] | None = None
-        self._pose = np.eye(4)
-
-    def poses(self, stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
-        """Poses (N, 7) of x y z qx qy qz qw at the stamps (N,) of the next twists (N, 6): m/s and
-        rad/s.
-        """
-        last_ns, last = self._last or (int(stamps_ns[0]), twists[0])
-        before = np.concatenate([[last], twists[:-1]])
-        seconds = np.diff(np.concatenate([[last_ns], stamps_ns])) * 1e-9
-        poses = np.empty((len(twists), 4, 4))
-        for row, step in enumerate(se3.exp((twists + before) / 2 * seconds[:, None])):
-            poses[row] = self._pose = self._pose @ step
-        self._pose[:3, :3] = se3.nearest_rotation(self._pose[:3, :3])
-        self._last = int(stamps_ns[-1]), twists[-1]
-        return np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]
 
 
 # What a row that is not finite lacks.

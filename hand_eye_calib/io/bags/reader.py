@@ -3,7 +3,6 @@
 import heapq
 from collections import defaultdict
 from collections.abc import Callable, Collection, Container, Iterator, Mapping
-from dataclasses import replace
 from itertools import chain, compress, pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -441,64 +440,6 @@ class PoseBag:
                 messages = [*compress(contents, is_of_kind)]
                 parts.append(Part(kind, rows, numbers, messages, bag_ns[rows]))
             yield parts
-
-
-# ---- whole trajectories
-
-
-def read_bag_trajectory(
-    path: str | Path, topic: str | None = None, tf: str | None = None, measures: str = "auto"
-) -> tuple[Trajectory, list[str]]:
-    """Read one trajectory of a bag.
-
-    Parameters
-    ----------
-    path : str or path-like
-    topic : str, optional
-    tf : str, optional
-        ``world:sensor``, instead of a topic.
-    measures : str
-        What to read of the poses, see :meth:`PoseBag.measured`.
-
-    Returns
-    -------
-    Trajectory
-        In the order of stamps; of those with equal stamps the first.
-    notes : list of str
-        What a person should know.
-
-    Raises
-    ------
-    InputError
-        If the bag or a pose cannot be read.
-    """
-    with PoseBag(path) as bag:
-        trajectory, notes = trajectory_of(bag, TfSource.parse(tf) if tf else topic or "", measures)
-        return trajectory, [*bag.warnings, *notes]
-
-
-def trajectory_of(
-    bag: PoseBag, source: Source, measures: str = "auto"
-) -> tuple[Trajectory, list[str]]:
-    """The trajectory of one source of an open bag, as :func:`read_bag_trajectory` gives it, and
-    what a person should know of it.
-    """
-    bag.topics.check(source)
-    kind = bag.measured(source, measures)
-    notes: list[str] = []
-    blocks = list(bag.blocks(source, None, measures={"parent": measures}))
-    if not blocks:
-        raise InputError(f"no poses on {source} of {bag}")
-    poses = PoseBlock.concatenate(blocks)
-    trajectory = poses.trajectory()
-    if len(trajectory) < len(poses):
-        notes.append(
-            f"{source}: {len(poses) - len(trajectory)} of {len(poses)} poses had a stamp that was "
-            "there already and were dropped"
-        )
-    if (np.diff(poses.stamps_ns) < 0).any():
-        notes.append(f"{source}: stamps were not in the order of the bag and were sorted")
-    return replace(trajectory, measures=kind) if kind != "poses" else trajectory, notes
 
 
 def _first_seen(

@@ -1,6 +1,7 @@
 """The storage files of bags: found, unpacked, and read through the library rosbags.
 
-A file that rosbags cannot open, or not read to its end, is read record by record: see recovery.py.
+An mcap file that rosbags cannot open, or not read to its end, is read record by record: see
+recovery.py.
 """
 
 import re
@@ -92,6 +93,8 @@ class Storage:
             except Exception as error:
                 self.close()
                 self._clear()
+                if self._file.suffix != ".mcap":
+                    raise
                 self._search(error)
         log = file.with_name(file.name + "-wal")
         if log.exists() and log.stat().st_size:
@@ -188,7 +191,7 @@ class Storage:
                     yield last
                 return
             except Exception as error:
-                if _is_out_of_memory(error):
+                if _is_out_of_memory(error) or self._file.suffix != ".mcap":
                     raise
                 self._lose(f"it is damaged ({reason_of(error)}), and was read record by record")
         own: dict[MessageKind, MessageKind] = {}
