@@ -17,8 +17,6 @@ from hand_eye_calib.geometry.trajectory import FARTHEST_M, far_position
 # than the usual step).
 _FACTOR = 10.0
 _SMALLEST_JUMP_M, _SMALLEST_JUMP_RAD, _SMALLEST_JUMP_S = 0.2, 0.1, 0.5
-# Poses that are judged at once, and that are kept to know the usual step of those that come next.
-_MOST_WAITING, _KEPT = 20_000, 64
 
 
 def check_positions(positions: FloatArray) -> None:
@@ -48,12 +46,8 @@ class PoseWatch:
 
     def __init__(self) -> None:
         self.n_stamps = 0
-        self._n_poses = self._n_jumps = 0
-        # Of the first jumps, and of the last pose if it jumps away: the next one decides about it.
-        self._first_stamp = self._first_pose = self._last_pose = ""
-        # Poses in the order of the recording, of which so many are judged already.
-        self._n_judged = 0
-        self._waiting: list[tuple[IntArray, IntArray, FloatArray]] = []
+        self._first_stamp = ""
+        self._poses: list[tuple[IntArray, IntArray, FloatArray]] = []
 
     def believable(self, first_number: int, stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
         """Mask of the stamps that can be right, of messages in the order of the recording.
@@ -100,61 +94,41 @@ class PoseWatch:
         except InputError as error:
             row = getattr(error, "index", 0)
             raise InputError(
-                f"message {message_numbers[row]}, stamp {_seconds(stamps_ns[row])}: {error}; "
+                f"message {message_numbers[row]}, stamp {stamps_ns[row]} ns: {error}; "
                 "the bag is damaged, record it again"
             ) from None
-        self._waiting.append((message_numbers, stamps_ns, poses))
-        self._n_poses += len(poses)
-        if sum(len(each) for _, _, each in self._waiting) > _MOST_WAITING:
-            self._judge()
-
-    def _judge(self) -> None:
-        """Judge the poses that wait; the last ones are kept as neighbours of the next."""
-        message_numbers, stamps_ns, poses = map(np.concatenate, zip(*self._waiting, strict=True))
-        start, self._n_judged = self._n_judged, min(len(poses), _KEPT) - 1
-        self._waiting = [(message_numbers[-_KEPT:], stamps_ns[-_KEPT:], poses[-_KEPT:])]
-        with np.errstate(over="ignore", invalid="ignore"):
-            jumps_m = _isolated(poses[:, :3], _distance, _SMALLEST_JUMP_M)
-            jumps_rad = _isolated(poses[:, 3:], _angle, _SMALLEST_JUMP_RAD)
-        found = start + np.flatnonzero((jumps_m > 0)[start:] | (jumps_rad > 0)[start:])
-        self._n_jumps += int((found < len(poses) - 1).sum())
-        said = [""]
-        for row in (*found[:1], *found[-1:]):
-            jump, unit = (jumps_m[row], "m") if jumps_m[row] else (jumps_rad[row], "rad")
-            said.append(_jump(message_numbers[row], stamps_ns[row], jump, unit))
-        is_last = len(found) > 0 and found[-1] == len(poses) - 1
-        self._last_pose = said[-1] if is_last else ""
-        if len(found) > is_last:
-            self._first_pose = self._first_pose or said[1]
+        self._poses.append((message_numbers, stamps_ns, poses))
 
     def warnings(self, name: str) -> list[str]:
         """List what was found, one line each; after the last pose."""
-        if sum(len(each) for _, _, each in self._waiting) > self._n_judged + 1:
-            self._judge()
-        found, n_jumps = [], self._n_jumps + bool(self._last_pose)
-        if n_jumps:
-            found.append(
-                f"{name}: {n_jumps} of {self._n_poses} poses jump away and back (first "
-                f"{self._first_pose or self._last_pose}), as in a damaged bag or when tracking "
-                "fails; check the stream, and use a method that rejects outliers"
-            )
+        found, n_poses = [], sum(len(poses) for _, _, poses in self._poses)
+        if n_poses:
+            numbers, stamps_ns, poses = map(np.concatenate, zip(*self._poses, strict=True))
+            with np.errstate(over="ignore", invalid="ignore"):
+                jumps_m = _isolated(poses[:, :3], _distance, _SMALLEST_JUMP_M)
+                jumps_rad = _isolated(poses[:, 3:], _angle, _SMALLEST_JUMP_RAD)
+            rows = np.flatnonzero((jumps_m > 0) | (jumps_rad > 0))
+            for row in rows[:1]:
+                jump, unit = (jumps_m[row], "m") if jumps_m[row] else (jumps_rad[row], "rad")
+                first = _jump(int(numbers[row]), int(stamps_ns[row]), jump, unit)
+                found.append(
+                    f"{name}: {len(rows)} of {n_poses} poses jump away and back (first {first}), "
+                    "as in a damaged bag or when tracking fails; check the stream, and use a "
+                    "method that rejects outliers"
+                )
         if self.n_stamps:
             found.append(
-                f"{name}: {self.n_stamps} of {self._n_poses + self.n_stamps} stamps jump away and "
-                f"back against the bag's own time (first {self._first_stamp}); their poses were "
-                "left out, the bag may be damaged"
+                f"{name}: {self.n_stamps} of {n_poses + self.n_stamps} stamps jump away and back "
+                f"against the bag's own time (first {self._first_stamp}); their poses were left "
+                "out, the bag may be damaged"
             )
         return found
 
 
 def _jump(message_number: int, stamp_ns: int, jump: float, unit: str) -> str:
     """A jump, for a person."""
-    return f"message {message_number}, stamp {_seconds(stamp_ns)}, by {jump:.3g} {unit}"
-
-
-def _seconds(stamp_ns: int) -> str:
     seconds, nanoseconds = divmod(int(stamp_ns), 10**9)
-    return f"{seconds}.{nanoseconds:09d}"
+    return f"message {message_number}, stamp {seconds}.{nanoseconds:09d}, by {jump:.3g} {unit}"
 
 
 def _isolated(

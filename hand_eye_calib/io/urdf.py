@@ -5,12 +5,10 @@ Only plain URDF is understood. A file with xacro macros is refused, as nobody ca
 value comes from.
 """
 
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.parsers import expat
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -22,24 +20,24 @@ from hand_eye_calib.io.files import read_bytes
 
 LARGEST_URDF = 64 << 20
 
-# A tag: attributes may have > in them.
-_TAG = re.compile(rb"(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
+# The rest of a tag: attributes may have > in them.
+_REST = rb"\b(?:[^>\"']|\"[^\"]*\"|'[^']*')*>"
+_NOT_TAGS = re.compile(rb"<!--.*?-->|<!\[CDATA\[.*?\]\]>", re.DOTALL)
+_JOINT, _ORIGIN = re.compile(rb"<joint" + _REST), re.compile(rb"<origin" + _REST)
 # Decimals of the numbers that are written: a millionth of a millimetre.
 _DECIMALS = 9
 
 
 @dataclass
 class _Joint:
-    """A joint: names, and where its tags are in the file, in bytes."""
+    """A joint; ``number`` counts the tags of that name in the file."""
 
     name: str
-    kind: str
-    parent: str = ""
-    child: str = ""
-    xyz_rpy: tuple[float, ...] = (0.0,) * 6
-    T_parent_child: FloatArray | None = None
-    start: tuple[int, int] = (0, 0)
-    origin: tuple[int, int] | None = None
+    is_fixed: bool
+    parent: str
+    child: str
+    xyz_rpy: list[float]
+    number: int
 
 
 class RobotDescription:
@@ -48,6 +46,10 @@ class RobotDescription:
     Parameters
     ----------
     path : str or path-like
+
+    Attributes
+    ----------
+    frames : FrameTree
 
     Raises
     ------
@@ -61,8 +63,15 @@ class RobotDescription:
             self._bytes = read_bytes(self._path, LARGEST_URDF)
         except OSError as error:
             raise InputError(f"cannot read {path}: {error.strerror}") from None
-        self._joints = _Reader(self._path, self._bytes).joints
-        self.frames = self._frames()
+        self._joints = self._read()
+        values = np.array([joint.xyz_rpy for joint in self._joints]).reshape(-1, 6)
+        rotations = se3.rotation_from_rpy(values[:, 3:])
+        poses = se3.from_rotation_translation(rotations, values[:, :3])
+        self.frames = FrameTree("the robot description")
+        for joint, pose in zip(self._joints, poses, strict=True):
+            if joint.child in self.frames.edges:
+                raise InputError(f"{self._path}: link {joint.child!r} has two parents")
+            self.frames.add(joint.parent, joint.child, pose, joint.is_fixed)
 
     def patched(self, parent_frame: str, child_frame: str, T_parent_child: FloatArray) -> bytes:
         """The file with one joint's origin changed, so that the child frame has this pose in the
@@ -74,23 +83,85 @@ class RobotDescription:
             If not exactly one fixed joint belongs to the child frame alone.
         """
         joint = self._joint_to_change(parent_frame, child_frame)
-        assert joint.T_parent_child is not None
         above = self.frames.pose(parent_frame, joint.parent)
         below = self.frames.pose(joint.child, child_frame)
         origin = se3.inverse(above) @ T_parent_child @ se3.inverse(below)
-        return self._with_origin(joint, origin)
+        numbers = [
+            " ".join(repr(round(float(value), _DECIMALS) + 0.0) for value in values)
+            for values in (origin[:3, 3], se3.rotation_to_rpy(origin[:3, :3]))
+        ]
+        data = self._bytes
+        # What is no tag keeps its place.
+        tags = _NOT_TAGS.sub(lambda found: b" " * len(found[0]), data)
+        start = [*_JOINT.finditer(tags)][joint.number].end()
+        found = _ORIGIN.search(tags, start, tags.find(b"</joint", start))
+        if found is None:
+            tag = f'\n    <origin xyz="{numbers[0]}" rpy="{numbers[1]}"/>'.encode()
+            return data[:start] + tag + data[start:]
+        tag = data[found.start() : found.end()]
+        for name, text in zip(("xyz", "rpy"), numbers, strict=True):
+            pattern = rb"(\s" + name.encode() + rb"\s*=\s*)(\"[^\"]*\"|'[^']*')"
+            if old := re.search(pattern, tag):
+                quote = old[2][:1]
+                tag = tag[: old.start()] + old[1] + quote + text.encode() + quote + tag[old.end() :]
+            else:
+                tag = re.sub(rb"\s*(/?>)$", f' {name}="{text}"'.encode() + rb"\1", tag)
+        return data[: found.start()] + tag + data[found.end() :]
 
     def joint_name(self, parent_frame: str, child_frame: str) -> str:
         """Name of the joint that :meth:`patched` changes."""
         return self._joint_to_change(parent_frame, child_frame).name
 
-    def _frames(self) -> FrameTree:
-        found = FrameTree("the robot description")
-        for joint in self._joints:
-            if joint.child in found.edges:
-                raise InputError(f"{self._path}: link {joint.child!r} has two parents")
-            found.add(joint.parent, joint.child, joint.T_parent_child, joint.kind == "fixed")
-        return found
+    def _read(self) -> list[_Joint]:
+        path, data = self._path, self._bytes
+        encoding = re.match(rb"<\?xml[^>]*encoding=[\"']([\w-]+)", data)
+        name = encoding[1].decode() if encoding else "utf-8"
+        if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+            name = "UTF-16"
+        if name.lower() not in ("utf-8", "us-ascii", "ascii"):
+            raise InputError(f"{path}: is in {name}; expected UTF-8")
+        if b"<!DOCTYPE" in data:
+            raise InputError(f"{path}: has a document type; expected a plain URDF file")
+        if macro := re.search(rb"<(xacro:\w+)", _NOT_TAGS.sub(b"", data)):
+            raise InputError(
+                f"{path}: has xacro macros (<{macro[1].decode()}>); give the URDF that xacro "
+                "makes of it, or change the file by hand"
+            )
+        try:
+            root = ElementTree.fromstring(data)
+        except ElementTree.ParseError as error:
+            raise InputError(f"{path}: not XML: {error}; expected a URDF file") from None
+        if root.tag != "robot":
+            raise InputError(f"{path}: expected a URDF file, found <{root.tag}>")
+        numbers = {element: number for number, element in enumerate(root.iter("joint"))}
+        return [self._joint(element, numbers[element]) for element in root.iterfind("joint")]
+
+    def _joint(self, element: ElementTree.Element, number: int) -> _Joint:
+        name = element.get("name", "")
+        parent, child = (
+            found.get("link", "") if (found := element.find(each)) is not None else ""
+            for each in ("parent", "child")
+        )
+        if not parent or not child:
+            raise InputError(f"{self._path}: joint {name!r} has no parent or no child")
+        origins = element.findall("origin")
+        attributes = origins[0].attrib if origins else {}
+        if len(origins) > 1 or set(attributes) - {"xyz", "rpy"}:
+            raise InputError(
+                f"{self._path}: the origin of joint {name!r} is not one pair of xyz and rpy; "
+                "change the file by hand"
+            )
+        try:
+            texts = [attributes.get(each, "0 0 0").split() for each in ("xyz", "rpy")]
+            values = [float(text) for three in texts for text in three]
+        except ValueError:
+            values = []
+        if len(values) != 6 or not np.isfinite(values).all():
+            raise InputError(
+                f"{self._path}: the origin of joint {name!r} is not six numbers: {attributes}; "
+                "xacro expressions must be evaluated first"
+            )
+        return _Joint(name, element.get("type") == "fixed", parent, child, values, number)
 
     def _joint_to_change(self, parent_frame: str, child_frame: str) -> _Joint:
         try:
@@ -111,116 +182,3 @@ class RobotDescription:
             f"{self._path}: {len(joints)} joints lead to {child_frame} ({names}), and any of them "
             "may be wrong; change the file by hand"
         )
-
-    def _with_origin(self, joint: _Joint, origin: FloatArray) -> bytes:
-        xyz = _numbers(origin[:3, 3])
-        rpy = _numbers(se3.rotation_to_rpy(origin[:3, :3]))
-        if joint.origin is None:
-            end = joint.start[1]
-            tag = f'\n    <origin xyz="{xyz}" rpy="{rpy}"/>'.encode()
-            return self._bytes[:end] + tag + self._bytes[end:]
-        start, end = joint.origin
-        tag = self._bytes[start:end]
-        for name, numbers in (("xyz", xyz), ("rpy", rpy)):
-            tag = _with_attribute(tag, name, numbers)
-        return self._bytes[:start] + tag + self._bytes[end:]
-
-
-class _Reader:
-    """Reads the joints of a file, with the places of their tags."""
-
-    def __init__(self, path: Path, data: bytes) -> None:
-        self.joints: list[_Joint] = []
-        self._path, self._data = path, data
-        self._open: list[str] = []
-        if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-            raise InputError(f"{path}: is in UTF-16; expected UTF-8")
-        self._parser = expat.ParserCreate()
-        self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._end
-        self._parser.StartDoctypeDeclHandler = self._refuse_doctype
-        self._parser.XmlDeclHandler = self._check_encoding
-        try:
-            self._parser.Parse(data, True)
-        except expat.ExpatError as error:
-            raise InputError(f"{path}: not XML: {error}; expected a URDF file") from None
-        for joint in self.joints:
-            if not joint.parent or not joint.child:
-                raise InputError(f"{path}: joint {joint.name!r} has no parent or no child")
-        values = np.array([joint.xyz_rpy for joint in self.joints]).reshape(-1, 6)
-        rotations = se3.rotation_from_rpy(values[:, 3:])
-        poses = se3.from_rotation_translation(rotations, values[:, :3])
-        for joint, pose in zip(self.joints, poses, strict=True):
-            joint.T_parent_child = pose
-
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        if not self._open and name != "robot":
-            raise InputError(f"{self._path}: expected a URDF file, found <{name}>")
-        if name.startswith("xacro:"):
-            raise InputError(
-                f"{self._path}: has xacro macros (<{name}>); give the URDF that xacro makes of it, "
-                "or change the file by hand"
-            )
-        if self._open == ["robot"] and name == "joint":
-            joint = _Joint(attributes.get("name", ""), attributes.get("type", ""))
-            joint.start = self._place()
-            self.joints.append(joint)
-        elif self._open == ["robot", "joint"]:
-            self._part_of_joint(self.joints[-1], name, attributes)
-        self._open.append(name)
-
-    def _part_of_joint(self, joint: _Joint, name: str, attributes: dict[str, str]) -> None:
-        if name in ("parent", "child"):
-            setattr(joint, name, attributes.get("link", ""))
-        elif name == "origin":
-            if joint.origin is not None or set(attributes) - {"xyz", "rpy"}:
-                raise InputError(
-                    f"{self._path}: the origin of joint {joint.name!r} is not one pair of xyz and "
-                    "rpy; change the file by hand"
-                )
-            joint.origin = self._place()
-            joint.xyz_rpy = self._numbers(joint, attributes)
-
-    def _numbers(self, joint: _Joint, attributes: dict[str, str]) -> tuple[float, ...]:
-        try:
-            texts = (attributes.get(name, "0 0 0").split() for name in ("xyz", "rpy"))
-            values = tuple(float(text) for three in texts for text in three)
-        except ValueError:
-            values = ()
-        if len(values) != 6 or not all(map(math.isfinite, values)):
-            raise InputError(
-                f"{self._path}: the origin of joint {joint.name!r} is not six numbers: "
-                f"{attributes}; xacro expressions must be evaluated first"
-            )
-        return values
-
-    def _place(self) -> tuple[int, int]:
-        """Bytes from the beginning to the end of the tag that is being read."""
-        start = self._parser.CurrentByteIndex
-        found = _TAG.match(self._data, start)
-        return start, found.end() if found else start
-
-    def _end(self, name: str) -> None:
-        self._open.pop()
-
-    def _refuse_doctype(self, *_: Any) -> None:
-        raise InputError(f"{self._path}: has a document type; expected a plain URDF file")
-
-    def _check_encoding(self, version: str, encoding: str | None, standalone: int) -> None:
-        if (encoding or "utf-8").lower() not in ("utf-8", "us-ascii", "ascii"):
-            raise InputError(f"{self._path}: is in {encoding}; expected UTF-8")
-
-
-def _with_attribute(tag: bytes, name: str, value: str) -> bytes:
-    """A tag with this value of an attribute, which is added if it is missing."""
-    pattern = re.compile(rb"(\s" + name.encode() + rb"\s*=\s*)(\"[^\"]*\"|'[^']*')")
-    changed, count = pattern.subn(
-        lambda found: found[1] + found[2][:1] + value.encode() + found[2][:1], tag
-    )
-    if count:
-        return changed
-    return re.sub(rb"\s*(/?>)$", lambda end: f' {name}="{value}"'.encode() + end[1], tag)
-
-
-def _numbers(values: FloatArray) -> str:
-    return " ".join(repr(round(float(value), _DECIMALS) + 0.0) for value in values)

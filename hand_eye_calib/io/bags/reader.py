@@ -78,6 +78,7 @@ class PoseBag:
         for name, about in chain(*(each.topics.items() for each in self._files.storages)):
             found[name].append(about)
         self.topics = joined(found, str(self))
+        self.topics.frames = self._first_transforms
         spans = [(each.start_ns, each.end_ns) for each in self._files.storages]
         known = [(first, last) for first, last in spans if first is not None and last is not None]
         self.start_ns = min((first for first, _ in known), default=None)
@@ -129,6 +130,11 @@ class PoseBag:
         return [storage.path for storage in self._files.storages]
 
     # ---- topics
+
+    def _first_transforms(self) -> list[str]:
+        """Pairs of frames in the first messages of transforms."""
+        names = [topic.name for topic in self.topics.values() if topic.type in TF_TYPES]
+        return sorted({pair for name in names for pair in self.frames_on(name)})
 
     def frames_on(self, topic: str) -> list[str]:
         """Pairs of frames in the first messages of a topic: ``world:sensor`` of poses, as far as

@@ -1,7 +1,7 @@
 """Topics of bags: what is on them, and which of them are meant."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from hand_eye_calib.arrays import IntArray
@@ -23,6 +23,8 @@ _FEWEST_POSES = 3
 # Words of a topic's name that say which stream it is, the likeliest parent first.
 _PARENT_WORDS = ("parent", "base", "lidar")
 _CHILD_WORD = "child"
+# Transforms that a message lists.
+_MOST_FRAMES = 20
 
 Source = str | TfSource
 
@@ -48,9 +50,12 @@ class TopicInfo(NamedTuple):
 
 
 class Topics(dict[str, TopicInfo]):
-    """The topics of a bag by their names; ``bag`` is its name, for messages."""
+    """The topics of a bag by their names; ``bag`` is its name, and ``frames`` lists its first
+    transforms, for messages.
+    """
 
     bag = ""
+    frames: Callable[[], list[str]] = list
 
     def __str__(self) -> str:
         if not self:
@@ -125,10 +130,16 @@ class Topics(dict[str, TopicInfo]):
         if wanted and not choices:
             raise InputError(
                 "name the topics of poses with --parent-topic and --child-topic, or frames with "
-                f"--parent-tf and --child-tf. {self}"
+                f"--parent-tf and --child-tf. {self}{self._transforms()}"
             )
         chosen = sorted(choices[0], key=_parent_first)[::-1] if wanted else []
         return parent or chosen.pop(), child or chosen.pop()
+
+    def _transforms(self) -> str:
+        """The frames of the first transforms, for a message."""
+        found = self.frames()
+        more = f" and {len(found) - _MOST_FRAMES} more" if len(found) > _MOST_FRAMES else ""
+        return f". Transforms are {', '.join(found[:_MOST_FRAMES])}{more}" if found else ""
 
 
 def joined_parts(source: str) -> tuple[str, ...]:
