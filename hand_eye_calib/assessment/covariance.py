@@ -187,7 +187,7 @@ def assess_lever_arm(Ts: FloatArray, solution: LeverArmSolution) -> Assessment:
         Of a transform with no rotation, which is unknown.
     """
     whole = np.zeros((6, 6))
-    whole[:3, :3] = _widened(solution.covariance, solution, slice(0, 3))
+    whole[:3, :3] = _widened(solution.covariance, solution, slice(0, 3)) + solution.beyond
     white, walk = _white_rotation(Ts), solution.rotation_walk
     hidden = noise_driven(
         Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)

@@ -20,8 +20,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import Solved, estimate_beside, estimate_extrinsic
-from hand_eye_calib.engine.lever_arms import estimate_lever_arm
-from hand_eye_calib.engine.rotations import estimate_rotation
+from hand_eye_calib.engine.partial import estimate_lever_arm, estimate_rotation
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs

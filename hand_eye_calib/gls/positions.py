@@ -7,6 +7,10 @@ to pose as the odometry says, up to its drift. So this is the state space of the
 (:mod:`~hand_eye_calib.gls.state_space`) with a white rotation error without bounds; the
 rotations are updated from what the positions say of them, until they stay. The sensor's frame has
 the axes of the other one by convention: ``X = (I, l)``.
+
+Errors that act like a lever arm and that the data hardly tell from it are no part of the model;
+:func:`_systematic` says what they leave open. A drone tilts to accelerate, so that positions which
+answer to acceleration by kappa (s^2), as smoothed ones do, move the vertical lever arm by kappa g.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from hand_eye_calib.gls.increments import (
     SCALE,
     TIME,
     Course,
+    Linearisation,
     Streams,
     course_of,
     linearise,
@@ -46,26 +51,27 @@ from hand_eye_calib.gls.problem import sample
 from hand_eye_calib.gls.solution import LeverArmSolution
 from hand_eye_calib.gls.stages import rough_levels
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
+from hand_eye_calib.gls.windows import aligned, first_lever_arm
+
+# A rate of the clock, one more parameter than poses have.
+CLOCK = N_SYSTEMATIC
 
 # Log variance (rad^2) of orientations that may be anything, and bounds of their walk.
 _ANY_ROTATION = float(np.log(100.0))
-_LEAST_WALK, _MOST_WALK = np.log(1e-12), np.log(0.1)
-_FIRST_WALK = np.log(1e-6)
+_LEAST_WALK, _MOST_WALK, _FIRST_WALK = np.log(1e-12), np.log(0.1), np.log(1e-6)
 _LEAST_WHITE_SHARE, _LEAST_WALK_SHARE = -14.0, -12.0
-
-# Poses of the windows that are aligned by themselves: for the first lever arm, and for the first
-# orientations. The first lever arm is drawn to zero by so much where the motion does not tell it.
-_START_WINDOWS, _ALIGNED_WINDOW = (480, 60), 100
-_START_STEPS, _SETTLED_START, _DRAWN = 50, 1e-6, 1e-6
 
 # Rounds of updating the orientations; those after which noise levels are fitted, errors that last
 # are looked for, and outliers; X moves by less than this share of its sigma in the last.
-_ROUNDS = 10
-_FITS, _LASTING, _OUTLIERS, _QUALITY = (1, 2, 4, 6), 2, (3, 5), (2, 4, 5)
+_ROUNDS, _FITS, _LASTING, _OUTLIERS, _QUALITY = 10, (1, 2, 4, 6), 2, (3, 5), (2, 4, 5)
 _SETTLED = 0.1
 
-# Standard deviation (m) of lever arms before anything is known.
-_LONG_M = 10.0
+# Standard deviations before anything is known: of the lever arm (m), of the rate of the clock, of
+# the scale of the odometry, of its direction (rad), and of what the positions answer to
+# acceleration (s^2). Accelerations are those over this time (s).
+_LONG_M, _CLOCK_SIGMA = 10.0, 1e-4
+_SCALE_SIGMA, _DIRECTION_SIGMA, _RESPONSE_SIGMA = 0.01, float(np.radians(0.15)), 0.002
+_ACCELERATING_S, _NEAR = 0.2, 2.5
 
 # An axis that is not known to this (m) need not settle: noise moves it on and on.
 _UNKNOWN_M = 0.2
@@ -74,14 +80,9 @@ _UNKNOWN_M = 0.2
 # share of the rest, a logarithm.
 _LEAST_GAIN, _FIRST_SHARE = 4.0, -1.0
 
-# Noise levels need no more poses than this.
-_MOST_POSES = 300
-
-# A jump is a step of the walk with this many times the variance that it needs.
-_JUMP_FACTOR = 10.0
-
-# Parts of a recording that are compared by themselves, and fewest positions of one.
-_PARTS = 10
+# Noise levels need no more poses than this. A jump is a step of the walk with this many times the
+# variance that it needs.
+_MOST_POSES, _JUMP_FACTOR = 300, 10.0
 
 # The quality of a solution is that of so many positions around; those whose squared errors exceed
 # that of the best quarter of the recording by this factor are left out: they would hardly count,
@@ -104,9 +105,10 @@ def solve(
     with_scale : bool
         Whether to estimate the scale between both worlds.
     """
+    lever_arm, scale = first_lever_arm(Ts_pw_p, positions, with_scale)
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
-    lever_arm, scale = _first_answer(Ts_pw_p, positions, with_scale)
-    state = _State.first(stamps_s, Ts_pw_p, scale * positions, lever_arm, with_scale)
+    Ts = aligned(Ts_pw_p, scale * positions, lever_arm)
+    state = _State.first(Streams(stamps_s, Ts_pw_p, Ts), lever_arm, with_scale)
     for number in range(_ROUNDS):
         state = state.fitted() if number in _FITS else state
         state = state.with_lasting_error() if number == _LASTING else state
@@ -125,106 +127,12 @@ def solve(
     return _solution(state, posterior, converged, scale)
 
 
-def _first_answer(
-    Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool
-) -> tuple[FloatArray, float]:
-    """The lever arm (3,) and the scale, if it is asked for, that fit windows best, each aligned by
-    itself; bad ones count less.
-
-    Short windows hardly know of the drift, but have local minima: long ones lead to the right one,
-    and know the scale.
-    """
-    lever_arm, scale = np.zeros(3), 1.0
-    of_all = Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions
-    for size in _START_WINDOWS:
-        windows = [_windows(values, min(size, len(positions))) for values in of_all]
-        lever_arm, scale = _fitting(windows, lever_arm, scale, with_scale)
-        with_scale = False
-    return lever_arm, scale
-
-
-def _fitting(
-    windows: list[FloatArray], lever_arm: FloatArray, scale: float, with_scale: bool
-) -> tuple[FloatArray, float]:
-    """Lever arm and scale that fit windows of orientations (n, k, 3, 3), path and positions (n, k,
-    3) best, from first ones on.
-    """
-    axes, path, measured = windows
-    information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * axes.shape[1] * np.eye(3)
-    for _ in range(_START_STEPS):
-        predicted = axes @ lever_arm + path
-        aligned = measured @ _rotations(measured, predicted)
-        if with_scale:
-            shares = (aligned * predicted).sum(axis=(1, 2)) / (aligned**2).sum(axis=(1, 2))
-            scale = float(np.median(shares))
-        residuals = scale * aligned - path
-        errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
-        weights = 1.0 / (1.0 + (errors / (np.median(errors) + 1e-12)) ** 2)
-        pulled = np.einsum("n,nkij,nki->j", weights, axes, residuals)
-        before = lever_arm
-        lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), pulled)
-        if np.abs(lever_arm - before).max() < _SETTLED_START:
-            break
-    return lever_arm, scale
-
-
-def unexplained_share(
-    Ts_pw_p: FloatArray, positions: FloatArray, solution: LeverArmSolution
-) -> float:
-    """Share of the path of positions (N, 3) that the poses (N, 4, 4) and the lever arm do not
-    explain, in tenths of the recording, each aligned by itself; 1 if nothing moves.
-    """
-    predicted = Ts_pw_p[:, :3, :3] @ solution.lever_arm + Ts_pw_p[:, :3, 3]
-    size = max(len(positions) // _PARTS, min(_PARTS, len(positions)))
-    expected, measured = (_windows(path, size) for path in (predicted, solution.scale * positions))
-    residuals = measured @ _rotations(measured, expected) - expected
-    left, whole = ((path**2).sum(axis=(1, 2)) for path in (residuals, measured))
-    return float(np.sqrt(np.median(left) / np.median(whole))) if np.median(whole) else 1.0
-
-
-def _windows(values: FloatArray, size: int) -> FloatArray:
-    """Values (N, ...) of windows of a size, (n, size, ...), each less its mean."""
-    whole = len(values) // size * size
-    windows = values[:whole].reshape(-1, size, *values.shape[1:])
-    return windows - windows.mean(axis=1, keepdims=True)
-
-
-def _rotations(measured: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of windows, centred."""
-    return se3.nearest_rotation(np.einsum("nki,nkj->nij", measured, predicted))
-
-
-def _aligned(Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) of the positions, with the other sensor's orientations turned into their
-    world, window by window.
-    """
-    predicted = Ts_pw_p[:, :3, :3] @ lever_arm + Ts_pw_p[:, :3, 3]
-    n_poses = len(positions)
-    size = min(_ALIGNED_WINDOW, n_poses)
-    rotations = np.empty((n_poses, 3, 3))
-    for start in range(0, n_poses, size):
-        first = max(min(start, n_poses - size), 0)  # the last window is as long as the others
-        window = slice(first, first + size)
-        turn = _rotations(_windows(positions[window], size), _windows(predicted[window], size))[0]
-        rotations[start : start + size] = turn @ Ts_pw_p[start : start + size, :3, :3]
-    return se3.from_rotation_translation(rotations, positions)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _State:
-    """Where the search stands.
-
-    Attributes
-    ----------
-    positions : (N, 3) array
-        As measured.
-    streams : Streams
-        The child's poses are its positions, bridged where they are left out, with the orientations
-        known so far.
-    columns : list of int
-        Parameters of systematic errors in the model, of ``parameters`` (11,).
-    boost : (n,) array
-        Factors of the walk's variance: above 1 at jumps.
+    """Where the search stands. The child's poses are its ``positions`` (N, 3), bridged where they
+    are left out, with the orientations known so far. ``columns`` of ``parameters`` (9,) are in the
+    model. ``boost`` (n,) are factors of the walk's variance, above 1 at jumps; those around
+    positions that are ``worse`` (N,) are far less precise than the best.
     """
 
     positions: FloatArray
@@ -239,33 +147,26 @@ class _State:
     worse: BoolArray
 
     @classmethod
-    def first(
-        cls,
-        stamps_s: FloatArray,
-        Ts_pw_p: FloatArray,
-        positions: FloatArray,
-        lever_arm: FloatArray,
-        with_scale: bool,
-    ) -> _State:
+    def first(cls, streams: Streams, lever_arm: FloatArray, with_scale: bool) -> _State:
         """Where it begins."""
-        streams = Streams(stamps_s, Ts_pw_p, _aligned(Ts_pw_p, positions, lever_arm))
-        steps = np.linalg.norm(np.diff(Ts_pw_p[:, :3, 3], axis=0), axis=1)
+        stamps_s = streams.stamps_s
+        steps = np.linalg.norm(np.diff(streams.Ts_pw_p[:, :3, 3], axis=0), axis=1)
         interval_s = float(np.median(np.diff(stamps_s)))
         extent = Extent(interval_s, max(float(np.median(steps)), 1e-9), float(stamps_s[-1]))
         n = len(steps)
         state = cls(
-            positions=positions,
+            positions=streams.Ts_cw_c[:, :3, 3],
             streams=streams,
             lever_arm=lever_arm,
-            columns=[SCALE, TIME] if with_scale else [TIME],
-            parameters=np.zeros(N_SYSTEMATIC),
+            columns=[SCALE, TIME, CLOCK] if with_scale else [TIME, CLOCK],
+            parameters=np.zeros(N_SYSTEMATIC + 1),
             model=NoiseModel((), "time", "sensors", extent),
             levels=np.zeros(0),
             outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
             boost=np.ones(n),
             worse=np.zeros(n + 1, dtype=bool),
         )
-        residuals = linearise(streams, state.course, state.X, state.parameters).residuals
+        residuals = state.linearised().residuals
         squares = (residuals[:, :3] ** 2).sum(axis=1)
         around = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
         worse = _worse(np.concatenate(around))
@@ -300,25 +201,55 @@ class _State:
             along=summed(worlds @ np.diff(course.along, axis=0)),
         )
 
+    def linearised(self) -> Linearisation:
+        """Increments between poses, with the columns of the model."""
+        streams, course = self.streams, self.course
+        away_s = streams.stamps_s - 0.5 * self.model.extent.duration_s
+        drifting = away_s[:, None] * course.twists
+        moved = streams.Ts_cw_c @ se3.exp(self.parameters[CLOCK] * drifting)
+        known = self.parameters[:CLOCK], [column for column in self.columns if column != CLOCK]
+        found = linearise(replace(streams, Ts_cw_c=moved), course, self.X, *known)
+        return found.with_columns(_by_motion(found, drifting))
+
     def space(
-        self, model: NoiseModel | None = None, columns: list[int] | None = None
+        self, model: NoiseModel | None = None, linearisation: Linearisation | None = None
     ) -> StateSpace:
-        """State space of all poses."""
-        model, X = model or self.model, self.X
-        course = self.course
-        columns = self.columns if columns is None else columns
-        linearisation = linearise(self.streams, course, X, self.parameters, columns)
-        # The drift is the odometry's, and grows with its path, not with that of the antenna.
+        """State space of all poses: without a rotation to estimate, with orientations that may be
+        anything, and with a walk that is the odometry's.
+        """
+        # The drift grows with the path of the odometry, not with that of the antenna.
         path = np.linalg.norm(np.diff(self.streams.Ts_pw_p[:, :3, 3], axis=0), axis=1)
-        space = model.state_space(
+        space = (model or self.model).state_space(
             self.streams,
-            replace(linearisation, metres=path),
-            course.twists,
-            X,
+            replace(linearisation or self.linearised(), metres=path),
+            self.course.twists,
+            self.X,
             np.where(self.left_out, 0.0, 1.0),
             np.zeros(len(self.boost), dtype=bool),
         )
-        return _of_positions(space, X, self.boost)
+        to_child = se3.adjoint(se3.inverse(self.X))
+        translation, rotation = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
+        columns = np.delete(space.columns, [3, 4, 5], axis=2)
+        return replace(
+            space,
+            relative=space.relative * self.boost,
+            columns=columns,
+            white=(translation[None], rotation[None]),
+            walk=(translation, to_child @ rotation @ to_child.T),
+            prior=self._known(columns.shape[2]),
+        )
+
+    def _known(self, n_columns: int) -> FloatArray:
+        """Products (p + 1, p + 1) that say that no lever arm is kilometres long and no clock much
+        too fast.
+        """
+        known = np.zeros((n_columns, n_columns))
+        values, at = np.r_[self.lever_arm, self.parameters[CLOCK]], [0, 1, 2, 2 + len(self.columns)]
+        weights = np.r_[np.full(3, _LONG_M), _CLOCK_SIGMA] ** -2.0
+        known[at, at] = weights
+        known[at, -1] = known[-1, at] = weights * values
+        known[-1, -1] = weights @ values**2
+        return known
 
     def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
         """State space of as many poses as noise levels need."""
@@ -336,9 +267,7 @@ class _State:
 
     def posterior(self) -> Posterior:
         """Of all poses."""
-        space = self.space()
-        known = _known(self.lever_arm, space.columns.shape[2])
-        return Posterior(replace(space, prior=known), self.levels)
+        return Posterior(self.space(), self.levels)
 
     def fitted(self) -> _State:
         """With noise levels fitted, for a drift that grows with time or with the path, whichever is
@@ -389,8 +318,7 @@ class _State:
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
         worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
-        streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
-        return replace(self, streams=streams, worse=worse)
+        return replace(self, streams=replace(self.streams, Ts_cw_c=Ts_cw_c), worse=worse)
 
     def moved(self, posterior: Posterior) -> _State:
         """After a step, with the orientations that the positions ask for."""
@@ -409,8 +337,7 @@ class _State:
 
 def _worse(squares: FloatArray, least: float = LOWEST_VARIANCE) -> BoolArray:
     """Which positions (N,) are clearly worse than the best quarter, by the squared errors (N,) of
-    those around. Errors no larger than the least square, that of the odometry's drift from one
-    position to the next, are never worse.
+    those around, and than the least square: the odometry's drift from one position to the next.
     """
     window = np.ones(min(_NEIGHBOURS, len(squares)))
     around = np.convolve(squares, window, mode="same")
@@ -419,28 +346,9 @@ def _worse(squares: FloatArray, least: float = LOWEST_VARIANCE) -> BoolArray:
     return np.asarray(around > _WORSE * usual * counts)
 
 
-def _known(lever_arm: FloatArray, n_columns: int) -> FloatArray:
-    """Products (p + 1, p + 1) that say that no lever arm is kilometres long."""
-    added = np.zeros((n_columns, n_columns))
-    added[:3, :3] = np.eye(3) / _LONG_M**2
-    added[:3, -1] = added[-1, :3] = lever_arm / _LONG_M**2
-    added[-1, -1] = lever_arm @ added[:3, -1]
-    return added
-
-
-def _of_positions(space: StateSpace, X: FloatArray, boost: FloatArray) -> StateSpace:
-    """A state space without a rotation to estimate, with orientations that may be anything, and
-    with a walk that is the odometry's.
-    """
-    to_child = se3.adjoint(se3.inverse(X))
-    translation, rotation = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
-    return replace(
-        space,
-        relative=space.relative * boost,
-        columns=np.delete(space.columns, [3, 4, 5], axis=2),
-        white=(translation[None], rotation[None]),
-        walk=(translation, to_child @ rotation @ to_child.T),
-    )
+def _by_motion(linearisation: Linearisation, moving: FloatArray) -> FloatArray:
+    """Column (n, 6, 1) of an error that moves poses by ``exp(-moving)``, (N, 6)."""
+    return (turned(linearisation.adjoints, moving[:-1]) - moving[1:])[:, :, None]
 
 
 def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
@@ -463,15 +371,24 @@ def _solution(
     n_evidence = len(state.boost) - int(state.left_out.sum())
     misfit = normal.cost / max(3 * n_evidence - 3 - len(state.columns), 1)
     covariance = max(misfit, 1.0) * normal.covariance
-    sigmas = np.zeros(N_SYSTEMATIC)
+    sigmas = np.zeros(CLOCK + 1)
     sigmas[state.columns] = np.sqrt(np.diag(covariance)[3:])
     parts = part_products(posterior)
+    common, by_response, response = _systematic(state, max(misfit, 1.0))
+    # Errors that last for a share of the recording do so for all of it, too: X takes their mean.
+    lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
+    known = posterior.space.prior
+    assert known is not None
     return LeverArmSolution(
         lever_arm=state.lever_arm + normal.step[:3],
         covariance=covariance[:3, :3],
-        **_by_common_errors(state),
+        beyond=by_response + lasting * np.eye(3),
+        common=common,
+        response=response,
         time_offset_s=-float(state.parameters[TIME]),
         time_offset_sigma_s=float(sigmas[TIME]),
+        clock_rate=-float(state.parameters[CLOCK]),
+        clock_rate_sigma=float(sigmas[CLOCK]),
         scale=first_scale * (1.0 + float(state.parameters[SCALE])),
         scale_sigma=first_scale * float(sigmas[SCALE]),
         model=state.model,
@@ -479,21 +396,61 @@ def _solution(
         worse=state.worse,
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
-        part_products=parts + _known(state.lever_arm, parts.shape[1]) / len(parts),
+        part_products=parts + known / len(parts),
         misfit=misfit,
         objective=0.5 * (posterior.precision.log_determinant + normal.cost),
         converged=converged,
     )
 
 
-def _by_common_errors(state: _State) -> dict[str, FloatArray]:
-    """Derivatives of the lever arm by errors of the odometry that are the same all the time."""
-    motions, steps = state.streams.motions_p, state.streams.steps[0]
-    metres = np.linalg.norm(steps.cleaned(np.inf), axis=1)
+def _systematic(state: _State, misfit: float) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
+    """Covariance (3, 3) of the lever arm by a scale and a direction of the odometry that are the
+    same all the time; that by what the positions answer to acceleration; and this, with its sigma.
+
+    The answer is not moved by them, but what it would move by is in the covariances, as is what the
+    data leave open: on recorded drones even the sign of the response depends on the frequency.
+    """
+    streams, found = state.streams, state.linearised()
+    metres = np.linalg.norm(streams.steps[0].cleaned(np.inf), axis=1)
     sideways = np.zeros((len(metres), 6, 3))
-    sideways[:, :3] = -np.swapaxes(motions[:, :3, :3], 1, 2) * metres[:, None, None]
-    space = state.space(columns=[SCALE])
-    columns = np.insert(space.columns, [4], sideways, axis=2)
-    products = Posterior(replace(space, columns=columns), state.levels).products
-    by: FloatArray = -np.linalg.pinv(products[:3, :3], hermitian=True) @ products[:3, 3:-1]
-    return {"by_scale": by[:, 0], "by_direction": by[:, 1:]}
+    sideways[:, :3] = -np.swapaxes(streams.motions_p[:, :3, :3], 1, 2) * metres[:, None, None]
+    response = _by_motion(found, _accelerations(streams, state.X))
+    by_scale = found.by_scale[:, :, :0] if SCALE in state.columns else found.by_scale
+    columns = np.concatenate([response, sideways, by_scale], axis=2)
+    space = state.space(linearisation=found.with_columns(columns))
+    products = Posterior(space, state.levels).products
+    known, rest = slice(3 + len(state.columns)), slice(3 + len(state.columns), None)
+    by = -np.linalg.pinv(products[known, known], hermitian=True) @ products[known, rest]
+    # Of what is left out, and last of the residuals, after a step of what is in the model.
+    left = (products[rest, rest] + products[rest, known] @ by) / misfit
+    sigmas = np.r_[_RESPONSE_SIGMA, np.full(3, _DIRECTION_SIGMA), _SCALE_SIGMA][: len(left) - 1]
+    spread = np.linalg.inv(left[:-1, :-1] + np.diag(sigmas**-2.0))
+    values = -spread @ left[:-1, -1]
+    shifts = by[:3, :-1]
+    squares = spread + np.outer(values, values)
+    by_response = squares[0, 0] * np.outer(shifts[:, 0], shifts[:, 0])
+    common = shifts[:, 1:] @ squares[1:, 1:] @ shifts[:, 1:].T
+    return common, by_response, (-float(values[0]), float(np.sqrt(spread[0, 0])))
+
+
+def _accelerations(streams: Streams, X: FloatArray) -> FloatArray:
+    """Accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes, from steps on
+    either side of each pose, whose own noise is not in them; zero beside gaps and at the ends.
+    """
+    path, stamps_s = (streams.Ts_pw_p @ X)[:, :3, 3], streams.stamps_s
+    found = np.zeros((len(path), 6))
+    interval_s = float(np.median(np.diff(stamps_s)))
+    span = max(round(_ACCELERATING_S / interval_s), 1)
+    at = np.arange(2 * span, len(path) - 2 * span)
+    times_s, places = (
+        np.stack([each[at + step * span] for step in (-2, -1, 1, 2)]) for each in (stamps_s, path)
+    )
+    before, after = (
+        (places[k + 1] - places[k]) / (times_s[k + 1] - times_s[k])[:, None] for k in (0, 2)
+    )
+    apart_s = 0.5 * (times_s[3] + times_s[2] - times_s[1] - times_s[0])
+    is_near = apart_s < _NEAR * 3 * span * interval_s
+    back = np.swapaxes(streams.Ts_pw_p[at, :3, :3], 1, 2)
+    of_body = turned(back, (after - before) / apart_s[:, None])
+    found[at, :3] = np.where(is_near[:, None], of_body, 0.0)
+    return found

@@ -37,6 +37,9 @@ _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 # Stamps that jitter by less are not worth a sentence (s).
 _NOTABLE_JITTER_S = 1e-4
 
+# An answer to acceleration is, beyond so many standard deviations.
+_PLAIN = 3.0
+
 
 @dataclass(frozen=True)
 class NoiseLevels:
@@ -329,9 +332,15 @@ class LeverArmSolution:
         m, in the axes of the sensor with poses.
     covariance : (3, 3) array
         Under the model, misfit accounted for.
-    by_scale, by_direction : (3,) and (3, 3) arrays
-        Derivatives of the lever arm by the scale of the odometry, and by a sideways error of it
-        per metre travelled.
+    beyond : (3, 3) array
+        Covariance by what is not in the model and differs from recording to recording: what the
+        positions answer to acceleration, and errors that last.
+    common : (3, 3) array
+        Covariance by a scale and a direction of the odometry that are the same all the time.
+    response : (float, float)
+        What positions less odometry are per m/s^2 of acceleration, s^2, and its sigma.
+    clock_rate, clock_rate_sigma : float
+        By how much the time offset grows each second.
     time_offset_s, time_offset_sigma_s, scale, scale_sigma : float
         As of an AdaptiveSolution.
     model, levels
@@ -347,8 +356,11 @@ class LeverArmSolution:
 
     lever_arm: FloatArray
     covariance: FloatArray
-    by_scale: FloatArray
-    by_direction: FloatArray
+    beyond: FloatArray
+    common: FloatArray
+    response: tuple[float, float]
+    clock_rate: float
+    clock_rate_sigma: float
     time_offset_s: float
     time_offset_sigma_s: float
     scale: float
@@ -382,6 +394,12 @@ class LeverArmSolution:
         ]
         if worse:
             said.append(f"{worse:.0%} of the positions are far less precise, and are left out")
+        response, sigma = 1e3 * np.array(self.response)
+        if abs(response) > _PLAIN * sigma:
+            said.append(
+                f"the positions answer to acceleration by {response:.1f} +/- {sigma:.1g} mm per "
+                "m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
+            )
         for what, found in (("jumps", self.jumps), ("positions wrong by themselves", self.spikes)):
             if found.any():
                 said.append(f"{int(found.sum())} {what}")

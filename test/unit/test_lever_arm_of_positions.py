@@ -101,6 +101,35 @@ class TestLeverArm:
         assert found.time_offset_s == pytest.approx(7.31, abs=0.01)
         assert np.abs(distances(found)).max() < 4.0
 
+    def test_the_rate_of_a_clock_is_found_with_its_sigma(self):
+        parent, child = recorded(noise_m=0.002, poses=swaying_poses(1500, seed=4))
+        slow = child.shifted(0.02, -2e-4, int(child.stamps_ns[750]))
+        rate = hec.calibrate(parent, slow).clock_rate
+        assert abs(rate.ppm - 200.0) < 4.0 * rate.sigma_ppm
+        assert rate.sigma_ppm < 40.0
+
+    def test_a_drone_whose_positions_are_smoothed_knows_its_height_no_better(self):
+        """It tilts to accelerate, so that 5 mm per m/s^2 look like 49 mm of height."""
+        times_s = STEP_NS * 1e-9 * np.arange(1200)
+        random = np.random.default_rng(3)
+        away_rad = 0.6 * times_s[:, None] * [1.0, 1.37, 0.0]
+        path = 4.0 * np.sin(away_rad) * [1.0, 1.0, 0.0]
+        pulls = -np.square([0.6, 0.6 * 1.37, 0.0]) * path
+        tilt = np.stack([-pulls[:, 1], pulls[:, 0], 3.0 * np.sin(0.1 * times_s)], axis=1) / 9.81
+        truth = se3.from_rotation_translation(se3.rotation_exp(tilt), path)
+        stamps_ns = START_NS + STEP_NS * np.arange(len(truth))
+        antenna = antenna_of(truth, 0.0)
+        bent = np.gradient(np.gradient(antenna, 0.1, axis=0), 0.1, axis=0)
+        positions = antenna + 0.005 * bent + 0.003 * random.standard_normal(antenna.shape)
+        noise = 0.001 * random.standard_normal((len(truth), 6))
+        found = hec.calibrate(
+            Trajectory(stamps_ns, truth @ se3.exp(noise), "lidar"),
+            Trajectory.from_positions(stamps_ns, positions, "antenna"),
+        )
+        assert abs(found.T_parent_child[2, 3] - LEVER_ARM[2]) > 0.02
+        assert np.abs(distances(found)).max() < 3.0
+        assert any("answer to acceleration" in text for text in found.noise.in_words)
+
     def test_a_scale_is_found_if_asked_for(self, streams):
         parent, child = streams
         small = Trajectory(parent.stamps_ns, parent.scaled(0.5).poses, "camera")

@@ -1,0 +1,392 @@
+"""From streams of which one gives only a part of its poses to a calibration.
+
+Positions beside poses: the lever arm. By convention the sensor that measures positions has the axes
+of the other one; the rotation is out of reach. Rotations, or angular rates: the rotation, and the
+bias of a gyroscope. The adaptive estimator sees trajectories that never leave their origins: what
+it finds for the rotation does not depend on the rest. Of both: the time offset.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hand_eye_calib.alignment.scale import horizontal_factors
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.assessment.covariance import assess_lever_arm, assess_rotation
+from hand_eye_calib.assessment.prior import Fused, fuse
+from hand_eye_calib.checks.check import in_other_units, unit_of
+from hand_eye_calib.checks.findings import Finding, finding
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls import estimator as adaptive_estimator
+from hand_eye_calib.gls import positions as of_positions
+from hand_eye_calib.gls.increments import (
+    RATE,
+    SYSTEMATIC_OF_RATES,
+    SYSTEMATIC_OF_ROTATIONS,
+    without_rate_bias,
+)
+from hand_eye_calib.gls.solution import AdaptiveSolution, LeverArmSolution
+from hand_eye_calib.gls.windows import unexplained_share
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
+from hand_eye_calib.results.records import ClockRate, RateBias
+
+# Two streams of which more than this share of the path, or of the rotation, stays unexplained are
+# not of one body. Of one body it is 0.05 of the path at most, of two 0.5 and more.
+_UNRELATED_PATH, _EXPLAINED_PATH, _UNRELATED_ROTATION = 0.3, 0.05, 0.5
+
+# Factors of x and y differ from 1 by more than this if latitude and longitude are wrong, and leave
+# at most this share of what was unexplained.
+_FACTOR_OFF, _MENDED = 0.03, 0.3
+
+# Poses between the ends of the motions that tell how much of the rotation is explained; the
+# quantile of their angles above which they count.
+_SPAN, _TURNING = 10, 0.75
+
+# Rates in another unit are off by this factor, within a share of it.
+_DEGREES, _UNIT_WITHIN = float(np.degrees(1.0)), 0.2
+
+# Where the frame of an odometry is, and where an antenna or a prism measures, is known to this (m)
+# along each axis.
+_POINT_M = 0.005
+
+_TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
+
+
+def _calibration(
+    solution: AdaptiveSolution | LeverArmSolution,
+    fused: Fused,
+    within_reach: slice,
+    residuals: Residuals,
+    pose_pairs: PosePairs,
+    config: CalibratorConfig,
+) -> Calibration:
+    """What both have: a result without frame names, time offset and scale."""
+    verdicts = [dof.verdict for dof in fused.assessment.observability[within_reach]]
+    status = SolveStatus.OK
+    if not solution.converged:
+        status = SolveStatus.NOT_CONVERGED
+    elif fused.contradictions:
+        status = SolveStatus.CONTRADICTED
+    elif DofVerdict.UNOBSERVABLE in verdicts:
+        status = SolveStatus.UNOBSERVABLE
+    return Calibration(
+        T_parent_child=fused.T_parent_child,
+        covariance=fused.assessment.cov_parent_child_in_child,
+        status=status,
+        observability=fused.assessment.observability,
+        objective=solution.objective,
+        method="adaptive",
+        reference="increments",
+        backend="fast",
+        n_poses=len(pose_pairs),
+        n_pairs=len(residuals),
+        n_inliers=int(residuals.is_inlier.sum()),
+        time_offset_sigma_s=solution.time_offset_sigma_s,
+        noise=solution.describe(pose_pairs.stamps_ns),
+        contradictions=fused.contradictions,
+        **config.target_fields(),
+        stamp_ns=int(pose_pairs.stamps_ns[-1]),
+        motion_residuals=residuals,
+    )
+
+
+def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
+    """Solve and assess synchronised poses and positions.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        On one clock. Of the sensor that measures positions, orientations are not looked at.
+    config : CalibratorConfig
+        With a time offset in seconds, which the poses already have.
+
+    Returns
+    -------
+    Calibration
+        Without frame names. Its rotation is the identity, and unknown.
+    """
+    stamps_ns, is_child = pose_pairs.stamps_ns, config.child_measures == "positions"
+    given = 1.0 if isinstance(config.scale, str) else config.scale
+    of_child = pose_pairs.Ts_cw_c.copy()
+    of_child[:, :3, 3] *= given
+    poses, measured = pose_pairs.Ts_pw_p, of_child
+    if not is_child:
+        poses, measured = measured, poses
+    positions = measured[:, :3, 3]
+    solution = _lever_arm(stamps_ns, poses, positions, config.scale in ("auto", "estimate"))
+    sign = 1.0 if is_child else -1.0
+    T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
+    fused = fuse(T, assess_lever_arm(poses, solution), config.prior())
+    axes = fused.assessment.observability[:3]
+    is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
+    findings = _of_path(solution, is_known, stamps_ns, poses, positions, is_child)
+    weights = ~(solution.jumps | solution.spikes[1:])
+    residuals = _steps(solution, poses, positions, pose_pairs, weights)
+    floor = np.zeros((6, 6))
+    floor[:3, :3] = solution.common + 2.0 * _POINT_M**2 * np.eye(3)
+    scale = solution.scale if is_child else 1.0 / solution.scale
+    # What does not explain the positions has no time offset either.
+    offset_s = 0.0 if findings else sign * solution.time_offset_s
+    middle_ns = int(stamps_ns[0] + (stamps_ns[-1] - stamps_ns[0]) // 2)
+    return replace(
+        _calibration(solution, fused, _TRANSLATION, residuals, pose_pairs, config),
+        measured="positions",
+        T_method=T,
+        floor=floor,
+        time_offset_s=float(config.time_offset) + offset_s,
+        clock_rate=ClockRate(
+            ppm=1e6 * sign * solution.clock_rate,
+            sigma_ppm=1e6 * solution.clock_rate_sigma,
+            at_ns=middle_ns - round((float(config.time_offset) + offset_s) * 1e9),
+            is_used=True,
+        ),
+        scale=given * scale,
+        scale_sigma=solution.scale_sigma * scale**2,
+        findings=tuple(findings),
+    )
+
+
+def _lever_arm(
+    stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, with_scale: bool
+) -> LeverArmSolution:
+    try:
+        return of_positions.solve(stamps_ns, poses, positions, with_scale)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "no lever arm explains the positions: they may jump, or be of another body; look at "
+            "both paths"
+        ) from None
+
+
+def _steps(
+    solution: LeverArmSolution,
+    poses: FloatArray,
+    positions: FloatArray,
+    pose_pairs: PosePairs,
+    weights: BoolArray,
+) -> Residuals:
+    """Of the steps from each position to the next, along the axes of the sensor with poses."""
+    steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    excess = lengths - np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
+    return Residuals(
+        translation=(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ along[:, :, None])[:, :, 0],
+        rotation=np.zeros((len(steps), 3)),
+        weights=weights.astype(float),
+        start_ns=pose_pairs.stamps_ns[:-1],
+        end_ns=pose_pairs.stamps_ns[1:],
+    )
+
+
+def _of_path(
+    solution: LeverArmSolution,
+    is_known: bool,
+    stamps_ns: IntArray,
+    poses: FloatArray,
+    positions: FloatArray,
+    is_child: bool,
+) -> list[Finding]:
+    """A finding if the path of the positions is not that of the odometry, or in other units."""
+    share = unexplained_share(poses, positions, solution.lever_arm, solution.scale)
+    if share < _EXPLAINED_PATH:
+        return []
+    if found := _coordinates(share, stamps_ns, poses, positions, "child" if is_child else "parent"):
+        return [found]
+    if is_known and share < _UNRELATED_PATH:
+        return []
+    found = finding(
+        "unrelated_parts",
+        share=min(share, 1.0),
+        other="odometry",
+        part="motion of the positions",
+        units="the units, the scale",
+    )
+    try:
+        scaled = _lever_arm(stamps_ns, poses, positions, with_scale=True)
+    except InputError:
+        return [found]
+    scale = scaled.scale if is_child else 1.0 / scaled.scale
+    explains = unexplained_share(poses, positions, scaled.lever_arm, scaled.scale) < _UNRELATED_PATH
+    if explains and (in_unit := unit_of(scale)):
+        factor, unit = in_unit
+        found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale), unit, factor)
+    return [found]
+
+
+def _coordinates(
+    share: float, stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, stream: str
+) -> Finding | None:
+    """What is wrong with east and north, if that explains the path: of which the given share is
+    unexplained as it is.
+    """
+
+    def solved(mended: FloatArray) -> tuple[float, FloatArray]:
+        """Unexplained share of the path of positions, and the lever arm."""
+        try:
+            solution = _lever_arm(stamps_ns, poses, mended, with_scale=False)
+        except InputError:
+            return 1.0, np.zeros(3)
+        return unexplained_share(
+            poses, mended, solution.lever_arm, solution.scale
+        ), solution.lever_arm
+
+    def told(key: str, factors: Sequence[float], left: float) -> Finding:
+        cosines = min(1.0 / factors[0], 1.0), min(factors[1], 1.0)
+        longitude, latitude = np.degrees(np.arccos(cosines))
+        return finding(
+            key,
+            stream,
+            factor_x=float(factors[0]),
+            factor_y=float(factors[1]),
+            latitude=latitude,
+            longitude=longitude,
+            unexplained_share=share,
+            unexplained_share_mended=left,
+        )
+
+    lever_arm_m, found = np.zeros(3), None
+    for _ in range(2):  # the second time with the lever arm
+        factors = horizontal_factors(poses[:, :3, :3] @ lever_arm_m + poses[:, :3, 3], positions)
+        if factors is None:
+            break
+        east, north = factors
+        off = np.abs(factors - 1.0) > _FACTOR_OFF
+        if east > 1.0 - _FACTOR_OFF and north < 1.0 + _FACTOR_OFF and off.any():
+            key, order = "swapped_coordinates", [1, 0, 2]
+        elif east < 1.0 and off.tolist() == [True, False]:
+            key, order = "longitude_scale", [0, 1, 2]
+        else:
+            break
+        left, lever_arm_m = solved((positions * [east, north, 1.0])[:, order])
+        found = told(key, (east, north), left) if left < _MENDED * share else None
+    if found:
+        return found
+    left, _ = solved(positions[:, [1, 0, 2]])
+    return told("mirrored_positions", (1.0, 1.0), left) if left < _MENDED * share else None
+
+
+def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
+    """Solve and assess synchronised rotations.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        On one clock. Positions are not looked at.
+    config : CalibratorConfig
+        With a time offset in seconds, which the poses already have.
+
+    Returns
+    -------
+    Calibration
+        Without frame names. Its translation is zero and unknown.
+
+    Raises
+    ------
+    ConfigError
+        If a scale is given or to be estimated: rotations have none.
+    """
+    if config.scale not in ("none", "auto"):
+        config.require_poses(f"scale {config.scale}")
+    Ts_pw_p, as_read = (
+        se3.from_rotation_translation(Ts[:, :3, :3], np.zeros((len(Ts), 3)))
+        for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
+    )
+    has_rates = "rates" in (config.parent_measures, config.child_measures)
+    solution, Ts_cw_c = _rotation(pose_pairs.stamps_ns, Ts_pw_p, as_read, has_rates)
+    findings = _of_rotation(Ts_pw_p, Ts_cw_c, solution)
+    if findings and has_rates:
+        findings = _rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
+    fused = fuse(solution.T_parent_child, assess_rotation(Ts_pw_p, solution), config.prior())
+    pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
+    translation, rotation = pairs.residuals(solution.T_parent_child)
+    residuals = Residuals(
+        translation=translation,
+        rotation=rotation,
+        weights=(~solution.jumps).astype(float),
+        start_ns=pose_pairs.stamps_ns[pairs.i],
+        end_ns=pose_pairs.stamps_ns[pairs.j],
+    )
+    return replace(
+        _calibration(solution, fused, _ROTATION, residuals, pose_pairs, config),
+        measured="rotations",
+        T_method=solution.T_parent_child,
+        time_offset_s=float(config.time_offset) + solution.time_offset_s,
+        rate_bias=_rate_bias(solution, config) if has_rates else None,
+        findings=findings,
+    )
+
+
+def _rotation(
+    stamps_ns: IntArray, Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, has_rates: bool
+) -> tuple[AdaptiveSolution, FloatArray]:
+    """The solution, and the child's poses freed of the bias of the rates.
+
+    The noise is fitted to increments of up to some seconds. What a bias does to these is linear
+    only for what is left of it after a first solve.
+    """
+    if not has_rates:
+        solution = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_ROTATIONS)
+        return solution, Ts_cw_c
+    first = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES, quick=True)
+    Ts_cw_c = without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
+    solution = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES)
+    parameters = solution.parameters.copy()
+    parameters[RATE] += first.parameters[RATE]
+    return replace(solution, parameters=parameters), Ts_cw_c
+
+
+def _rate_bias(solution: AdaptiveSolution, config: CalibratorConfig) -> RateBias:
+    """The bias of the rates, in the axes of the sensor that has it.
+
+    Of two gyroscopes only the difference of the biases shows, the child's less the parent's.
+    """
+    bias, sigmas = solution.rate_bias
+    of = "child" if config.parent_measures != "rates" else "child less parent, child's axes"
+    if config.child_measures != "rates":
+        rotation = solution.T_parent_child[:3, :3]
+        of, bias = "parent", -rotation @ bias
+        sigmas = np.sqrt(np.diag(rotation @ np.diag(sigmas**2) @ rotation.T))
+    return RateBias(of=of, rad_per_s=tuple(bias.tolist()), sigma=tuple(sigmas.tolist()))
+
+
+def _of_rotation(
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, solution: AdaptiveSolution
+) -> tuple[Finding, ...]:
+    """A finding if the rotations of one stream do not explain those of the other."""
+    span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
+    pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
+    left = np.linalg.norm(pairs.residuals(solution.T_parent_child)[1], axis=1)
+    turned = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
+    most = turned >= np.quantile(turned, _TURNING)  # a sensor may stand still for long
+    share = float(np.median(left[most]) / max(float(np.median(turned[most])), 1e-12))
+    if share < _UNRELATED_ROTATION:
+        return ()
+    found = finding(
+        "unrelated_parts",
+        share=min(share, 1.0),
+        part="rotation of one sensor",
+        other="other",
+        units="the unit of the rates",
+    )
+    return (found,)
+
+
+def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, ...]:
+    """A finding if the rates of one stream are in degrees and those of the other in radians."""
+    of_parent, of_child = (
+        max(float(np.quantile(se3.rotation_angle(Ts[:, :3, :3]), _TURNING)), 1e-12)
+        for Ts in (steps.Ts_parenti_parentj, steps.Ts_childi_childj)
+    )
+    stream, ratio = "child", of_child / of_parent
+    if config.child_measures != "rates":
+        stream, ratio = "parent", of_parent / of_child
+    if min(abs(ratio / _DEGREES - 1.0), abs(ratio * _DEGREES - 1.0)) >= _UNIT_WITHIN:
+        return ()
+    unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
+    return (finding("rate_unit", stream, ratio=ratio, unit=unit, read_as=read_as),)
