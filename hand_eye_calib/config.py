@@ -503,6 +503,11 @@ class NodeConfig(OptionSet):
         choices=("new", "resume", "off"),
         read_only=True,
     )
+    enabled: bool = option(
+        True,
+        "Accept poses from the start; false waits for ~/set_enabled.",
+        read_only=True,
+    )
     report: bool = option(
         True,
         "Also write report.html whenever the result is saved, in a process of its own that goes on "

@@ -6,6 +6,7 @@ Every parameter of the node is an argument of the same name; one that is not giv
 parameter file.
 """
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -15,7 +16,14 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.config import (
+    CalibratorConfig,
+    NodeConfig,
+    check_value,
+    option_name,
+    other_names,
+)
+from hand_eye_calib.errors import ConfigError
 
 PARAMETERS = {
     option_name(field): field
@@ -26,10 +34,13 @@ PARAMETERS = {
 # Beside this folder, in the repository as in an installed package.
 CONFIG_FILE = Path(__file__).parents[1] / "config" / "calibrator.yaml"
 
+# Topics that may be other ones: argument to the node's own name.
+REMAPPED = {"parent_topic": "parent_odom", "child_topic": "child_odom"}
+REMAPPED |= {f"{name}_topic": f"{name}_odom" for name in other_names()}
+REMAPPED |= {"tf_topic": "/tf", "tf_static_topic": "/tf_static"}
+
 # Name, default and description of the arguments that are not parameters of the node's own.
-ARGUMENTS = {
-    "parent_topic": ("parent_odom", "Topic with the poses of the parent sensor."),
-    "child_topic": ("child_odom", "Topic with the poses of the child sensor."),
+ARGUMENTS = {name: (topic, f"Topic in place of {topic}.") for name, topic in REMAPPED.items()} | {
     "config_file": (str(CONFIG_FILE), "File with the node's parameters."),
     "name": ("calibrator", "Name of the node."),
     "namespace": ("", "Namespace of the node; relative topics are looked for in it."),
@@ -39,9 +50,22 @@ ARGUMENTS = {
 }
 
 
-def value_type(field: dataclasses.Field) -> type | None:
-    """Type of a parameter; None for one that takes a word or a number."""
-    return None if field.metadata["words"] else type(field.default)
+def value_of(text: str, field: dataclasses.Field) -> bool | int | float | str:
+    """Value of a parameter as it is typed.
+
+    Raises
+    ------
+    ConfigError
+        If it is not allowed.
+    """
+    kind = float if field.metadata["words"] else type(field.default)
+    value: bool | int | float | str = text
+    if kind is bool:
+        value = {"true": True, "false": False}.get(text.lower(), text)
+    elif kind is not str:
+        with contextlib.suppress(ValueError):
+            value = kind(text)
+    return check_value(field, value)
 
 
 def describe(field: dataclasses.Field) -> str:
@@ -65,14 +89,31 @@ def logger_name(context: LaunchContext) -> str:
     return ".".join([*words, given(context, "name")])
 
 
+def is_true(context: LaunchContext, name: str) -> bool:
+    """Whether an argument is true.
+
+    Raises
+    ------
+    ConfigError
+        If it is neither true nor false.
+    """
+    text = given(context, name).lower()
+    if text not in ("true", "false"):
+        raise ConfigError(f"{name} must be true or false; got '{text}'")
+    return text == "true"
+
+
 def calibrator(context: LaunchContext) -> list[Node]:
     """The node, with the parameters that were given."""
-    types = {name: value_type(field) for name, field in PARAMETERS.items()} | {"use_sim_time": bool}
-    parameters = {
-        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
-        for name, kind in types.items()
-        if given(context, name)
-    }
+    parameters = {}
+    for name, field in PARAMETERS.items():
+        if text := given(context, name):
+            value = value_of(text, field)
+            is_text = isinstance(value, str)  # which launch would read as YAML
+            as_it_is = ParameterValue(LaunchConfiguration(name), value_type=str)
+            parameters[name] = as_it_is if is_text else value
+    if given(context, "use_sim_time"):
+        parameters["use_sim_time"] = is_true(context, "use_sim_time")
     level = given(context, "log_level")
     return [
         Node(
@@ -81,12 +122,9 @@ def calibrator(context: LaunchContext) -> list[Node]:
             name=LaunchConfiguration("name"),
             namespace=LaunchConfiguration("namespace"),
             parameters=[LaunchConfiguration("config_file"), parameters],
-            remappings=[
-                ("parent_odom", LaunchConfiguration("parent_topic")),
-                ("child_odom", LaunchConfiguration("child_topic")),
-            ],
+            remappings=[(old, LaunchConfiguration(name)) for name, old in REMAPPED.items()],
             ros_arguments=["--log-level", f"{logger_name(context)}:={level}"] if level else [],
-            respawn=given(context, "respawn").lower() == "true",
+            respawn=is_true(context, "respawn"),
             output="screen",
         )
     ]

@@ -1,11 +1,36 @@
-"""``calibrator``: the ROS 2 node."""
+"""``calibrator``: the node."""
 
 import argparse
+import dataclasses
+import json
+import textwrap
+from collections.abc import Iterator
 
-EXAMPLES = """\
+from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+
+INTERFACE = """\
 examples:
   hand_eye_calib calibrator --ros-args -r parent_odom:=/lidar/odometry -r child_odom:=/camera/odom
-  hand_eye_calib calibrator --ros-args --params-file calibrator.yaml"""
+  hand_eye_calib calibrator --ros-args --params-file calibrator.yaml
+
+subscribed topics (-r NAME:=TOPIC):
+  parent_odom, child_odom        poses of both sensors: Odometry, PoseStamped, TransformStamped ...
+  child2_odom, child3_odom, ...  poses of further child sensors (other_children)
+  /tf, /tf_static                with parent_tf, child_tf, base_frame, installed:=tf, publish_tf
+
+published topics:
+  ~/extrinsic                    geometry_msgs/TransformStamped: pose of the child in the parent
+  ~/extrinsic_with_covariance    geometry_msgs/PoseWithCovarianceStamped
+  ~/progress                     std_msgs/String: the whole state as JSON
+  /diagnostics                   diagnostic_msgs/DiagnosticArray
+  /tf_static                     with publish_tf, once the goal is reached
+
+services:
+  ~/solve, ~/save, ~/reset       std_srvs/Trigger
+  ~/set_enabled                  std_srvs/SetBool: stop or resume accepting poses
+
+parameters (-p NAME:=VALUE):
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,8 +39,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "hand_eye_calib calibrator [--ros-args -p NAME:=VALUE ... --params-file FILE "
         "-r FROM:=TO ...]"
     )
-    parser.epilog = EXAMPLES
+    parser.epilog = (INTERFACE + "\n".join(_parameters())).replace("%", "%%")
     parser.set_defaults(passed_on=())
+
+
+def _parameters() -> Iterator[str]:
+    for field in (*dataclasses.fields(CalibratorConfig), *dataclasses.fields(NodeConfig)):
+        value = " ".join(filter(None, (json.dumps(field.default), field.metadata["unit"])))
+        yield f"  {option_name(field)} ({value})"
+        yield textwrap.indent(textwrap.fill(field.metadata["doc"], 90), 6 * " ")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -182,9 +182,14 @@ def write_session() -> None:
             pickle.dump(_session_rig(directory / "rig", result), sys.stdout.buffer)
         if result.with_report:
             from hand_eye_calib.engine.run import review
+            from hand_eye_calib.io.results import save_result
 
             found = review(result.calibration, result.snapshot, may_solve=False)
             calibration, evidence = with_cross_check(found.calibration, result.snapshot)
+            # The file and the report beside it say the same.
+            save_result(calibration, directory, result.inputs)
+            if calibration.verdict is not result.calibration.verdict:
+                note(f"with cross-checks by other methods: {calibration.headline}")
             write_report(directory, calibration, evidence, result.snapshot.config, result.inputs)
     except HandEyeCalibError as error:
         sys.exit(fail(error, 1))

@@ -34,6 +34,8 @@ _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
 _NS_PER_S = 1_000_000_000
 _LARGEST_STAMP_NS = int(np.iinfo(np.int64).max)
+# What comments note of a stream.
+_KINDS = {_BATCH: int, "options": dict, "given": list, "topic": str, "frame": str, "origin": list}
 
 #: What is known of each stream: plain values, such as topic, frame, origin and options.
 About = Mapping[str, Mapping[str, Any]]
@@ -69,31 +71,30 @@ class JournalWriter:
     ) -> None:
         self._directory = Path(directory)
         self._directory.mkdir(parents=True, exist_ok=True)
-        self._files: dict[str, BinaryIO] = {}
-        self._pending: dict[str, list[str]] = {stream: [] for stream in about}
-        whole_bytes = {} if resumed is None else resumed.whole_bytes
-        self._about = dict(about) | ({} if resumed is None else resumed.about)
-        poses = poses or {}
+        if self._directory.is_symlink():
+            raise OSError(f"{self._directory} is a symbolic link")
+        poses, known, whole_bytes = poses or {}, dict(about), {}
         self._parent_poses = len(poses.get("parent", ()))
         if resumed is not None:
+            known, whole_bytes = known | resumed.about, resumed.whole_bytes
             self._parent_poses = int((resumed.streams == "parent").sum())
         texts = {}
         for stream in about.keys() - whole_bytes.keys():
+            head = {"format": _FORMAT, "version": _VERSION, "stream": stream, **about[stream]}
             lines = tum_lines(poses[stream]) if stream in poses else []
-            texts[self._path(stream)] = "\n".join([_head(stream, about[stream]), *lines, ""])
+            texts[self._path(stream)] = "\n".join([_comment(head), *lines, ""])
         write_atomically(texts)
-        for stream in self._about:
-            self._pending.setdefault(stream, [])
-            self._open(stream)
+        self._about: dict[str, Mapping[str, Any]] = known
+        self._pending: dict[str, list[str]] = {stream: [] for stream in known}
+        self._files: dict[str, BinaryIO] = {}
+        for stream in known:
+            flags = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
+            descriptor = os.open(self._path(stream), flags)
+            # Unbuffered: what is flushed is with the operating system and survives this process.
+            self._files[stream] = open(descriptor, "ab", buffering=0)  # noqa: SIM115
             if stream in whole_bytes:
                 self._files[stream].truncate(whole_bytes[stream])
         self.describe(about)
-
-    def _open(self, stream: str) -> None:
-        flags = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
-        descriptor = os.open(self._path(stream), flags)
-        # Unbuffered: what is flushed is with the operating system and survives this process.
-        self._files[stream] = open(descriptor, "ab", buffering=0)  # noqa: SIM115
 
     def _path(self, stream: str) -> Path:
         return self._directory / f"{stream}.tum"
@@ -115,18 +116,14 @@ class JournalWriter:
 
     def flush(self) -> None:
         """Hand everything noted to the operating system, where it survives this process."""
-        parent = self._pending["parent"]
-        self._write("parent", parent)
-        self._parent_poses += len(parent)
-        parent.clear()
-        for stream, lines in self._pending.items():
+        for stream, lines in self._pending.items():  # the parent is first
             if lines:
-                self._write(stream, [_comment({_BATCH: self._parent_poses}), *lines])
+                batch = [] if stream == "parent" else [_comment({_BATCH: self._parent_poses})]
+                self._write(stream, [*batch, *lines])
+                self._parent_poses += len(lines) * (stream == "parent")
                 lines.clear()
 
     def _write(self, stream: str, lines: Sequence[str]) -> None:
-        if not lines:
-            return
         file, text = self._files[stream], "\n".join([*lines, ""]).encode()
         # A file that is no longer where it was would take what is written, and lose it.
         if not os.path.samestat(os.stat(self._path(stream)), os.fstat(file.fileno())):
@@ -144,10 +141,6 @@ class JournalWriter:
                 file.close()
 
 
-def _head(stream: str, known: Mapping[str, Any]) -> str:
-    return _comment({"format": _FORMAT, "version": _VERSION, "stream": stream, **known})
-
-
 def _comment(values: Mapping[str, Any]) -> str:
     return f"# {json.dumps(values)}"
 
@@ -160,8 +153,7 @@ class Journal:
     ----------
     about : dict of str to dict
         By stream: "options", "topic", "frame", "origin" and what else was noted.
-    streams : (N,) str array
-    stamps_ns : (N,) int64 array
+    streams, stamps_ns : (N,) str and int64 arrays
     poses : (N, 7) array
         x y z (m), qx qy qz qw.
     whole_bytes : dict of str to int
@@ -189,13 +181,9 @@ def read_journal(directory: str | Path) -> Journal:
     directory = Path(directory)
     if not has_session(directory):
         raise InputError(f"no session journal in {directory}")
-    found = {
-        stream: _read_file(path)
-        for stream in _STREAMS
-        if os.path.lexists(path := directory / f"{stream}.tum")
-    }
-    arrived = np.concatenate([each.arrived for each in found.values()])
-    order = np.argsort(arrived, kind="stable")
+    paths = {stream: directory / f"{stream}.tum" for stream in _STREAMS}
+    found = {stream: _read_file(path) for stream, path in paths.items() if os.path.lexists(path)}
+    order = np.argsort(np.concatenate([each.arrived for each in found.values()]), kind="stable")
     counts = [len(each.arrived) for each in found.values()]
     return Journal(
         about={stream: each.about for stream, each in found.items()},
@@ -250,49 +238,25 @@ def _read_file(path: Path) -> _File:
             f"the session journal {path} is of format version {about.get('version')}, this program "
             f"reads {_VERSION}: use the version that wrote it, or move it away to start anew"
         )
-    return _File(
-        about,
-        np.array(stamps_ns),
-        np.array(poses).reshape(-1, 7),
-        np.array(arrived),
-        whole_bytes,
-        size - whole_bytes,
-    )
+    rows = np.array(poses).reshape(-1, 7)
+    lost_bytes = size - whole_bytes
+    return _File(about, np.array(stamps_ns), rows, np.array(arrived), whole_bytes, lost_bytes)
 
 
 def _noted(line: bytes) -> dict[str, Any]:
-    """What a comment notes of the stream; nothing if it is somebody's own.
-
-    Raises
-    ------
-    ValueError
-    """
+    """What a comment notes of the stream; nothing if it is somebody's own. Raises ValueError."""
     if not line.startswith(b"# {"):
         return {}
     noted: dict[str, Any] = json.loads(line[2:])
-    kinds = {
-        _BATCH: int,
-        "options": dict,
-        "given": list,
-        "topic": str,
-        "frame": str,
-        "origin": list,
-    }
-    for name, kind in kinds.items():
-        if not isinstance(noted.get(name, kind()), kind):
-            raise ValueError(f"{name} is no {kind.__name__}")
+    if not all(isinstance(noted.get(name, kind()), kind) for name, kind in _KINDS.items()):
+        raise ValueError("a value of another kind")
     if "origin" in noted and [*map(type, noted["origin"])] != [float] * 3:
         raise ValueError("origin is no latitude, longitude and height")
     return noted
 
 
 def _pose(line: bytes) -> tuple[int, list[float]]:
-    """Stamp (ns) and pose of a line.
-
-    Raises
-    ------
-    ValueError
-    """
+    """Stamp (ns) and pose of a line. Raises ValueError."""
     stamp, *values = line.split()
     seconds, _, decimals = stamp.partition(b".")
     if len(values) != 7 or len(decimals) != 9:
@@ -310,13 +274,8 @@ def has_session(directory: str | Path) -> bool:
 
 
 def keep_aside(directory: str | Path) -> Path:
-    """Rename a journal's directory so that a new session can use it; returns where it went.
-
-    Only the last one is kept: what was kept before is removed.
-
-    Raises
-    ------
-    OSError
+    """Rename a journal's directory so that a new session can use it; returns where it went. Only
+    the last one is kept: what was kept before is removed. Raises OSError.
     """
     directory = Path(directory)
     aside = directory.with_name(f"{directory.name}.previous")

@@ -11,17 +11,23 @@ from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.engine.run import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.log import ONCE_S, NodeLog
 from hand_eye_calib.live.processes import SolvingProcess
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.solving import Answer, Checked, Failure, FailureKind, Job
 from hand_eye_calib.live.stream_checks import StreamChecks
 from hand_eye_calib.results.calibration import Calibration, SolveStatus
-from hand_eye_calib.results.records import Progress
 from hand_eye_calib.session.goal import Goal
+from hand_eye_calib.text import amount
 
 # Takes whether a solve was good, and a line about it.
 OnSolved = Callable[[bool, str], None]
+
+# The line about the result is logged so often (s), a sentence that says what to do now so often.
+_RESULT_EVERY_S, _SENTENCE_EVERY_S = 60.0, 30.0
+
+# What the motion does not determine is worth a warning after so many seconds of it.
+_ENOUGH_MOTION_S = 30.0
 
 
 class SolveCycle:
@@ -35,31 +41,24 @@ class SolveCycle:
     log : NodeLog
     wake : callable
         Called in another thread when :meth:`take_answers` has something to do.
-    complete : callable
-        Called with each usable Calibration; gives it with what there is to add.
-    publish : callable
-        Called with each usable Calibration.
+    complete, publish : callable
+        Called with each usable Calibration, which gives it with what there is to add; and with the
+        session's result whenever there is a new one.
     targets : (6,) sequence
         Standard deviations wanted, m and rad.
 
     Attributes
     ----------
-    checks : StreamChecks
-    goal : Goal
     solves : int
-        Solves of this node so far.
-    seconds : float
-        Duration of the last one.
-    is_solving : bool
+        Solves of this node so far; the last one took so many ``seconds``.
     result : Calibration or None
-        The session's result: the newest usable one; once the goal is reached, the one kept. The
+        The session's result, which is told, published, saved and broadcast: the newest usable one;
+        once the goal is reached, the one kept, whose warnings say why the newest is not. The
         newest was found at ``solved_at_s`` (steady time).
     snapshot : Snapshot or None
         The poses and options that gave that result.
-    seen : Excitation or None
-        How the sensors have moved, as of the last solve.
-    failure : Failure or None
-        Of the last solve.
+    seen, failure
+        How the sensors have moved, and what went wrong, as of the last solve.
     """
 
     def __init__(
@@ -92,6 +91,7 @@ class SolveCycle:
         self._certain: dict[str, Any] = {}
         self._told: tuple[str, ...] = ()
         self._said: tuple[object, ...] = ()
+        self._sentence_at_s = -np.inf
         self.checks.restart()
         self.goal.restart()
 
@@ -128,7 +128,7 @@ class SolveCycle:
         for note in self._process.notes():
             self._log.warning(note)
         for answer in self._process.answers():
-            good, text = self._conclude(answer)
+            good, text = self.conclude(answer)
             self.is_solving = False
             asked, self._asked_in_flight = self._asked_in_flight, []
             for on_solved in asked:
@@ -140,7 +140,7 @@ class SolveCycle:
         """Wait so long for the solve under way, take its result, and end the process."""
         self._process.stop(timeout_s)
         for answer in self._process.answers():
-            self._conclude(answer)
+            self.conclude(answer)
 
     def _start(self) -> None:
         self.is_solving = True
@@ -154,7 +154,7 @@ class SolveCycle:
         self._submitted = self._session.calibrator.snapshot()
         self._process.submit(Job(self._session.number, self._submitted, check, self._certain))
 
-    def _conclude(self, answer: Answer) -> tuple[bool, str]:
+    def conclude(self, answer: Answer) -> tuple[bool, str]:
         """Take an answer; whether it is good, and a line about it."""
         if answer.session != self._session.number:
             return False, "the session was reset during the solve: its result is dropped"
@@ -166,17 +166,21 @@ class SolveCycle:
         self._session.calibrator.adopt(answer.time_offset)
         if answer.check is not None:
             self._take_check(answer.check)
-        if answer.calibration is None:
-            assert answer.failure is not None
+        if answer.failure is not None:
             missing = what_is_missing(self.seen) if self.seen and self.seen.n_poses else ""
             self.goal.wait(missing or answer.failure.what)
             return False, self._report_failure(answer.failure)
-        return self._report_result(answer.calibration)
+        assert answer.calibration is not None
+        told = tuple(dict.fromkeys((*self._told, *answer.calibration.warnings)))
+        newest = self._with_findings(replace(answer.calibration, warnings=told))
+        if newest.status.failure:
+            return False, self._answer_with(newest)
+        return self._take(self._complete(newest))
 
     def _take_check(self, checked: Checked) -> None:
         if checked.failure is not None:
             text = f"the streams cannot be checked: {checked.failure.what}"
-            self._log.warning(text, "unchecked")
+            self._log.warning(text)
             return
         if checked.options:
             self._certain, self._told = self._certain | checked.options, checked.told
@@ -186,39 +190,55 @@ class SolveCycle:
         for line in gone:
             self._log.info(line)
 
-    def _report_result(self, calibration: Calibration) -> tuple[bool, str]:
-        warnings = dict.fromkeys((*self._told, *calibration.warnings))
-        calibration = self._with_findings(replace(calibration, warnings=tuple(warnings)))
-        if not calibration.status.failure:
-            assert self.seen is not None
-            calibration = self._complete(calibration)
-            progress = self.goal.add(calibration, self.seen, self.checks.faults())
-            self._tell(progress)
-            best = self.goal.best or calibration
-            if best is calibration:
-                assert self._submitted is not None
-                self.snapshot = with_options(self._submitted, self._certain)
-            self.result, self.solved_at_s = self._with_findings(best), time.monotonic()
-            self._publish(self.result)
-        text = describe(calibration)
-        self._log.info(text, "result", 1.0)
-        for reason in calibration.reasons:
-            if not reason.is_finding:  # which are in the log already
-                told = f"{reason.verdict.value}: {reason.sentence}; {reason.what_to_do}"
-                self._log.warning(told, (reason.rule, reason.axes))
-        for warning in calibration.warnings:
-            self._log.warning(warning, warning)
-        said = [f"{reason.sentence}; {reason.what_to_do}" for reason in calibration.reasons]
-        return calibration.status is SolveStatus.OK, "; ".join((text, *said, *calibration.warnings))
+    def _take(self, newest: Calibration) -> tuple[bool, str]:
+        """Take a usable calibration: it becomes the session's result, unless a better one that has
+        reached the goal is kept.
+        """
+        assert self.seen is not None
+        assert self._submitted is not None
+        was_done = self.goal.progress.done
+        progress = self.goal.add(newest, self.seen, self.checks.faults())
+        result = self.goal.best or newest
+        if result is newest:
+            self.snapshot = with_options(self._submitted, self._certain)
+        else:
+            result = replace(result, warnings=(*result.warnings, _why_kept(result, newest)))
+        self.result, self.solved_at_s = self._with_findings(result), time.monotonic()
+        self._publish(self.result)
+        self._tell()
+        every_s = _RESULT_EVERY_S if progress.done == was_done else 0.0
+        return self.result.status is SolveStatus.OK, self._answer_with(self.result, every_s)
 
-    def _tell(self, progress: Progress) -> None:
-        """Log the progress unless only its figures differ from what was said last."""
+    def _answer_with(self, calibration: Calibration, every_s: float = _RESULT_EVERY_S) -> str:
+        """A line about a calibration with its reasons and warnings. What is new of that is logged:
+        the reasons once the motion has had its chance, as the progress says what to do before.
+        """
+        text = describe(calibration)
+        self._log.info(text, every_s, key="result")
+        progress, seen = self.goal.progress, self.seen
+        is_late = seen is not None and seen.motion_s >= _ENOUGH_MOTION_S
+        is_final = progress.done or progress.will_not_get_there or bool(calibration.status.failure)
+        said = []
+        for reason in calibration.reasons:
+            said.append(f"{reason.sentence}; {reason.what_to_do}")
+            is_due = is_final or (is_late and reason.rule == "unobservable")
+            if is_due and not reason.is_finding:  # which are in the log already
+                self._log.warning(f"{reason.verdict.value}: {said[-1]}")
+        for warning in calibration.warnings:
+            self._log.warning(warning)
+        return "; ".join((text, *said, *calibration.warnings))
+
+    def _tell(self) -> None:
+        """Log what to do now, unless only its figures differ from what was said last."""
+        progress, now_s = self.goal.progress, time.monotonic()
         said = progress.limiting_axis, progress.done, progress.will_not_get_there
         if said == self._said or progress.is_faulty or not progress.sentence:
             return
-        self._said = said
-        write = self._log.warning if progress.will_not_get_there else self._log.info
-        write(progress.sentence)
+        is_turn = said[1:] != self._said[1:]
+        if is_turn or now_s - self._sentence_at_s >= _SENTENCE_EVERY_S:
+            self._said, self._sentence_at_s = said, now_s
+            write = self._log.warning if progress.will_not_get_there else self._log.info
+            write(progress.sentence)
 
     def _with_findings(self, calibration: Calibration) -> Calibration:
         if calibration.measured != "poses":
@@ -227,22 +247,36 @@ class SolveCycle:
 
     def _report_failure(self, failure: Failure) -> str:
         if failure.kind is FailureKind.NOT_ENOUGH_DATA:
-            self._log.info(f"cannot solve yet: {failure.what}", "not enough data")
+            self._log.info(f"cannot solve yet: {failure.what}", ONCE_S)
             return failure.what
         if failure.kind is FailureKind.UNUSABLE:
-            self._log.warning(f"cannot solve: {failure.what}", "failed")
+            self._log.warning(f"cannot solve: {failure.what}")
             return failure.what
         details = f"\n{failure.details}" if failure.details else ""
         text = f"the solve failed unexpectedly: {failure.what}"
-        self._log.error(f"{text}{details}", "unexpected")
+        self._log.error(f"{text}{details}")
         return f"{text}; see the log"
+
+
+def _why_kept(kept: Calibration, newest: Calibration) -> str:
+    """Which result is kept, and what speaks against the newest one."""
+    if newest.reasons:
+        why = f"of that is said: {newest.headline}"
+    else:
+        worst = int(np.argmax(newest.sigmas / kept.sigmas))
+        dof = newest.observability[worst].name
+        before, now = (amount(dof, float(each.sigmas[worst])) for each in (kept, newest))
+        why = f"that knows {dof} to {now} only, this one to {before}"
+    xyz, rpy = _pose_in_words(newest)
+    return (
+        f"kept is the result of {kept.n_poses} poses, not the newest (of {newest.n_poses} poses, "
+        f"xyz = ({xyz}) m, rpy = ({rpy}) deg): {why}"
+    )
 
 
 def describe(calibration: Calibration) -> str:
     """One line for a log: whose pose in whose frame, how good, from how much."""
-    xyz = ", ".join(f"{value:.4f}" for value in calibration.T_parent_child[:3, 3])
-    angles = np.degrees(se3.rotation_to_rpy(calibration.T_parent_child[:3, :3]))
-    rpy = ", ".join(f"{value:.3f}" for value in angles)
+    xyz, rpy = _pose_in_words(calibration)
     sigmas_mm = ", ".join(_sigma(1000 * value, 1) for value in calibration.sigmas[:3])
     sigmas_deg = ", ".join(_sigma(value, 3) for value in np.degrees(calibration.sigmas_rpy))
     backend = " ipopt" * (calibration.backend == "ipopt")
@@ -253,6 +287,14 @@ def describe(calibration: Calibration) -> str:
         f"{calibration.method} {calibration.reference}{backend}: "
         f"{calibration.n_poses} poses, {calibration.n_pairs} pairs, "
         f"{calibration.n_inliers} inliers"
+    )
+
+
+def _pose_in_words(calibration: Calibration) -> tuple[str, str]:
+    angles = np.degrees(se3.rotation_to_rpy(calibration.T_parent_child[:3, :3]))
+    return (
+        ", ".join(f"{value:.4f}" for value in calibration.T_parent_child[:3, 3]),
+        ", ".join(f"{value:.3f}" for value in angles),
     )
 
 

@@ -3,7 +3,6 @@
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -20,47 +19,28 @@ from hand_eye_calib.live.state import InputState, Level
 STALE_AFTER_S = 2.0
 BAD_INPUT_FOR_S = 10.0
 
-# A message that waited so long in the node's queue is late: the node falls behind (s).
-_LATE_S = 1.0
-# Shares of lost and of late messages from which on somebody should look.
-_MUCH_LOST, _MUCH_LATE = 0.01, 0.05
+# Share of lost messages from which on somebody should look.
+_MUCH_LOST = 0.01
 # A message may be overtaken by so many others of its publisher; farther back, the publisher was
 # started again.
 _MOST_OVERTAKEN = 1000
 # Reports (one a second) over which rates and shares are taken, and most delays looked at in one.
 _REPORTS, _MOST_DELAYS = 10, 5000
-# Inputs whose stamps differ by more than this (s) from what time_offset says are suspected of
-# different clocks.
-_SUSPICIOUS_OFFSET_S = 2.0
 
 
 class Delivery:
     """Counts the messages of one topic, and by the numbers that their publisher gives them the lost
-    ones.
-
-    Attributes
-    ----------
-    received, lost, late : int
-        Messages since the first one.
-    longest_wait_s : float
-        In the node's queue, since it was last set to 0.
-    has_one_publisher, is_known : bool
-        Nothing is known of lost messages of several, or if the middleware does not number them.
+    ones; nothing is known of these with several publishers, or a middleware without numbers.
     """
 
     def __init__(self) -> None:
-        self.received = self.lost = self.late = 0
-        self.longest_wait_s = 0.0
+        self.received = self.lost = 0
         self.has_one_publisher, self.is_known = True, False
         self._next: int | None = None
 
-    def note(self, sequence_number: int | None, waited_s: float) -> None:
-        """Count a message by the number of its publication, None if the middleware does not tell,
-        and its time from its arrival in this process to its callback.
-        """
+    def note(self, sequence_number: int | None) -> None:
+        """Count a message by the number of its publication, None if it has none."""
         self.received += 1
-        self.late += waited_s > _LATE_S
-        self.longest_wait_s = max(self.longest_wait_s, waited_s)
         self.is_known = sequence_number is not None and self.has_one_publisher
         if sequence_number is None or not self.has_one_publisher:
             self._next = None
@@ -92,11 +72,9 @@ class PoseInput:
     Attributes
     ----------
     is_enabled : bool
-        Whether poses are taken.
+        Whether poses are taken; ``ignored`` counts those that came while it was not.
     problem : str
         Why the topic is not used; empty if it is.
-    ignored : int
-        Messages that came while it was not enabled.
     refused : Counter
         Messages that could not be used, by reason.
     """
@@ -125,7 +103,7 @@ class PoseInput:
         self._bad, self._bad_at_s = "", -np.inf
         self._delay_s: float | None = None
         self._delays_ns: deque[int] = deque(maxlen=_MOST_DELAYS)
-        self._counts = deque([(time.monotonic(), 0, 0, 0, 0)], maxlen=_REPORTS + 1)
+        self._counts = deque([(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
         self._begin_gaps()
 
     def _begin_gaps(self) -> None:
@@ -194,11 +172,8 @@ class PoseInput:
         """Count a message that cannot be used, and say why."""
         self.refused[reason] += 1
         self._bad, self._bad_at_s = text, time.monotonic()
-        self._log.warning(
-            f"{self.topic}: message {which} refused: {text} "
-            f"({self.refused.total()} refused so far)",
-            ("refused", self.name),
-        )
+        self._log.warning(f"{self.topic}: a message is refused: {text}")
+        self._log.debug(f"{self.topic}: message {which} refused: {text}")
 
     def _note(self, stamp_ns: int, steady_s: float) -> None:
         self._arrived += 1
@@ -217,20 +192,19 @@ class PoseInput:
             self.refuse(with_stamp(stamp_ns), "corrupt stamp", text)
         for stamp_ns, read in judgement.taken:
             try:
-                self._take(stamp_ns, read())
+                pose = read()
+                # An empty name is the one before, too: parameters or a default name it.
+                if pose.sensor_frame not in (None, self._sensor_frame):
+                    self._session.set_frame(self.name, pose.sensor_frame)
+                    self._sensor_frame = pose.sensor_frame
+                if not self._session.add_pose(self.name, stamp_ns, pose.position, pose.quat_xyzw):
+                    which = with_stamp(stamp_ns)
+                    self._log.debug(f"{self.topic}: message {which} is repeated or too late")
             except HandEyeCalibError as error:
                 self.refuse(with_stamp(stamp_ns), "unusable", str(error))
         if is_first and judgement.taken:
             first_s = judgement.taken[0][0] * 1e-9
             self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
-
-    def _take(self, stamp_ns: int, pose: PoseFields) -> None:
-        frame = pose.sensor_frame
-        # An empty name is the one before, too: parameters or a default name it.
-        if frame is not None and frame != self._sensor_frame:
-            self._session.set_frame(self.name, frame)
-            self._sensor_frame = frame
-        self._session.add_pose(self.name, stamp_ns, pose.position, pose.quat_xyzw)
 
     def _say_jump_back(self, stamp_ns: int, last_ns: int | None) -> None:
         jump_s = ((last_ns or 0) - stamp_ns) * 1e-9
@@ -246,28 +220,23 @@ class PoseInput:
         return self._arrived_s is not None and steady_s - self._arrived_s > STALE_AFTER_S
 
     def state(self, steady_s: float, may_rest: bool) -> InputState:
-        """What has come in; begins a new interval, to be called once a second.
-
-        Parameters
-        ----------
-        steady_s : float
-        may_rest : bool
-            Silence is nothing to look at: there is a result, and the other input is silent too.
+        """What has come in; to be called once a second. ``may_rest`` if silence is nothing to look
+        at: there is a result, and the other input is silent too.
         """
         delivery, taken = self.delivery, self._session.statistics(self.name)
-        newest = steady_s, self._arrived, delivery.received, delivery.lost, delivery.late
+        newest = steady_s, self._arrived, delivery.received, delivery.lost
         self._counts.append(newest)
-        seconds, arrived, received, lost, late = np.subtract(newest, self._counts[0]).tolist()
+        seconds, arrived, received, lost = np.subtract(newest, self._counts[0]).tolist()
         rate_hz = arrived / seconds if seconds > 0 else 0.0
-        lost_share, late_share = lost / max(received + lost, 1), late / max(received, 1)
+        lost_share = lost / max(received + lost, 1)
         delays_s = np.array(self._delays_ns) * 1e-9
         self._delays_ns.clear()
         if delays_s.size:
             self._delay_s = float(np.median(delays_s))
-        level, text = self._judge(steady_s, rate_hz, lost_share, late_share, may_rest)
+        level, text = self._judge(steady_s, rate_hz, lost_share, may_rest)
         refused = {"repeated stamp": taken.refused_duplicate, "too late": taken.refused_late}
         outdated = {"of the session before": self._guard.outdated} if self._guard.outdated else {}
-        state = InputState(
+        return InputState(
             level=level,
             text=text,
             topic=self.topic,
@@ -279,24 +248,15 @@ class PoseInput:
             ignored_while_disabled=self.ignored,
             lost=delivery.lost if delivery.is_known else None,
             lost_share=lost_share if delivery.is_known else None,
-            late=delivery.late,
-            longest_wait_s=delivery.longest_wait_s,
             longest_gap_s=self._longest_gap_ns * 1e-9,
             gaps_above_max_gap=self._long_gaps,
             silent_s=None if self._arrived_s is None else steady_s - self._arrived_s,
             delay_s=self._delay_s,
             delay_99_s=float(np.percentile(delays_s, 99)) if delays_s.size else None,
         )
-        delivery.longest_wait_s = 0.0
-        return state
 
     def _judge(
-        self,
-        steady_s: float,
-        rate_hz: float,
-        lost_share: float,
-        late_share: float,
-        may_rest: bool,
+        self, steady_s: float, rate_hz: float, lost_share: float, may_rest: bool
     ) -> tuple[Level, str]:
         if self._arrived_s is None:
             text = f"no message on {self.topic} yet"
@@ -306,41 +266,12 @@ class PoseInput:
         if self.is_silent(steady_s):
             text = f"{self.topic} has been silent for {steady_s - self._arrived_s:.0f} s"
             return (Level.OK if may_rest else Level.WARN), text
-        problems = []
-        if lost_share >= _MUCH_LOST:
-            problems.append(f"{lost_share:.1%} of the messages are lost")
-        if late_share >= _MUCH_LATE:
-            waited = f"waited up to {self.delivery.longest_wait_s:.1f} s in the node"
-            problems.append(f"{late_share:.0%} of the messages are late, they {waited}")
-        if not problems:
+        if lost_share < _MUCH_LOST:
             return Level.OK, f"{rate_hz:.1f} Hz"
         advice = "give the node more processor time, or publish at a lower rate"
-        return Level.WARN, f"{rate_hz:.1f} Hz; {'; '.join(problems)}: {advice}"
+        return Level.WARN, f"{rate_hz:.1f} Hz; {lost_share:.1%} of the messages are lost: {advice}"
 
 
 def with_stamp(stamp_ns: int) -> str:
     """Which message, in words."""
     return f"with stamp {stamp_ns * 1e-9:.9f} s"
-
-
-def with_clock_offset(
-    parent: InputState, child: InputState, used_s: float | str
-) -> tuple[InputState, InputState]:
-    """The states of both inputs with the clock offset seen between them, in s to be added to the
-    child's stamps; a warning if it is far from ``used_s``, what is added.
-    """
-    if parent.delay_s is None or child.delay_s is None:
-        return parent, child
-    seen_s = child.delay_s - parent.delay_s
-    parent, child = (replace(each, clock_offset_s=seen_s) for each in (parent, child))
-    if isinstance(used_s, str) or abs(seen_s - used_s) <= _SUSPICIOUS_OFFSET_S:
-        return parent, child
-    told = (
-        f"; the stamps of the two inputs are {seen_s:.3f} s apart but time_offset is "
-        f"{used_s:.3f}: if their clocks differ, set time_offset"
-    )
-    warned = [
-        replace(each, level=Level.WARN, text=each.text + told) if each.level is Level.OK else each
-        for each in (parent, child)
-    ]
-    return warned[0], warned[1]

@@ -2,6 +2,7 @@
 up a message.
 """
 
+import contextlib
 import fcntl
 import os
 import queue
@@ -16,6 +17,7 @@ import numpy as np
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.files import write_atomically
 from hand_eye_calib.io.journal import (
     About,
     Journal,
@@ -31,7 +33,7 @@ FLUSH_PERIOD_S = 0.25
 # After a failed write the journal is started anew this often.
 _RETRY_S = 5.0
 
-# Holds the process id of the node that writes into a directory.
+# Says which process writes into a directory; the lock is on the directory itself.
 _LOCK_NAME = ".calibrator.lock"
 
 # Batches that may wait for a disk that does not answer: a minute.
@@ -99,17 +101,17 @@ class DirectoryLock:
     def __init__(self, directory: Path) -> None:
         self.directory = Path(directory)
         self._descriptor: int | None = None
+        note = self.directory / _LOCK_NAME
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
-            self._descriptor = os.open(self.directory / _LOCK_NAME, flags, 0o644)
+            self._descriptor = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY)
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.ftruncate(self._descriptor, 0)
-            os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
+            write_atomically({note: str(os.getpid())})
         except BlockingIOError:
-            assert self._descriptor is not None
-            owner = os.pread(self._descriptor, 32, 0).decode(errors="replace")
             self.release()
+            owner = 0
+            with contextlib.suppress(OSError, ValueError):
+                owner = int(note.read_bytes()[:32])
             raise ConfigError(
                 f"output_directory {self.directory} is in use by another calibrator "
                 f"(process {owner or 'unknown'}): stop that one, or choose another directory"
@@ -150,8 +152,7 @@ class SessionJournal:
         poses: Callable[[], Poses],
         resumed: Journal | None = None,
     ) -> None:
-        self.directory = Path(directory)
-        self.error = ""
+        self.directory, self.error = Path(directory), ""
         self._make_about, self._make_poses = about, poses
         self._about = about()
         self._notes: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
@@ -185,8 +186,9 @@ class SessionJournal:
 
     def begin(self) -> None:
         """Start a new session without poses; the one so far is kept aside."""
-        self._jobs.put(partial(self._write, self._events, self._about))
-        self._events, self._about = [], self._make_about()
+        events, self._events = self._events, []
+        self._jobs.put(partial(self._write, events, self._about))
+        self._about = self._make_about()
         self._jobs.put(partial(self._begin, self._about))
 
     def notes(self) -> Iterator[tuple[bool, str]]:
@@ -215,13 +217,11 @@ class SessionJournal:
                 work()
             except Exception as error:  # a defect, too: the node must say so and go on
                 self._writer = None
-                reason = f"{type(error).__name__}: {error}"
-                if isinstance(error, OSError):
-                    reason = error.strerror or str(error)
-                self._give_up(reason)
+                what = str(error) if isinstance(error, OSError) else repr(error)
+                self._give_up(getattr(error, "strerror", None) or what)
 
     def _open(self, about: About, poses: Poses, resumed: Journal | None = None) -> None:
-        if not self._is_ours:
+        if not self._is_ours and has_session(self.directory):
             self._keep_aside()
         self._is_ours = True
         self._writer = JournalWriter(self.directory, about, poses, resumed)
@@ -237,18 +237,17 @@ class SessionJournal:
 
     def _keep_aside(self) -> None:
         """Keep an earlier session, unless there is nothing in it."""
-        poses = count_poses(self.directory) if has_session(self.directory) else 0
-        if poses == 0:
-            return
-        aside = keep_aside(self.directory)
-        size = f"the session before this one ({poses} poses)"
-        if poses is None:
-            size = "a session that cannot be read"
-        text = (
-            f"{size} is kept in {aside}; to go on with it, stop the node, rename that folder to "
-            f"{self.directory.name} and start with the parameter journal at resume"
-        )
-        self._notes.put((False, text))
+        poses = count_poses(self.directory)
+        if poses != 0:
+            what = "a session that cannot be read"
+            if poses is not None:
+                what = f"the session before this one ({poses} poses)"
+            text = (
+                f"{what} is kept in {keep_aside(self.directory)}; to go on with it, stop the node, "
+                f"rename that folder to {self.directory.name} and start with the parameter journal "
+                "at resume"
+            )
+            self._notes.put((False, text))
 
     def _write(self, events: list[_Event], about: About) -> None:
         if self._writer is not None:

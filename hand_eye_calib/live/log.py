@@ -1,61 +1,62 @@
-"""The node's log: a message that repeats is written once in a while."""
+"""The node's log: what differs in its numbers only is not written again and again."""
 
+import re
 import time
-from collections.abc import Hashable
-from typing import Protocol
+from typing import Any
 
 from hand_eye_calib.errors import printable
 
-LOG_PERIOD_S = 5.0
+# A warning or an error is written once for each reason: in a session, and in so many seconds.
+ONCE_S = 1800.0
 
-
-class Logger(Protocol):
-    """What is used of a ROS logger."""
-
-    def info(self, message: str) -> bool: ...
-
-    def warning(self, message: str) -> bool: ...
-
-    def error(self, message: str) -> bool: ...
+_NUMBERS = re.compile(r"[\d.,+-]+")
 
 
 class NodeLog:
     """Writes to a ROS logger; rclpy's own throttle cannot tell two topics apart.
 
-    Each method takes the text and, for a message that may repeat, a key: of messages with the same
-    key only one is written per period.
+    Each method takes the text, and how often it may be written: texts that differ in their numbers
+    only are the same.
 
     Parameters
     ----------
     logger : rclpy logger
     """
 
-    def __init__(self, logger: Logger) -> None:
+    def __init__(self, logger: Any) -> None:
         self._logger = logger
-        self._written_at_s: dict[Hashable, float] = {}
+        self._written_at_s: dict[str, float] = {}
+
+    def restart(self) -> None:
+        """Begin a new session, in which everything may be said again."""
+        self._written_at_s.clear()
 
     # rclpy ties a place in the code to its severity: each method writes by itself.
 
-    def info(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
-        """Write what a person may want to know."""
-        if self._is_due(key, period_s):
+    def debug(self, text: str) -> None:
+        """Write what somebody looks for who has asked for it."""
+        self._logger.debug(_escaped(text))
+
+    def info(self, text: str, every_s: float = 0.0, key: str = "") -> None:
+        """Write what a person may want to know; texts with a ``key`` are all the same."""
+        if self._is_due(f"info {key or text}", every_s):
             self._logger.info(_escaped(text))
 
-    def warning(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
+    def warning(self, text: str, every_s: float = ONCE_S) -> None:
         """Write what a person should look at."""
-        if self._is_due(key, period_s):
+        if self._is_due(f"warning {text}", every_s):
             self._logger.warning(_escaped(text))
 
-    def error(self, text: str, key: Hashable = None, period_s: float = LOG_PERIOD_S) -> None:
+    def error(self, text: str, every_s: float = ONCE_S) -> None:
         """Write what went wrong."""
-        if self._is_due(key, period_s):
+        if self._is_due(f"error {text}", every_s):
             self._logger.error(_escaped(text))
 
-    def _is_due(self, key: Hashable, period_s: float) -> bool:
-        now_s = time.monotonic()
-        if now_s - self._written_at_s.get(key, -float("inf")) < period_s:
+    def _is_due(self, text: str, every_s: float) -> bool:
+        key, now_s = _NUMBERS.sub("", text), time.monotonic()
+        if now_s - self._written_at_s.get(key, -float("inf")) < every_s:
             return False
-        if key is not None:
+        if len(self._written_at_s) < 10_000:
             self._written_at_s[key] = now_s
         return True
 

@@ -78,18 +78,9 @@ _RIDGE = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Alarm:
-    """The mount has moved.
-
-    Attributes
-    ----------
-    since_ns : int
-        About when, parent clock.
-    raised_ns : int
-        When that was clear.
-    shift : (6,) array
-        Along (m) and about (rad) the axes of the parent sensor: child's pose now minus installed.
-    sigmas : (6,) array
-    log_ratio : float
+    """The mount has moved since about a stamp of the parent's clock, which was clear at another.
+    The shift (6,) is along (m) and about (rad) the axes of the parent sensor: the child's pose now
+    minus installed.
     """
 
     since_ns: int
@@ -154,15 +145,12 @@ class _Scale:
         self._information += information
         self._score += score
         if self._seconds == _STRETCH_S:
-            self._end_stretch(long_run)
-
-    def _end_stretch(self, long_run: float) -> None:
-        squared = (self._score / self._information) ** 2 - long_run / self._information
-        most = _NOISE_MEMORY_S / _STRETCH_S
-        share = 1.0 / (min(self._stretches, most) + _ASSUMED_STRETCHES)
-        self._variance += share * (_STRETCH_S * squared - self._variance)
-        self._stretches += 1
-        self._seconds, self._information, self._score = 0, 0.0, 0.0
+            squared = (self._score / self._information) ** 2 - long_run / self._information
+            most = _NOISE_MEMORY_S / _STRETCH_S
+            share = 1.0 / (min(self._stretches, most) + _ASSUMED_STRETCHES)
+            self._variance += share * (_STRETCH_S * squared - self._variance)
+            self._stretches += 1
+            self._seconds, self._information, self._score = 0, 0.0, 0.0
 
 
 class MountMonitor:
@@ -293,7 +281,9 @@ class MountMonitor:
         assert self._noise is not None
         residuals, jacobians = residuals_and_jacobians(motions, self._installed)
         jacobians = np.concatenate([jacobians, _by_scale(motions)], axis=2)
-        shift = np.append(self._memory_answer(), 0.0)
+        if self.seconds % _LONG_RUN_EVERY == 0 and len(self._memory) >= LEARNING_S:
+            self._centre = self._memory.answer()
+        shift = np.append(self._centre, 0.0)
         both_H, both_S, scatter = _information(residuals, jacobians, self._noise, shift)
         score = float(both_S[6] - both_H[6] @ shift)
         self._scale.add(float(both_H[6, 6]), score, self.long_run)
@@ -306,11 +296,6 @@ class MountMonitor:
         share = 1.0 / _NOISE_MEMORY_S
         self._noise = (1.0 - share) * self._noise + share * scatter
         self._motions_per_s += (len(motions) - self._motions_per_s) / min(len(self._memory), 100)
-
-    def _memory_answer(self) -> FloatArray:
-        if self.seconds % _LONG_RUN_EVERY == 0 and len(self._memory) >= LEARNING_S:
-            self._centre = self._memory.answer()
-        return self._centre
 
     # ------------------------------------------------------------- the judgement
 
@@ -390,7 +375,12 @@ class MountMonitor:
         known = (self._old[0] + H) / self.long_run
         before = np.linalg.inv(np.linalg.inv(self._covariance) + known) + self._wander
         H /= len(self._memory)
-        H[:3, :3] -= self._motions_per_s * self._information_of_noise()
+        # Of that, what the rotation noise of a motion seems to tell of a translation: rotations
+        # that never took place reveal nothing.
+        assert self._noise is not None
+        turns, precision = se3.skew(np.eye(3)), np.linalg.inv(self._noise)[:3, :3]
+        seeming = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, precision, turns)
+        H[:3, :3] -= self._motions_per_s * seeming
         H *= seconds / self.long_run
         scale = np.sqrt(np.diag(shift_covariance(100.0, np.pi)))
         values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
@@ -402,22 +392,11 @@ class MountMonitor:
         seen_sigmas = np.sqrt(2.0 * THRESHOLD + log_volumes) + NINE_TIMES_OUT_OF_TEN
         return np.repeat(seen_sigmas, 3) * self._sigmas(covariance)
 
-    def _information_of_noise(self) -> FloatArray:
-        """What the rotation noise of a motion seems to tell of a translation, (3, 3), on average:
-        rotations that never took place reveal nothing.
-        """
-        assert self._noise is not None
-        turns = se3.skew(np.eye(3))
-        precision = np.linalg.inv(self._noise)[:3, :3]
-        return np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, precision, turns)
-
 
 def _floor(learned: list[MotionPairs], T_parent_child: FloatArray) -> FloatArray:
     """Common-mode floor (6, 6) of motions like these; never singular."""
-    parent, child = (
-        np.concatenate([getattr(each, name) for each in learned])
-        for name in ("Ts_parenti_parentj", "Ts_childi_childj")
-    )
+    parent = np.concatenate([each.Ts_parenti_parentj for each in learned])
+    child = np.concatenate([each.Ts_childi_childj for each in learned])
     index = np.arange(len(parent))
     pairs = MotionPairs(parent, child, index, index + 1)
     floor = common_mode_floor(pairs, np.ones(len(parent)), T_parent_child)

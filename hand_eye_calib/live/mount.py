@@ -91,14 +91,14 @@ class MountWatch:
         if monitor is None:
             return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")
         visible, alarm = monitor.visible(_LONG_S), monitor.alarm
+        level = Level.OK if alarm is None else Level.ERROR
         if alarm is not None:
-            level, text = Level.ERROR, in_words(alarm)
+            text = in_words(alarm)
         elif monitor.is_learning:
-            level, text = Level.OK, f"learning the noise: {monitor.seconds} of {LEARNING_S} s"
-            text += " of motion"
+            text = f"learning the noise: {monitor.seconds} of {LEARNING_S} s of motion"
         else:
             targets = np.array(self._session.calibrator.config.targets)
-            level, text = Level.OK, _quiet(visible, visible <= _TARGETS * targets)
+            text = _quiet(visible, visible <= _TARGETS * targets)
         return MountState(
             level=level,
             text=text,
@@ -118,13 +118,12 @@ class MountWatch:
 def in_words(alarm: Alarm) -> str:
     """Which axes have moved, by how much, since when (local time)."""
     ratios = np.abs(alarm.shift) / alarm.sigmas
-    axes = np.flatnonzero(ratios > _CLEARLY)
     told = [
         f"{axes_in_words([axis])} by {amount(axis, shift)} +/- {amount(axis, sigma)}"
-        for axis, shift, sigma in (
-            (AXES[index], float(alarm.shift[index]), float(alarm.sigmas[index]))
-            for index in (axes if len(axes) else [np.argmax(ratios)])
+        for axis, shift, sigma, ratio in zip(
+            AXES, alarm.shift.tolist(), alarm.sigmas.tolist(), ratios, strict=True
         )
+        if ratio >= min(_CLEARLY, ratios.max())
     ]
     since = datetime.fromtimestamp(alarm.since_ns * 1e-9).isoformat(" ", timespec="seconds")
     return f"the mount has moved: {listing(told)}, since about {since}"
@@ -133,11 +132,10 @@ def in_words(alarm: Alarm) -> str:
 def _quiet(visible: FloatArray, is_watched: np.ndarray) -> str:
     text = "the mount has not moved"
     told = []
-    for part in (slice(0, 3), slice(3, 6)):
-        known = [AXES[index] for index in range(6)[part] if is_watched[index]]
-        if known:
-            worst = float(visible[part][is_watched[part]].max())
-            told.append(f"{amount(known[0], worst)} in {axes_in_words(known)}")
+    for part in (range(3), range(3, 6)):
+        if known := [index for index in part if is_watched[index]]:
+            worst = amount(AXES[known[0]], float(visible[known].max()))
+            told.append(f"{worst} in {axes_in_words([AXES[index] for index in known])}")
     if told:
         text += f": ten minutes of motion would show {listing(told)}"
     unwatched = [axis for axis, watched in zip(AXES, is_watched, strict=True) if not watched]

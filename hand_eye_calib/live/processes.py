@@ -76,7 +76,7 @@ class SolvingProcess:
         self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._hangs_after_s = HANGS_AFTER_S
-        self._process = self._started()
+        self._process = _start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         # A daemon: a disk or a pipe that hangs must not keep the node alive.
         self._thread = threading.Thread(target=self._run, name="solving", daemon=True)
         self._thread.start()
@@ -109,9 +109,6 @@ class SolvingProcess:
         self._thread.join(_LAST_BREATH_S)  # its pipe has ended
         _end(self._process)
 
-    def _started(self) -> "subprocess.Popen[bytes]":
-        return _start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             found = self._answer(job)
@@ -124,53 +121,44 @@ class SolvingProcess:
         """The job's answer, a failure if the process dies again and again; None at the end."""
         cause = ""
         for _ in range(_ATTEMPTS):
-            began_s, timer = time.monotonic(), self._killer()
+            began_s = time.monotonic()
+            killer = threading.Timer(self._hangs_after_s, self._process.kill)
+            killer.daemon = True
+            killer.start()
             try:
-                found = self._exchange(job)
+                to, back = self._process.stdin, self._process.stdout
+                assert to is not None
+                assert back is not None
+                pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
+                to.flush()
+                found: Answer = pickle.load(back)
                 longest_s = _HANGS_TIMES * (time.monotonic() - began_s)
                 self._hangs_after_s = max(self._hangs_after_s, longest_s)
                 return found
             except _NOT_AN_ANSWER:
                 if self._stopping.is_set():
                     return None
-                hangs = time.monotonic() - began_s >= self._hangs_after_s
-                cause = self._restart(hangs)
             finally:
-                timer.cancel()
+                killer.cancel()
+            hangs = time.monotonic() - began_s >= self._hangs_after_s
+            cause = self._restart(hangs)
             if hangs:
                 self._hangs_after_s *= 2.0  # it may have been a long solve
                 break
         failure = Failure(FailureKind.UNEXPECTED, f"the solving process {cause}")
         return Answer(job.session, 0.0, failure=failure)
 
-    def _killer(self) -> threading.Timer:
-        """Kills a process that hangs, unless it is cancelled."""
-        timer = threading.Timer(self._hangs_after_s, self._process.kill)
-        timer.daemon = True
-        timer.start()
-        return timer
-
-    def _exchange(self, job: Job) -> Answer:
-        to, back = self._process.stdin, self._process.stdout
-        assert to is not None
-        assert back is not None
-        pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
-        to.flush()
-        found: Answer = pickle.load(back)
-        return found
-
     def _restart(self, hangs: bool) -> str:
         """Start the process again; returns how it ended."""
         code = _end(self._process)
-        self._process = self._started()
+        self._process = _start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         if self._stopping.is_set():
             self._process.kill()
+        cause = f"ended with code {code}"
         if hangs:
             cause = f"had no answer after {self._hangs_after_s:.3g} s and was killed"
         elif code < 0:
             cause = f"was ended by {signal.Signals(-code).name}"
-        else:
-            cause = f"ended with code {code}"
         self._notes.put(f"the solving process {cause}; it was started again")
         return cause
 
@@ -220,25 +208,25 @@ class ReportProcess:
         The result is handed over in a file that has no name: nobody else can change it, and no
         pipe has to be waited for at the end of the node.
         """
+        self.stop()
         try:
-            self._write(directory, result)
+            answer = tempfile.TemporaryFile() if result.others else None  # noqa: SIM115
+            with tempfile.TemporaryFile() as file:
+                pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
+                file.seek(0)
+                out = answer or subprocess.DEVNULL
+                self._process = _start(_REPORT, str(directory.resolve()), stdin=file, stdout=out)
         except OSError as error:  # a full temporary directory, or no process can be started
             return f"{result.files} cannot be written: {error.strerror}"
+        self._answer = answer
         return f"{result.files} follow" + "s" * (" and " not in result.files)
 
-    def _write(self, directory: Path, result: SessionResult) -> None:
+    def stop(self) -> None:
+        """End the process: what it writes is out of date."""
         if self._process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+            self._process.kill()
             self._process.wait()
         self._process = self._answer = None
-        answer = tempfile.TemporaryFile() if result.others else None  # noqa: SIM115
-        with tempfile.TemporaryFile() as file:
-            pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
-            file.seek(0)
-            out = answer or subprocess.DEVNULL
-            self._process = _start(_REPORT, str(directory.resolve()), stdin=file, stdout=out)
-        self._answer = answer
 
     def take_others(self) -> list[Calibration]:
         """Results of further child sensors in their order, once, when they are there."""

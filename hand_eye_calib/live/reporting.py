@@ -1,13 +1,14 @@
 """The parts of the session as the node's state has them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.cycle import SolveCycle
-from hand_eye_calib.live.input import PoseInput, with_clock_offset
+from hand_eye_calib.live.input import PoseInput
 from hand_eye_calib.live.solving import FailureKind
 from hand_eye_calib.live.state import (
     AxisValues,
@@ -26,6 +27,10 @@ from hand_eye_calib.results.status import AXES
 # If poses wait that no result contains, the result is stale when it is older than this many solve
 # periods, and than so many seconds.
 _STALE_PERIODS, _STALE_S = 5, 10.0
+
+# Inputs whose stamps differ by more than this (s) from what time_offset says are suspected of
+# different clocks.
+_SUSPICIOUS_OFFSET_S = 2.0
 
 
 def extrinsic_state(
@@ -47,16 +52,33 @@ def extrinsic_state(
         What is done about ``/tf_static``, and the reason.
     waited_for_s : float or None
         The solve period while poses wait; None on a parked robot.
-    steady_s : float
-        Steady time.
-    clock_ns : int
-        The node's clock; 0 if it does not run yet.
+    steady_s, clock_ns
+        Steady time, and the node's clock, 0 if it does not run yet.
     """
-    seen, result = cycle.seen, cycle.result
+    seen, result, failure = cycle.seen, cycle.result, cycle.failure
     age_s, stale_s = cycle.age_s(steady_s), np.inf
     if waited_for_s is not None:
         stale_s = max(_STALE_S, _STALE_PERIODS * waited_for_s)
-    level, text = _judged(cycle, accepts_poses, tf_static, age_s, stale_s)
+    said = failure.what if failure else ""
+    broadcast, why = tf_static
+    # The gravest that applies.
+    level = Level.WARN
+    if failure is not None and failure.kind is FailureKind.UNEXPECTED:
+        level, text = Level.ERROR, f"the solve failed unexpectedly, see the log: {said}"
+    elif not accepts_poses:
+        text = "not accepting poses: call ~/set_enabled to go on"
+    elif result is None:
+        faults = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in cycle.checks.faults()[:1]]
+        text = "; ".join(filter(None, (*faults, said))) or "no result yet"
+    elif result.verdict is Verdict.DO_NOT_USE:
+        text = result.headline
+    elif broadcast in (Broadcast.REFUSED, Broadcast.ON) and why:
+        text = f"publish_tf is refused: {why}"
+    elif age_s > stale_s:
+        text = ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
+    else:
+        level = Level.OK if result.verdict is Verdict.USE else Level.WARN
+        text = result.headline
     rotation = np.degrees(seen.rotation).tolist() if seen else []
     return ExtrinsicState(
         level=level,
@@ -65,66 +87,34 @@ def extrinsic_state(
         is_solving=cycle.is_solving,
         solves=cycle.solves,
         last_solve_s=cycle.seconds,
-        last_failure=cycle.failure.what if cycle.failure else "",
+        last_failure=said,
         n_poses=seen.n_poses if seen else 0,
         path_m=seen.distance if seen else 0.0,
         motion_s=seen.motion_s if seen else 0.0,
         has_vehicle_axes=bool(seen and seen.has_vehicle_axes),
         rotation_deg=dict(zip("xyz", rotation, strict=False)),
-        tf_static=tf_static[0],
-        tf_static_reason=tf_static[1],
+        tf_static=broadcast,
+        tf_static_reason=why,
         result=_result_state(result, age_s, clock_ns) if result else None,
     )
-
-
-def _judged(
-    cycle: SolveCycle,
-    accepts_poses: bool,
-    tf_static: tuple[Broadcast, str],
-    age_s: float,
-    stale_s: float,
-) -> tuple[Level, str]:
-    """Level and message: the gravest that applies."""
-    result, failure = cycle.result, cycle.failure
-    if failure is not None and failure.kind is FailureKind.UNEXPECTED:
-        return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
-    if not accepts_poses:
-        return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
-    said = failure.what if failure else ""
-    if result is None:
-        faults = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in cycle.checks.faults()[:1]]
-        return Level.WARN, "; ".join(filter(None, (*faults, said))) or "no result yet"
-    if result.verdict is Verdict.DO_NOT_USE:
-        return Level.WARN, result.headline
-    if tf_static[0] in (Broadcast.REFUSED, Broadcast.ON) and tf_static[1]:
-        return Level.WARN, f"publish_tf is refused: {tf_static[1]}"
-    if age_s > stale_s:
-        return Level.WARN, ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
-    return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
 
 
 def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultState:
     T = result.T_parent_child
     pose = np.concatenate([T[:3, 3], se3.rotation_to_rpy(T[:3, :3])])
     sigmas = np.concatenate([result.sigmas[:3], result.sigmas_rpy])
+    same = ("parent_frame", "child_frame", "warnings", "n_poses", "n_pairs", "time_offset_s",
+            "time_offset_sigma_s", "scale", "scale_sigma")  # fmt: skip
     return ResultState(
-        parent_frame=result.parent_frame,
-        child_frame=result.child_frame,
+        **{name: getattr(result, name) for name in same},
         verdict=result.verdict.value,
         status=result.status.value,
         reasons=tuple(f"{each.sentence}: {each.what_to_do}" for each in result.reasons),
-        warnings=result.warnings,
         pose=_by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
         pose_sigma=_by_axis(sigmas),
         axis_verdict={dof.name: dof.verdict.value for dof in result.observability},
         method=f"{result.method} {result.reference} {result.backend}",
-        n_poses=result.n_poses,
-        n_pairs=result.n_pairs,
         inlier_share=result.n_inliers / max(result.n_pairs, 1),
-        time_offset_s=result.time_offset_s,
-        time_offset_sigma_s=result.time_offset_sigma_s,
-        scale=result.scale,
-        scale_sigma=result.scale_sigma,
         age_s=age_s,
         newest_pose_age_s=(clock_ns - result.stamp_ns) * 1e-9 if clock_ns else None,
     )
@@ -135,15 +125,9 @@ def _by_axis(values: Any) -> AxisValues:
 
 
 def progress_state(cycle: SolveCycle, why_not_compared: str) -> ProgressState:
-    """Each axis against its target, the seconds left, and what to do now.
-
-    WARN before the first result, and while the motion is of no use for an axis that lacks.
-
-    Parameters
-    ----------
-    cycle : SolveCycle
-    why_not_compared : str
-        Why there is no comparison with what is installed; empty if none was asked for.
+    """Each axis against its target, the seconds left, and what to do now; WARN before the first
+    result, and while the motion is of no use for an axis that lacks. ``why_not_compared`` with what
+    is installed: empty if that was not asked for.
     """
     progress, result = cycle.goal.progress, cycle.result
     comparison = result.comparison if result is not None else None
@@ -174,5 +158,18 @@ def input_states(
     """
     may_rest = has_result and all(each.is_silent(steady_s) for each in inputs[:2])
     states = {each.name: each.state(steady_s, may_rest) for each in inputs}
-    pair = with_clock_offset(states["parent"], states["child"], time_offset)
-    return states | dict(zip(("parent", "child"), pair, strict=True))
+    delays_s = [states[name].delay_s for name in ("parent", "child")]
+    if delays_s[0] is None or delays_s[1] is None:
+        return states
+    seen_s, told = delays_s[1] - delays_s[0], ""
+    if not isinstance(time_offset, str) and abs(seen_s - time_offset) > _SUSPICIOUS_OFFSET_S:
+        told = (
+            f"; the stamps of the two inputs are {seen_s:.3f} s apart but time_offset is "
+            f"{time_offset:.3f}: if their clocks differ, set time_offset"
+        )
+    for name in ("parent", "child"):
+        state = replace(states[name], clock_offset_s=seen_s)
+        if told and state.level is Level.OK:
+            state = replace(state, level=Level.WARN, text=state.text + told)
+        states[name] = state
+    return states

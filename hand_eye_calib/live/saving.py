@@ -66,6 +66,7 @@ class Saver:
             if self._earlier_kept_in != directory:
                 keep_earlier_results(path)
             self._earlier_kept_in = directory
+            self._report.stop()  # it writes the result too, an older one
             save_result(result, path, inputs)
         except (OSError, HandEyeCalibError) as error:
             return False, f"cannot save to {directory}: {error}"

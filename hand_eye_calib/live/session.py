@@ -23,10 +23,6 @@ _GRACE_S = 0.3
 class LiveSession:
     """Every pose that the engine takes is written to the journal as well, if there is one.
 
-    Parameters
-    ----------
-    log : NodeLog
-
     Attributes
     ----------
     engines : dict of str to Calibrator
@@ -63,16 +59,17 @@ class LiveSession:
 
     def add_pose(
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
-    ) -> None:
-        """Take a pose; see :meth:`Calibrator.add_pose`."""
+    ) -> bool:
+        """Take a pose, or not; see :meth:`Calibrator.add_pose`."""
         (own_stream, first), *others = takers(stream, self.engines)
         if not first.add_pose(own_stream, stamp_ns, position, quat_xyzw):
-            return
+            return False
         for _, other in others:
             other.add_pose(own_stream, stamp_ns, position, quat_xyzw)
         if self._journal is not None:
             self._journal.add_pose(stream, stamp_ns, position, quat_xyzw)
         self.has_new_poses |= self._is_solved and stream in STREAMS
+        return True
 
     def take_others(self, names: Sequence[str]) -> None:
         """Take further child sensors, known by the names of their inputs, from now on."""
@@ -156,12 +153,7 @@ class LiveSession:
 
     def follow_journal(self, options: NodeConfig, resuming: bool = False) -> None:
         """Write the journal where the options want it; with ``resuming``, go on with the session
-        that is there.
-
-        Raises
-        ------
-        ConfigError
-            If another node writes there.
+        that is there. Raises ConfigError if another node writes there.
         """
         directory = journal_directory(options)
         if directory == (self._journal.directory if self._journal else None):
@@ -170,9 +162,8 @@ class LiveSession:
         if directory is not None:
             self._lock = DirectoryLock(directory.parent)
             resumed = self._resume(directory) if resuming else None
-            self._journal = SessionJournal(
-                directory, self._about, lambda: poses_so_far(self.engines), resumed
-            )
+            so_far = lambda: poses_so_far(self.engines)  # noqa: E731
+            self._journal = SessionJournal(directory, self._about, so_far, resumed)
 
     def flush_journal(self) -> None:
         """Hand what came in to the disk; to be called often."""
@@ -185,23 +176,22 @@ class LiveSession:
         if self._journal is not None:
             self._journal.stop(_GRACE_S)
             self._log_notes(self._journal)
-            self._journal = None
         if self._lock is not None:
             self._lock.release()
-            self._lock = None
+        self._journal = self._lock = None
 
     def journal_state(self, options: NodeConfig) -> JournalState:
         """Whether a crash would lose the session."""
-        directory = str(self._journal.directory) if self._journal else ""
-        if self._journal is not None and self._journal.error:
-            text = f"cannot write: {self._journal.error}; a crash would lose the session"
-            return JournalState(level=Level.ERROR, text=text, directory=directory)
-        level, text = Level.OK, "the session is being written"
-        if self._journal is None and options.journal == "off":
+        journal, level, text = self._journal, Level.OK, "the session is being written"
+        if journal is not None and journal.error:
+            level = Level.ERROR
+            text = f"cannot write: {journal.error}; a crash would lose the session"
+        elif journal is None and options.journal == "off":
             text = "off"
-        elif self._journal is None:
+        elif journal is None:
             level = Level.WARN
             text = "off: output_directory is not set, a crash would lose the session"
+        directory = str(journal.directory.resolve()) if journal else ""
         return JournalState(level=level, text=text, directory=directory)
 
     def _resume(self, directory: Path) -> Journal | None:
@@ -231,20 +221,16 @@ class LiveSession:
         of_all = {"options": config.to_options(), "given": sorted(config.given)}
         about: dict[str, dict[str, Any]] = {}
         for stream in ("parent", *self.engines):
-            about[stream] = {"topic": self.topics.get(stream, ""), **of_all}
             own_stream, engine = takers(stream, self.engines)[0]
-            if frame := engine.frame(own_stream):
-                about[stream]["frame"] = frame
-            if stream in self._origins and (geodetic := self._origins[stream].geodetic):
-                about[stream]["origin"] = [*geodetic]
+            origin = self._origins.get(stream, LocalOrigin()).geodetic
+            known = {"frame": engine.frame(own_stream), "origin": [*(origin or ())]}
+            known = {name: each for name, each in known.items() if each}
+            about[stream] = {"topic": self.topics.get(stream, ""), **of_all, **known}
         return about
 
     def _log_notes(self, journal: SessionJournal) -> None:
         for is_warning, text in journal.notes():
-            if is_warning:
-                self._log.warning(text, "journal")
-            else:
-                self._log.info(text)
+            (self._log.warning if is_warning else self._log.info)(text)
 
 
 def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorConfig:
@@ -265,19 +251,12 @@ def journal_directory(options: NodeConfig) -> Path | None:
 
 
 def output_path(directory: str) -> Path:
-    """The path of an output directory, ``~`` expanded.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such user.
-    """
+    """The path of an output directory, ``~`` expanded. Raises ConfigError for an unknown user."""
     try:
         return Path(directory).expanduser()
     except RuntimeError as error:
-        raise ConfigError(
-            f"output_directory {directory!r}: {error}; write the whole path"
-        ) from None
+        text = f"output_directory {directory!r}: {error}; write the whole path"
+        raise ConfigError(text) from None
 
 
 def check_below(base: Path, directory: str) -> None:

@@ -47,16 +47,8 @@ class Failure:
 
 @dataclass(frozen=True)
 class Job:
-    """A snapshot to solve, in a session of this number.
-
-    Attributes
-    ----------
-    session : int
-    snapshot : Snapshot
-    check : bool
-        Check its streams as well.
-    options : dict
-        Options that an earlier check was certain of.
+    """A snapshot to solve, and perhaps its streams to check, in a session of this number, with
+    options that an earlier check was certain of.
     """
 
     session: int
@@ -68,14 +60,8 @@ class Job:
 @dataclass(frozen=True)
 class Checked:
     """How a stream check ended: with neither findings nor a failure if the motion is too short or
-    has too little rotation to tell.
-
-    Attributes
-    ----------
-    options : dict
-        Options that the check is certain of: the result is one with them.
-    told : tuple of str
-        Warnings about that.
+    has too little rotation to tell. The result is one with the options that it is certain of, and
+    warnings tell of that.
     """
 
     result: CheckResult | None = None
@@ -86,16 +72,8 @@ class Checked:
 
 @dataclass(frozen=True)
 class Answer:
-    """How a job ended, after how many seconds: with a calibration or with a failure.
-
-    Attributes
-    ----------
-    seen : Excitation or None
-        How the sensors have moved.
-    time_offset : TimeOffset or None
-        The time offset, if it was estimated.
-    check : Checked or None
-        If a check was asked for.
+    """How a job ended, after how many seconds: with a calibration or with a failure; and how the
+    sensors have been seen to move.
     """
 
     session: int
@@ -120,29 +98,22 @@ def answer(job: Job) -> Answer:
     except Exception as error:  # the node reports it
         failure = _failure(error)
     if job.check:
-        calibration, checked = _check(job, calibration)
+        checked = Checked()
+        try:
+            if can_check(*job.snapshot.streams):
+                as_sent = with_options(job.snapshot, job.options)
+                if calibration is None:
+                    checked = Checked(check(as_sent))
+                else:
+                    found = review(calibration, as_sent, job.options)
+                    calibration = found.calibration if found.options else calibration
+                    checked = Checked(found.check, options=dict(found.options), told=found.told)
+        except Exception as error:  # the node reports it
+            checked = Checked(failure=_failure(error))
     if calibration is not None:  # the node has no use for the noise model's whole solution
         calibration = replace(calibration, model=None)
     seconds = time.monotonic() - start_s
     return Answer(job.session, seconds, seen, calibration, snapshot.time_offset, failure, checked)
-
-
-def _check(job: Job, calibration: Calibration | None) -> tuple[Calibration | None, Checked]:
-    """The calibration after a check of the streams with the time offset and the scale that it
-    found, and what the check found.
-    """
-    try:
-        if not can_check(*job.snapshot.streams):
-            return calibration, Checked()
-        snapshot = with_options(job.snapshot, job.options)
-        if calibration is None:
-            return None, Checked(check(snapshot))
-        found = review(calibration, snapshot, job.options)
-    except Exception as error:  # the node reports it
-        return calibration, Checked(failure=_failure(error))
-    if found.options:
-        calibration = found.calibration
-    return calibration, Checked(found.check, options=dict(found.options), told=found.told)
 
 
 def _failure(error: Exception) -> Failure:

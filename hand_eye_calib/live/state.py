@@ -43,15 +43,8 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class ResultState:
-    """The session's result.
-
-    Attributes
-    ----------
-    pose, pose_sigma : mapping by axis
-        x, y, z (m), roll, pitch, yaw (rad) as they are printed, and their standard deviations;
-        None if an axis is not determined.
-    age_s, newest_pose_age_s : float or None
-        None while the node's clock does not run.
+    """The session's result. ``pose`` has x, y, z (m), roll, pitch, yaw (rad) as they are printed,
+    None if an axis is not determined; ages are None while the node's clock does not run.
     """
 
     parent_frame: str
@@ -104,15 +97,9 @@ class ExtrinsicState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressState(Part):
-    """How far the session is from its goal; the text says what to do now.
-
-    Attributes
-    ----------
-    has_result : bool
-    progress : Progress
-        Standard deviations are along (m) and about (rad) the axes of the parent sensor's frame.
-    comparison : Comparison or None
-        Of the result with what is installed; only a sentence while it cannot be made.
+    """How far the session is from its goal; the text says what to do now. Standard deviations are
+    along and about the axes of the parent sensor's frame. The comparison of the result with what is
+    installed is only a sentence while it cannot be made.
     """
 
     has_result: bool
@@ -122,16 +109,9 @@ class ProgressState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class InputState(Part):
-    """What an input has delivered.
-
-    Attributes
-    ----------
-    lost : int or None
-        Messages that were published and never arrived; None if the middleware does not tell.
-    delay_s, delay_99_s : float or None
-        Median and 99th percentile of the node's clock minus the stamps.
-    clock_offset_s : float or None
-        What the other input's delay is more than this one's.
+    """What an input has delivered. ``lost`` messages were published and never arrived, None if the
+    middleware does not tell; ``delay_s`` is the node's clock minus the stamps, the median, and
+    ``clock_offset_s`` what the other input's delay is more than this one's.
     """
 
     topic: str
@@ -143,8 +123,6 @@ class InputState(Part):
     ignored_while_disabled: int
     lost: int | None
     lost_share: float | None
-    late: int
-    longest_wait_s: float
     longest_gap_s: float
     gaps_above_max_gap: int
     silent_s: float | None
@@ -171,16 +149,8 @@ class JournalState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class MountState(Part):
-    """A mount that is watched.
-
-    Attributes
-    ----------
-    shift, shift_sigma : mapping by axis
-        The alarm's, if there is one.
-    visible_1min, visible_10min : mapping by axis
-        Shift that so much motion would show; None if none would.
-    since_ns, newest_ns : int or None
-        Stamp from which on it has been moved, and that of the newest pose.
+    """A mount that is watched: the alarm's shift since a stamp, and the shift that so much motion
+    would show, None if none would.
     """
 
     is_learning: bool = False
@@ -206,19 +176,9 @@ class SavedState:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeState:
-    """Everything that the node says of itself; a node that watches the mount has no result,
-    progress, checks and journal, and only it has a mount.
-
-    Attributes
-    ----------
-    node : str
-        Fully qualified name.
-    inputs : dict of str to InputState
-        By name: parent, child, child2 and so on.
-    saved : SavedState or None
-        The newest save of this session.
-    has_ended : bool
-        The last that the node says.
+    """Everything that the node, by its fully qualified name, says of itself. A node that watches
+    the mount has no result, progress, checks and journal, and only it has a mount. The inputs are
+    by name: parent, child, child2 and so on. ``saved`` is the newest save of the session.
     """
 
     node: str

@@ -76,20 +76,20 @@ class StreamChecks:
 
     def state(self, steady_s: float) -> ChecksState:
         """Findings of the last check."""
-        if self._result is None:
+        result, faults = self._result, self.faults()
+        if result is None:
             text = (
                 f"not checked yet: that takes {MIN_DURATION_S:g} s of motion with rotations of "
                 f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
             )
             return ChecksState(level=Level.WARN, text=text)
-        faults = self.faults()
         return ChecksState(
             level=Level.WARN if faults else Level.OK,
             text="; ".join(faults) or "both streams can be of one rigid body",
             age_s=steady_s - self._checked_at_s,
-            correlation=self._result.correlation.correlation,
+            correlation=result.correlation.correlation,
             findings=tuple(
-                f"{each.severity.value}: {in_parameters(each)}" for each in self._result.findings
+                f"{each.severity.value}: {in_parameters(each)}" for each in result.findings
             ),
         )
 

@@ -43,6 +43,7 @@ class TfStream:
         self.left_out = 0
         self._tree = TransformTree()
         self._static: dict[str, PoseFields] = {}
+        self._fixed: dict[str, FloatArray] = {}
         self._up: list[str] = []
         self._down: list[str] = []
         self._moving: dict[str, _MovingEdge] = {}
@@ -59,11 +60,15 @@ class TfStream:
         frame, edges = transform.sensor_frame or "", self._tree.edges
         before = edges[frame].is_static if frame in edges else None
         self._tree.note(transform, is_static)
+        is_new = before != edges[frame].is_static
+        if is_new:
+            self._find_chain()
         if edges[frame].is_static:
             self._static[frame] = transform
-        if before != edges[frame].is_static:
-            self._find_chain()
-        if frame in self._moving and not is_static:
+        if is_new or edges[frame].is_static:
+            chain = {*self._up, *self._down} & self._static.keys()
+            self._fixed = {each: _matrix(self._static[each]) for each in chain}
+        if not edges[frame].is_static and frame in self._moving and not is_static:
             yield from self._move(frame, transform)
 
     def describe_missing(self) -> str:
@@ -73,12 +78,6 @@ class TfStream:
         except InputError as error:
             return str(error).replace("the bag's transforms", "/tf and /tf_static")
         return "its transforms do not come at the same times"
-
-    def restart(self) -> None:
-        """Forget the moving edges: their stamps begin anew."""
-        self._slowest = ""
-        for edge in self._moving.values():
-            edge.clear()
 
     def _find_chain(self) -> None:
         self._slowest = ""
@@ -91,27 +90,28 @@ class TfStream:
         self._moving = {frame: self._moving.get(frame, _MovingEdge()) for frame in moving}
 
     def _move(self, frame: str, transform: PoseFields) -> Iterator[PoseFields]:
+        T = _matrix(transform)
         if len(self._moving) == 1:  # the usual case, for which nothing is kept
-            yield self._composed(transform.stamp_ns, {frame: _matrix(transform)})
+            yield self._composed(transform.stamp_ns, {frame: T})
             return
         edge = self._moving[frame]
         if edge and transform.stamp_ns < edge[-1][0] - _JUMP_BACK_NS:
-            self.restart()
+            self._slowest = ""
+            for each in self._moving.values():  # their stamps begin anew
+                each.clear()
         # Of repeated ones the first counts, and late ones are left out.
         if not edge or transform.stamp_ns > edge[-1][0]:
-            edge.append((transform.stamp_ns, _matrix(transform)))
+            edge.append((transform.stamp_ns, T))
         if not self._slowest and all(len(each) >= _RATE_FROM for each in self._moving.values()):
             self._slowest = max(self._moving, key=lambda name: self._moving[name].interval_ns())
-        if self._slowest:
-            yield from self._known()
-
-    def _known(self) -> Iterator[PoseFields]:
-        """The poses at the waiting stamps of the slowest edge that no other edge keeps waiting."""
+        if not self._slowest:
+            return
+        # The poses at the waiting stamps of the slowest edge that no other edge keeps waiting.
         base = self._moving[self._slowest]
         others = {name: edge for name, edge in self._moving.items() if edge is not base}
-        while base and all(edge and edge[-1][0] >= base[0][0] for edge in others.values()):
+        while base and all(each and each[-1][0] >= base[0][0] for each in others.values()):
             stamp_ns, T_base = base.popleft()
-            Ts = {name: edge.at(stamp_ns, self.max_gap_s) for name, edge in others.items()}
+            Ts = {name: each.at(stamp_ns, self.max_gap_s) for name, each in others.items()}
             known = {name: T for name, T in Ts.items() if T is not None}
             if len(known) == len(Ts):
                 yield self._composed(stamp_ns, {self._slowest: T_base, **known})
@@ -119,10 +119,11 @@ class TfStream:
                 self.left_out += 1
 
     def _composed(self, stamp_ns: int, moving: dict[str, FloatArray]) -> PoseFields:
-        T_world_sensor = np.eye(4)
-        for frame in self._up + self._down:
-            T = moving[frame] if frame in moving else _matrix(self._static[frame])
-            T_world_sensor = T_world_sensor @ (se3.inverse(T) if frame in self._up else T)
+        T_world_sensor, Ts = np.eye(4), self._fixed | moving
+        for frame in self._up:
+            T_world_sensor = T_world_sensor @ se3.inverse(Ts[frame])
+        for frame in self._down:
+            T_world_sensor = T_world_sensor @ Ts[frame]
         x, y, z = T_world_sensor[:3, 3].tolist()
         qx, qy, qz, qw = se3.to_quat_xyzw(T_world_sensor).tolist()
         return PoseFields(stamp_ns, *self.source, (x, y, z), (qx, qy, qz, qw))

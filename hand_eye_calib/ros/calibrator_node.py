@@ -6,7 +6,6 @@ nothing here needs a lock.
 
 import time
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,13 +22,9 @@ from hand_eye_calib.io.transforms import TfSource
 from hand_eye_calib.live.cycle import SolveCycle
 from hand_eye_calib.live.input import PoseInput
 from hand_eye_calib.live.journal import FLUSH_PERIOD_S
-from hand_eye_calib.live.log import LOG_PERIOD_S, NodeLog
+from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.mount import LIMITS, MountWatch
-from hand_eye_calib.live.reporting import (
-    extrinsic_state,
-    input_states,
-    progress_state,
-)
+from hand_eye_calib.live.reporting import extrinsic_state, input_states, progress_state
 from hand_eye_calib.live.saving import Saver
 from hand_eye_calib.live.session import LiveSession, check_below, output_path
 from hand_eye_calib.live.state import NodeState
@@ -37,11 +32,19 @@ from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.inputs import TfInput, TopicInput, qos_parameter_names
 from hand_eye_calib.ros.outputs import ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
-from hand_eye_calib.ros.robot import Robot, needs_tf
-from hand_eye_calib.ros.tf import TfBroadcaster, message_type
+from hand_eye_calib.ros.tf import (
+    STATIC_TOPIC,
+    Robot,
+    RobotTree,
+    TfBroadcaster,
+    message_type,
+    needs_tf,
+)
 
 _DISCOVERY_PERIOD_S = 0.2
 _STATE_PERIOD_S = 1.0
+# Inputs that have not delivered anything yet are named in the log so often.
+_SILENT_EVERY_S = 30.0
 
 # Answers to many calls are sent a few at a time: a client keeps ten that it has not taken yet, and
 # loses the others.
@@ -83,11 +86,13 @@ class CalibratorNode(Node):
             config.require_poses("monitor")
         _ = config.measured  # or it raises
         self._session.reconfigure(config)
-        self._tf = TfBroadcaster(self, self._log)
-        self._robot = Robot(self, self._log, options, self._tf.is_own)
+        tree = RobotTree(self, self._log)
+        self._robot = Robot(self._log, options, tree)
+        self._tf = TfBroadcaster(self, self._log, tree, *[STATIC_TOPIC] * bool(needs_tf(options)))
         self._others = other_names(options.other_children)
         self._session.take_others(self._others)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *self._others)]
+        self._say_start()
         self._session.topics = {each.name: each.topic for each in self._inputs[:2]}
         self._session.follow_journal(options, resuming=options.journal == "resume")
         for each in self._inputs:
@@ -131,6 +136,21 @@ class CalibratorNode(Node):
 
     # ---------------------------------------------------------------- set-up
 
+    def _say_start(self) -> None:
+        """Say in one line what the node goes by."""
+        options, inputs = self._options.node, self._inputs
+        what = "watching" if options.monitor else "calibrating"
+        children = ", ".join(each.topic for each in inputs[1:])
+        given = self._options.given.items()
+        told = [f"{name} {value}" for name, value in given if name != "output_directory"]
+        base = self._output_base if options.output_directory else None
+        self._log.info(
+            f"{what} {children} against {inputs[0].topic}"
+            + (f"; files go to {base}" if base else "; nothing is saved: no output_directory")
+            + (f"; set are {', '.join(told)}" if told else "")
+            + ("" if options.enabled else "; no poses are accepted before ~/set_enabled")
+        )
+
     def _watch_mount(self) -> MountWatch:
         robot = self._robot
         self._session.watch_only(LIMITS)
@@ -144,30 +164,36 @@ class CalibratorNode(Node):
         else:
             made = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), *parts)
         made.configure(self._options.calibrator, options.monitor)
+        made.is_enabled = options.enabled
         return made
 
     def _serve(self) -> None:
         # A group of its own: while it awaits a solve, it would hold up every other callback of its
         # group.
-        apart = ReentrantCallbackGroup()
-        self.create_service(
-            Trigger, "~/solve", self._on_solve, qos_profile=_SERVICE_QOS, callback_group=apart
-        )
-        self.create_service(Trigger, "~/reset", self._on_reset, qos_profile=_SERVICE_QOS)
-        self.create_service(Trigger, "~/save", self._on_save, qos_profile=_SERVICE_QOS)
-        self.create_service(
-            SetBool, "~/set_enabled", self._on_set_enabled, qos_profile=_SERVICE_QOS
-        )
+        groups = {"solve": ReentrantCallbackGroup()}
+        for name, kind, answer in (
+            ("solve", Trigger, self._on_solve),
+            ("reset", Trigger, self._on_reset),
+            ("save", Trigger, self._on_save),
+            ("set_enabled", SetBool, self._on_set_enabled),
+        ):
+            self.create_service(
+                kind, f"~/{name}", answer, qos_profile=_SERVICE_QOS, callback_group=groups.get(name)
+            )
 
     def _start_timers(self) -> None:
         # Steady time: these go on while a bag, and with it simulated time, is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        period_s = self._options.node.solve_period
-        self._solve_timer = self.create_timer(period_s, self._on_solve_timer, clock=steady)
-        self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=steady)
-        self.create_timer(_STATE_PERIOD_S, self._publish_state, clock=steady)
-        self._answer_timer = self.create_timer(_ANSWER_PERIOD_S, self._answer_some, clock=steady)
-        self.create_timer(FLUSH_PERIOD_S, self._session.flush_journal, clock=steady)
+        self._solve_timer, _, _, self._answer_timer, _ = (
+            self.create_timer(period_s, callback, clock=steady)
+            for period_s, callback in (
+                (self._options.node.solve_period, self._on_solve_timer),
+                (_DISCOVERY_PERIOD_S, self._discover),
+                (_STATE_PERIOD_S, self._publish_state),
+                (_ANSWER_PERIOD_S, self._answer_some),
+                (FLUSH_PERIOD_S, self._session.flush_journal),
+            )
+        )
 
     # ---------------------------------------------------------------- timers
 
@@ -180,7 +206,7 @@ class CalibratorNode(Node):
         silent = [each for each in self._inputs if not each.has_poses]
         if silent and silent[0].is_enabled:
             text = "; ".join(each.describe_silence() for each in silent)
-            self._log.info(text, "silent", 2 * LOG_PERIOD_S)
+            self._log.info(text, _SILENT_EVERY_S)
         self._cycle.start_if_due()
 
     def _answer_some(self) -> None:
@@ -192,20 +218,20 @@ class CalibratorNode(Node):
 
     def _publish_result(self, calibration: Calibration) -> None:
         self._results.publish(calibration)
-        if not self._robot.lacks_base(calibration):
-            self._tf.add(calibration, self._cycle.goal.progress.done)
-
-    def _publish_others(self, calibrations: Sequence[Calibration]) -> None:
-        """Publish new results of the further child sensors, in their order."""
-        for name, calibration in zip(self._others, calibrations, strict=False):
-            self._results.publish_other(name, calibration)
-        mounted = [self._robot.in_base(each) for each in calibrations]
-        if mounted:
-            self._tf.add_others([each for each in mounted if not self._robot.lacks_base(each)])
+        progress = self._cycle.goal.progress
+        faulty = "the streams are faulty" * progress.is_faulty
+        why_not = "" if progress.done else faulty or "the goal is not reached"
+        self._tf.add(calibration, why_not or self._robot.lacks_base(calibration))
 
     def _publish_state(self, has_ended: bool = False) -> None:
+        # New results of the further child sensors, in their order.
+        others = self._saver.take_others()
+        for name, calibration in zip(self._others, others, strict=False):
+            self._results.publish_other(name, calibration)
+        mounted = [self._robot.in_base(each) for each in others]
+        if mounted:
+            self._tf.add_others([each for each in mounted if not self._robot.lacks_base(each)])
         self._tf.look()
-        self._publish_others(self._saver.take_others())
         if self._mount is not None:
             self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds
@@ -219,16 +245,17 @@ class CalibratorNode(Node):
         inputs = input_states(self._inputs, cycle.has_valid_result, used_s, steady_s)
         if self._mount is not None:
             return NodeState(node=name, mount=self._mount.state(), inputs=inputs)
+        extrinsic = extrinsic_state(
+            cycle,
+            accepts_poses=self._inputs[0].is_enabled,
+            tf_static=self._tf.state,
+            waited_for_s=options.solve_period if self._session.has_new_poses else None,
+            steady_s=steady_s,
+            clock_ns=clock_ns,
+        )
         return NodeState(
             node=name,
-            extrinsic=extrinsic_state(
-                cycle,
-                accepts_poses=self._inputs[0].is_enabled,
-                tf_static=self._tf.state,
-                waited_for_s=options.solve_period if self._session.has_new_poses else None,
-                steady_s=steady_s,
-                clock_ns=clock_ns,
-            ),
+            extrinsic=extrinsic,
             progress=progress_state(cycle, self._robot.why_not_compared),
             inputs=inputs,
             checks=cycle.checks.state(steady_s),
@@ -241,7 +268,7 @@ class CalibratorNode(Node):
     def _begin_session(self, because_of: PoseInput | None = None) -> None:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._session.reset()
-        for part in (self._cycle, self._saver, self._tf, self._mount):
+        for part in (self._log, self._cycle, self._saver, self._tf, self._mount):
             if part is not None:
                 part.restart()
         self._results.clear()
@@ -290,8 +317,8 @@ class CalibratorNode(Node):
         """Raise ConfigError if options cannot be had together, or not on this machine."""
         if options.publish_tf:
             message_type()
-        if needs_tf(options):
-            message_type("base_frame" if options.base_frame else "installed")
+        if wanted_by := needs_tf(options):
+            message_type(wanted_by)
         if options.monitor and not options.installed:
             raise ConfigError("monitor needs installed: what the mount is watched against")
         if options.monitor and options.other_children:

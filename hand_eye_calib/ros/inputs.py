@@ -1,6 +1,5 @@
 """The subscriptions of the node's inputs: from a topic, or from transforms, to poses."""
 
-import time
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -13,11 +12,7 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import CalibratorConfig, other_names
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.bags.messages import (
-    MALFORMED,
-    MessageReader,
-    unpack_stamp_ns,
-)
+from hand_eye_calib.io.bags.messages import MALFORMED, MessageReader, unpack_stamp_ns
 from hand_eye_calib.io.transforms import PoseFields, TfSource
 from hand_eye_calib.live.input import PoseInput, with_stamp
 from hand_eye_calib.live.log import NodeLog
@@ -38,6 +33,17 @@ _BAD_QOS = (
     AssertionError,
     ValueError,
 )
+
+
+def _quick() -> QoSProfile:
+    """Best effort hears reliable publishers too; a queue for seconds of a fast stream. A profile
+    for each subscription: rclpy writes its overrides into it.
+    """
+    return QoSProfile(
+        depth=1000,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )
 
 
 class TopicInput(PoseInput):
@@ -63,11 +69,10 @@ class TopicInput(PoseInput):
         log: NodeLog,
         on_jump_back: Any,
     ) -> None:
-        self._relative_topic = _relative_topic(name)
+        self._relative_topic = f"{name}_odom"
         topic = node.resolve_topic_name(self._relative_topic)
         super().__init__(name, topic, session, log, _clock_of(node), on_jump_back)
-        self._node = node
-        self._wanted_type = wanted_type
+        self._node, self._wanted_type = node, wanted_type
         self._subscription: Subscription | None = None
         self._type_name = ""
 
@@ -90,7 +95,7 @@ class TopicInput(PoseInput):
                 if is_wanted:
                     raise
                 self.problem = str(error)
-                self._log.error(f"{self.topic} is not used: {error}", ("unusable", self.name))
+                self._log.error(f"{self.topic} is not used: {error}")
         publishers = self._node.count_publishers(self.topic)  # which does not follow remaps itself
         self.delivery.has_one_publisher = publishers == 1
 
@@ -110,8 +115,7 @@ class TopicInput(PoseInput):
         if offered and not usable:
             self._log.warning(
                 f"{self.topic} has type {', '.join(offered)}; expected {', '.join(MESSAGES)}: "
-                f"remap {self._relative_topic} to a topic with poses",
-                ("type", self.name),
+                f"remap {self._relative_topic} to a topic with poses"
             )
         return usable[0] if usable else None
 
@@ -132,19 +136,12 @@ class TopicInput(PoseInput):
         # rclpy looks at the signature: with two arguments it passes the info as well, which its
         # annotations do not know.
         callback: Any = on_message
-        # Best effort hears reliable publishers too; a queue for seconds of a fast stream. A profile
-        # for each subscription: rclpy writes its overrides into it.
-        qos = QoSProfile(
-            depth=1000,
-            reliability=ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.VOLATILE,
-        )
         try:
             self._subscription = self._node.create_subscription(
                 MESSAGES[type_name],
                 self._relative_topic,
                 callback,
-                qos,
+                _quick(),
                 # As bytes: making the objects of a message takes ten times as long as reading what
                 # is needed of it.
                 raw=True,
@@ -159,8 +156,7 @@ class TopicInput(PoseInput):
 
     def receive(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
         """Take a message: the callback of the subscription."""
-        waited_ns = time.time_ns() - info["received_timestamp"]
-        self.delivery.note(info["publication_sequence_number"], waited_ns * 1e-9)
+        self.delivery.note(info["publication_sequence_number"])
         try:
             stamp_ns = unpack_stamp_ns(data)
         except MALFORMED as error:
@@ -195,9 +191,9 @@ class TfInput(PoseInput):
         self._source, self._stream = source, TfStream(source, max_gap_s=0.0)
         self._subscriptions: dict[str, Subscription] = {}
         kind = message_type(f"{name}_tf")
-        for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, _MOVING_QOS)):
-            callback: Any = partial(self._hear, topic)
-            self._subscriptions[topic] = node.create_subscription(kind, topic, callback, qos)
+        for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, _quick())):
+            heard: Any = partial(self._hear, topic)
+            self._subscriptions[topic] = node.create_subscription(kind, topic, heard, qos)
         log.info(f"{source} is taken from /tf for the {name} sensor")
 
     def configure(self, config: CalibratorConfig, is_watching: bool) -> None:
@@ -213,23 +209,16 @@ class TfInput(PoseInput):
         """Why nothing has come yet, as far as the transforms tell."""
         return f"no pose yet of {self._source}: {self.problem}"
 
-    def _hear(self, topic: str, message: Any, info: dict[str, Any]) -> None:
-        self._receive(topic, message, info)
-        for queued in waiting_messages(self._subscriptions.get(topic)):
-            self._receive(topic, *queued)
-
-    def _receive(self, topic: str, message: Any, info: dict[str, Any]) -> None:
-        waited_ns = time.time_ns() - info["received_timestamp"]
-        self.delivery.note(None, waited_ns * 1e-9)  # /tf has many publishers
-        for transform in map(from_transform, message.transforms):
-            try:
-                for pose in self._stream.add(transform, topic == STATIC_TOPIC):
-                    self.accept(pose.stamp_ns, partial(PoseFields, *pose))
-            except InputError as error:
-                self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
-
-
-_MOVING_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    def _hear(self, topic: str, message: Any) -> None:
+        waiting = (queued for queued, _ in waiting_messages(self._subscriptions.get(topic)))
+        for each in (message, *waiting):
+            self.delivery.note(None)  # /tf has many publishers
+            for transform in map(from_transform, each.transforms):
+                try:
+                    for pose in self._stream.add(transform, topic == STATIC_TOPIC):
+                        self.accept(pose.stamp_ns, partial(PoseFields, *pose))
+                except InputError as error:
+                    self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
 
 
 def _clock_of(node: Node) -> Any:
@@ -254,14 +243,9 @@ def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, d
             yield taken
 
 
-def _relative_topic(name: str) -> str:
-    """The topic of an input before remapping."""
-    return f"{name}_odom"
-
-
 def qos_parameter_names(node: Node) -> Iterator[str]:
     """The parameters that rclpy declares for the QoS of the inputs."""
     for name in ("parent", "child", *other_names()):
-        topic = node.resolve_topic_name(_relative_topic(name))
+        topic = node.resolve_topic_name(f"{name}_odom")
         for policy in _QOS_OVERRIDES:
             yield f"qos_overrides.{topic}.subscription.{policy.name.lower()}"

@@ -4,7 +4,6 @@ clean end.
 ROS and the engine are imported late, so that Ctrl-C while they load ends the program quietly too.
 """
 
-import argparse
 import os
 import re
 import signal
@@ -36,28 +35,20 @@ def main(args: list[str] | None = None) -> int:
         Exit code: 0 stopped by a signal; 1 bad parameter, failure, or a result that could not be
         saved (reported on stderr); 2 wrong usage.
     """
-    signals = _signal_pipe()
-    arguments = sys.argv[1:] if args is None else args
-    code = _init(arguments) or _run_node(signals)
-    # The interpreter's own clean-up would restore the defaults, and a late Ctrl-C change the exit
-    # code.
-    for number in STOP_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-    return code
-
-
-def _signal_pipe() -> int:
-    """File descriptor that becomes readable on SIGINT or SIGTERM.
-
-    The signals do nothing else: no KeyboardInterrupt in the middle of a callback, no context that
-    rclpy shuts down while a callback still publishes, and a second Ctrl-C changes nothing.
-    """
+    # The signals do nothing but make a pipe readable: no KeyboardInterrupt in the middle of a
+    # callback, no context that rclpy shuts down while a callback still publishes, and a second
+    # Ctrl-C changes nothing.
     readable, writable = os.pipe()
     os.set_blocking(writable, False)
     signal.set_wakeup_fd(writable, warn_on_full_buffer=False)
     for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: None)
-    return readable
+    code = _init(sys.argv[1:] if args is None else args) or _run_node(readable)
+    # The interpreter's own clean-up would restore the defaults, and a late Ctrl-C change the exit
+    # code.
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    return code
 
 
 def _init(arguments: list[str]) -> int:
@@ -68,23 +59,20 @@ def _init(arguments: list[str]) -> int:
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import remove_ros_args
 
-    parser = argparse.ArgumentParser(
-        prog="calibrator",
-        description="The extrinsic between two sensors from their odometry, live.",
-        epilog="ROS arguments follow --ros-args.",
-    )
+    def fail(text: str, code: int) -> int:
+        print(f"calibrator: {text}", file=sys.stderr)
+        return code
+
     # rcl logs an error of its own before it raises the one that says what is wrong.
     set_logger_level("rcl", LoggingSeverity.FATAL)
     try:
-        parser.parse_args(remove_ros_args(args=arguments))
+        if unknown := remove_ros_args(args=arguments):
+            return fail(f"unknown arguments {unknown}; ROS arguments follow --ros-args", 2)
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except UnknownROSArgsError as error:
-        print(f"calibrator: unknown ROS arguments {error}", file=sys.stderr)
-        return 2
+        return fail(f"unknown ROS arguments {error}", 2)
     except RCLError as error:
-        reason = re.sub(r", at \S+:\d+", "", " ".join(str(error).split()))
-        print(f"calibrator: {reason}", file=sys.stderr)
-        return 1
+        return fail(re.sub(r", at \S+:\d+", "", " ".join(str(error).split())), 1)
     set_logger_level("rcl", LoggingSeverity.UNSET)
     return 0
 

@@ -39,20 +39,14 @@ class ResultTopics:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._publishers: dict[str, Publisher] = {}
-        self._open()
-
-    def _open(self) -> None:
-        kinds = {"extrinsic": TransformStamped}
-        kinds |= {"extrinsic_with_covariance": PoseWithCovarianceStamped}
-        for name, kind in kinds.items():
-            self._publishers[name] = self._node.create_publisher(kind, f"~/{name}", LATCHED)
+        self.clear()
 
     def publish(self, calibration: Calibration) -> None:
-        """Publish a result, if there is one that says enough to be used."""
+        """Publish a result: with its covariance always, alone if that says enough to be used."""
+        pose = to_pose_with_covariance(calibration)
+        self._publishers["extrinsic_with_covariance"].publish(pose)
         if _is_known(calibration):
             self._publishers["extrinsic"].publish(to_transform(calibration))
-            pose = to_pose_with_covariance(calibration)
-            self._publishers["extrinsic_with_covariance"].publish(pose)
 
     def publish_other(self, input_name: str, calibration: Calibration) -> None:
         """Publish a result of a further child sensor, by the name of its input."""
@@ -67,7 +61,11 @@ class ResultTopics:
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
         self._publishers.clear()
-        self._open()
+        for name, kind in (
+            ("extrinsic", TransformStamped),
+            ("extrinsic_with_covariance", PoseWithCovarianceStamped),
+        ):
+            self._publishers[name] = self._node.create_publisher(kind, f"~/{name}", LATCHED)
 
 
 def _is_known(calibration: Calibration) -> bool:

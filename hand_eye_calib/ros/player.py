@@ -17,7 +17,6 @@ from std_srvs.srv import Trigger
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.ros.conversions import LATCHED, from_transform, to_time
 
 if TYPE_CHECKING:  # what reads bags is not needed to play poses
@@ -25,7 +24,7 @@ if TYPE_CHECKING:  # what reads bags is not needed to play poses
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-_SPIN_S = 0.02
+_SPIN_S, _PATIENCE_S = 0.02, 120.0
 
 
 class LiveExtrinsic(NamedTuple):
@@ -38,17 +37,8 @@ class LiveExtrinsic(NamedTuple):
 
 
 class Player:
-    """Publishes nav_msgs/Odometry and listens to the node; a context manager.
-
-    Parameters
-    ----------
-    topics : mapping
-        "parent" and "child" to the names of their topics.
-    check : callable
-        Called while waiting; raises if waiting has become pointless, such as when the node has
-        died.
-    patience_s : float
-        How long to wait for the node at each step.
+    """Publishes nav_msgs/Odometry on topics by their streams and listens to the node; a context
+    manager. ``check`` is called while waiting, and raises if that has become pointless.
 
     Raises
     ------
@@ -56,33 +46,24 @@ class Player:
         If ROS cannot start; from the methods, if the node does not do its part in time.
     """
 
-    def __init__(
-        self,
-        topics: Mapping[str, str],
-        check: Callable[[], None] = lambda: None,
-        patience_s: float = 120.0,
-    ) -> None:
-        self._check, self._patience_s = check, patience_s
+    def __init__(self, topics: Mapping[str, str], check: Callable[[], None]) -> None:
+        self._check = check
         self._context = rclpy.Context()
         try:
             rclpy.init(args=[], context=self._context)
         except RCLError as error:
             raise HandEyeCalibError(f"cannot start ROS: {' '.join(str(error).split())}") from None
-        self._node = rclpy.create_node("hand_eye_calib_player", context=self._context)
+        self._node = node = rclpy.create_node("hand_eye_calib_player", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._executor.add_node(node)
         self._publishers = {
-            stream: self._node.create_publisher(Odometry, topic, _LOSSLESS)
+            stream: node.create_publisher(Odometry, topic, _LOSSLESS)
             for stream, topic in topics.items()
         }
-        self._solve = self._node.create_client(Trigger, "calibrator/solve")
-        self._heard: list[PoseFields] = []
-        self._node.create_subscription(
-            TransformStamped,
-            "calibrator/extrinsic",
-            lambda message: self._heard.append(from_transform(message)),
-            LATCHED,
-        )
+        self._solve = node.create_client(Trigger, "calibrator/solve")
+        self._heard: list[TransformStamped] = []
+        heard = self._heard.append
+        node.create_subscription(TransformStamped, "calibrator/extrinsic", heard, LATCHED)
 
     def __enter__(self) -> "Player":
         return self
@@ -114,27 +95,26 @@ class Player:
         Poses and service calls share no order, so one call of ``~/solve`` would not be enough.
         """
         self._wait(self._solve.service_is_ready, "serve ~/solve")
-        asked = self._solve.call_async(Trigger.Request())
+        asked = [self._solve.call_async(Trigger.Request())]
 
         def is_covered() -> bool:
-            nonlocal asked
-            if self._heard and self._heard[-1].stamp_ns >= stamp_ns:
+            if self._heard and from_transform(self._heard[-1]).stamp_ns >= stamp_ns:
                 return True
-            if asked.done():
-                asked = self._solve.call_async(Trigger.Request())
+            if asked[-1].done():
+                asked.append(self._solve.call_async(Trigger.Request()))
             return False
 
         self._wait(is_covered, "give a result with all poses")
-        found = self._heard[-1]
+        found = from_transform(self._heard[-1])
         T = se3.from_quat_xyzw(found.position, found.quat_xyzw)
         return LiveExtrinsic(T, found.world_frame, found.sensor_frame or "", found.stamp_ns)
 
     def _wait(self, condition: Callable[[], object], purpose: str) -> None:
-        end_s = time.monotonic() + self._patience_s
+        end_s = time.monotonic() + _PATIENCE_S
         while not condition():
             self._check()
             if time.monotonic() > end_s:
-                raise HandEyeCalibError(f"waited {self._patience_s:g} s for the node to {purpose}")
+                raise HandEyeCalibError(f"waited {_PATIENCE_S:g} s for the node to {purpose}")
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
 

@@ -1,9 +1,12 @@
-"""The extrinsic on ``/tf_static``: only once the goal is reached, and never as a second parent."""
+"""The robot's transform tree: what is installed and the base frame are read from it, and the
+extrinsic is broadcast on ``/tf_static``, only once the goal is reached, never as a second parent.
+"""
 
 import math
 import time
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,22 +16,39 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.config import NodeConfig
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
+from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.geometry.frames import FrameTree, checked_pose
+from hand_eye_calib.io.installed import of_frames, open_installed
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import Broadcast
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Verdict
+from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.results.verdict import target_of
-from hand_eye_calib.ros.conversions import LATCHED, LISTENING, to_mounting
+from hand_eye_calib.ros.conversions import (
+    LATCHED,
+    LISTENING,
+    covariance_about_parent_axes,
+    from_transform,
+    to_mounting,
+)
+from hand_eye_calib.session.compare import with_comparison
 from hand_eye_calib.text import axes_in_words
 
-STATIC_TOPIC = "/tf_static"
-DYNAMIC_TOPIC = "/tf"
+TF, STATIC_TOPIC, DYNAMIC_TOPIC = "tf", "/tf_static", "/tf"
 
-_DYNAMIC_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+_QOS = {
+    STATIC_TOPIC: LISTENING,
+    DYNAMIC_TOPIC: QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT),
+}
 
 # The transform tree is listened to for so long before anything is broadcast (s): discovery takes up
 # to 2.4 s.
 LOOK_S = 5.0
+
+# What is installed is looked for again after so long (s); own broadcasts that are recognised.
+_AGAIN_S, _MOST_OWN = 5.0, 100
 
 # What to do without tf2_msgs.
 _INSTEAD = {
@@ -38,192 +58,6 @@ _INSTEAD = {
     "base_frame": "leave base_frame empty and give --base-frame and --urdf to replay",
     "installed": "give a URDF, an extrinsic.yaml or numbers instead of tf",
 }
-
-# Own broadcasts that are recognised when they are heard.
-_MOST_OWN = 100
-
-
-class FrameTree:
-    """The edges that others have broadcast."""
-
-    def __init__(self) -> None:
-        self._parents: dict[str, dict[str, str]] = {}  # child to parent to topic
-
-    def add(self, parent: str, child: str, topic: str) -> None:
-        """Take note of an edge."""
-        self._parents.setdefault(child, {})[parent] = topic
-
-    def what_forbids(self, parent: str, child: str) -> str:
-        """Why the edge ``parent -> child`` must not be broadcast; empty if it may."""
-        for other, topic in self._parents.get(child, {}).items():
-            if other == parent:
-                return f"{topic} has the edge {parent} -> {child} already, from another node"
-            return f"{child} has the parent {other} on {topic} already, and a frame has one parent"
-        above, waiting = set[str](), [parent]
-        while waiting:
-            for frame in self._parents.get(waiting.pop(), {}):
-                if frame not in above:
-                    above.add(frame)
-                    waiting.append(frame)
-        if child in above:
-            return f"{parent} is below {child} in the tree already: the edge would close a circle"
-        return ""
-
-
-class TfBroadcaster:
-    """Broadcasts the results of a session that has reached its goal on ``/tf_static`` while that is
-    switched on, and with them the results of further child sensors.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    log : NodeLog
-    """
-
-    def __init__(self, node: Node, log: NodeLog) -> None:
-        self._node, self._log = node, log
-        self._tree = FrameTree()
-        self._own: deque[TransformStamped] = deque(maxlen=_MOST_OWN)
-        self._publisher: Publisher | None = None
-        self._subscriptions: dict[str, Subscription] = {}
-        self._began_s = 0.0
-        self._forget()
-
-    def _forget(self) -> None:
-        self._newest: Calibration | None = None
-        self._others: list[Calibration] = []
-        self._waiting_for = "no result yet"
-        self._forbidden: dict[str, str] = {}  # frame to the reason
-
-    @property
-    def refused(self) -> str:
-        """Why something may not be broadcast; empty if all may."""
-        return "; ".join(self._forbidden.values())
-
-    @property
-    def state(self) -> tuple[Broadcast, str]:
-        """What is done about it, and the reason."""
-        if not self._subscriptions:
-            return Broadcast.OFF, ""
-        if self._publisher is not None:
-            return Broadcast.ON, self.refused
-        if self._forbidden:
-            return Broadcast.REFUSED, self.refused
-        return Broadcast.WAITING, self._waiting_for or "the transform tree is looked at first"
-
-    def switch(self, on: bool) -> None:
-        """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
-        if on and not self._subscriptions:
-            kind = message_type()
-            for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, _DYNAMIC_QOS)):
-                self._subscriptions[topic] = self._node.create_subscription(
-                    kind, topic, partial(self._hear, topic), qos
-                )
-            self._began_s = time.monotonic()
-            self._tree, self._forbidden = FrameTree(), {}
-            self.look()
-        elif not on and self._subscriptions:
-            for subscription in self._subscriptions.values():
-                self._node.destroy_subscription(subscription)
-            self._subscriptions.clear()
-            self._withdraw()
-
-    def is_own(self, transform: TransformStamped) -> bool:
-        """Whether this node has broadcast the transform."""
-        return transform in self._own
-
-    def add(self, calibration: Calibration, is_done: bool) -> None:
-        """Take the next result of the session, and whether the goal is reached with it."""
-        self._newest = calibration
-        unknown = what_is_unknown(calibration)
-        self._waiting_for = unknown if is_done else "the goal is not reached"
-        self._broadcast()
-
-    def add_others(self, calibrations: Sequence[Calibration]) -> None:
-        """Take the results of all further child sensors, in the frames that they are mounted on."""
-        self._others = []
-        for calibration in calibrations:
-            if unknown := what_is_unknown(calibration):
-                self._log.info(f"{calibration.child_frame} is not on /tf_static: {unknown}")
-            else:
-                self._others.append(calibration)
-        self._broadcast()
-
-    def look(self) -> None:
-        """Go on if the transform tree has been listened to for long enough; to be called often."""
-        if self._publisher is None:
-            self._broadcast()
-
-    def restart(self) -> None:
-        """Begin a new session: what was broadcast is withdrawn."""
-        self._forget()
-        self._withdraw()
-
-    def _hear(self, topic: str, message: Any) -> None:
-        for transform in message.transforms:
-            if not self.is_own(transform):
-                self._tree.add(transform.header.frame_id, transform.child_frame_id, topic)
-        if self._publisher is not None and topic == STATIC_TOPIC and self._finds_forbidden():
-            self._broadcast()
-
-    def _finds_forbidden(self) -> bool:
-        """Whether there is another edge that may not be broadcast."""
-        assert self._newest is not None
-        before, self._forbidden = self._forbidden, {}
-        for each in (self._newest, *self._others):
-            if why := self._tree.what_forbids(each.mounting[0], each.child_frame):
-                self._forbidden[each.child_frame] = why
-        new = [why for frame, why in self._forbidden.items() if why != before.get(frame)]
-        for why in new:
-            self._log.error(
-                f"publish_tf is refused: {why}. Put the result into the robot's description "
-                "(extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf off"
-            )
-            if self._publisher is not None:
-                self._log.error("restart the listeners: some of them believe the other parent")
-        return bool(new)
-
-    def _broadcast(self) -> None:
-        is_looking = time.monotonic() - self._began_s < LOOK_S
-        if not self._subscriptions or is_looking or self._waiting_for or self._newest is None:
-            return
-        self._finds_forbidden()
-        if self._newest.child_frame in self._forbidden:
-            self._withdraw()
-            return
-        if DYNAMIC_TOPIC in self._subscriptions:  # enough of that: it may be fast
-            self._node.destroy_subscription(self._subscriptions.pop(DYNAMIC_TOPIC))
-        if self._publisher is None:
-            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
-            self._log.info("the result is broadcast on /tf_static from now on")
-        # In one message: new listeners get the last one alone.
-        found = [each for each in self._others if each.child_frame not in self._forbidden]
-        transforms = [to_mounting(each) for each in (self._newest, *found)]
-        self._own.extend(transforms)
-        self._publisher.publish(message_type()(transforms=transforms))
-
-    def _withdraw(self) -> None:
-        """Give nothing to new listeners; those who have heard the edge keep it."""
-        if self._publisher is not None:
-            self._node.destroy_publisher(self._publisher)
-            self._publisher = None
-            self._log.warning(
-                "the edge on /tf_static is withdrawn; listeners that have heard it keep it until "
-                "they are restarted"
-            )
-
-
-def what_is_unknown(calibration: Calibration) -> str:
-    """What a result lacks to be a whole transform that may be used; empty if nothing."""
-    if calibration.verdict is Verdict.DO_NOT_USE:
-        return calibration.headline
-    rough = [
-        dof.name
-        for dof in calibration.observability
-        if not math.isfinite(dof.sigma)
-        or (dof.verdict is not DofVerdict.PRIOR and dof.sigma > target_of(dof.name, calibration))
-    ]
-    return f"{axes_in_words(rough)} not known to the target" if rough else ""
 
 
 def message_type(wanted_by: str = "publish_tf") -> type[Any]:
@@ -247,3 +81,303 @@ def message_type(wanted_by: str = "publish_tf") -> type[Any]:
             f"ros-jazzy-tf2-msgs, or {_INSTEAD[wanted_by]}"
         ) from None
     return TFMessage
+
+
+def needs_tf(options: NodeConfig) -> str:
+    """The parameter for which the robot's transforms have to be listened to; empty if none."""
+    return "base_frame" * bool(options.base_frame) or "installed" * (options.installed == TF)
+
+
+class RobotTree(FrameTree):
+    """The edges that others broadcast; of two parents of a frame the first counts.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    log : NodeLog
+
+    Attributes
+    ----------
+    own : deque of TransformStamped
+        What this node has broadcast itself, which is not heard.
+    """
+
+    def __init__(self, node: Node, log: NodeLog) -> None:
+        super().__init__(STATIC_TOPIC)
+        self.own: deque[TransformStamped] = deque(maxlen=_MOST_OWN)
+        self._node, self._log = node, log
+        self._subscriptions: dict[str, Subscription] = {}
+
+    def listen(self, *topics: str) -> None:
+        """Listen to these topics alone from now on, as if nothing had been heard yet."""
+        self.edges.clear()
+        self.ignore(*self._subscriptions)
+        for topic in topics:
+            heard = partial(self._hear, topic)
+            subscription = self._node.create_subscription(message_type(), topic, heard, _QOS[topic])
+            self._subscriptions[topic] = subscription
+
+    def ignore(self, *topics: str) -> None:
+        """Listen to these topics no longer."""
+        for topic in topics:
+            if topic in self._subscriptions:
+                self._node.destroy_subscription(self._subscriptions.pop(topic))
+
+    def what_forbids(self, parent: str, child: str) -> str:
+        """Why the edge ``parent -> child`` must not be broadcast; empty if it may."""
+        if child in self.edges:
+            edge = self.edges[child]
+            topic = STATIC_TOPIC if edge.is_static else DYNAMIC_TOPIC
+            if edge.parent == parent:
+                return f"{topic} has the edge {parent} -> {child} already, from another node"
+            return f"{child} has the parent {edge.parent} on {topic} already, and a frame has one"
+        try:
+            is_below = child in self.above(parent)
+        except InputError:  # it is not there, or others have closed a circle
+            return ""
+        if is_below:
+            return f"{parent} is below {child} in the tree already: the edge would close a circle"
+        return ""
+
+    def _hear(self, topic: str, message: Any) -> None:
+        for each in message.transforms:
+            if each in self.own:
+                continue
+            edge, pose, problem = from_transform(each), None, ""
+            frame = edge.sensor_frame or ""
+            try:
+                pose = checked_pose(edge.position, edge.quat_xyzw)
+            except InputError as error:
+                problem = str(error)
+            try:
+                self.add(edge.world_frame, frame, pose, is_static=topic == STATIC_TOPIC)
+            except InputError as error:
+                problem = str(error)
+            if problem:
+                text = f"{topic} has an unusable transform of {frame}: {problem}"
+                self._log.warning(text)
+
+
+class Robot:
+    """Completes results with what is installed, and with the pose in the base frame.
+
+    Parameters
+    ----------
+    log : NodeLog
+    options : NodeConfig
+        Its ``installed`` and ``base_frame`` do not change while the node runs.
+    frames : FrameTree
+        The robot's.
+
+    Attributes
+    ----------
+    problem : str
+        Why the installed extrinsic or the base frame is not known yet; empty if it is, or if
+        nothing was asked for.
+
+    Raises
+    ------
+    ConfigError, InputError
+        If what is installed cannot be read.
+    """
+
+    def __init__(self, log: NodeLog, options: NodeConfig, frames: FrameTree) -> None:
+        self._log, self._frames = log, frames
+        self._source, self._base_frame = options.installed, options.base_frame
+        self._installed: Extrinsic | None = None
+        self._again_at_s = 0.0
+        self.problem = ""
+        is_file = self._source not in ("", TF)
+        of_tree = partial(of_frames, frames, origin=STATIC_TOPIC)
+        self._read = open_installed(self._source) if is_file else of_tree
+
+    def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
+        """What is installed; None if nothing was given, or it is not known (yet)."""
+        if self._installed is None and self._source and time.monotonic() >= self._again_at_s:
+            self._again_at_s = time.monotonic() + _AGAIN_S
+            try:
+                self._installed = self._read(parent_frame, child_frame)
+                self.problem = ""
+                self._log.info(f"installed is what {self._installed.origin} says")
+            except HandEyeCalibError as error:
+                self._report(f"what is installed is not known: {error}")
+        return self._installed
+
+    def complete(self, calibration: Calibration) -> Calibration:
+        """A usable result with its comparison and its pose in the base frame. A single axis that
+        the motion cannot determine has the value that is installed.
+        """
+        installed = self.installed(calibration.parent_frame, calibration.child_frame)
+        if installed is not None:
+            calibration = with_comparison(calibration, installed)
+            calibration = _with_axis_of(installed, calibration)
+        return self.in_base(calibration)
+
+    def in_base(self, calibration: Calibration) -> Calibration:
+        """A result with its pose in the base frame, if one was asked for and is known."""
+        if not self._base_frame:
+            return calibration
+        try:
+            T_base_parent = self._frames.pose(self._base_frame, calibration.parent_frame)
+        except InputError as error:
+            self._report(f"base_frame {self._base_frame} is not known from {STATIC_TOPIC}: {error}")
+            return calibration
+        return replace(calibration, base_frame=self._base_frame, T_base_parent=T_base_parent)
+
+    @property
+    def why_not_compared(self) -> str:
+        """Why a result is not compared with what is installed; empty if that was not asked for."""
+        return (self.problem or "no result yet") if self._source else ""
+
+    def lacks_base(self, calibration: Calibration) -> str:
+        """Why a result has no pose in the base frame; empty if it has, or none was asked for."""
+        is_there = calibration.base_frame == self._base_frame
+        return "" if is_there else f"base_frame {self._base_frame} is not known"
+
+    def _report(self, problem: str) -> None:
+        self.problem = problem
+        self._log.warning(problem)
+
+
+def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration:
+    """A result whose only unobservable axis, of the translation, is that of what is installed."""
+    hidden = calibration.unobservable()
+    if len(hidden) != 1 or hidden[0] in (*ROTATIONS, *calibration.out_of_reach):
+        return calibration
+    index = AXES.index(hidden[0])
+    T = calibration.T_parent_child.copy()
+    covariance = covariance_about_parent_axes(T, calibration.covariance)
+    missing = float(installed.T_parent_child[index, 3] - T[index, 3])
+    # The other axes follow as far as the motion has tied them to this one.
+    T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
+    told = f"{hidden[0]} is that of what is installed ({installed.origin})"
+    return replace(calibration, T_parent_child=T, warnings=(*calibration.warnings, told))
+
+
+class TfBroadcaster:
+    """Broadcasts the results of a session that has reached its goal on ``/tf_static`` while that is
+    switched on, and with them the results of further child sensors.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    log : NodeLog
+    tree : RobotTree
+    topics : str
+        What the tree is listened to for other reasons.
+    """
+
+    def __init__(self, node: Node, log: NodeLog, tree: RobotTree, *topics: str) -> None:
+        self._node, self._log, self._tree, self._topics = node, log, tree, topics
+        self._is_on = False
+        self._publisher: Publisher | None = None
+        self._sent: list[TransformStamped] = []
+        self._began_s = 0.0
+        self._tree.listen(*topics)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new session: what was broadcast is withdrawn."""
+        self._results: list[Calibration] = []
+        self._others: list[Calibration] = []
+        self._why_not, self._unknown = "no result yet", ""
+        self._refused: dict[str, str] = {}  # frame to the reason
+        self._withdraw()
+
+    @property
+    def state(self) -> tuple[Broadcast, str]:
+        """What is done about it, and the reason."""
+        refused = self._unknown or "; ".join(self._refused.values())
+        if not self._is_on:
+            return Broadcast.OFF, ""
+        if self._publisher is not None:
+            return Broadcast.ON, refused
+        if self._why_not:
+            return Broadcast.WAITING, self._why_not
+        return (Broadcast.REFUSED, refused) if refused else (Broadcast.WAITING, _LOOKING)
+
+    def switch(self, on: bool) -> None:
+        """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
+        if on != self._is_on:
+            self._is_on, self._began_s, self._refused = on, time.monotonic(), {}
+            self._tree.listen(*((STATIC_TOPIC, DYNAMIC_TOPIC) if on else self._topics))
+            self.look()
+
+    def add(self, calibration: Calibration, why_not: str) -> None:
+        """Take the session's result, and why it may not be broadcast yet; empty if it may."""
+        self._results, self._why_not = [calibration], why_not
+        self._unknown = "" if why_not else what_is_unknown(calibration)
+        self.look()
+
+    def add_others(self, calibrations: Sequence[Calibration]) -> None:
+        """Take the results of all further child sensors, in the frames that they are mounted on."""
+        self._others = []
+        for calibration in calibrations:
+            if unknown := what_is_unknown(calibration):
+                self._log.info(f"{calibration.child_frame} is not on /tf_static: {unknown}")
+            else:
+                self._others.append(calibration)
+        self.look()
+
+    def look(self) -> None:
+        """Broadcast what is new, as far as the tree allows it now; to be called often."""
+        if not self._is_on or self._why_not or self._unknown:
+            self._withdraw()
+            return
+        if time.monotonic() - self._began_s < LOOK_S:
+            return
+        wanted = [*self._results, *self._others]
+        before, self._refused = self._refused, {}
+        for each in wanted:
+            if why := self._tree.what_forbids(each.mounting[0], each.child_frame):
+                self._refused[each.child_frame] = why
+                if why != before.get(each.child_frame):
+                    self._report(each.child_frame, why)
+        if self._results[0].child_frame in self._refused:
+            self._withdraw()
+            return
+        self._tree.ignore(DYNAMIC_TOPIC)  # enough of that: it may be fast
+        if self._publisher is None:
+            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
+            self._log.info("the result is broadcast on /tf_static from now on")
+        # In one message: new listeners get the last one alone.
+        transforms = [to_mounting(each) for each in wanted if each.child_frame not in self._refused]
+        if transforms != self._sent:
+            self._sent = transforms
+            self._tree.own.extend(transforms)
+            self._publisher.publish(message_type()(transforms=transforms))
+
+    def _report(self, frame: str, why: str) -> None:
+        self._log.error(
+            f"publish_tf is refused: {why}. Put the result into the robot's description "
+            "(extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf off"
+        )
+        if frame in (each.child_frame_id for each in self._sent):
+            self._log.error("restart the listeners: some of them believe the other parent")
+
+    def _withdraw(self) -> None:
+        """Give nothing to new listeners; those who have heard the edge keep it."""
+        self._sent = []
+        if self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = None
+            self._log.warning(
+                "the edge on /tf_static is withdrawn; listeners that have heard it keep it until "
+                "they are restarted"
+            )
+
+
+_LOOKING = "the transform tree is looked at first"
+
+
+def what_is_unknown(calibration: Calibration) -> str:
+    """What a result lacks to be a whole transform that may be used; empty if nothing."""
+    if calibration.verdict is Verdict.DO_NOT_USE:
+        return calibration.headline
+    rough = [
+        dof.name
+        for dof in calibration.observability
+        if not math.isfinite(dof.sigma)
+        or (dof.verdict is not DofVerdict.PRIOR and dof.sigma > target_of(dof.name, calibration))
+    ]
+    return f"{axes_in_words(rough)} not known to the target" if rough else ""

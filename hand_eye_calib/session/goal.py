@@ -124,7 +124,7 @@ class Goal:
         sentence = self._sentence(calibration, seen, faults, AXES[worst], left_s[worst], stuck)
         self.progress = Progress(
             sentence=sentence,
-            done=is_done,
+            done=is_done and not faults,
             is_faulty=bool(faults),
             limiting_axis="" if is_done else AXES[worst],
             will_not_get_there=stuck,

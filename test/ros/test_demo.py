@@ -109,7 +109,8 @@ def test_demo_without_ros_says_what_to_install(tmp_path):
 
 def test_player_does_not_wait_for_ever(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    with Player(TOPICS, patience_s=0.1) as player:
+    monkeypatch.setattr("hand_eye_calib.ros.player._PATIENCE_S", 0.1)
+    with Player(TOPICS, lambda: None) as player:
         with pytest.raises(HandEyeCalibError, match="waited 0.1 s for the node to subscribe"):
             player.play([], speed=1.0)
         with pytest.raises(HandEyeCalibError, match="to serve ~/solve"):

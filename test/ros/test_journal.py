@@ -101,6 +101,13 @@ def test_a_signal_saves_the_newest_result_and_the_whole_journal(start_node, peer
     assert read_journal(tmp_path / "journal").lost_bytes == 0
 
 
+def test_a_relative_directory_is_told_as_a_whole_path(start_node, peer, tmp_path):
+    node = start_node(*QUIET, *into("live"))
+    node.wait_for_log(f"files go to {tmp_path / 'live'}")
+    peer.solve(peer.publishers(), *drive())
+    assert f"result saved to {tmp_path / 'live'}: " in peer.trigger("save").message
+
+
 def test_a_disk_that_is_full_is_reported_the_node_goes_on_and_the_journal_comes_back(
     start_node, peer, tmp_path
 ):

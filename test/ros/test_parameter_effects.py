@@ -208,6 +208,7 @@ def report_is_used(start_node, peer, tmp_path):
     page = (out / "report.html").read_text()
     assert "/parent_odom" in page
     saved = yaml.safe_load((out / "extrinsic.yaml").read_text())
+    assert saved["cross_check"]["x"]["of_halves"] is not None  # as in the report
     assert saved["provenance"]["inputs"]["child"]["topic"] == "/child_odom"
     assert main(["replay", str(out), "--out", str(tmp_path / "again")]) == 0
     assert (tmp_path / "again" / "report.html").exists()
@@ -262,6 +263,14 @@ def base_frame_is_used(start_node, peer, tmp_path):
     )
 
 
+def enabled_is_used(start_node, peer, tmp_path):
+    node = start_node(*QUIET, "-p enabled:=false")
+    node.wait_for_log("no poses are accepted before ~/set_enabled")
+    peer.feed(peer.publishers(), *drive(10))
+    peer.spin_until(lambda: peer.set_enabled(True).message.endswith("; 20 ignored so far"), "them")
+    assert peer.solve(peer.publishers(), *drive())[0].success
+
+
 def monitor_is_used(start_node, peer, tmp_path):
     start_node(*QUIET, "-p monitor:=true", "-p installed:=0 0 0 0 0 0")
     heard = []
@@ -289,6 +298,7 @@ EFFECTS = {
     "installed": installed_is_used,
     "base_frame": base_frame_is_used,
     "monitor": monitor_is_used,
+    "enabled": enabled_is_used,
 }
 
 
@@ -347,6 +357,7 @@ GIVEN = {name: (str(value), value) for name, (value, _) in CHANGES.items()} | {
     "installed": ("1 0 0 0 0 0", "1 0 0 0 0 0"),
     "base_frame": ("base_link", "base_link"),
     "monitor": ("true", True),
+    "enabled": ("false", False),
 }
 
 # monitor watches one child sensor.
@@ -442,12 +453,43 @@ def test_what_is_not_given_is_left_to_the_parameter_file(start_launch, peer, tmp
 TYPES = [f"{stream}_type:=nav_msgs/msg/Odometry" for stream in ("parent", "child")]
 
 
+@pytest.mark.parametrize(
+    ("argument", "told"),
+    [
+        ("respawn:=yes", "respawn must be true or false; got 'yes'"),
+        ("use_sim_time:=on", "use_sim_time must be true or false; got 'on'"),
+        ("report:=yes", "report must be true or false; got 'yes'"),
+        ("min_pairs:=3.5", "min_pairs must be a whole number; got '3.5'"),
+        ("method:=magic", "method must be one of "),
+    ],
+)
+def test_a_value_that_is_not_allowed_is_refused_with_its_name(prefix, argument, told):
+    """The node is not started."""
+    command = [sys.executable, "-c", LAUNCH, str(PROJECT / "launch" / "calibrator.launch.py")]
+    environment = {"ROS_LOG_DIR": str(prefix / "ros_log"), "AMENT_PREFIX_PATH": str(prefix)}
+    environment["PYTHONPATH"] = os.pathsep.join([str(PROJECT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [*command, argument],
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+        timeout=PATIENCE_S,
+    )
+    assert done.returncode == 1
+    assert told in done.stdout + done.stderr
+
+
 def test_name_namespace_topics_and_log_level(start_launch, peer):
     arguments = ["name:=front", "namespace:=/robot1", "parent_topic:=/lidar/odom"]
+    arguments += ["other_children:=1", "child2_topic:=/rear/odom"]
+    arguments += ["publish_tf:=true", "tf_topic:=/robot1/tf", "tf_static_topic:=tf_static"]
     log = start_launch(*TYPES, *arguments, "log_level:=warn")
     peer.target = "/robot1/front"
-    publishers = [peer.publisher(Odometry, name) for name in ("/lidar/odom", "/robot1/child_odom")]
+    topics = ("/lidar/odom", "/robot1/child_odom", "/rear/odom")
+    publishers = [peer.publisher(Odometry, name) for name in topics]
     peer.wait_matched(*publishers)
+    for topic in ("/robot1/tf", "/robot1/tf_static"):
+        peer.spin_until(lambda: peer.node.count_subscribers(topic) == 1, topic)  # noqa: B023
     assert peer.trigger("reset").success
     assert "subscribed to" not in log.read_text()
 

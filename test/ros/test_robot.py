@@ -1,5 +1,6 @@
 """What is installed and the base frame, from transforms as they come in; no middleware needed."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,9 +12,10 @@ from result_making import shifted
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.ros import robot as module
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict
+from hand_eye_calib.ros import tf as module
 from hand_eye_calib.ros.conversions import to_mounting
-from hand_eye_calib.ros.robot import Robot
+from hand_eye_calib.ros.tf import STATIC_TOPIC, Robot, RobotTree
 
 LIDAR = se3.from_rotation_translation(se3.rotation_from_rpy([0.1, 0.0, 0.5]), [1.0, 0.0, 2.0])
 
@@ -31,11 +33,13 @@ class Heard:
     """A node that only subscribes, and a log that only remembers."""
 
     def __init__(self, monkeypatch, **options):
-        monkeypatch.setattr(module, "message_type", lambda wanted_by: object)
-        self.lines, self.own, self._callbacks = [], [], []
+        monkeypatch.setattr(module, "message_type", lambda: object)
+        self.lines, self._callbacks = [], []
         logger = SimpleNamespace(**dict.fromkeys(("info", "warning", "error"), self.lines.append))
-        is_own = self.own.__contains__
-        self.robot = Robot(self, NodeLog(logger), NodeConfig(**options), is_own)
+        log = NodeLog(logger)
+        tree = RobotTree(self, log)
+        tree.listen(STATIC_TOPIC)
+        self.own, self.robot = tree.own, Robot(log, NodeConfig(**options), tree)
 
     def create_subscription(self, kind, topic, callback, qos):
         assert topic == "/tf_static"
@@ -79,11 +83,27 @@ def test_what_is_installed_comes_from_tf_but_not_from_the_node_itself(monkeypatc
     assert heard.robot.problem == ""
 
 
+def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(monkeypatch):
+    found = result()
+    dofs = [*found.observability]
+    dofs[2] = DofObservability("z", DofVerdict.UNOBSERVABLE, np.inf)
+    covariance = np.eye(6) * 1e-6
+    R = found.T_parent_child[:3, :3]
+    covariance[:3, :3] += 9.0 * np.outer(R[2], R[2])
+    hidden = dataclasses.replace(found, observability=tuple(dofs), covariance=covariance)
+    heard = Heard(monkeypatch, installed="7 8 9 0 0 0")
+    T = heard.robot.complete(hidden).T_parent_child
+    np.testing.assert_allclose(T[:2, 3], found.T_parent_child[:2, 3], atol=1e-4)
+    assert T[2, 3] == pytest.approx(9.0)
+    assert "z is that of what is installed (7 8" in heard.robot.complete(hidden).warnings[-1]
+    np.testing.assert_array_equal(heard.robot.complete(found).T_parent_child, found.T_parent_child)
+
+
 def test_an_unusable_transform_is_said(monkeypatch):
     heard = Heard(monkeypatch, base_frame="base_link")
     bad = edge("base_link", "lidar", LIDAR)
     bad.transform.rotation.w = 0.0
     bad.transform.rotation.x = bad.transform.rotation.y = bad.transform.rotation.z = 0.0
     heard.hear(bad)
-    assert "unusable transform of lidar" in heard.robot.problem
+    assert "unusable transform of lidar" in heard.lines[-1]
     assert heard.robot.lacks_base(heard.robot.complete(result()))

@@ -1,24 +1,26 @@
 """What is broadcast on /tf_static, and what is not."""
 
 import dataclasses
-import itertools
+import json
 import time
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from motions import as_trajectory, child_of, feed, wandering_poses
 from ros_harness import LATCHED, RELIABLE_INPUTS, drive, matrix
+from std_msgs.msg import String
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.results import load_result
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import Broadcast
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
 from hand_eye_calib.ros import tf
-from hand_eye_calib.ros.tf import FrameTree
+from hand_eye_calib.ros.tf import RobotTree
 
 
 @pytest.mark.parametrize(
@@ -35,9 +37,9 @@ from hand_eye_calib.ros.tf import FrameTree
     ],
 )
 def test_a_frame_has_one_parent_and_the_tree_no_circle(edges, why):
-    tree = FrameTree()
+    tree = RobotTree(None, None)
     for parent, child in edges:
-        tree.add(parent, child, "/tf_static")
+        tree.add(parent, child)
     found = tree.what_forbids("lidar", "camera")
     assert why in found if why else found == ""
 
@@ -120,32 +122,16 @@ class TestNode:
         peer.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
         return newest
 
-    @staticmethod
-    def play(peer, condition, what):
-        """Feed a drive until something happens."""
-        publishers = peer.publishers()
-        peer.wait_matched(*publishers)
-        poses = drive(1200, period_ns=50_000_000)
-        blocks = (slice(start, start + 20) for start in itertools.count(0, 20))
-        due = [time.monotonic()]
-
-        def check():
-            if time.monotonic() >= due[0]:
-                due[0] += 0.2  # five times as fast as recorded
-                block = next(blocks)
-                peer.feed(publishers, *(part[block] for part in poses))
-            return condition()
-
-        peer.spin_until(check, what)
-
-    ON = ("-p publish_tf:=true", "-p solve_period:=0.5", *RELIABLE_INPUTS)
-
     def test_what_is_done_is_broadcast_to_who_stops_then_and_a_reset_withdraws_it(
-        self, start_node, peer, listen, robot, said
+        self, start_node, peer, listen, robot, said, tmp_path
     ):
         robot(("base_link", "lidar"))
         heard, extrinsics = listen(), peer.listen(TransformStamped, "extrinsic")
-        start_node("-p publish_tf:=true", "-p solve_period:=1000.0", *RELIABLE_INPUTS)
+        states = peer.listen(String, "progress")
+        start_node(
+            "-p publish_tf:=true", "-p solve_period:=1000.0", f"-p output_directory:={tmp_path}",
+            *RELIABLE_INPUTS,
+        )  # fmt: skip
 
         def edges(found):
             return [each for each in found if each.child_frame_id == "camera"]
@@ -155,56 +141,89 @@ class TestNode:
 
         publishers, poses = peer.publishers(), drive(450)
         peer.solve(publishers, *(part[:400] for part in poses))
-        peer.spin_until(lambda: said and state() == "not yet", "the state")
-        assert state(key="tf_static_reason") == "the goal is not reached"
+        early = "the goal is not reached"
+        peer.spin_until(lambda: said and state(key="tf_static_reason") == early, "the state")
+        assert state() == "not yet"
         peer.solve(publishers, *(part[400:] for part in poses))
         peer.spin_until(lambda: state("progress", "done") == "true", "the goal")
         # Nothing comes in any more: the two results that reached the goal suffice.
         peer.spin_until(lambda: edges(heard), "the edge")
         peer.spin_until(lambda: state() == "broadcast", "the state")
         assert edges(heard)[0].header.frame_id == "lidar"
-        assert matrix(edges(heard)[0]) == pytest.approx(matrix(extrinsics[-1]))
+        T = matrix(edges(heard)[-1])
+        assert pytest.approx(matrix(extrinsics[-1])) == T
+        # The answer, the file and the page say the same, and of the same poses.
+        answer = peer.trigger("solve").message
+        assert f"xyz = ({', '.join(f'{value:.4f}' for value in T[:3, 3])})" in answer
+        assert peer.trigger("save").success
+        saved = load_result(tmp_path)
+        assert saved.T_parent_child == pytest.approx(T)
+        assert f"{saved.n_poses} poses" in answer
+        told = json.loads(states[-1].data)
+        assert [told["extrinsic"]["result"]["pose"][axis] for axis in "xyz"] == pytest.approx(
+            T[:3, 3].tolist()
+        )
+        assert (told["progress"]["progress"]["done"], saved.goal.done) == (True, True)
         assert peer.trigger("reset").success
         late = listen()
         peer.spin_until(lambda: late, "the robot's edge")
         time.sleep(0.5)
         assert not edges(late)
 
-    def test_a_frame_that_has_a_parent_is_refused_loudly(
-        self, start_node, peer, listen, robot, said
-    ):
-        robot(("base_link", "lidar"), ("base_link", "camera"))
-        node = start_node(*self.ON)
-        heard = listen()
-
-        def refused():
-            status = said.get("extrinsic")
-            return status and status.message.startswith("publish_tf is refused: camera has the")
-
-        self.play(peer, refused, "the refusal")
-        assert said["extrinsic"].level == DiagnosticStatus.WARN
-        node.wait_for_log("[ERROR]", "publish_tf is refused: camera has the parent base_link")
-        assert {each.header.frame_id for each in heard} == {"base_link"}
-
-    def test_a_parent_that_comes_later_ends_the_broadcast(self, start_node, peer, listen, robot):
-        node = start_node(*self.ON)
-        heard = listen()
-        self.play(peer, lambda: heard, "the edge")
-        robot(("base_link", "camera"))
-        node.wait_for_log("publish_tf is refused: camera has the parent base_link", "withdrawn")
-
     @pytest.fixture
     def broadcaster(self, kind, peer, calibration, monkeypatch):
         """In the peer's own node, switched on, without looking at the tree first."""
         monkeypatch.setattr(tf, "LOOK_S", 0.0)
-        made = tf.TfBroadcaster(peer.node, NodeLog(peer.node.get_logger()))
+        log = NodeLog(peer.node.get_logger())
+        made = tf.TfBroadcaster(peer.node, log, RobotTree(peer.node, log))
         made.switch(True)
         yield made
         made.switch(False)
 
     @staticmethod
     def settle(broadcaster, calibration):
-        broadcaster.add(calibration, is_done=True)
+        broadcaster.add(calibration, why_not="")
+
+    def test_a_frame_that_has_a_parent_is_refused_loudly(
+        self, peer, robot, listen, broadcaster, calibration, capfd
+    ):
+        child = calibration.child_frame
+        robot(("base_link", child))
+        self.frames_of_new_listener(peer, listen, child)
+        self.settle(broadcaster, calibration)
+        told, why = broadcaster.state
+        assert told is Broadcast.REFUSED
+        assert why.startswith(f"{child} has the parent base_link on /tf_static")
+        assert f"publish_tf is refused: {child} has the parent" in capfd.readouterr().err
+
+    def test_a_parent_that_comes_later_ends_the_broadcast(
+        self, peer, robot, listen, broadcaster, calibration, capfd
+    ):
+        child = calibration.child_frame
+        self.settle(broadcaster, calibration)
+        assert self.frames_of_new_listener(peer, listen, child) == {child}
+        robot(("base_link", child))
+
+        def is_refused():
+            broadcaster.look()
+            return broadcaster.state[0] is Broadcast.REFUSED
+
+        peer.spin_until(is_refused, "the refusal")
+        log = capfd.readouterr().err
+        assert "restart the listeners" in log
+        assert "is withdrawn" in log
+
+    def test_what_is_done_but_may_not_be_broadcast_is_refused_and_withdrawn(
+        self, broadcaster, calibration
+    ):
+        self.settle(broadcaster, calibration)
+        assert broadcaster.state == (Broadcast.ON, "")
+        faulty = "the streams are faulty"
+        broadcaster.add(calibration, why_not=faulty)
+        assert broadcaster.state == (Broadcast.WAITING, faulty)
+        hidden = TestWhatIsUnknown.with_z(calibration, DofVerdict.WEAK, 0.06)
+        self.settle(broadcaster, hidden)
+        assert broadcaster.state == (Broadcast.REFUSED, "z not known to the target")
 
     @staticmethod
     def frames_of_new_listener(peer, listen, until):
@@ -222,7 +241,7 @@ class TestNode:
         self.settle(broadcaster, calibration)
         child = calibration.child_frame
         assert self.frames_of_new_listener(peer, listen, "rear") == {child, "rear"}
-        assert broadcaster.refused == ""
+        assert broadcaster.state[1] == ""
         broadcaster.restart()
         self.settle(broadcaster, calibration)
         assert self.frames_of_new_listener(peer, listen, child) == {child}
@@ -236,12 +255,17 @@ class TestNode:
         others = [dataclasses.replace(calibration, child_frame=name) for name in ("rear", "side")]
         self.settle(broadcaster, calibration)
         broadcaster.add_others(others)
-        assert broadcaster.refused.startswith("rear has the parent base_link on /tf_static")
-        assert broadcaster.state == (Broadcast.ON, broadcaster.refused)
+        assert broadcaster.state[1].startswith("rear has the parent base_link on /tf_static")
+        assert broadcaster.state == (Broadcast.ON, broadcaster.state[1])
         heard = listen()
         peer.spin_until(lambda: {each.child_frame_id for each in heard} >= {child, "side"}, "both")
         robot(("base_link", "side"))
-        peer.spin_until(lambda: "side has the parent base_link" in broadcaster.refused, "refusal")
+
+        def looked():  # as the node does every second
+            broadcaster.look()
+            return broadcaster.state[1]
+
+        peer.spin_until(lambda: "side has the parent" in looked(), "refusal")
         late = listen()
         peer.spin_until(lambda: child in {each.child_frame_id for each in late}, "the child")
         assert (calibration.parent_frame, "side") not in {

@@ -8,10 +8,10 @@ import hand_eye_calib as hec
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.pose_buffer import BufferLimits
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
-from hand_eye_calib.live.journal import give, poses_so_far, takers
+from hand_eye_calib.live.journal import DirectoryLock, give, poses_so_far, takers
 
 CONFIG = CalibratorConfig(reference="B3")
 BOTH = {"parent": {}, "child": {}}
@@ -202,3 +202,25 @@ def test_further_child_sensors_are_resumed_too(tmp_path):
     T = engines["child"].estimate().T_parent_child
     for each in again.values():
         assert np.array_equal(each.estimate().T_parent_child, T)
+
+
+def test_the_lock_is_on_the_directory_and_follows_no_link(tmp_path):
+    (tmp_path / "theirs").write_text("kept")
+    note = tmp_path / ".calibrator.lock"
+    note.symlink_to(tmp_path / "theirs")
+    lock = DirectoryLock(tmp_path)
+    assert (tmp_path / "theirs").read_text() == "kept"
+    for _ in range(2):
+        with pytest.raises(ConfigError, match="is in use by another calibrator"):
+            DirectoryLock(tmp_path)
+        note.unlink(missing_ok=True)  # by hand
+    lock.release()
+    DirectoryLock(tmp_path).release()
+
+
+def test_a_journal_that_is_a_link_is_not_followed(tmp_path):
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "journal").symlink_to(tmp_path / "theirs")
+    with pytest.raises(OSError, match="is a symbolic link"):
+        JournalWriter(tmp_path / "journal", BOTH)
+    assert not list((tmp_path / "theirs").iterdir())

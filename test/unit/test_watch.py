@@ -74,11 +74,9 @@ SAVED = SavedState(directory="/home/live", at_s=time.time(), text="USE: all six 
 
 def inputs(parent=Level.OK, child=Level.OK):
     texts = ["20.0 Hz", "/odom has been silent for 3 s", "/odom: bad quaternion"]
-    figures = dict.fromkeys(
-        ("rate_hz", "lost_share", "longest_wait_s", "longest_gap_s", "silent_s", "delay_s"), 0.0
-    )
+    figures = dict.fromkeys(("rate_hz", "lost_share", "longest_gap_s", "silent_s", "delay_s"), 0.0)
     figures |= dict.fromkeys(
-        ("messages", "poses_taken", "dropped_unpaired", "ignored_while_disabled", "lost", "late",
+        ("messages", "poses_taken", "dropped_unpaired", "ignored_while_disabled", "lost",
          "gaps_above_max_gap"), 0,
     )  # fmt: skip
     return {

@@ -1,0 +1,168 @@
+"""One result: what ~/solve answers, what is published and saved, and what the log says of it."""
+
+import dataclasses
+import textwrap
+import types
+import typing
+from enum import Enum
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from result_making import calibration
+
+from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.assessment.excitation import Excitation
+from hand_eye_calib.assessment.lever_arm import LeverArms
+from hand_eye_calib.checks.check import CheckResult
+from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.live import cycle as module
+from hand_eye_calib.live.cycle import SolveCycle
+from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.session import LiveSession
+from hand_eye_calib.live.solving import Answer, Checked
+from hand_eye_calib.live.state import Level, NodeState
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
+
+TARGETS = (0.02,) * 3 + (0.005,) * 3
+
+
+def result(sigmas_m=0.005, **fields):
+    sigmas = np.r_[np.broadcast_to(sigmas_m, 3), np.full(3, 0.001)].tolist()
+    verdicts = [DofVerdict.OBSERVED if s < np.inf else DofVerdict.UNOBSERVABLE for s in sigmas]
+    dofs = tuple(map(DofObservability, AXES, verdicts, sigmas))
+    fields = {"status": SolveStatus.OK, "noise": None, "warnings": (), "findings": ()} | fields
+    return dataclasses.replace(calibration(), observability=dofs, **fields)
+
+
+def seen(motion_s):
+    return Excitation(
+        100, np.radians([40.0, 30.0, 60.0]), LeverArms.of(np.zeros((1, 3, 3))), 10.0, motion_s
+    )
+
+
+@pytest.fixture
+def lines():
+    return []
+
+
+@pytest.fixture
+def cycle(lines, monkeypatch):
+    """A cycle whose process answers nothing, with what it has published."""
+    nothing = SimpleNamespace(submit=lambda job: None, stop=lambda s: None, answers=list)
+    monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
+    levels = ("debug", "info", "warning", "error")
+    write = {level: lambda text, level=level: lines.append((level, text)) for level in levels}
+    log = NodeLog(SimpleNamespace(**write))
+    published = []
+    made = SolveCycle(LiveSession(log), log, print, lambda each: each, published.append, TARGETS)
+    made.published = published
+    made.ask(lambda good, text: None)
+    return made
+
+
+def answered(cycle, motion_s, sigmas_m=0.005, n_poses=100, check=None, **fields):
+    found = result(sigmas_m=sigmas_m, n_poses=n_poses, **fields)
+    return cycle.conclude(Answer(0, 0.1, seen(motion_s), found, check=check))
+
+
+def reach_goal(cycle):
+    for motion_s in (40.0, 42.0, 44.0):
+        good, text = answered(cycle, motion_s)
+    assert cycle.goal.progress.done
+    return good, text
+
+
+def test_what_is_kept_is_answered_published_and_saved_and_says_why_it_is_not_the_newest(cycle):
+    reach_goal(cycle)
+    kept = cycle.result
+    moved = result().T_parent_child + np.eye(4, k=3) * 0.1
+    good, text = answered(cycle, 46.0, (0.005, 0.01, 0.005), 120, T_parent_child=moved)
+    assert good
+    assert f"{kept.n_poses} poses, {kept.n_pairs} pairs" in text
+    (warning,) = cycle.result.warnings
+    assert warning in text
+    assert warning.startswith("kept is the result of 100 poses, not the newest (of 120 poses, xyz")
+    assert f"{moved[0, 3]:.4f}" in warning
+    assert warning.endswith("that knows y to 1 cm only, this one to 5 mm")
+    assert cycle.published[-1] is cycle.result
+    np.testing.assert_array_equal(cycle.result.T_parent_child, kept.T_parent_child)
+    assert cycle.goal.progress.done
+    # A better one takes its place, and the note is gone.
+    _, text = answered(cycle, 48.0, 0.003, 130)
+    assert "130 poses, " in text
+    assert cycle.result.warnings == ()
+
+
+def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
+    reach_goal(cycle)
+    before = cycle.result, len(cycle.published)
+    good, text = answered(cycle, 46.0, status=SolveStatus.NOT_CONVERGED)
+    assert (good, text.startswith("DO NOT USE: the solver did not converge")) == (False, True)
+    assert (cycle.result, len(cycle.published)) == before
+
+
+def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(cycle):
+    reach_goal(cycle)
+    finding = Finding(
+        code="inverse", severity=Severity.ERROR, what="inverse poses", advice="invert"
+    )
+    found = CheckResult(findings=(finding,))
+    good, text = answered(cycle, 46.0, check=Checked(found))
+    assert cycle.result.verdict is Verdict.DO_NOT_USE
+    assert text.startswith("DO NOT USE: ")
+    assert not cycle.goal.progress.done
+    assert cycle.goal.progress.sentence.startswith("Stop: the streams are faulty")
+
+
+def test_the_log_of_a_good_session_of_seven_minutes_is_short_and_asks_for_nothing(
+    cycle, lines, monkeypatch
+):
+    """One solve every two seconds; each axis in turn is the one that lacks."""
+    for k in range(210):
+        now_s = 1e4 + 2.0 * k
+        monkeypatch.setattr(module.time, "monotonic", lambda now_s=now_s: now_s)
+        sigmas_m = 0.2 / np.sqrt(1.0 + k) * np.roll([1.0, 0.95, 0.9], k)
+        answered(cycle, 2.0 * k, tuple(np.where(k > 170, 0.005, sigmas_m)), 100 + k)
+    assert cycle.goal.progress.done
+    assert {level for level, _ in lines} <= {"info", "debug"}, lines
+    shown = [text for level, text in lines if level != "debug"]
+    assert sum(len(text) + 60 for text in shown) < 5000  # 60: what ROS writes before it
+    assert any(text.startswith("Done: ") for text in shown)
+
+
+def test_a_reason_is_a_warning_once_and_again_in_a_new_session(cycle, lines):
+    for session in range(2):
+        for motion_s in (20.0, 40.0, 42.0):
+            answered(cycle, motion_s, (0.005, 0.005, np.inf), status=SolveStatus.UNOBSERVABLE)
+        warned = [text for level, text in lines if (level, "CARE: z" in text) == ("warning", True)]
+        assert len(warned) == 1 + session, warned
+        cycle.restart()
+        cycle._log.restart()
+
+
+def shape(hint):
+    """What JSON has for a value of this type, in words; ? where it may be null."""
+    words = {str: "text", bool: "true/false", int: "integer", float: "number", Level: "0/1/2"}
+    inner = typing.get_args(hint)
+    if types.NoneType in inner:
+        return f"{shape(inner[0])}?" if len(inner) == 2 else shape(hint.__origin__)
+    if inner and Ellipsis in inner:
+        return f"[{shape(inner[0])}, ...]"
+    if inner:
+        return f"{{KEY: {shape(inner[1])}, ...}}"
+    if dataclasses.is_dataclass(hint):
+        hints = typing.get_type_hints(hint)
+        return f"{{{', '.join(f'{name}: {shape(each)}' for name, each in hints.items())}}}"
+    if hint not in words and issubclass(hint, Enum):
+        return "/".join(each.value for each in hint)
+    return words[hint]
+
+
+def test_the_keys_of_the_progress_topic_are_on_the_page_of_the_node():
+    lines = [f"{name}: {shape(each)}" for name, each in typing.get_type_hints(NodeState).items()]
+    wrapped = [textwrap.fill(each, 98, subsequent_indent="  ") for each in lines]
+    text = "\n".join(["```text", *wrapped, "```"])
+    page = (Path(__file__).parents[2] / "docs" / "node.md").read_text()
+    assert text in page, f"docs/node.md must have this text:\n{text}"
