@@ -233,7 +233,7 @@ def test_paths_that_are_no_bag(tmp_path):
     messages = {
         "absent": "no bag at .*absent",
         "notes.txt": r"notes\.txt is not a bag; expected",
-        "folder": r"no bag in .*: expected metadata\.yaml or files that end in .*check the path",
+        "folder": r"no bag in .*: expected files that end in .*check the path",
         "fifo.mcap": "is not a regular file",
     }
     for suffix in ("bag", "mcap", "db3"):
@@ -266,18 +266,6 @@ def test_a_path_is_not_read_as_an_address(tmp_path, name):
     write_bag(tmp_path / "bag", STREAMS, "sqlite3")
     storage_file(tmp_path / "bag").rename(tmp_path / name)
     assert len(all_poses(tmp_path / name)) == 120
-
-
-def test_hostile_metadata_leaves_the_bag_beside_it_readable(tmp_path):
-    write_bag(tmp_path / "bag", STREAMS, "mcap")
-    aliases = (f"a{k}: &a{k} {{<<: [{', '.join([f'*a{k - 1}'] * 9)}]}}" for k in range(1, 12))
-    texts = ["\n".join(["a0: &a0 {x: 1}", *aliases]), "[" * 100_000, "a: &a {b: *a}"]
-    texts += ["x: 2024-13-45", "n: " + "9" * 5000, "!!float abc", "\x00", "é: \udcff"]
-    for text in texts:
-        metadata = tmp_path / "bag" / "metadata.yaml"
-        metadata.write_bytes(text.encode("utf-8", "surrogateescape"))
-        poses, (warning,) = read(tmp_path / "bag")
-        assert (len(poses), "metadata.yaml is damaged" in warning) == (120, True)
 
 
 def test_a_rosbag2_of_more_files_than_are_read_is_refused(tmp_path, monkeypatch):

@@ -32,7 +32,6 @@ from hand_eye_calib.io.limits import (
     SMALLEST_UNPACKED,
     ReadingMemory,
 )
-from hand_eye_calib.io.yaml_files import read_yaml
 
 #: Messages that are unpacked at once, and a part of them.
 BLOCK_SIZE, _PIECE_SIZE = 2048, 64
@@ -361,7 +360,7 @@ class BagFiles:
             If there is no bag or it cannot be read; one line that names the path.
         """
         _check_path(path)
-        for file in [path] if path.is_file() else self._files_in(path):
+        for file in [path] if path.is_file() else _files_in(path):
             self.storages.append(Storage(file, self._readable(file), self._memory, number))
             if len(self.storages) > MOST_BAG_FILES:
                 raise InputError(f"{path} has more than {MOST_BAG_FILES} files; read it in parts")
@@ -373,44 +372,6 @@ class BagFiles:
             storage.close()
         if self._temporary:
             self._temporary.cleanup()
-
-    def _files_in(self, path: Path) -> list[Path]:
-        """The files that hold a bag's messages, in order."""
-        files = self._listed_files(path) if (path / "metadata.yaml").exists() else []
-        if not files:
-            found = (file for file in path.iterdir() if _suffix(file) and file.is_file())
-            files = sorted(islice(found, MOST_BAG_FILES + 1))
-        if not files:
-            raise InputError(
-                f"no bag in {path}: expected metadata.yaml or files that end in "
-                f"{', '.join(_REPAIRS)}; check the path"
-            )
-        return files
-
-    def _listed_files(self, path: Path) -> list[Path]:
-        """The files that metadata.yaml names; none if it cannot be used."""
-        metadata = path / "metadata.yaml"
-        try:
-            names = read_yaml(metadata)["rosbag2_bagfile_information"]["relative_file_paths"]
-            named = [path / PurePath(name).name for name in dict.fromkeys(names)]
-        except (InputError, LookupError, TypeError) as error:
-            why = error if isinstance(error, InputError) else f"it names no files: {error!r}"
-            self.notes.append(
-                f"{metadata} is damaged ({why}); the files beside it were read instead"
-            )
-            return []
-        found = [file for file in named if file.is_file() and _suffix(file)]
-        missing = [file.name for file in named if not file.is_file()]
-        if not found:
-            self.notes.append(
-                f"{metadata} names none of the files beside it; they were read instead"
-            )
-        elif missing:
-            self.notes.append(
-                f"{path}: {', '.join(missing[:10])} of {len(named)} files in metadata.yaml is "
-                "missing; its messages are left out"
-            )
-        return found
 
     def _readable(self, file: Path) -> Path:
         """The file as rosbags can read it: unpacked, and under a name that is not read as an
@@ -445,6 +406,19 @@ class BagFiles:
             f"cannot read bag {file}: its content unpacks to more than {LARGEST_RATIO} times its "
             "size, which is not believable"
         )
+
+
+def _files_in(path: Path) -> list[Path]:
+    """The files of a directory that hold messages; those that are there unpacked, too, once."""
+    found = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
+    found -= {
+        file for file in found if file.name.endswith(".zstd") and file.with_suffix("") in found
+    }
+    if not found:
+        raise InputError(
+            f"no bag in {path}: expected files that end in {', '.join(_REPAIRS)}; check the path"
+        )
+    return sorted(found)
 
 
 def _suffix(file: Path) -> str:
