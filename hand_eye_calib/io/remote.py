@@ -110,24 +110,23 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
 
 def _copied(url: str, folder: Path) -> Path:
     """Copy the files of a bag into a new folder; returns where it is."""
-    from fsspec.callbacks import Callback
-
     folder.mkdir()
     # Half of the free space is left to the copies of other processes.
     largest = shutil.disk_usage(folder).free // 2
-
-    class Room(Callback):
-        """Ends a copy that is too large, whatever size the store gave for it."""
-
-        def relative_update(self, inc: int = 1) -> None:
-            super().relative_update(inc)
-            if self.value > largest:
-                raise InputError(
-                    f"it is larger than {largest / 1e9:.3g} GB, half of the free space of "
-                    f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
-                )
-
     with _reached(url) as (system, path):
+        from fsspec.callbacks import Callback
+
+        class Room(Callback):
+            """Ends a copy that is too large, whatever size the store gave for it."""
+
+            def relative_update(self, inc: int = 1) -> None:
+                super().relative_update(inc)
+                if self.value > largest:
+                    raise InputError(
+                        f"it is larger than {largest / 1e9:.3g} GB, half of the free space of "
+                        f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
+                    )
+
         files, room = _files(system, path), Room()
         for file in files:
             # The name's last part only: a store does not choose where things go.

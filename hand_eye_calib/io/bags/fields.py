@@ -101,7 +101,7 @@ def rows_of_messages(
     """
     from hand_eye_calib.io.trajectory_files.columns import choose_columns
     from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
-    from hand_eye_calib.io.trajectory_files.table import Table
+    from hand_eye_calib.io.trajectory_files.table import Table, table_of
 
     pairs = [each.partition("=")[::2] for each in fields.split(",")]
     if not all(name and path for name, path in pairs):
@@ -111,15 +111,18 @@ def rows_of_messages(
         )
     names, paths = [name for name, _ in pairs], [path.split(".") for _, path in pairs]
     is_twist = {*_VELOCITIES} <= {*names}
-    chosen = choose_columns(topic, names, measures="rates" if is_twist else "auto")
-    table = Table(topic, fields, tuple(chosen.quantities), chosen.stamp_unit, chosen.units)
-    rows = (
-        (number, "\0".join(_text(topic, number, message, path) for path in paths))
-        for number, message in enumerate(messages, 1)
-    )
-    order = [names.index(name) for name in _VELOCITIES] if is_twist else []
-    at = order or [*chosen.quantities.values()]
-    table.fill(rows, lambda text: text.split("\0"), len(names), at, chosen.stamp)
+    rows = enumerate(messages, 1)
+
+    def cells_of(message: Any) -> list[str]:
+        return [_text(topic, message, path) for path in paths]
+
+    if is_twist:
+        chosen = choose_columns(topic, names, measures="rates")
+        table = Table(topic, fields, _VELOCITIES, chosen.stamp_unit)
+        at = [names.index(name) for name in _VELOCITIES]
+        table.fill(rows, cells_of, len(names), at, chosen.stamp)
+    else:
+        table = table_of(topic, names, rows, cells_of)
     if not table.stamps:
         raise InputError(f"no messages on {topic}")
     stamps_ns = stamps_in_ns(table, None)
@@ -130,7 +133,7 @@ def rows_of_messages(
     return stamps_ns, np.c_[positions, quats_xyzw], table.guesses
 
 
-def _text(topic: str, number: int, message: Any, path: list[str]) -> str:
+def _text(topic: str, message: Any, path: list[str]) -> str:
     """A value of a message; a stamp in seconds with all its digits."""
     value = message
     for part in path:
@@ -141,7 +144,7 @@ def _text(topic: str, number: int, message: Any, path: list[str]) -> str:
                 value = value[int(part)] if part.isdecimal() else getattr(value, part)
         except (AttributeError, KeyError, IndexError, TypeError):
             raise InputError(
-                f"{topic}, message {number}: has no {'.'.join(path)}; name other fields"
+                f"{topic}: a message has no {'.'.join(path)}; name other fields"
             ) from None
     get = value.get if isinstance(value, dict) else lambda name: getattr(value, name, None)
     if get("sec") is not None:

@@ -10,7 +10,7 @@ from datetime import datetime
 from decimal import Decimal, InvalidOperation
 from itertools import takewhile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     choose_columns,
     listed,
 )
-from hand_eye_calib.io.trajectory_files.foreign import Rows, rows_of
+from hand_eye_calib.io.trajectory_files.foreign import rows_of
 from hand_eye_calib.io.trajectory_files.formats import (
     AUTO,
     FIXED_FORMATS,
@@ -261,8 +261,8 @@ class Table:
 
     def fill(
         self,
-        lines: Iterable[Line],
-        cells_of: Callable[[str], list[str]],
+        lines: Iterable[tuple[int, Any]],
+        cells_of: Callable[[Any], list[str]],
         n_columns: int,
         at: Sequence[int],
         stamp_at: Sequence[int] = (0,),
@@ -279,7 +279,7 @@ class Table:
         for number, text in lines:
             cells = cells_of(text)
             if len(cells) != n_columns and not (may_have_more and len(cells) > n_columns):
-                shown = text if len(text) <= _MOST_SHOWN else text[:_MOST_SHOWN] + "..."
+                shown = text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
                 raise InputError(
                     f"{self.path}, line {number}: expected {self.expected}; found {len(cells)}: "
                     f"{shown!r}"
@@ -344,7 +344,10 @@ def read_table(path: _Path, options: FileOptions) -> Table:
         If the stamps of format kitti are nowhere.
     """
     if (found := rows_of(path, options.columns)) is not None:
-        return _of_rows(path, found, options.measures)
+        names, rows = found.header.split(","), enumerate(found.rows, 1)
+        table = table_of(path, names, rows, texts, options.measures)
+        table.guesses += [f"{path}: {note}" for note in found.notes]
+        return table
     lines = Lines.of_file(path, "a trajectory")
     layout = Layout(options.format, True)
     columns, times, guesses = options.columns, options.times, list[str]()
@@ -353,7 +356,12 @@ def read_table(path: _Path, options: FileOptions) -> Table:
         if columns is None and times is None:
             n_columns = len(_cells_of(lines.first()[1]))
             if n_columns == 4 and not layout.is_named:
-                columns = _named_four(path, options.measures)
+                columns = _OF_FOUR.get(options.measures)
+                if columns is None:
+                    raise InputError(
+                        f"{path}: four columns without names; name them with `columns`: t,x,y,z "
+                        "for positions, t,wx,wy,wz for angular rates"
+                    )
             elif layout.format != "tum":
                 guesses = [
                     f"{path} looks like format {layout.format}; to change that, give `format`"
@@ -374,28 +382,32 @@ def read_table(path: _Path, options: FileOptions) -> Table:
     return table
 
 
-def _of_rows(path: _Path, found: Rows, measures: str) -> Table:
-    """The rows of a format of another program."""
-    names = found.header.split(",")
+def table_of(
+    path: _Path,
+    names: Sequence[str],
+    lines: Iterable[tuple[int, Any]],
+    cells_of: Callable[[Any], list[str]],
+    measures: str = AUTO,
+) -> Table:
+    """The numbers of lines whose columns have names.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, or a line cannot be used.
+    """
+    if len(names) > MOST_COLUMNS:
+        raise InputError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are read")
     chosen = choose_columns(path, names, measures=measures)
-    expected = f"{len(names)} values: {listed(names)}"
+    expected = f"{len(names)} columns: {listed(names)}"
     table = Table(path, expected, tuple(chosen.quantities), chosen.stamp_unit, chosen.units)
-    lines = ((number, "\0".join(map(str, row))) for number, row in enumerate(found.rows, 1))
-    at = [*chosen.quantities.values()]
-    table.fill(lines, lambda text: text.split("\0"), len(names), at, chosen.stamp)
-    for note in found.notes:
-        table.guess(note)
+    table.fill(lines, cells_of, len(names), [*chosen.quantities.values()], chosen.stamp)
     return table
 
 
-def _named_four(path: _Path, measures: str) -> str:
-    """Names of four columns that have none."""
-    if measures not in _OF_FOUR:
-        raise InputError(
-            f"{path}: four columns without names; name them with `columns`: t,x,y,z for "
-            "positions, t,wx,wy,wz for angular rates"
-        )
-    return _OF_FOUR[measures]
+def texts(row: Sequence[Any]) -> list[str]:
+    """The cells of a row of any values."""
+    return [*map(str, row)]
 
 
 def _read_fixed(path: _Path, lines: Lines, layout: Layout, times: _Path | None) -> Table:
@@ -435,40 +447,20 @@ def _read_csv(path: _Path, lines: Lines, columns: str | None, options: FileOptio
     else:
         header = [name.strip() for name in columns.split(",")]
         number, row = lines.first()
-        if number and not any(map(_is_number, _cells_of(row))):
+        if number and not any(map(_NUMBER.fullmatch, _cells_of(row))):
             lines = lines.after(number)
-    if header is None:
-        return _read_unnamed(path, lines, options.format == AUTO)
-    if len(header) > MOST_COLUMNS:
-        raise InputError(f"{path}: {len(header)} columns; at most {MOST_COLUMNS} are read")
-    chosen = choose_columns(path, header, measures=options.measures)
-    expected = f"{len(header)} columns: {listed(header)}"
-    table = Table(path, expected, tuple(chosen.quantities), chosen.stamp_unit, chosen.units)
+    if header is None:  # a stamp, a position and a quaternion, whose order is to be found
+        n_columns = len(_cells_of(lines.first()[1]))
+        if n_columns and not (options.format == AUTO and n_columns == 8):
+            raise InputError(
+                f"{path}: the first line names no columns, so the order of the quaternion is "
+                "unknown; name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
+                f"{n_columns}"
+            )
+        expected = "8 columns: a stamp, a position and a quaternion"
+        table = Table(path, expected, (*POSITION, *UNNAMED))
+        table.fill(lines.data(), _cells_of, 8, range(1, 8))
+        return table
+    table = table_of(path, header, lines.data(), _cells_of, options.measures)
     table.header = tuple(header)
-    at = [*chosen.quantities.values()]
-    table.fill(lines.data(), _cells_of, len(header), at, chosen.stamp)
     return table
-
-
-def _read_unnamed(path: _Path, lines: Lines, may_guess: bool) -> Table:
-    """Eight columns without names: a stamp, a position and a quaternion, whose order is to be
-    found.
-    """
-    n_columns = len(_cells_of(lines.first()[1]))
-    if n_columns and not (may_guess and n_columns == 8):
-        raise InputError(
-            f"{path}: the first line names no columns, so the order of the quaternion is unknown; "
-            "name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
-            f"{n_columns}"
-        )
-    table = Table(path, "8 columns: a stamp, a position and a quaternion", (*POSITION, *UNNAMED))
-    table.fill(lines.data(), _cells_of, 8, range(1, 8))
-    return table
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
