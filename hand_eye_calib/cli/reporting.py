@@ -7,7 +7,7 @@ import os
 import pickle
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,28 +27,13 @@ REPORT, CHECK = "report.html", "check.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 # Frame of a child sensor that names none: in a rig it has the name of its input.
 _NAMELESS = "child_sensor"
-# Every other program goes before the process that writes the pages of a session.
-_NICENESS = 15
 
 
 def with_cross_check(
     calibration: Calibration, snapshot: "Snapshot"
 ) -> "tuple[Calibration, Evidence]":
     """Cross-check a calibration with other methods, other references and the two halves of the
-    recording.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    snapshot : Snapshot
-        The poses and options that gave it.
-
-    Returns
-    -------
-    calibration : Calibration
-        With the cross-checks' scatter.
-    evidence : Evidence
-        For a report.
+    recording that gave it; returns it with their scatter, and the evidence for a report.
     """
     from hand_eye_calib.engine.evidence import gather
 
@@ -100,22 +85,13 @@ def rendered(
     return render(calibration, config, evidence, inputs=inputs, command=command)
 
 
-def write_report(directory: Path, calibration: Calibration, *more: Any) -> None:
-    """Write the report of a calibration; the arguments are those of :func:`rendered`.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    if can_draw(REPORT):
-        with waiting_for(f"writing {REPORT}"):
-            save_text(Path(directory) / REPORT, rendered(calibration, *more))
-        note(f"wrote {Path(directory) / REPORT}")
+def write_report(directory: Path, *of: Any) -> None:
+    """Write the report of a calibration; the arguments are those of :func:`rendered`."""
+    write_page(Path(directory) / REPORT, rendered, *of)
 
 
-def write_page(path: Path, function: str, *arguments: Any) -> None:
-    """Write the page that a function of the package ``report`` returns, such as
+def write_page(path: Path, render: str | Callable[..., str], *arguments: Any) -> None:
+    """Write the page that a function returns, or one of the package ``report`` by its name, such as
     ``rig_page.render_rig``; if a library for it is missing, say so and go on.
 
     Raises
@@ -125,9 +101,11 @@ def write_page(path: Path, function: str, *arguments: Any) -> None:
     """
     if can_draw(path.name):
         with waiting_for(f"writing {path.name}"):
-            module, _, name = function.partition(".")
-            render = getattr(import_module(f"hand_eye_calib.report.{module}"), name)
-            save_text(path, render(*arguments))
+            made: Any = render
+            if isinstance(render, str):
+                module, _, name = render.partition(".")
+                made = getattr(import_module(f"hand_eye_calib.report.{module}"), name)
+            save_text(path, made(*arguments))
         note(f"wrote {path}")
 
 
@@ -174,7 +152,7 @@ def write_session() -> None:
     It reads the result from standard input, as ``live/processes.py`` writes it. The results of
     further child sensors go to standard output.
     """
-    os.nice(_NICENESS)
+    os.nice(15)  # every other program goes first
     result: SessionResult = pickle.load(sys.stdin.buffer)
     directory = Path(sys.argv[1])
     try:

@@ -32,9 +32,6 @@ _LAGS_S, _MAX_MOTIONS, _MIN_MOTIONS = (3.0, 1.0, 0.4), 400, 12
 # Smallest rotation (rad) whose axis means something.
 _HAS_AXIS = float(np.radians(2.0))
 
-# Time over which rotations are shown (s); from one pose to the next if poses are rarer.
-_ROTATION_SPAN_S = 2.0
-
 
 @dataclass(frozen=True)
 class ResidualView:
@@ -48,17 +45,6 @@ class ResidualView:
     rotation_rad: FloatArray
     is_outlier: BoolArray
     reference: str
-
-
-@dataclass(frozen=True)
-class Rotations:
-    """Rotations over equal times ``span_s``: rotation vectors (N, 3) of the parent sensor, in its
-    own axes, or of the child if the parent has none; from ``times_s`` on.
-    """
-
-    times_s: FloatArray
-    vectors: FloatArray
-    span_s: float
 
 
 @dataclass(frozen=True)
@@ -127,7 +113,6 @@ class Evidence:
     pose_pairs: PosePairs
     residuals: ResidualView
     tracks: Tracks
-    rotations: Rotations
     excitation: Excitation
     convergence: tuple[Answer, ...]
     comparison: tuple[Answer, ...]
@@ -179,7 +164,6 @@ def gather(
             calibration.reference if METHODS[calibration.method].uses_reference else "B1",
         ),
         tracks=_tracks(calibration, scaled, of_parent),
-        rotations=_rotations(rotating),
         excitation=excitation(rotating),
         convergence=answers.growing(),
         comparison=comparison,
@@ -311,12 +295,3 @@ def _spans(pose_pairs: PosePairs, span_s: float) -> tuple[IntArray, IntArray]:
     ends = np.searchsorted(times_s, times_s + span_s - 1e-9)
     start = np.flatnonzero(ends < len(times_s))
     return start, np.maximum(ends[start], start + 1)
-
-
-def _rotations(pose_pairs: PosePairs) -> Rotations:
-    times_s = _seconds(pose_pairs, pose_pairs.stamps_ns)
-    start, end = _spans(pose_pairs, _ROTATION_SPAN_S)
-    rotation = pose_pairs.Ts_pw_p[:, :3, :3]
-    vectors = se3.rotation_log(np.swapaxes(rotation[start], 1, 2) @ rotation[end])
-    span_s = float(np.median(times_s[end] - times_s[start])) if len(start) else _ROTATION_SPAN_S
-    return Rotations(times_s[start], vectors, span_s)

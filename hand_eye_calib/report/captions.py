@@ -22,7 +22,6 @@ TITLES = {
     "trajectories": "Both trajectories, aligned",
     "residuals": "Residuals over time",
     "convergence": "Convergence",
-    "excitation": "Excitation",
     "answers": "Other methods, other references, and each half alone",
     "streams": "Both streams before any solve",
 }
@@ -62,7 +61,6 @@ def captions(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "trajectories": _of_trajectories,
         "residuals": _of_residuals,
         "convergence": _of_convergence,
-        "excitation": _of_excitation,
         "answers": _of_answers,
     }
     if calibration.measured == "rotations":
@@ -133,45 +131,21 @@ def _of_convergence(calibration: Calibration, evidence: Evidence) -> str:
     sigmas = np.array([one.calibration.sigmas for one in estimates])
     limits = _DISAGREE * np.where(np.isfinite(sigmas), sigmas, 0)
     near = np.all((np.abs(moved) <= limits)[:, known], axis=1)
-    first = 0 if near.all() else len(near) - int(np.argmin(near[::-1]))
     late = max(len(estimates) * 7 // 10 - 1, 0)
     rest = 1 - estimates[late].until_s / estimates[-1].until_s
-    last = (
+    text = (
         f"The last {rest:.0%} of the recording changed the result by "
         f"{_largest(moved[late], known)}. Shaded: one standard deviation.{_downsampled(estimates)}"
     )
-    if first == len(estimates) - 1:
-        if calibration.verdict is Verdict.USE:
-            return last
-        return f"The result had not settled before the end: record longer. {last}"
-    since = _at(estimates[first].until_s, evidence).replace("at", "From")
-    return (
-        f"{since} on, the result stays within {_DISAGREE:g} of its standard deviations of the "
-        f"final result. {last}"
-    )
-
-
-def _of_excitation(calibration: Calibration, evidence: Evidence) -> str:
-    seen, rotations = evidence.excitation, evidence.rotations
-    if not len(rotations.times_s):
-        return "The poses are too far apart to show the rotations."
-    over = np.percentile(np.abs(rotations.vectors), 95, axis=0)
-    angles = [f"{angle(value)} about {axis}" for value, axis in zip(over, "xyz", strict=True)]
-    text = f"Rotation within {rotations.span_s:.1f} s: up to {listing(angles)} (95 % of the time)."
-    if calibration.measured == "rotations":
-        return f"{text} Only rotations about two axes and more show the whole orientation."
-    least = "xyz"[int(np.argmax(np.abs(seen.worst)))]
-    return (
-        f"{text} The lever arm along {least} is observed least: an error of 1 cm in it moves a "
-        f"motion by {length(0.01 * seen.worst_gain)}, one along the best observed axis by "
-        f"{length(0.01 * seen.gain.max())}. Rotations inside the grey band say little about it."
-    )
+    if not near[:-1].any() and calibration.verdict is not Verdict.USE:
+        return f"The result had not settled before the end: record longer. {text}"
+    return text
 
 
 def _of_answers(calibration: Calibration, evidence: Evidence) -> str:
+    known = known_axes(calibration)
     if not (evidence.comparison or evidence.halves):
         return "The recording is too short to compare methods, or to be divided into halves."
-    known = known_axes(calibration)
     if not known.any():
         return "No axis is observable, so there is nothing to compare."
     texts = []
@@ -186,30 +160,24 @@ def _of_answers(calibration: Calibration, evidence: Evidence) -> str:
             f"{_largest(np.median(moved, axis=0), known)} of the result; the farthest, "
             f"{evidence.comparison[farthest].label}, is {_largest(moved[farthest], known)} away."
         )
-    texts += [_halves(calibration, evidence)] if len(evidence.halves) == 2 else []
+    if len(evidence.halves) == 2:
+        first, second = (half.calibration for half in evidence.halves)
+        shown = np.isfinite(first.sigmas) & np.isfinite(second.sigmas) & known
+        apart = deviation(first.T_parent_child, second.T_parent_child)
+        ratios = np.where(shown, np.abs(apart) / np.hypot(first.sigmas, second.sigmas), 0.0)
+        worst = int(np.argmax(ratios))
+        text = (
+            f"The two halves alone differ by {_largest(apart, shown)}; the largest, {AXES[worst]}, "
+            f"is {ratios[worst]:.1f} standard deviations"
+        )
+        if ratios[worst] > _DISAGREE and calibration.verdict is not Verdict.USE:
+            text += ", more than chance. Do not trust the result beyond that difference"
+        text = text if shown.any() else "No axis is observable in both halves"
+        texts.append(f"{text}.{_downsampled(evidence.halves)}")
     return (
         f"{' '.join(texts)} B<n> pairs each pose with the n-th before it. Bars: one standard "
         "deviation; triangles lie beyond the axis; shaded: one standard deviation of the result."
     )
-
-
-def _halves(calibration: Calibration, evidence: Evidence) -> str:
-    """Whether the halves of the recording, without priors, differ by more than chance."""
-    first, second = (half.calibration for half in evidence.halves)
-    known = np.isfinite(first.sigmas) & np.isfinite(second.sigmas) & measured_axes(calibration)
-    if not known.any():
-        return "No axis is observable in both halves."
-    apart = deviation(first.T_parent_child, second.T_parent_child)
-    ratio = np.where(known, np.abs(apart) / np.hypot(first.sigmas, second.sigmas), 0.0)
-    worst = int(np.argmax(ratio))
-    judged = f"the largest, {AXES[worst]}, is {ratio[worst]:.1f} standard deviations"
-    text = f"The two halves alone differ by {_largest(apart, known)}; {judged}"
-    if ratio[worst] > _DISAGREE and calibration.verdict is not Verdict.USE:
-        text += ", more than chance. Do not trust the result beyond that difference"
-    hidden = known_axes(calibration) & ~known
-    less = [name for name, is_hidden in zip(AXES, hidden, strict=True) if is_hidden]
-    missing = f" Half of the recording does not determine {listing(less)}." if less else ""
-    return f"{text}.{missing}{_downsampled(evidence.halves)}"
 
 
 def of_streams(seen: StreamView) -> str:

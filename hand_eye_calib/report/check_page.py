@@ -24,24 +24,11 @@ def render_check(
     verdict: str,
     max_gap_s: float = CalibratorConfig.max_gap,
 ) -> str:
-    """The page as HTML.
+    """The page as HTML, of streams with the time offset and the scale that are known already.
 
-    Parameters
-    ----------
-    parent, child : Trajectory
-        With the time offset and the scale that are known already.
-    checked : CheckResult
-    findings : sequence of Finding
-        Its findings, and what else there is to say of the files.
-    inputs : sequence of str
-        Where the streams came from.
-    verdict : str
-        What the findings mean, in a sentence that begins with USE, USE WITH CARE or DO NOT USE.
-    max_gap_s : float
-
-    Returns
-    -------
-    str
+    ``findings`` are those of the check, and what else there is to say of the files; ``inputs`` say
+    where the streams came from; ``verdict`` is a sentence that begins with USE, USE WITH CARE or DO
+    NOT USE.
     """
     figures = []
     # Without any correlation the streams were not looked at: they are too short, or their stamps
@@ -58,7 +45,5 @@ def render_check(
         svg = draw_streams(seen, ("parent", "child"))
         figures = [{"name": "streams", "title": TITLES["streams"], "said": text, "svg": svg}]
     word, _, said = verdict.partition(": ")
-    told = findings
-    return page(
-        "check.html", TONES[word], word, said, inputs=inputs, findings=told, figures=figures
-    )
+    more = {"inputs": inputs, "findings": findings, "figures": figures}
+    return page("check.html", TONES[word], word, said, **more)

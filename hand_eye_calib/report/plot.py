@@ -84,16 +84,16 @@ def draw_views(panels: Sequence[Axes], calibration: Calibration) -> None:
     for panel, (across, up, title) in zip(panels, _VIEWS, strict=True):
         seen = [across, up]
         panel.plot(*T[seen, 3][:, None] * [[0.0, 1.0]], color=MUTED, lw=0.8, ls=":", zorder=1)
-        for pose, name, colour in (
-            (np.eye(4), calibration.parent_frame, PARENT),
-            (T, calibration.child_frame, CHILD),
+        for pose, name, colour, below in (
+            (np.eye(4), calibration.parent_frame, PARENT, 6),
+            (T, calibration.child_frame, CHILD, -14),
         ):
             at = pose[seen, 3]
             for axis, of_axis in zip(pose[seen, :3].T, (BAD, GREEN, PARENT), strict=True):
                 panel.plot(*np.stack([at, at + _AXIS * extent * axis], axis=1), color=of_axis)
             panel.plot(*at, "o", color=colour, ms=5)
             panel.annotate(
-                plain_label(name), (at[0], at[1]), (5, 6), textcoords="offset points", color=INK
+                plain_label(name), (at[0], at[1]), (5, below), textcoords="offset points", color=INK
             )
         if np.isfinite(sigmas[seen]).all():
             values, vectors = np.linalg.eigh(covariance[np.ix_(seen, seen)])

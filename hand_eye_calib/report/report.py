@@ -22,13 +22,11 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.captions import TITLES, captions
 from hand_eye_calib.report.report_figures import draw_all
 from hand_eye_calib.results.calibration import Calibration, Reason, Verdict
-from hand_eye_calib.results.records import Noise
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.text import (
     amount,
     angle,
-    counted,
     duration,
     fixed,
     given_or_estimated,
@@ -184,7 +182,8 @@ def _at_distance(calibration: Calibration) -> str:
         if not np.isfinite(calibration.sigmas[:3]).all():
             J[:, :3] = 0.0  # the rotation alone
         errors[axis] = float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.T)[-1]))
-    because = "" if J[:, :3].any() else ", by the rotation alone"
+    because = ", constant odometry errors included"
+    because += "" if J[:, :3].any() else ", by the rotation alone"
     return (
         f"An object {_DISTANCE_M:.0f} m from {printable(calibration.child_frame)} is misplaced by "
         f"up to {length(max(errors.values()))} (one standard deviation{because})."
@@ -285,21 +284,8 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "Scale": given_or_estimated(*scale, ""),
     }
     if noise := calibration.noise:
-        is_whole = calibration.measured == "poses"
-        rows["Noise"] = _noise(noise) if is_whole else "; ".join(noise.in_words)
+        rows["Noise"] = "; ".join(noise.in_words)
     return rows
-
-
-def _noise(noise: Noise) -> str:
-    def levels(kind: str, suffix: str) -> str:
-        translation = length(getattr(noise, f"translation_{kind}_m{suffix}"))
-        return f"{translation} and {angle(getattr(noise, f'rotation_{kind}_rad{suffix}'))}"
-
-    jumps = counted(len(noise.jumps_before_stamp_ns), "jump")
-    return (
-        f"{levels('white', '')} per pose and axis; growing by {levels('drift', '_per_pose')} from "
-        f"pose to pose; systematic error: {noise.systematic}; {jumps}"
-    )
 
 
 def _stream(name: str, inputs: Plain, streams: Mapping[str, Trajectory]) -> dict[str, str]:
@@ -325,10 +311,6 @@ def _stream(name: str, inputs: Plain, streams: Mapping[str, Trajectory]) -> dict
             "poses": f"{whole.poses:,}",
             "rate": f"{whole.rate_hz:.1f} Hz",
         }
-    span_s = ((known.get("last_stamp_ns") or 0) - (known.get("first_stamp_ns") or 0)) * 1e-9
-    if span_s > 0:
-        row["duration"] = duration(span_s)
-        row["rate"] = f"{(count - 1) / span_s:.1f} Hz" if count and count > 1 else "-"
     return row
 
 

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import AXES
-from hand_eye_calib.assessment.excitation import MIN_ROTATION
 from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.report.captions import measured_axes, relative_to, residual_sizes, time_axis
 from hand_eye_calib.report.plot import draw_views
@@ -50,7 +49,6 @@ def draw_all(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
         "trajectories": _trajectories,
         "residuals": _residuals,
         "convergence": _convergence,
-        "excitation": _excitation,
         "answers": _answers,
     }
     if calibration.measured == "rotations":
@@ -231,25 +229,6 @@ def _draw_convergence(
     for sign, marker in ((1, "^"), (-1, "v")):
         out = beyond & (np.sign(values) == sign)
         panel.plot(times[out], np.full(out.sum(), sign * limit * 0.94), marker, color=BAD, ms=6)
-
-
-def _excitation(calibration: Calibration, evidence: Evidence) -> Figure | None:
-    rotations = evidence.rotations
-    if not len(rotations.times_s):
-        return None
-    factor, unit = time_axis(evidence.tracks.times_s[-1])
-    shown = _downsample(len(rotations.times_s), _MOST_ON_A_LINE)
-    figure, panels = _figure(4.2, 3, 1, left=0.8, top=0.1, sharex=True)
-    enough = np.degrees(MIN_ROTATION)
-    for index, panel in enumerate(panels[:, 0]):
-        values = np.degrees(rotations.vectors[shown, index])
-        panel.axhspan(-enough, enough, color=MUTED, alpha=0.16, lw=0)
-        panel.plot(rotations.times_s[shown] * factor, values, color=PARENT, lw=1.2)
-        limit = 1.1 * max(np.abs(values).max(), 1.3 * enough)
-        panel.set(ylim=(-limit, limit), ylabel=f"{AXES[3 + index]}\nabout {'xyz'[index]} (deg)")
-        panel.yaxis.set_label_coords(-0.06, 0.5)
-    panels[2, 0].set_xlabel(f"time ({unit})")
-    return figure
 
 
 def _answers(calibration: Calibration, evidence: Evidence) -> Figure | None:

@@ -33,15 +33,9 @@ _CLEARLY = 3.0
 # The answer to a button is shown for so long (s).
 ANSWER_FOR_S = 20.0
 
-# What an axis of a vehicle means: x is forward, z is up.
-_ON_A_VEHICLE = {
-    "x": "forward",
-    "y": "sideways",
-    "z": "height",
-    "roll": "tilt to a side",
-    "pitch": "nose up or down",
-    "yaw": "turn",
-}
+# What the axes of a vehicle mean: x is forward, z is up.
+_WORDS = ("forward", "sideways", "height", "tilt to a side", "nose up or down", "turn")
+_ON_A_VEHICLE = dict(zip(AXES, _WORDS, strict=True))
 
 
 class Tone(Enum):
@@ -67,22 +61,10 @@ class Line:
 class Bar:
     """One axis of the parent sensor's frame against its target.
 
-    Attributes
-    ----------
-    name : str
-        Such as ``along x`` or ``about z``.
-    meaning : str
-        Such as ``forward``; empty if the axes are not those of a vehicle.
-    share : float
-        0 to 1: the share of the information that the target needs. It grows evenly while the motion
-        stays as it is.
-    tone : Tone
-    word : str
-        Such as ``enough`` or ``30 s left``.
-    against : str
-        The standard deviation against the target, such as ``± 0.065 of 0.3 deg``.
-    difference : str
-        From what is installed, with units; empty if not known.
+    ``name`` is such as "about z", ``meaning`` such as "turn", if the axes are those of a vehicle.
+    ``share`` is 0 to 1, of the information that the target needs: it grows evenly while the motion
+    stays as it is. ``word`` is such as "30 s left", ``against`` such as "± 0.065 of 0.3 deg";
+    ``difference`` is from what is installed, empty if not known.
     """
 
     name: str
@@ -440,13 +422,12 @@ def _number(value: float | None) -> float:
 
 # ------------------------------------------------- health, verdict, comparison
 
-_TONES = {Level.OK: Tone.GOOD, Level.WARN: Tone.ACT, Level.ERROR: Tone.BAD}
-_VERDICTS = {"USE": Tone.GOOD, "USE WITH CARE": Tone.ACT, "DO NOT USE": Tone.BAD}
-_COMPARED = {"same": Tone.GOOD, "moved": Tone.ACT}
-_BROADCAST = {
+# Of levels, verdicts, comparisons and broadcasts.
+_TONES: dict[object, Tone] = {
+    **dict.fromkeys((Level.OK, "USE", "same", Broadcast.ON), Tone.GOOD),
+    **dict.fromkeys((Level.WARN, "USE WITH CARE", "moved", Broadcast.REFUSED), Tone.ACT),
+    **dict.fromkeys((Level.ERROR, "DO NOT USE"), Tone.BAD),
     Broadcast.WAITING: Tone.BUSY,
-    Broadcast.REFUSED: Tone.ACT,
-    Broadcast.ON: Tone.GOOD,
 }
 
 
@@ -465,18 +446,15 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
 def _result(state: NodeState) -> Iterator[Line]:
     result = state.extrinsic.result if state.extrinsic else None
     verdict = result.verdict if result else "no result yet"
-    yield Line(_VERDICTS.get(verdict, Tone.UNKNOWN), "verdict", verdict)
-    comparison = state.progress.comparison if state.progress else None
-    if comparison is None:
-        text = "nothing to compare with (parameter installed)"
-        yield Line(Tone.UNKNOWN, "compared with what is installed", text)
-    else:
-        tone = _COMPARED.get(comparison.verdict, Tone.UNKNOWN)
-        text = comparison.sentence.replace("+/-", "±")
-        yield Line(tone, "compared with what is installed", text)
+    yield Line(_TONES.get(verdict, Tone.UNKNOWN), "verdict", verdict)
+    found, tone = state.progress.comparison if state.progress else None, Tone.UNKNOWN
+    text = "nothing to compare with (parameter installed)"
+    if found is not None:
+        text, tone = found.sentence.replace("+/-", "±"), _TONES.get(found.verdict, tone)
+    yield Line(tone, "compared with what is installed", text)
     if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
         text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
-        yield Line(_BROADCAST[broadcast], "on /tf_static", text)
+        yield Line(_TONES[broadcast], "on /tf_static", text)
     if state.saved is not None:
         where = f"at {at_time(state.saved.at_s)} in {state.saved.directory}: {state.saved.text}"
         yield Line(Tone.GOOD, "saved", where)

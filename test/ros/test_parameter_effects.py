@@ -278,6 +278,11 @@ def monitor_is_used(start_node, peer, tmp_path):
     peer.spin_until(lambda: heard, "diagnostics")
     names = [status.name for status in heard[-1].status]
     assert names == [f"/calibrator: {part}" for part in ("mount", "parent input", "child input")]
+    # Its page has a button that ends the watch, and calibrates anew.
+    assert peer.set_parameter("monitor", False).successful
+    peer.solve(peer.publishers(), *drive(60))
+    peer.spin_until(lambda: len(heard[-1].status) > 3, "the state of a calibration")
+    assert {each.name for each in heard[-1].status} >= {"/calibrator: extrinsic"}
 
 
 EFFECTS = {

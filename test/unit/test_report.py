@@ -35,7 +35,7 @@ from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import REALISTIC
 from hand_eye_calib.text import amount, with_sigma
 
-FIGURES = ("views", "trajectories", "residuals", "convergence", "excitation", "answers", "streams")
+FIGURES = ("views", "trajectories", "residuals", "convergence", "answers", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 
 
