@@ -37,7 +37,9 @@ def open_export(path: Path) -> "ForeignExtrinsics":
     """
     if path.suffix == ".npy":
         try:
-            return ForeignExtrinsics(path, np.load(path, allow_pickle=False).tolist())
+            return ForeignExtrinsics(
+                path, np.load(path, allow_pickle=False, mmap_mode="r").tolist()
+            )
         except (OSError, ValueError, EOFError) as error:
             raise InputError(f"cannot read {path}: {error}") from None
     text = read_text(path, _EXPECTED, LARGEST_YAML)

@@ -348,23 +348,6 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
             "again with --prior"
         )
     target, source = frames[::-1] if is_inverted else frames
-    about = [
-        f"{name}, by hand_eye_calib {package_version()}. {headline}",
-        f"Maps coordinates of {source} into {target}: the pose of {source} in {target}.",
-    ]
-    if is_inverted:
-        about.append(f"Inverted: the calibration is the pose of {frames[1]} in {frames[0]}.")
-    if not is_certain:
-        roles = [each.partition(":")[0] for each in layout[:2]]
-        pairs = zip(roles, (target, source), strict=True)
-        said = [f"{frame} is the {role}" for role, frame in pairs if role]
-        about.append(f"Assumed, as the names of the frames do not say it: {', '.join(said)}.")
-    if name == "driveworks":
-        about.append(f"The axes of {source} must be x forward, y left, z up.")
-    if name == "px4":
-        about.append(f"x forward, y right, z down, from axes of {target} forward, left, up.")
-    about.append(f"Clocks: t({frames[0]}) = t({frames[1]}) + {_number(result.time_offset_s)} s.")
-    lines = [printable(" ".join(line.split())) for line in about]
     texts = _numbers(se3.inverse(T) if is_inverted else T, usable if result.unobservable() else {})
     shift = layout.clock * (-1 if is_inverted else 1) * result.time_offset_s
     texts |= {"target": json.dumps(target), "source": json.dumps(source), "shift": _number(shift)}
@@ -375,12 +358,44 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
     texts["ev_delay"] = f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
     if not 0 <= delay_ms <= _LONGEST_DELAY_MS:
         texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
+    offset = (
+        f"Clocks: t({result.parent_frame}) = t({result.child_frame}) + "
+        f"{_number(result.time_offset_s)} s, "
+        + ("estimated." if result.time_offset_sigma_s else "given, not estimated.")
+    )
+    about = _about(name, target, source, frames if is_inverted else None, layout, is_certain)
+    about = [f"{name}, by hand_eye_calib {package_version()}. {headline}", *about, offset]
+    lines = [printable(" ".join(line.split())) for line in about]
     texts["about"] = "\n".join(f"# {line}" for line in lines)
     if name in _JSON:
         texts["about"] = json.dumps(lines)
     elif name == "kitti":
         texts["about"] = json.dumps(" ".join(lines))
     return layout.text % texts
+
+
+def _about(
+    name: str,
+    target: str,
+    source: str,
+    inverted: tuple[str, str] | None,
+    layout: Layout,
+    is_certain: bool,
+) -> list[str]:
+    """What the numbers of a file mean, in lines."""
+    lines = [f"Maps coordinates of {source} into {target}: the pose of {source} in {target}."]
+    if inverted:
+        lines.append(f"Inverted: the calibration is the pose of {inverted[1]} in {inverted[0]}.")
+    if not is_certain:
+        roles = [each.partition(":")[0] for each in layout[:2]]
+        pairs = zip(roles, (target, source), strict=True)
+        said = [f"{frame} is the {role}" for role, frame in pairs if role]
+        lines.append(f"Assumed, as the names of the frames do not say it: {', '.join(said)}.")
+    if name == "driveworks":
+        lines.append(f"The axes of {source} must be x forward, y left, z up.")
+    if name == "px4":
+        lines.append(f"x forward, y right, z down, from axes of {target} forward, left, up.")
+    return lines
 
 
 def _numbers(T: FloatArray, by_hand: Mapping[str, float | str]) -> dict[str, str]:

@@ -40,6 +40,13 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
+# What a file that is not what it begins like may raise.
+_MALFORMED = (
+    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
+    ElementTree.ParseError,
+)
+
+
 class Rows(NamedTuple):
     """The rows of a file under names of columns, and what a person should know."""
 
@@ -83,7 +90,7 @@ def rows_of(path: str | Path, choice: str | None = None) -> Rows | None:
             whole = read_text(path, "a trajectory", LARGEST_TEXT)
             try:
                 return read(whole, choice)
-            except (ValueError, KeyError, IndexError, TypeError, ElementTree.ParseError) as error:
+            except _MALFORMED as error:
                 reason = " ".join(str(error).split())[:200]
                 raise InputError(f"{path}: {reason or type(error).__name__}") from None
     return None
@@ -122,7 +129,7 @@ def _of_nmea(text: str, _: str | None) -> Rows:
 
 
 def _of_gpx(text: str, _: str | None) -> Rows:
-    if "<!DOCTYPE" in text[:_HEAD_BYTES]:
+    if "<!DOCTYPE" in text:
         raise ValueError("GPX with a document type is not read; remove it")
     points = ElementTree.fromstring(text).iterfind(".//{*}trkpt")
     rows = []
@@ -158,7 +165,7 @@ def _of_rtklib(text: str, _: str | None) -> Rows:
             yield stamp, *cells[2:5]
 
     note = "stamps are of GPS time, 18 s ahead of UTC since 2017" if "GPST" in header else ""
-    return Rows(f"t,{columns}", rows(), tuple(filter(None, [note])))
+    return Rows(f"t,{columns}", [*rows()], tuple(filter(None, [note])))
 
 
 # ---- poses
@@ -267,7 +274,7 @@ def _of_vicon(text: str, choice: str | None) -> Rows:
 
 def _of_numpy(path: Path) -> Rows:
     try:
-        values = np.load(path, allow_pickle=False)
+        values = np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"cannot read {path}: {error}") from None
     if values.dtype.names:
