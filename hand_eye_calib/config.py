@@ -521,7 +521,8 @@ class NodeConfig(OptionSet):
     installed: str = option(
         "",
         "What the robot uses now, to compare the result with: tf (from /tf_static), a URDF, an "
-        "earlier extrinsic.yaml, a bag, or X Y Z ROLL PITCH YAW in m and rad. Empty for nothing.",
+        "earlier extrinsic.yaml, a file of another program, a bag, or X Y Z ROLL PITCH YAW in m "
+        "and rad. Empty for nothing.",
         read_only=True,
     )
     base_frame: str = option(

@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--with",
         dest="installed",
         metavar="SOURCE",
-        help="what is installed: a URDF, an earlier extrinsic.yaml, a bag with /tf_static, or "
+        help="what is installed: a URDF, an earlier extrinsic.yaml, a file of "
+        "another program (as of info --as), a bag with /tf_static, or "
         '"X Y Z ROLL PITCH YAW" in m and rad',
     )
     add_json_argument(parser)

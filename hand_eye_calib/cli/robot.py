@@ -21,8 +21,9 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--installed",
         metavar="SOURCE",
-        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a bag with "
-        '/tf_static, or "X Y Z ROLL PITCH YAW" in m and rad. Default: --urdf, if it is given',
+        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
+        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad. Default: '
+        "--urdf, if it is given",
     )
     group.add_argument(
         "--base-frame",
