@@ -92,7 +92,6 @@ class CalibratorNode(Node):
         self._others = other_names(options.other_children)
         self._session.take_others(self._others)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *self._others)]
-        self._say_start()
         self._session.topics = {each.name: each.topic for each in self._inputs[:2]}
         self._session.follow_journal(options, resuming=options.journal == "resume")
         for each in self._inputs:
@@ -114,6 +113,7 @@ class CalibratorNode(Node):
         self._serve()
         self._start_timers()
         self._discover()
+        self._say_start()
 
     def stop(self, timeout_s: float) -> bool:
         """End the solving process and save the newest result.

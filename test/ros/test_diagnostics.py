@@ -189,15 +189,21 @@ class TestStreamChecks:
             (inverted, "the child stream seems to hold inverse poses"),
         ],
     )
-    def test_faulty_streams_are_named(self, start_node, peer, state, damage, said):
+    def test_faulty_streams_that_can_be_repaired_are_named_and_solved_with(
+        self, start_node, peer, state, damage, said
+    ):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
         child = damage(Trajectory(stamps_ns, Ts_cw_c)).poses
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, child)
-        found = state(lambda each: said in each.checks.text and said in each.extrinsic.text)
-        assert (found.checks.level, found.extrinsic.level) == (Level.WARN, Level.WARN)
-        assert found.extrinsic.text.startswith("DO NOT USE: ")
-        node.wait_for_log(said)
+
+        def is_told(each):
+            result = each.extrinsic.result
+            return result and any(said in text for text in result.warnings)
+
+        found = state(is_told)
+        assert (found.checks.level, found.extrinsic.result.verdict) == (Level.OK, "USE")
+        node.wait_for_log(said, "Solved with child_")
 
     def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(
         self, start_node, peer, state, tmp_path
