@@ -55,13 +55,40 @@ def extrinsic_state(
     steady_s, clock_ns
         Steady time, and the node's clock, 0 if it does not run yet.
     """
-    seen, result, failure = cycle.seen, cycle.result, cycle.failure
-    age_s, stale_s = cycle.age_s(steady_s), np.inf
-    if waited_for_s is not None:
-        stale_s = max(_STALE_S, _STALE_PERIODS * waited_for_s)
+    seen, result = cycle.seen, cycle.result
+    age_s = cycle.age_s(steady_s)
+    level, text = _judged(cycle, accepts_poses, tf_static, age_s, waited_for_s)
+    rotation = np.degrees(seen.rotation).tolist() if seen else []
+    return ExtrinsicState(
+        level=level,
+        text=text,
+        accepts_poses=accepts_poses,
+        is_solving=cycle.is_solving,
+        solves=cycle.solves,
+        last_solve_s=cycle.seconds,
+        last_failure=cycle.failure.what if cycle.failure else "",
+        n_poses=seen.n_poses if seen else 0,
+        path_m=seen.distance if seen else 0.0,
+        motion_s=seen.motion_s if seen else 0.0,
+        has_vehicle_axes=bool(seen and seen.has_vehicle_axes),
+        rotation_deg=dict(zip("xyz", rotation, strict=False)),
+        tf_static=tf_static[0],
+        tf_static_reason=tf_static[1],
+        result=_result_state(result, age_s, clock_ns) if result else None,
+    )
+
+
+def _judged(
+    cycle: SolveCycle,
+    accepts_poses: bool,
+    tf_static: tuple[Broadcast, str],
+    age_s: float,
+    waited_for_s: float | None,
+) -> tuple[Level, str]:
+    """Level and message: the gravest that applies."""
+    result, failure = cycle.result, cycle.failure
     said = failure.what if failure else ""
-    broadcast, why = tf_static
-    # The gravest that applies.
+    is_stale = waited_for_s is not None and age_s > max(_STALE_S, _STALE_PERIODS * waited_for_s)
     level = Level.WARN
     if failure is not None and failure.kind is FailureKind.UNEXPECTED:
         level, text = Level.ERROR, f"the solve failed unexpectedly, see the log: {said}"
@@ -72,31 +99,14 @@ def extrinsic_state(
         text = "; ".join(filter(None, (*faults, said))) or "no result yet"
     elif result.verdict is Verdict.DO_NOT_USE:
         text = result.headline
-    elif broadcast in (Broadcast.REFUSED, Broadcast.ON) and why:
-        text = f"publish_tf is refused: {why}"
-    elif age_s > stale_s:
+    elif tf_static[0] in (Broadcast.REFUSED, Broadcast.ON) and tf_static[1]:
+        text = f"publish_tf is refused: {tf_static[1]}"
+    elif is_stale:
         text = ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
     else:
         level = Level.OK if result.verdict is Verdict.USE else Level.WARN
         text = result.headline
-    rotation = np.degrees(seen.rotation).tolist() if seen else []
-    return ExtrinsicState(
-        level=level,
-        text=text,
-        accepts_poses=accepts_poses,
-        is_solving=cycle.is_solving,
-        solves=cycle.solves,
-        last_solve_s=cycle.seconds,
-        last_failure=said,
-        n_poses=seen.n_poses if seen else 0,
-        path_m=seen.distance if seen else 0.0,
-        motion_s=seen.motion_s if seen else 0.0,
-        has_vehicle_axes=bool(seen and seen.has_vehicle_axes),
-        rotation_deg=dict(zip("xyz", rotation, strict=False)),
-        tf_static=broadcast,
-        tf_static_reason=why,
-        result=_result_state(result, age_s, clock_ns) if result else None,
-    )
+    return level, text
 
 
 def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultState:
