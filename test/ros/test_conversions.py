@@ -38,7 +38,7 @@ def calibration(covariance, T_parent_child=T_PARENT_CHILD):
 
 def test_every_pose_type_of_the_options_can_be_read():
     assert {*conversions.MESSAGES, "auto"} == set(config.POSE_TYPES)
-    assert set(conversions.MESSAGES) == set(MESSAGE_TYPES)
+    assert set(conversions.MESSAGES) <= set(MESSAGE_TYPES)  # bags have more
 
 
 def test_control_characters_in_names_of_frames_are_escaped():
