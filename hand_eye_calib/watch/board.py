@@ -19,7 +19,7 @@ from hand_eye_calib.live.state import (
 )
 from hand_eye_calib.results.records import AxisProgress, Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
-from hand_eye_calib.text import amount, duration, listing, two_digits
+from hand_eye_calib.text import amount, duration, fixed, listing, two_digits
 
 # A node that has said nothing for so long is silent; it reports once a second (s).
 SILENT_AFTER_S = 3.5
@@ -397,7 +397,7 @@ def _values(state: NodeState) -> Iterator[tuple[str, str]]:
         if value is None or sigma is None:
             yield axis, "? not observed"
         elif axis in ROTATIONS:
-            yield axis, f"{math.degrees(value):.2f} ± {two_digits(math.degrees(sigma))} deg"
+            yield axis, f"{fixed(math.degrees(value), 2)} ± {two_digits(math.degrees(sigma))} deg"
         else:
             yield axis, f"{value:.3f} m ± {amount(axis, sigma)}"
 
