@@ -218,6 +218,16 @@ def _quaternion(stream: str) -> Any:
     )
 
 
+def _kind(stream: str) -> Any:
+    return option(
+        "odometry",
+        f"How the poses of the {stream} sensor were made. odometry (lidar, camera, wheels) has "
+        "constant errors that no recording shows: they are part of every standard deviation. exact "
+        "(motion capture, surveyed, an INS with RTK, simulated) has none.",
+        choices=("odometry", "exact"),
+    )
+
+
 def _prior(axis: str) -> Any:
     unit = AXIS_UNITS[axis]
     example = "1.85+/-0.02 or 185cm+/-2cm" if unit == "m" else "-90deg+/-2deg"
@@ -263,8 +273,8 @@ class CalibratorConfig(OptionSet):
     reference: str = option(
         "auto",
         "Which poses form motion pairs: A (each with the first), B<n> (each with the n-th before "
-        "it), C<n> (each with the first of its segment of n), or auto (lowest error predicted "
-        "from the estimated noise).",
+        "it), C<n> (each with the first of its segment of n), or auto (the one with the answer "
+        "nearest to adaptive's).",
         pattern=REFERENCE_PATTERN,
         form="auto, A, B<n> such as B5, or C<n> such as C20",
     )
@@ -348,6 +358,8 @@ class CalibratorConfig(OptionSet):
     child_invert: str = _invert("child")
     parent_quaternion: str = _quaternion("parent")
     child_quaternion: str = _quaternion("child")
+    parent_kind: str = _kind("parent")
+    child_kind: str = _kind("child")
     prior_x: str = _prior("x")
     prior_y: str = _prior("y")
     prior_z: str = _prior("z")
@@ -436,6 +448,11 @@ class CalibratorConfig(OptionSet):
         single = parse_targets("target.axes", self.target_axes)
         of_unit = {"m": self.target_translation, "rad": self.target_rotation}
         return tuple(single.get(axis, of_unit[unit]) for axis, unit in AXIS_UNITS.items())
+
+    @property
+    def odometry_share(self) -> float:
+        """Share of both streams that are odometry."""
+        return 0.5 * [self.parent_kind, self.child_kind].count("odometry")
 
     def target_fields(self) -> dict[str, Any]:
         """The targets as the fields of a result."""

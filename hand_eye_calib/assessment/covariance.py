@@ -91,11 +91,6 @@ class Assessment:
         """Names of the axes with a verdict."""
         return [dof.name for dof in self.observability if dof.verdict is verdict]
 
-    def known_translations(self) -> BoolArray:
-        """Whether the motion, not a prior alone, reveals x, y and z of the parent, (3,)."""
-        unknown = (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
-        return np.array([dof.verdict not in unknown for dof in self.observability[:3]])
-
 
 def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:
     """Covariance and observability of a solution.

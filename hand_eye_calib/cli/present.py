@@ -20,7 +20,6 @@ from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import (
     amount,
-    angle,
     axes_in_words,
     given_or_estimated,
     listing,
@@ -44,7 +43,6 @@ _PROOF = {
 _SCATTER = {
     "of_methods": "scatter of other methods and references about it",
     "of_halves": "scatter of the two halves of the recording about it",
-    "of_model": "difference between dnlo and adaptive",
 }
 
 
@@ -295,18 +293,15 @@ def _observability(calibration: Calibration) -> str:
 def _floor(calibration: Calibration) -> Iterator[str]:
     """Errors that nothing in the recording shows."""
     if calibration.floor is not None and np.isfinite(calibration.sigmas).any():
-        from hand_eye_calib.assessment.floor import FLOOR_ROTATION, FLOOR_SCALE, FLOOR_TILT
-
         sigmas = zip(calibration.observability, calibration.sigmas_of_floor, strict=True)
         told = [
-            f"{axes_in_words([dof.name])} by {amount(dof.name, sigma)}"
+            f"{axes_in_words([dof.name])} {amount(dof.name, sigma)}"
             for dof, sigma in sigmas
             if np.isfinite(dof.sigma)
         ]
         yield (
-            f"not in these standard deviations: a constant odometry error ({100 * FLOOR_SCALE:g} % "
-            f"in scale, {angle(FLOOR_ROTATION)}, an axis of rotation tilted by "
-            f"{angle(FLOOR_TILT)}) would change {', '.join(told)}"
+            "of these standard deviations, a constant odometry error, which no recording shows, "
+            f"has {', '.join(told)}"
         )
 
 

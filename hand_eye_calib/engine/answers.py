@@ -293,15 +293,12 @@ def compare_answers(
         if halves[0].method != calibration.method:
             beside = calibration.sigmas_with_floor
         excess_of_halves = of_halves / np.hypot(allowed / 2, beside)
-    of_model, excess_of_model = _from_other_model(calibration)
     columns = {
         "sigma": calibration.sigmas,
         "of_methods": of_methods,
         "of_halves": of_halves,
-        "of_model": of_model,
         "excess_of_methods": excess_of_methods,
         "excess_of_halves": excess_of_halves,
-        "excess_of_model": excess_of_model,
         "excess_over_own": _over_own(calibration, robust),
     }
     known = np.isfinite(calibration.sigmas)
@@ -364,17 +361,3 @@ def _apart(
     joint = np.hypot(np.hypot(first.sigmas, second.sigmas), floor)
     known = np.isfinite(joint)
     return np.where(known, distance, np.nan), np.where(known, np.maximum(joint, _ROUNDING), np.nan)
-
-
-def _from_other_model(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
-    """Distance (6,) from the answer under other assumptions, and the same in joint standard
-    deviations.
-    """
-    if calibration.other_answer is None:
-        return np.full(6, np.nan), np.full(6, np.nan)
-    T_other, covariance = calibration.other_answer
-    distance = np.abs(deviation(T_other, calibration.T_parent_child))
-    to_parent = np.kron(np.eye(2), T_other[:3, :3])
-    variances = np.diag(to_parent @ covariance @ to_parent.T) + calibration.sigmas**2
-    variances += calibration.sigmas_of_floor**2
-    return distance, distance / np.sqrt(np.maximum(variances, _ROUNDING**2))

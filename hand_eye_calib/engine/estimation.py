@@ -2,6 +2,7 @@
 assess, add the prior, judge.
 """
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
@@ -9,9 +10,9 @@ import numpy as np
 
 from hand_eye_calib.alignment.scale import Scale, ScaleInUse, child_scaled, settle_scale
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive, without_axes
-from hand_eye_calib.assessment.floor import axes_lost_by_tilt, common_mode_floor
+from hand_eye_calib.assessment.floor import common_mode_floor, floor_of_pairs
 from hand_eye_calib.assessment.mount_change import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
@@ -20,26 +21,19 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
-from hand_eye_calib.gls.increments import SYSTEMATIC, Streams, course_of
+from hand_eye_calib.gls.increments import SYSTEMATIC
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
+from hand_eye_calib.results.calibration import Calibration, Residuals
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
-
-# Poses between the ends of motion pairs that show the motion well: over one interval noise would
-# look like motion.
-_SPAN = 10
 
 # Largest share of the increments that may be jumps: with jumps at a tenth of the poses of both
 # trajectories it is a fifth.
 _MAX_JUMPS = 0.25
 
 _PROVED = {True: "yes", False: "no", None: "not tried"}
-
-# Tried in turn if the reference that auto chose leaves an axis unobservable.
-_LONGER_REFERENCES = ("B5", "B20")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +42,6 @@ class _Evaluation:
 
     Attributes
     ----------
-    spans : MotionPairs and (K,) array
-        Pairs that are long enough to show the motion, and their weights, for the floor.
     shift : PossibleShift or None
         Of the mount within the recording.
     is_beside : bool
@@ -64,12 +56,10 @@ class _Evaluation:
     reference: str
     pairs: MotionPairs
     weights: FloatArray
-    spans: tuple[MotionPairs, FloatArray]
     method_reason: str = ""
     reference_reason: str = ""
     proved_global: str = "not tried"
     warnings: tuple[str, ...] = ()
-    other_answer: tuple[FloatArray, FloatArray] | None = None
     shift: PossibleShift | None = None
     is_beside: bool = False
     model: AdaptiveSolution | None = None
@@ -97,14 +87,11 @@ class Solved:
         Parameters
         ----------
         unseen : collection of str
-            Axes that count as unobservable whatever the method says; so do those that a tilted
-            axis of rotation would move too far.
+            Axes that count as unobservable whatever the method says.
         """
         evaluation, scale, offset = self.evaluation, self.scale, self.time_offset
         T_method = evaluation.solution.T_parent_child
-        sigmas = np.array([dof.sigma for dof in self.assessment.observability[:3]])
-        hidden = {*unseen, *axes_lost_by_tilt(*evaluation.spans, T_method, sigmas)}
-        fused = fuse(T_method, without_axes(self.assessment, T_method, hidden), self.config.prior())
+        fused = fuse(T_method, without_axes(self.assessment, T_method, unseen), self.config.prior())
         result = _calibration(evaluation, fused, self.stamps_ns, self.config)
         offset_s = offset.seconds if offset else fixed_time_offset(self.config)
         offset_sigma_s = offset.sigma_s if offset else 0.0
@@ -198,8 +185,7 @@ def _calibration(
     residuals = _residuals(evaluation, stamps_ns, fused.T_parent_child)
     floor = None
     if not evaluation.is_beside:
-        known = fused.assessment.known_translations()
-        floor = common_mode_floor(*evaluation.spans, fused.T_parent_child, known)
+        floor = config.odometry_share * _floor(evaluation)
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
@@ -227,9 +213,17 @@ def _calibration(
             *(evaluation.shift.warnings if evaluation.shift else ()),
         ),
         motion_residuals=residuals,
-        other_answer=evaluation.other_answer,
         model=evaluation.model,
     )
+
+
+def _floor(evaluation: _Evaluation) -> FloatArray:
+    """Common-mode floor (6, 6) of errors of two odometries."""
+    if (found := evaluation.adaptive) is None:
+        T_method = evaluation.solution.T_parent_child
+        return floor_of_pairs(evaluation.pairs, evaluation.weights, T_method)
+    lasting = [slow.sigma for slow in found.noise.slow if slow.part == "translation"]
+    return common_mode_floor(found.by_scale, found.scale_variance, math.hypot(*lasting))
 
 
 def _residuals(
@@ -263,10 +257,7 @@ def _solve_auto(
     pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
 ) -> _Evaluation:
     """The adaptive estimator, unless its noise model cannot work on these poses or a reference is
-    given, which only the paper's methods have: then DNLO. The other answer is that of the other
-    method, whose distance the verdict judges.
-
-    The adaptive estimator is solved once; DNLO's reference is chosen from the noise that it found.
+    given, which only the paper's methods have: then DNLO.
     """
     with_dnlo = replace(config, method="dnlo")
     if config.reference != "auto":
@@ -275,61 +266,33 @@ def _solve_auto(
             dnlo, method_reason=f"auto: dnlo, because the user set reference {config.reference}"
         )
     solution = _adaptive_solution(pose_pairs, config, is_clock_free)
-    by_model = _evaluated(pose_pairs, solution)
-    if len(pose_pairs) < MIN_POSES:
-        reason = f"auto: adaptive; fewer than {MIN_POSES} poses are too few to compare with dnlo"
-        return replace(by_model, method_reason=reason)
-    if not solution.converged or solution.is_drowned:
-        why = "single poses are noisier than the motion between them"
-        why = why if solution.is_drowned else "the adaptive estimator did not converge"
-        dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
-        reason = f"auto: dnlo on reference {dnlo.reference}, because {why}"
-        return replace(dnlo, method_reason=reason, other_answer=_beside(by_model), model=solution)
-    # DNLO does not know of systematic errors: it is compared on poses without them.
-    if solution.systematic != "none":
-        pose_pairs = _without_bias(_corrected(pose_pairs, solution), solution)
+    works = solution.converged and not solution.is_drowned
+    if works or len(pose_pairs) < MIN_POSES:
+        by_model = _evaluated(pose_pairs, solution)
+        return replace(by_model, method_reason="auto: adaptive, because its noise model works here")
+    why = "single poses are noisier than the motion between them"
+    why = why if solution.is_drowned else "the adaptive estimator did not converge"
     dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
-    reason = f"auto: adaptive, compared with dnlo on reference {dnlo.reference}"
-    return replace(by_model, method_reason=reason, other_answer=_beside(dnlo))
-
-
-def _beside(evaluation: _Evaluation) -> tuple[FloatArray, FloatArray] | None:
-    """An answer that was not chosen, and its covariance, if it knows all axes."""
-    if not evaluation.solution.converged or evaluation.assessment.named(DofVerdict.UNOBSERVABLE):
-        return None
-    return (
-        evaluation.solution.T_parent_child,
-        evaluation.assessment.cov_parent_child_in_child,
-    )
+    reason = f"auto: dnlo on reference {dnlo.reference}, because {why}"
+    return replace(dnlo, method_reason=reason, model=solution)
 
 
 def _solve_pairs(
-    pose_pairs: PosePairs, config: CalibratorConfig, noise_model: AdaptiveSolution | None = None
+    pose_pairs: PosePairs, config: CalibratorConfig, solution: AdaptiveSolution | None = None
 ) -> _Evaluation:
-    """A method of the paper on the motion pairs of one reference."""
+    """A method of the paper on the motion pairs of one reference; ``solution`` is the adaptive
+    estimator's, if it is known.
+    """
     method = _method(config)
     if config.reference != "auto":
         return _solve_reference(pose_pairs, method, config.reference)
-    choice = select_reference(pose_pairs, method, solution=noise_model)
-    chosen = _solve_reference(
-        pose_pairs, method, choice.reference, choice.reason(), choice.solution
-    )
-    for reference in _LONGER_REFERENCES:
-        # The prediction assumes noise without spikes and favours short baselines if there are any.
-        # Longer ones may still lift the motion out of the noise.
-        n_unobservable = len(chosen.assessment.named(DofVerdict.UNOBSERVABLE))
-        if n_unobservable == 0:
-            break
-        if len(pose_pairs) < 2 * int(reference[1:]):
-            continue
-        reason = (
-            f"{reference}: {chosen.reference}, which has the smaller predicted error, "
-            "leaves more axes unobservable"
-        )
-        longer = _solve_reference(pose_pairs, method, reference, reason)
-        if len(longer.assessment.named(DofVerdict.UNOBSERVABLE)) < n_unobservable:
-            chosen = longer
-    return replace(chosen, other_answer=choice.answer, shift=choice.shift)
+    fast = replace(method, backend="fast")
+    choice = select_reference(pose_pairs, fast, solution=solution)
+    found, model = _solve_reference(pose_pairs, method, choice.reference), choice.model
+    shift = None
+    if model.converged and not model.unseen.size:
+        shift = possible_shift(model.part_products, model.misfit)
+    return replace(found, reference_reason=choice.reason(), shift=shift)
 
 
 def _method(config: CalibratorConfig) -> Method:
@@ -340,15 +303,13 @@ def _solve_reference(
     pose_pairs: PosePairs,
     method: Method,
     reference: str,
-    reason: str = "",
-    found: Solution | None = None,
     is_beside: bool = False,
 ) -> _Evaluation:
-    """A method's answer for one reference, which may be known already, assessed; beside another
-    result, without a proof and a floor.
+    """A method's answer for one reference, assessed; beside another result, without a proof and a
+    floor.
     """
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-    solution = found or method.solve(pairs)
+    solution = method.solve(pairs)
     if not is_beside:
         solution = method.prove(pairs, solution)
     assessment = assess(
@@ -361,9 +322,7 @@ def _solve_reference(
         reference=reference,
         pairs=pairs,
         weights=solution.weights,
-        spans=(pairs, solution.weights),
         is_beside=is_beside,
-        reference_reason=reason,
         proved_global=_PROVED[solution.is_proved_global],
     )
 
@@ -393,16 +352,6 @@ def _corrected(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
     return PosePairs(stamps_ns, pose_pairs.Ts_pw_p, Ts_cw_c)
 
 
-def _without_bias(pose_pairs: PosePairs, solution: AdaptiveSolution) -> PosePairs:
-    """The poses without the bias per metre of path that the solution found."""
-    stamps_ns = pose_pairs.stamps_ns
-    Ts_pw_p, Ts_cw_c = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c.copy()
-    streams = Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c)
-    course = course_of(streams, solution.T_parent_child)
-    Ts_cw_c[:, :3, 3] -= course.along @ solution.bias
-    return PosePairs(stamps_ns, Ts_pw_p, Ts_cw_c)
-
-
 def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation:
     """An answer of the adaptive estimator, assessed."""
     Ts_cw_c = _corrected(pose_pairs, solution).Ts_cw_c
@@ -418,23 +367,10 @@ def _evaluated(pose_pairs: PosePairs, solution: AdaptiveSolution) -> _Evaluation
         reference="increments",
         pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
         weights=(~solution.jumps).astype(float),
-        spans=_spans(pose_pairs.Ts_pw_p, Ts_cw_c, solution.left_out),
         warnings=(warning,) if jumps > _MAX_JUMPS else (),
         model=solution,
         shift=possible_shift(solution.part_products, solution.misfit),
     )
-
-
-def _spans(
-    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, left_out: BoolArray
-) -> tuple[MotionPairs, FloatArray]:
-    """Motion pairs over a tenth of a short recording, or ten poses, without those across an
-    increment that is left out.
-    """
-    baseline = min(_SPAN, max(len(left_out) // 10, 1))
-    pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{baseline}")
-    before = np.concatenate([[0], np.cumsum(left_out)])
-    return pairs, (before[pairs.i] == before[pairs.j]).astype(float)
 
 
 def _spread_by_alignment(scale: Scale | None, time_offset: TimeOffset | None) -> FloatArray:

@@ -44,6 +44,8 @@ def calibrate(
     child_invert: str | None = None,
     parent_quaternion: str | None = None,
     child_quaternion: str | None = None,
+    parent_kind: str | None = None,
+    child_kind: str | None = None,
     prior: Prior | None = None,
     target_translation: float | None = None,
     target_rotation: float | None = None,

@@ -15,13 +15,14 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.increments import SYSTEMATIC, Streams
+from hand_eye_calib.gls.increments import SCALE, SYSTEMATIC, Streams
 from hand_eye_calib.gls.noise_model import ROTATION
 from hand_eye_calib.gls.normal import N_BLOCKS, answers_without
 from hand_eye_calib.gls.parts import part_products
 from hand_eye_calib.gls.problem import Fit, Problem
 from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.gls.stages import STAGES, start
+from hand_eye_calib.gls.state_space import Posterior
 from hand_eye_calib.gls.tuning import TUNING, Tuning
 from hand_eye_calib.stats import median
 
@@ -143,6 +144,7 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     parts = part_products(posterior)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     final = fit.moved(normal.step)
+    by_scale, scale_variance = _of_scale(posterior, fit)
     return AdaptiveSolution(
         T_parent_child=final.T,
         cov_parent_child_in_child=covariance[:6, :6],
@@ -159,10 +161,25 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         misfit=misfit,
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
         part_products=parts,
+        by_scale=by_scale,
+        scale_variance=max(misfit, 1.0) * scale_variance,
         objective=0.5 * (posterior.precision.log_determinant + normal.cost),
         converged=fit.converged,
         iterations=fit.n_evaluations,
     )
+
+
+def _of_scale(posterior: Posterior, fit: Fit) -> tuple[FloatArray, float]:
+    """Derivative (6,) of xi by a scale of the child's path that is not in the model, and what the
+    data leave open of that scale, as a variance.
+    """
+    if SCALE in fit.columns:
+        return np.zeros(6), 0.0
+    columns = fit.linearised(fit.poses, fit.course, fit.error, [*fit.columns, SCALE]).columns
+    products = posterior.with_columns(columns).products[:-1, :-1]
+    by_scale = -posterior.normal.covariance @ products[:-1, -1]
+    information = products[-1, -1] + products[-1, :-1] @ by_scale
+    return by_scale[:6], 1.0 / max(float(information), np.finfo(float).tiny)
 
 
 def _sigmas(tuning: Tuning, fit: Fit, covariance: FloatArray, parts: FloatArray) -> FloatArray:

@@ -146,6 +146,10 @@ class AdaptiveSolution:
         Path of the parent from pose to pose.
     part_products : (K, p + 1, p + 1) array
         What each part of the recording adds, see :mod:`~hand_eye_calib.gls.parts`.
+    by_scale : (6,) array
+        Derivative of xi by the logarithm of the scale of the child's path.
+    scale_variance : float
+        Of that scale, by the data; zero if it is in the model.
     objective : float
         Negative log likelihood.
     converged : bool
@@ -168,6 +172,8 @@ class AdaptiveSolution:
     misfit: float
     metres_per_pose: float
     part_products: FloatArray
+    by_scale: FloatArray
+    scale_variance: float
     objective: float
     converged: bool
     iterations: int

@@ -165,29 +165,6 @@ class StateSpace:
         return states
 
 
-class Covariance:
-    """V of all increments of a state space, at log levels."""
-
-    def __init__(self, space: StateSpace, levels: FloatArray) -> None:
-        self._space = space
-        self._white = space.white_covariance(levels) / space.weights[:, None, None]
-        self._walk = space.relative[:, None, None] * space.walk_covariance(levels)
-        self._markov = [markov(group, levels, space.intervals_s) for group in space.groups]
-
-    def products(self, columns: FloatArray) -> FloatArray:
-        """(k, k) array: products of columns (n, 6, k), weighed with V."""
-        forces = self._space.gathered(columns)
-        white = np.ascontiguousarray(forces[:, :WHITE])
-        products = multiplied(columns, self._walk @ columns)
-        products += multiplied(white, self._white @ white)
-        for process in self._markov:
-            of_group = forces[:, process.group.states].reshape(len(forces), -1)
-            moved = process.variance * process.covariance_times(of_group)
-            shape = (len(forces), process.group.size, -1)
-            products += multiplied(of_group.reshape(shape), moved.reshape(shape))
-        return products
-
-
 @dataclass(frozen=True)
 class Markov:
     """A group at given levels: ``dt_i / tau``, phi_i and the innovations' relative variances

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.floor import common_mode_floor
+from hand_eye_calib.assessment.floor import floor_of_pairs
 from hand_eye_calib.assessment.mount_change import noise_covariance, residuals_and_jacobians
 from hand_eye_calib.assessment.moved import (
     log_ratio,
@@ -399,7 +399,7 @@ def _floor(learned: list[MotionPairs], T_parent_child: FloatArray) -> FloatArray
     child = np.concatenate([each.Ts_childi_childj for each in learned])
     index = np.arange(len(parent))
     pairs = MotionPairs(parent, child, index, index + 1)
-    floor = common_mode_floor(pairs, np.ones(len(parent)), T_parent_child)
+    floor = floor_of_pairs(pairs, np.ones(len(parent)), T_parent_child)
     return floor + shift_covariance(1e-3, 1e-4)
 
 

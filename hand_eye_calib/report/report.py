@@ -230,15 +230,16 @@ def _direction(transform: Plain, unknown: set[str]) -> dict[str, Any]:
 
 def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
     """Rows of the table of uncertainties, along and about the parent's axes."""
-    for dof in calibration.observability:
+    totals = calibration.sigmas_with_floor.tolist()
+    for dof, total in zip(calibration.observability, totals, strict=True):
         if dof.name not in calibration.out_of_reach:
             yield {
                 "name": dof.name,
                 "title": _AXIS_NAMES.get(dof.name, f"along {dof.name}"),
-                "sigma": amount(dof.name, dof.sigma),
+                "sigma": amount(dof.name, total),
                 "verdict": dof.verdict.value,
                 "words": _WORDS[dof.verdict.value],
-                "bar": _bar(dof.sigma / target_of(dof.name, calibration)),
+                "bar": _bar(total / target_of(dof.name, calibration)),
             }
 
 

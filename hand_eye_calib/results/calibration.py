@@ -62,7 +62,7 @@ _MATRICES = (
     "T_world_world",
     "cov_world_world",
 )
-_NOT_IN_FILES = ("motion_residuals", "other_answer", "model")
+_NOT_IN_FILES = ("motion_residuals", "model")
 
 # An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
 _SHARED = 0.02
@@ -315,6 +315,9 @@ class Calibration(Result):
                 "units": "m, rad",
                 "matrix": self.floor,
             }
+        document["sigma_total"] = dict(
+            zip((dof.name for dof in self.observability), self.sigmas_with_floor, strict=True)
+        )
         document |= {
             name: getattr(self, name)
             for name in self.__dataclass_fields__

@@ -156,9 +156,7 @@ class AxisScatter:
         Robust standard deviation of other methods and references about the result.
     of_halves : float or None
         Standard deviation that follows from the difference between both halves of the recording.
-    of_model : float or None
-        Distance from the answer under other assumptions on the noise.
-    excess_of_methods, excess_of_halves, excess_of_model : float or None
+    excess_of_methods, excess_of_halves : float or None
         The same in joint standard deviations, which contain the common-mode uncertainty; those of
         the halves also the result's own if the halves are solved with another method.
     excess_over_own : float or None
@@ -169,10 +167,8 @@ class AxisScatter:
     sigma: float | None
     of_methods: float | None
     of_halves: float | None
-    of_model: float | None = None
     excess_of_methods: float | None = None
     excess_of_halves: float | None = None
-    excess_of_model: float | None = None
     excess_over_own: float | None = None
 
 

@@ -109,9 +109,6 @@ class Result:
         the recording about this one; None without that cross-check.
     warnings : tuple of str
         What a person should know before using the result.
-    other_answer : ((4, 4) array, (6, 6) array) or None
-        T_parent_child and covariance under other assumptions on the noise: of the adaptive
-        estimator beside DNLO, or the reverse. Not part of files.
     model : object
         The adaptive estimator's solution, for the stream checks. Not part of files.
 
@@ -172,10 +169,6 @@ class Result:
     findings: tuple[Finding, ...] = ()
     cross_check: CrossCheck | None = None
     warnings: tuple[str, ...] = ()
-    other_answer: tuple[FloatArray, FloatArray] | None = field(
-        default=None, repr=False, compare=False
-    )
-
     model: object = field(default=None, repr=False, compare=False)
 
     parent_frame: str = "parent"

@@ -104,13 +104,10 @@ _PHYSICS = frozenset({"nothing_known", "unobservable", "target", "floor"})
 _NO_FAULT = " (a limit of the recording; no fault was found)"
 
 _OTHERS = {
-    "model": "dnlo and adaptive, which assume different noise,",
     "halves": "the two halves of the recording",
     "methods": "other methods and references",
 }
 _WHAT_TO_DO = {
-    "model": "take the difference as the standard deviation, or record again with more varied "
-    "motion; look for an odometry that drifts to one side",
     "halves": "check that both mounts are tight and record again; what the halves agree on holds",
     "methods": "use their scatter as the standard deviation, or record longer with more varied "
     "motion",
@@ -293,16 +290,17 @@ def _floor(result: Result) -> Iterator[_Found]:
     rough = {}
     for dof, floor in zip(result.observability, result.sigmas_of_floor, strict=True):
         target = target_of(dof.name, result)
-        if dof.sigma <= min(target, float(floor)) and target < math.hypot(dof.sigma, float(floor)):
-            rough[dof.name] = float(floor)
+        if dof.sigma <= target < (total := math.hypot(dof.sigma, float(floor))):
+            rough[dof.name] = total
     if rough:
-        told = [f"{axes_in_words([axis])} by {amount(axis, far)}" for axis, far in rough.items()]
+        told = [f"{axes_in_words([axis])} to {amount(axis, far)}" for axis, far in rough.items()]
         targets = dict.fromkeys(amount(axis, target_of(axis, result)) for axis in rough)
         text = (
-            f"a constant odometry error (1 % in scale, 0.15 deg) would change {listing(told)}. No "
-            f"recording can show it, and it is above your target of {listing(list(targets))}"
+            "constant odometry errors, which no recording can show, limit the knowledge of "
+            f"{listing(told)}: more than the target of {listing(list(targets))}"
         )
-        yield text, "check the scale of both odometries on a known distance", tuple(rough), {}
+        advice = "compare several recordings; give parent_kind or child_kind exact if one is"
+        yield text, advice, tuple(rough), {}
 
 
 _OF_RECORDINGS = {
@@ -342,8 +340,10 @@ def _motion_for(axes: Sequence[str]) -> str:
 
 
 def _known(result: Result) -> str:
-    """The largest standard deviations of a translation and of a rotation."""
+    """The largest standard deviations of a translation and of a rotation, with the floor."""
     texts = []
+    names_of_axes = [dof.name for dof in result.observability]
+    total = dict(zip(names_of_axes, result.sigmas_with_floor.tolist(), strict=True))
     for names in (TRANSLATIONS, ROTATIONS):
         known = [
             dof
@@ -351,8 +351,8 @@ def _known(result: Result) -> str:
             if dof.name in names and dof.name not in result.out_of_reach
         ]
         if known:
-            worst = max(known, key=lambda dof: dof.sigma)
-            texts.append(amount(worst.name, worst.sigma))
+            worst = max(known, key=lambda dof: total[dof.name])
+            texts.append(amount(worst.name, total[worst.name]))
     if result.out_of_reach:
         known_axes = [
             dof.name for dof in result.observability if dof.name not in result.out_of_reach
@@ -366,7 +366,7 @@ def _known(result: Result) -> str:
 
 def _condition(kind: str) -> str:
     text = (
-        f"{_OTHERS[kind].partition(',')[0]} differ by more than {CONTRADICTED_SIGMAS:g} joint "
+        f"{_OTHERS[kind]} differ by more than {CONTRADICTED_SIGMAS:g} joint "
         f"standard deviations and {CONTRADICTED_SHARE:g} of the target"
     )
     if kind == "methods":
@@ -439,8 +439,7 @@ RULES = (
     Rule(
         "floor",
         _CARE,
-        "an axis is worse than its target only together with the common-mode floor, which is the "
-        "larger part",
+        "an axis is worse than its target only together with the common-mode floor",
         _floor,
     ),
 )

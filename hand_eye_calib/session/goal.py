@@ -21,6 +21,8 @@ from hand_eye_calib.text import amount, angle, axes_in_words, duration, length
 
 # An axis is known if its standard deviation is below this share of its target ...
 _SHARE = 0.7
+# ... or what the common-mode floor leaves of it, of the variance at least this share, ...
+_LEAST_ROOM = 0.25
 # ... at so many results in a row, ...
 _RESULTS = 2
 # ... after so many seconds of motion, and so many correlation times of errors that last.
@@ -102,7 +104,9 @@ class Goal:
         """
         wanted = _SHARE * self._targets
         exempt = _settled_by_prior(calibration) | _out_of_reach(calibration)
-        ratios = np.where(exempt, 0.0, (calibration.sigmas / wanted) ** 2)
+        # What the common-mode floor leaves of the target; a floor above it cannot be driven away.
+        room = np.maximum(wanted**2 - calibration.sigmas_of_floor**2, _LEAST_ROOM * wanted**2)
+        ratios = np.where(exempt, 0.0, calibration.sigmas**2 / room)
         worst = int(np.argmax(ratios))
         motion_s = seen.motion_s
         faults = faults or _errors(calibration)

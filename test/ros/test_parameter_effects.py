@@ -59,6 +59,8 @@ CHANGES = {
     "parent_scale": (1.5, {}),
     **{f"{each}_invert": ("poses", {}) for each in ("parent", "child")},
     **{f"{each}_quaternion": ("wxyz", {}) for each in ("parent", "child")},
+    "parent_kind": ("exact", {}),
+    "child_kind": ("exact", {}),
     "target.translation": (1e-5, {}),
     "target.rotation": (1e-5, {}),
     "target.axes": ("yaw=1e-5", {}),

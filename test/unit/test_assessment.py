@@ -10,13 +10,10 @@ from hand_eye_calib.assessment.covariance import (
     judged,
     model_covariance,
 )
-from hand_eye_calib.assessment.metrics import absolute_errors
-from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.normal import answers_without
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofVerdict
 from hand_eye_calib.solvers.registry import Method
 
@@ -140,32 +137,6 @@ def test_turning_about_one_axis_in_place_hides_shift_and_turn_along_it():
     ]
     assert "y" in hidden
     assert "pitch" in hidden or len(hidden) > 2
-
-
-def test_of_references_that_promise_alike_the_one_nearest_to_the_adaptive_answer_is_chosen():
-    parent = wandering_poses(150)
-    poses = PosePairs(
-        np.arange(150) * 100_000_000,
-        disturbed(parent, 1, 0.003, 0.003),
-        disturbed(child_of(parent), 2, 0.003, 0.003),
-    )
-    method = Method("dnlo")
-    choice = select_reference(poses, method)
-    joint = choice.joint_errors()
-    assert 1 < len(choice.alike) < len(joint)
-    assert max(joint[reference] for reference in choice.alike) <= 1.3 * min(joint.values())
-    best = estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c).T_parent_child
-
-    def distance(reference):
-        pairs = motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, reference)
-        metres, radians = absolute_errors(method.solve(pairs).T_parent_child, best)
-        least_m, least_rad = min(choice.predicted_m.values()), min(choice.predicted_rad.values())
-        return np.hypot(metres / least_m, radians / least_rad)
-
-    least = min(map(distance, choice.alike))
-    near = [reference for reference in choice.alike if distance(reference) <= 1.1 * least]
-    assert choice.reference == min(near, key=joint.__getitem__)
-    assert f"of {', '.join(choice.alike)} its answer is nearest" in choice.reason()
 
 
 def test_the_jackknife_of_dnlo_sees_the_inliers_change_sides():

@@ -16,12 +16,11 @@ from motions import (
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.metrics import absolute_errors
-from hand_eye_calib.assessment.reference_selection import ReferenceChoice
+from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine import estimation
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.verdict import Verdict
 from hand_eye_calib.solvers.registry import Method
@@ -52,7 +51,7 @@ class TestWhichAnswerStands:
         np.testing.assert_array_equal(result.T_parent_child, model.T_parent_child)
         np.testing.assert_array_equal(result.covariance, model.covariance)
         assert (result.method, result.reference) == ("adaptive", "increments")
-        assert result.method_reason.startswith("auto: adaptive, compared with dnlo on reference ")
+        assert result.method_reason == "auto: adaptive, because its noise model works here"
         assert result.noise == model.noise
         assert model.method_reason == ""
 
@@ -68,7 +67,7 @@ class TestWhichAnswerStands:
         np.testing.assert_array_equal(result.T_parent_child, shifted(0.1))
         assert result.method == "adaptive"
         assert result.verdict is Verdict.USE_WITH_CARE
-        assert "model" in {reason.rule for reason in result.reasons}
+        assert "methods" in {reason.rule for reason in result.reasons}
 
     @pytest.mark.parametrize(
         ("changes", "why"),
@@ -139,34 +138,6 @@ class TestWhichAnswerStands:
         assert apart > 22.46
         assert result.method == "adaptive"
         assert result.time_offset_s == pytest.approx(0.05, abs=1e-3)
-        # The verdict compares with the same answer: of DNLO without that offset.
-        assert squared_distance(result, *result.other_answer) < 22.46
-
-    def test_the_witness_gets_poses_without_the_bias_that_was_found(self):
-        """Of a path that is off by so much per metre, DNLO knows nothing."""
-        parent = smooth_poses(np.arange(400) / 10)
-        child = child_of(parent)
-        steps = np.linalg.norm(np.diff(child[:, :3, 3], axis=0), axis=1)
-        drift = child[:-1, :3, :3] @ [0.0, 0.06, 0.0] * steps[:, None]
-        child[1:, :3, 3] += np.cumsum(drift, axis=0)
-        given = PosePairs(np.arange(400) * 10**8, parent, disturbed(child, 1, 1e-4, 1e-4))
-        solution = estimator.solve(given.stamps_ns, given.Ts_pw_p, given.Ts_cw_c)
-        assert "bias" in solution.systematic
-        off = [
-            np.linalg.norm(
-                Method("dnlo")
-                .solve(motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, "B5"))
-                .T_parent_child[:3, 3]
-                - T_PARENT_CHILD[:3, 3]
-            )
-            for poses in (given, estimation._without_bias(given, solution))
-        ]
-        assert off[1] < 0.2 * off[0]
-
-    def test_few_poses_are_not_compared(self):
-        result = hec.calibrate(*noisy_streams(12), method="auto")
-        assert result.method == "adaptive"
-        assert "too few to compare" in result.method_reason
 
     def test_the_cross_check_solves_with_the_method_that_was_used(self):
         streams = noisy_streams(60)
@@ -176,16 +147,9 @@ class TestWhichAnswerStands:
         assert found["x"].of_halves == expected["x"].of_halves
 
 
-class TestReferenceChoice:
-    choice = ReferenceChoice(
-        "B5", {"B1": 0.01, "B5": 0.02, "B20": 0.1}, {"B1": 0.02, "B5": 0.002, "B20": 0.001}
-    )
-
-    def test_the_joint_error_weighs_translation_and_rotation_alike(self):
-        joint = self.choice.joint_errors()
-        assert joint["B1"] == pytest.approx(np.sqrt((1 + 20**2) / 2))
-        assert joint["B5"] == pytest.approx(2.0)
-        assert joint["B20"] == pytest.approx(np.sqrt((10**2 + 1) / 2))
-
-    def test_the_reason_has_both(self):
-        assert "0.02 m and 0.11 deg, that of B1 0.01 m and 1.1 deg" in self.choice.reason()
+def test_the_reference_whose_answer_is_nearest_is_chosen():
+    parent, child = noisy_streams()
+    poses = PosePairs(parent.stamps_ns, parent.poses, child.poses)
+    choice = select_reference(poses, Method("dnlo"))
+    assert choice.distances[choice.reference] == min(choice.distances.values())
+    assert f"{choice.reference} of B1, B2, B3" in choice.reason()

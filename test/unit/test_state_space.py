@@ -9,7 +9,6 @@ from hand_eye_calib.gls.normal import NormalEquations, answers_without
 from hand_eye_calib.gls.outliers import surprises
 from hand_eye_calib.gls.parts import part_products
 from hand_eye_calib.gls.state_space import (
-    Covariance,
     Group,
     Posterior,
     StateSpace,
@@ -139,14 +138,6 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
     ]
     forced = np.array([slope[np.ix_(rows, rows)] @ P @ r for slope in slopes])
     np.testing.assert_allclose(information, 0.5 * forced @ P @ forced.T, atol=1e-7)
-
-
-def test_products_weighed_with_the_covariance_are_those_of_the_dense_matrix():
-    space, columns = space_of(), np.random.default_rng(3).standard_normal((N_POSES - 1, 6, 4))
-    flat = columns.reshape(-1, 4)
-    expected = flat.T @ dense_covariance(space, LEVELS) @ flat
-    found = Covariance(space, LEVELS).products(columns)
-    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_surprises_are_what_leaving_one_out_makes_of_it():
