@@ -41,6 +41,12 @@ _MOST_SPIKES = 0.3
 # factor (4/3 for normal ones).
 _HEAVY_KURTOSIS = 1.7
 
+# Poses on either side that may share a level of the white errors.
+_WIDTHS = (2, 5, 12, 30)
+
+# A level that changes is believed if it lowers the loss per pose by so much.
+_LEAST_GAIN = 0.1
+
 # Share of a covariance that keeps differences of covariances away from zero.
 _ROUNDING, _LEAST_VARIANCE = 1e-9, 1e-18
 
@@ -216,11 +222,13 @@ def tails_are_heavy(outliers: Outliers, of_white: FloatArray) -> bool:
     return bool(np.mean(normal**2) > _HEAVY_KURTOSIS * np.mean(normal) ** 2)
 
 
-def student_weights(posterior: Posterior) -> FloatArray:
-    """Weights (N,) of white errors with Student's t distribution, from those in force.
+def tail_weights(posterior: Posterior) -> FloatArray:
+    """Weights (N,) of white errors with Student's t distribution, whose level may change over time:
+    ``u = (nu + 6) / (nu m + E w' S^-1 w)``.
 
-    ``u = (nu + 6) / (nu + E w' S^-1 w)``; of the expectation, the share that smoothing takes from
-    the white errors is spread over the poses in inverse proportion to their weights.
+    The level m of a pose is the mean of as many poses around it as predict it best, or 1 if none
+    do. Of the expectation, the share that smoothing takes from the white errors is spread over the
+    poses in inverse proportion to their weights.
     """
     states = posterior.states_after(posterior.normal.step)[:, :WHITE]
     pulled = (posterior.precision.white @ states[:, :, None])[:, :, 0]
@@ -228,4 +236,21 @@ def student_weights(posterior: Posterior) -> FloatArray:
     weights, free = posterior.space.weights, posterior.space.is_free
     kept = min(float(np.mean((weights * squares)[~free])) / 6.0, 1.0)
     hidden = 6.0 * (1.0 - kept) / np.where(free, 1.0, weights)
-    return (STUDENT + 6.0) / (STUDENT + squares + hidden)
+    expected = np.where(free, 0.0, squares + hidden)
+    levels = [np.ones(len(expected))]
+    for width in _WIDTHS:
+        around = STUDENT + 6.0 * _around((~free).astype(float), width)
+        levels.append((STUDENT + _around(expected, width)) / around)
+    losses = [
+        float(np.mean((3.0 * np.log(m) + 5.0 * np.log1p(expected / (STUDENT * m)))[~free]))
+        for m in levels
+    ]
+    best = int(np.argmin(losses))
+    level = levels[best if losses[best] < losses[0] - _LEAST_GAIN else 0]
+    return np.asarray((STUDENT + 6.0) / (STUDENT * level + expected))
+
+
+def _around(values: FloatArray, width: int) -> FloatArray:
+    """Sums (N,) of the values of so many neighbours on either side."""
+    sums = np.cumsum(np.r_[0.0, np.pad(values, width)])
+    return np.asarray(sums[2 * width + 1 :] - sums[: len(values)] - values)

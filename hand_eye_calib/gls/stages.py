@@ -21,8 +21,8 @@ from hand_eye_calib.gls.outliers import (
     bridged,
     first_outliers,
     judged,
-    student_weights,
     surprises,
+    tail_weights,
     tails_are_heavy,
     with_jumps_across_spikes,
 )
@@ -161,15 +161,15 @@ def _outliers_found(problem: Problem, fit: Fit, rounds: int, with_spikes: bool =
 
 
 def tails(problem: Problem, fit: Fit) -> Fit:
-    """Weights of white errors with Student's t distribution, if their tails are heavy."""
+    """Weights of white errors whose level varies, if their tails are heavy."""
     if not fit.has_heavy_tails:
         return fit
     for _ in range(2):
         posterior = problem.posterior(fit)
         for _ in range(problem.tuning.tail_rounds - 1):
-            weights = np.where(fit.outliers.spikes, 0.0, student_weights(posterior))
+            weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior))
             posterior = posterior.with_weights(weights)
-        fit = noise(problem, replace(fit, weights=student_weights(posterior)))
+        fit = noise(problem, replace(fit, weights=tail_weights(posterior)))
     return _outliers_found(problem, fit, 2, with_spikes=False)
 
 
@@ -224,7 +224,7 @@ def polish(problem: Problem, fit: Fit) -> Fit:
         if _is_settled(posterior.normal, problem):
             break
         if fit.has_heavy_tails and "tails" not in problem.without:
-            fit = replace(fit, weights=student_weights(posterior))
+            fit = replace(fit, weights=tail_weights(posterior))
         step = posterior.normal.step
         fit = replace(fit.moved(step), n_evaluations=fit.n_evaluations + 1)
         fit = fit.freed(problem.streams, posterior.states_after(step))
