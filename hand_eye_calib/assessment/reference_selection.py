@@ -86,5 +86,5 @@ def select_reference(
         pairs = motion_pairs(*poses, reference)
         if len(pairs) >= _MIN_PAIRS:
             error = se3.log(to_answer @ method.solve(pairs).T_parent_child)
-            distances[reference] = float(np.sqrt(max(error @ information @ error, 0.0)))
+            distances[reference] = max(float(error @ information @ error), 0.0) ** 0.5
     return ReferenceChoice(min(distances, key=distances.__getitem__), distances, solution)
