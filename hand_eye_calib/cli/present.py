@@ -293,15 +293,15 @@ def _observability(calibration: Calibration) -> str:
 def _floor(calibration: Calibration) -> Iterator[str]:
     """Errors that nothing in the recording shows."""
     if calibration.floor is not None and np.isfinite(calibration.sigmas).any():
-        sigmas = zip(calibration.observability, calibration.sigmas_of_floor, strict=True)
+        sigmas = zip(calibration.observability, calibration.sigmas_with_floor, strict=True)
         told = [
             f"{axes_in_words([dof.name])} {amount(dof.name, sigma)}"
             for dof, sigma in sigmas
             if np.isfinite(dof.sigma)
         ]
         yield (
-            "of these standard deviations, a constant odometry error, which no recording shows, "
-            f"has {', '.join(told)}"
+            "standard deviations with constant odometry errors, which no recording shows: "
+            f"{', '.join(told)}"
         )
 
 

@@ -248,4 +248,4 @@ def _beyond_target(calibration: Calibration, targets: FloatArray) -> str:
     ]
     if not told:
         return ""
-    return f" An error of 1 % in the odometry's scale would add {', '.join(told)}."
+    return f" Constant odometry errors, which no motion shows, add {', '.join(told)}."
