@@ -194,7 +194,6 @@ class TfInput(PoseInput):
         for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, _quick())):
             heard: Any = partial(self._hear, topic)
             self._subscriptions[topic] = node.create_subscription(kind, topic, heard, qos)
-        log.info(f"{source} is taken from /tf for the {name} sensor")
 
     def configure(self, config: CalibratorConfig, is_watching: bool) -> None:
         super().configure(config, is_watching)
