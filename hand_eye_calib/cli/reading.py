@@ -341,9 +341,9 @@ def read_bags(
         measures = measures_of(bag, sources, config)
         of_streams: dict[str, Any] = {f"{stream}_measures": measures[stream] for stream in STREAMS}
         calibrator = Calibrator(dataclasses.replace(config, **of_streams))
+        bag.shown = with_progress
         blocks = bag.blocks(parent, child, config.max_gap, measures)
-        with waiting_for(f"opening {bag}"):
-            first = list(islice(blocks, 1))
+        first = list(islice(blocks, 1))
         expected = bag.expected(parent, child)
         shown = with_progress(chain(first, blocks), expected, f"reading {bag}", len)
         found = feed(calibrator, shown, sources) + bag.n_left_out

@@ -62,7 +62,7 @@ _ROS1 = _Packing("<", False, "II")
 _START = 4
 
 
-class _Cursor:
+class Cursor:
     """Reads the parts of a message one after the other."""
 
     def __init__(self, data: Buffer, is_ros1: bool) -> None:
@@ -82,6 +82,10 @@ class _Cursor:
     def length(self) -> int:
         """Read an unsigned integer of 4 bytes."""
         return int(self._read("I", 4, 4)[0])
+
+    def byte(self) -> int:
+        """Read an unsigned byte."""
+        return int(self._read("B", 1, 1)[0])
 
     def stamp_ns(self) -> int:
         """Read a stamp."""
@@ -177,7 +181,7 @@ class MessageType(NamedTuple):
     name: str
     measures: Mapping[str, slice]
     has_child_frame: bool
-    unpack: Callable[[_Cursor], list[float]]
+    unpack: Callable[[Cursor], list[float]]
     is_sensors: bool = False
     is_geodetic: bool = False
     is_twist: bool = False
@@ -190,26 +194,27 @@ _OF_TWIST = {"poses": slice(6), "rotations": slice(3, 6)}
 
 # The likeliest first.
 _ROWS = (
-    MessageType("nav_msgs/msg/Odometry", _OF_POSES, True, _Cursor.pose),
-    MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, False, _Cursor.pose),
-    MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, False, _Cursor.pose),
-    MessageType("geometry_msgs/msg/TransformStamped", _OF_POSES, True, _Cursor.pose),
-    MessageType("sensor_msgs/msg/Imu", _OF_IMU, False, _Cursor.imu, is_sensors=True),
-    MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, False, _Cursor.fix, True, True),
-    MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, False, _Cursor.point),
+    MessageType("nav_msgs/msg/Odometry", _OF_POSES, True, Cursor.pose),
+    MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, False, Cursor.pose),
+    MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, False, Cursor.pose),
+    MessageType("geometry_msgs/msg/TransformStamped", _OF_POSES, True, Cursor.pose),
+    MessageType("sensor_msgs/msg/Imu", _OF_IMU, False, Cursor.imu, is_sensors=True),
+    MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, False, Cursor.fix, True, True),
+    MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, False, Cursor.point),
     MessageType(
-        "geographic_msgs/msg/GeoPoseStamped", _OF_POSES, False, _Cursor.geo_pose, is_geodetic=True
+        "geographic_msgs/msg/GeoPoseStamped", _OF_POSES, False, Cursor.geo_pose, is_geodetic=True
     ),
     *(
-        MessageType(f"geometry_msgs/msg/{name}", _OF_TWIST, False, _Cursor.twist, True, False, True)
+        MessageType(f"geometry_msgs/msg/{name}", _OF_TWIST, False, Cursor.twist, True, False, True)
         for name in ("TwistStamped", "TwistWithCovarianceStamped")
     ),
 )
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Those that carry whole poses.
-POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is _Cursor.pose)
+POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is Cursor.pose)
 # Arrays of PoseStamped and of TransformStamped.
 PATH_TYPE = "nav_msgs/msg/Path"
+POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 #: Types of topics that can be one of the two sensors.
 SENSOR_TYPES = (
@@ -217,6 +222,7 @@ SENSOR_TYPES = (
     PATH_TYPE,
     *(name for name in MESSAGE_TYPES if name not in POSE_TYPES),
     *FIELDS,
+    POINTS_TYPE,
 )
 
 
@@ -251,10 +257,10 @@ def unpack_stamp_ns(data: Buffer) -> int:
     struct.error, ValueError
         If the bytes are not such a message.
     """
-    return _Cursor(data, is_ros1=False).stamp_ns()
+    return Cursor(data, is_ros1=False).stamp_ns()
 
 
-def _unpack(cursor: _Cursor, row: MessageType) -> tuple[int, str, str | None, list[float]]:
+def _unpack(cursor: Cursor, row: MessageType) -> tuple[int, str, str | None, list[float]]:
     """Stamp in ns, the header's frame, the sensor's behind it, and values."""
     stamp_ns, frame = cursor.header()
     return stamp_ns, frame, cursor.name() if row.has_child_frame else None, row.unpack(cursor)
@@ -284,7 +290,7 @@ def unpack_poses(messages: Sequence[Buffer], message_type: str, is_ros1: bool) -
     is_alike = len(messages) > 1 and {*map(len, messages)} == {size}
     if is_alike and message_type in POSE_TYPES:
         try:
-            first = _Cursor(messages[0], is_ros1)
+            first = Cursor(messages[0], is_ros1)
             _, world_frame, sensor_frame, _ = _unpack(first, row)
         except MALFORMED as error:
             raise MalformedMessage(0, error) from error
@@ -298,7 +304,7 @@ def unpack_poses(messages: Sequence[Buffer], message_type: str, is_ros1: bool) -
     found_rows = []
     for index, data in enumerate(messages):
         try:
-            found_rows.append(_unpack(_Cursor(data, is_ros1), row))
+            found_rows.append(_unpack(Cursor(data, is_ros1), row))
         except MALFORMED as error:
             raise MalformedMessage(index, error) from error
     stamps_ns, frames, sensor_frames, values = zip(*found_rows, strict=True)
@@ -336,7 +342,7 @@ def unpack_path(data: Buffer, is_ros1: bool) -> tuple[str, IntArray, FloatArray]
     struct.error, ValueError
         If the bytes are not such a message.
     """
-    cursor = _Cursor(data, is_ros1)
+    cursor = Cursor(data, is_ros1)
     _, world_frame = cursor.header()
     count = cursor.count("poses")
     stamps_ns, poses = np.empty(count, dtype=np.int64), np.empty((count, 7))
@@ -364,7 +370,7 @@ def unpack_transforms(data: Buffer, is_ros1: bool) -> Iterator[PoseFields]:
     struct.error, ValueError
         If the bytes are not such a message.
     """
-    cursor = _Cursor(data, is_ros1)
+    cursor = Cursor(data, is_ros1)
     for _ in range(cursor.count("transforms")):
         stamp_ns, world_frame = cursor.header()
         frames = world_frame.lstrip("/"), cursor.name().lstrip("/")
@@ -383,7 +389,7 @@ def frames_in(data: Buffer, message_type: str, is_ros1: bool) -> set[str]:
     if message_type in TF_TYPES:
         found = unpack_transforms(data, is_ros1)
         return {f"{each.world_frame}:{each.sensor_frame}" for each in found}
-    cursor = _Cursor(data, is_ros1)
+    cursor = Cursor(data, is_ros1)
     _, frame = cursor.header()
     row = MESSAGE_TYPES.get(message_type)
     sensor_frame = cursor.name() if row and row.has_child_frame else ""
@@ -483,7 +489,7 @@ class MessageReader:
         """
         try:
             if self._row.name in POSE_TYPES and self._measures == "poses":
-                stamp_ns, world, sensor, of_pose = _unpack(_Cursor(data, False), self._row)
+                stamp_ns, world, sensor, of_pose = _unpack(Cursor(data, False), self._row)
                 return PoseFields(stamp_ns, world, sensor, of_pose[:3], of_pose[3:])
             columns, is_usable = self.columns([data], is_ros1=False)
         except InputError:

@@ -2,7 +2,7 @@
 
 import heapq
 from collections import defaultdict
-from collections.abc import Callable, Collection, Container, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from itertools import chain, compress, pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -21,6 +21,7 @@ from hand_eye_calib.io.bags.messages import (
     MALFORMED,
     MESSAGE_TYPES,
     PATH_TYPE,
+    POINTS_TYPE,
     SENSOR_TYPES,
     TF_TYPES,
     MalformedMessage,
@@ -63,6 +64,10 @@ class PoseBag:
 
     def __init__(self, *paths: str | Path) -> None:
         self.paths = [Path(path) for path in paths]
+        # Passes on messages that take long, and may show how far they are.
+        self.shown: Callable[[Iterable[Message], int, str], Iterable[Message]] = (
+            lambda messages, count, doing: messages
+        )
         self._files = BagFiles()
         self._watches: dict[str, PoseWatch] = {}
         self._readers: dict[str, MessageReader] = {}
@@ -212,7 +217,7 @@ class PoseBag:
         self._watches = {str(source): PoseWatch() for source in sources.values()}
         self._readers, self._parts = {}, {}
         direct: dict[str, str] = {}
-        paths, transforms = {}, {}
+        paths, transforms, scans = {}, {}, {}
         for stream, source in sources.items():
             type_ = self.topics.type_of(source)
             if isinstance(source, TfSource):
@@ -223,10 +228,13 @@ class PoseBag:
                 self._readers[source] = MessageReader(type_, measured)
             elif source and (type_ in (PATH_TYPE, *FIELDS) or {*"?+"} & {*source}):
                 paths[stream] = source
+            elif source is not None and type_ == POINTS_TYPE:
+                scans[stream] = source
         blocks = self._direct_blocks(direct) if direct else iter(())
-        if paths or transforms:
+        if paths or transforms or scans:
             of_others = self._transformed_poses(transforms, max_gap_s) if transforms else []
             of_others += [self._other_poses(*each) for each in paths.items()]
+            of_others += [self._scan_poses(*each) for each in scans.items()]
             whole = PoseBlock.concatenate([*blocks, *of_others])
             whole = whole[np.argsort(whole.bag_ns, kind="stable")]
             blocks = (whole[k : k + BLOCK_SIZE] for k in range(0, len(whole), BLOCK_SIZE))
@@ -356,6 +364,21 @@ class PoseBag:
             )
         columns = PoseColumns(stamps_ns, [world_frame] * count, [None] * count, poses)
         return self._whole(topic, stream, columns, bag_ns)
+
+    def _scan_poses(self, stream: str, topic: str) -> PoseBlock:
+        """Odometry from the points of a lidar, which is kept beside the bag for the next time."""
+        from hand_eye_calib.io.bags import scans
+
+        place = scans.kept_file(self.paths[0], topic)
+        found = scans.read_kept(place, self.files())
+        if found is None:
+            doing, count = f"odometry of {topic}", self.topics[topic].count
+            found = scans.odometry(self.shown(self._messages([topic]), count, doing))
+            scans.keep(place, self.files(), found)
+        about = f"{topic}: odometry from {len(found.poses)} scans"
+        lost = f", {found.n_failed} of which could not be registered" if found.n_failed else ""
+        self._files.notes.append(f"{about}{lost}; it is kept in {place}")
+        return self._whole(topic, stream, found.columns(), found.bag_ns)
 
     def _transformed_poses(self, sources: dict[str, TfSource], max_gap_s: float) -> list[PoseBlock]:
         """A PoseBlock for each stream whose poses come from the transform tree."""

@@ -1,0 +1,264 @@
+"""Odometry from the scans of a lidar (``sensor_msgs/PointCloud2``), by registration with
+small_gicp.
+
+Each scan is registered against a map of the scans before it, by their local planes (generalised
+ICP). Registration of points to points, as of KISS-ICP, drags along the rings of a lidar that has 16
+of them: they look the same on flat ground whatever the pitch, and pitch and roll are not followed.
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.errors import InputError, MissingDependencyError, printable
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags.messages import MALFORMED, Buffer, Cursor
+from hand_eye_calib.io.bags.poses import PoseColumns
+from hand_eye_calib.io.bags.recovery import Message
+from hand_eye_calib.io.bags.topics import unreadable
+
+# numpy's name of each datatype of a PointField.
+_DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+# Names that drivers give the time of a point.
+_TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset", "ts")
+# A scan lasts so long (s): tells the unit of the times of its points.
+_SHORTEST_S, _LONGEST_S = 0.005, 1.0
+_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+
+# Ranges that are used (m): the robot itself is nearer, and beyond a scan is too sparse.
+_NEAREST_M, _FARTHEST_M = 1.0, 80.0
+# Size of a voxel as a share of the median range, within limits (m).
+_VOXEL_SHARE, _LEAST_VOXEL_M, _MOST_VOXEL_M = 0.03, 0.1, 0.4
+# Over so many voxels points are matched: each scan is registered twice, its distortion corrected
+# anew.
+_MATCH_VOXELS = (6.0, 2.0)
+_NEIGHBOURS = 12
+# Of what does not depend on their number.
+_N_THREADS = os.cpu_count() or 1
+# A scan becomes part of the map after so much motion; the map has so many.
+_KEY_M, _KEY_RAD, _N_KEYS = 0.7, 0.06, 30
+# Parts of a scan whose points have the same correction.
+_PARTS = 40
+# A registration with a smaller share of matched points counts as failed.
+_LEAST_MATCHED = 0.3
+
+
+class Scan(NamedTuple):
+    """Points (N, 3) of one turn of a lidar, m, in its own frame; their times (N,) from 0, the first
+    one's, to 1, the last one's; and the stamp of the last.
+    """
+
+    points: FloatArray
+    phases: FloatArray
+    stamp_ns: int
+    frame: str
+
+
+def unpack_scan(data: Buffer, is_ros1: bool) -> Scan:
+    """Points and times of a PointCloud2 message. Without times of its points, a scan counts as
+    taken at once.
+
+    Raises
+    ------
+    ValueError
+        If the message is damaged, or has no x, y and z.
+    """
+    cursor = Cursor(data, is_ros1)
+    header_ns, frame = cursor.header()
+    height, width = cursor.length(), cursor.length()
+    fields = {}
+    for _ in range(cursor.length()):
+        name, offset, kind = cursor.name(), cursor.length(), cursor.byte()
+        cursor.length()
+        if not 0 < kind < len(_DATATYPES):
+            raise ValueError(f"field {name} of the points has datatype {kind}")
+        fields[name] = (_DATATYPES[kind], offset)
+    order = ">" if cursor.byte() else "<"
+    step, _, size = cursor.length(), cursor.length(), cursor.length()
+    if not {"x", "y", "z"} <= fields.keys():
+        raise ValueError(f"points have no x, y, z, but {', '.join(fields)}")
+    if size < height * width * step or cursor.position + size > len(data):
+        raise ValueError(f"{height * width} points do not fit into {size} bytes")
+    names = list(fields)
+    layout = np.dtype(
+        {
+            "names": names,
+            "formats": [order + fields[name][0] for name in names],
+            "offsets": [fields[name][1] for name in names],
+            "itemsize": step,
+        }
+    )
+    table = np.frombuffer(data, layout, height * width, cursor.position)
+    points = np.stack([table[axis].astype(float) for axis in "xyz"], axis=-1)
+    of_time = next((name for name in _TIMES if name in fields), None)
+    times = table[of_time].astype(float) if of_time else np.zeros(len(points))
+    ranges = np.linalg.norm(points, axis=1)
+    is_used = (ranges > _NEAREST_M) & (ranges < _FARTHEST_M)  # nor those that are not finite
+    points, times = points[is_used], times[is_used]
+    if not len(points):
+        return Scan(points, times, header_ns, frame)
+    first, span = times.min(), np.ptp(times)
+    unit = next((u for u in _UNITS_S if _SHORTEST_S <= span * u <= _LONGEST_S), None)
+    if unit is None:
+        return Scan(points, np.ones(len(points)), header_ns, frame)
+    last_s = times.max() * unit
+    # Times are relative to the stamp of the header, or absolute.
+    last_ns = header_ns + round(last_s * 1e9) if last_s <= _LONGEST_S else round(last_s * 1e9)
+    return Scan(points, (times - first) / span, last_ns, frame)
+
+
+class ScanOdometry:
+    """Poses of a lidar from its scans, each at the end of its scan, in the frame of the first.
+
+    Raises
+    ------
+    MissingDependencyError
+        If small_gicp is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            import small_gicp
+        except ImportError:
+            raise MissingDependencyError(
+                "odometry from the points of a lidar needs small_gicp, which is not installed: pip "
+                "install 'hand_eye_calib[lidar]'; or record the odometry of a lidar SLAM"
+            ) from None
+        self._gicp = small_gicp
+        self.pose = np.eye(4)
+        self._step = np.eye(4)
+        self._voxel_m = 0.0
+        self._keys: list[tuple[FloatArray, FloatArray]] = []
+        self.n_failed = 0
+
+    def add(self, scan: Scan) -> FloatArray:
+        """Pose (4, 4) of the lidar at the end of the next scan."""
+        if not self._keys:
+            share = _VOXEL_SHARE * float(np.median(np.linalg.norm(scan.points, axis=1)))
+            self._voxel_m = min(max(share, _LEAST_VOXEL_M), _MOST_VOXEL_M)
+            self._add_to_map(scan.points)
+            return self.pose
+        before, step, pose = self.pose, self._step, self.pose
+        for n_voxels in _MATCH_VOXELS:
+            points = self._gicp.voxelgrid_sampling(_without_motion(scan, step), self._voxel_m)
+            self._gicp.estimate_covariances(points, None, _NEIGHBOURS, _N_THREADS)
+            found = self._gicp.align(
+                *(self._map[0], points, self._map[1]),
+                init_T_target_source=before @ step,
+                registration_type="GICP",
+                max_correspondence_distance=n_voxels * self._voxel_m,
+                max_iterations=30,
+            )
+            if found.num_inliers < _LEAST_MATCHED * points.size():
+                pose, step = before, np.eye(4)  # rather than on and away from the map
+                self.n_failed += 1
+                break
+            pose = np.array(found.T_target_source)
+            # Rounding must not grow from scan to scan.
+            pose[:3, :3] = se3.nearest_rotation(pose[None, :3, :3])[0]
+            step = se3.inverse(before) @ pose
+        self.pose, self._step = pose, step
+        moved = se3.inverse(self._keys[-1][0]) @ self.pose
+        is_new = len(self._keys) < 5 or np.linalg.norm(moved[:3, 3]) > _KEY_M
+        if is_new or se3.rotation_angle(moved[:3, :3]) > _KEY_RAD:
+            self._add_to_map(_without_motion(scan, step))
+        return self.pose
+
+    def _add_to_map(self, points: FloatArray) -> None:
+        placed = points @ self.pose[:3, :3].T + self.pose[:3, 3]
+        sampled = self._gicp.voxelgrid_sampling(placed, self._voxel_m / 2.0)
+        self._keys = [*self._keys, (self.pose, np.array(sampled.points()[:, :3]))][-_N_KEYS:]
+        whole = np.concatenate([each for _, each in self._keys])
+        self._map = self._gicp.preprocess_points(whole, self._voxel_m, _NEIGHBOURS, _N_THREADS)
+
+
+def _without_motion(scan: Scan, step: FloatArray) -> FloatArray:
+    """Points (N, 3) as if the whole scan was taken at its end, after a constant motion ``step``."""
+    before_end = (np.arange(_PARTS) + 0.5) / _PARTS - 1.0
+    Ts = se3.exp(np.outer(before_end, se3.log(step)))
+    part = np.minimum((scan.phases * _PARTS).astype(int), _PARTS - 1)
+    turned = np.einsum("nij,nj->ni", Ts[part, :3, :3], scan.points)
+    return np.asarray(np.where(scan.phases[:, None] < 1.0, turned + Ts[part, :3, 3], scan.points))
+
+
+class Odometry(NamedTuple):
+    """Poses (N, 7) x y z qx qy qz qw of a lidar, their stamps and bag times (N,), its frame, and
+    how many scans could not be registered.
+    """
+
+    poses: FloatArray
+    stamps_ns: IntArray
+    bag_ns: IntArray
+    frame: str
+    n_failed: int
+
+    def columns(self) -> PoseColumns:
+        """As the poses of messages."""
+        count = len(self.stamps_ns)
+        return PoseColumns(self.stamps_ns, ["scans"] * count, [self.frame] * count, self.poses)
+
+
+def odometry(messages: Iterable[Message]) -> Odometry:
+    """Register all scans of a topic.
+
+    Raises
+    ------
+    InputError
+        If a message is damaged, or most scans cannot be registered.
+    MissingDependencyError
+        If small_gicp is not installed.
+    """
+    lidar = ScanOdometry()
+    found: list[tuple[FloatArray, int, int]] = []
+    kind, frame = None, ""
+    for number, (kind, bag_ns, data) in enumerate(messages, start=1):
+        try:
+            scan = unpack_scan(data, kind.encoding == "ros1")
+        except MALFORMED as error:
+            raise unreadable(kind, number, error) from error
+        frame = scan.frame
+        if len(scan.points) > _NEIGHBOURS:
+            found.append((lidar.add(scan), scan.stamp_ns, bag_ns))
+    if kind is None or 2 * lidar.n_failed >= len(found):
+        raise InputError(
+            f"{kind.topic if kind else 'the points'}: {lidar.n_failed} of {len(found)} scans could "
+            "not be registered; use the odometry of a lidar SLAM"
+        )
+    poses, stamps_ns, times_ns = (np.array(column) for column in zip(*found, strict=True))
+    rows = np.concatenate([poses[:, :3, 3], se3.to_quat_xyzw(poses)], axis=1)
+    return Odometry(rows, stamps_ns, times_ns, frame, lidar.n_failed)
+
+
+def kept_file(bag: Path, topic: str) -> Path:
+    """Where the odometry of a bag's scans is kept: beside the bag."""
+    return bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
+
+
+def read_kept(path: Path, files: Sequence[Path]) -> Odometry | None:
+    """Odometry that was kept for files of this size and time; None if there is none."""
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            if not np.array_equal(kept["files"], _state_of(files)):
+                return None
+            columns = (kept["poses"], kept["stamps_ns"], kept["bag_ns"])
+            return Odometry(*columns, printable(str(kept["frame"])), int(kept["n_failed"]))
+    except (OSError, ValueError, KeyError, EOFError):
+        return None
+
+
+def keep(path: Path, files: Sequence[Path], found: Odometry) -> None:
+    """Keep odometry for the next time, if the folder can be written to."""
+    try:
+        with open(path, "wb") as file:
+            np.savez(file, files=_state_of(files), **found._asdict())
+    except OSError:
+        path.unlink(missing_ok=True)
+
+
+def _state_of(files: Sequence[Path]) -> IntArray:
+    found = [file.stat() for file in files]
+    return np.array([[each.st_size, each.st_mtime_ns] for each in found], dtype=np.int64)
