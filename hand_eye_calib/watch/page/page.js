@@ -28,7 +28,8 @@ function show(isLive) {
 // Who drives does not look at the page: let the phone shake, and sound, when it says something
 // else; high for what is good, low for what is bad.
 function call(tone) {
-  if (navigator.vibrate) navigator.vibrate([200, 100, 200]);
+  const mayShake = navigator.userActivation?.hasBeenActive !== false;
+  if (navigator.vibrate && mayShake) navigator.vibrate([200, 100, 200]);
   if (tones === null) return;
   const beep = tones.createOscillator();
   beep.frequency.value = {good: 1047, bad: 262, act: 392}[tone] || 659;
