@@ -62,8 +62,6 @@ _DISTANCE_M = 10.0
 # Figures for whoever uses the result; the others are evidence for whoever doubts it.
 _SHOWN_FIRST = ("views", "trajectories")
 
-_REFUSED = {"refused_duplicate": "with a repeated stamp", "refused_late": "late arrivals"}
-
 
 def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> str:
     """A page from its template: every page begins with a verdict, in words and by a tone.
@@ -293,12 +291,10 @@ def _stream(name: str, inputs: Plain, streams: Mapping[str, Trajectory]) -> dict
     """Where a stream came from, how many poses, their rate, the longest gap, the path length."""
     known = inputs.get(name, {})
     count = known.get("messages", known.get("poses"))
-    refused = [f"{known[key]:,} {words}" for key, words in _REFUSED.items() if known.get(key)]
     row = dict.fromkeys(("rate", "duration", "gap", "path"), "-") | {
         "name": name,
         "source": known.get("topic") or Path(known.get("file", "-")).name,
         "poses": "-" if count is None else f"{count:,}",
-        "refused": "; ".join(refused) or "none",
     }
     stream = streams.get(name)
     # In a very long recording only the newest poses are at hand: of the stream as a whole they say
