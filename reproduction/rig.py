@@ -89,14 +89,13 @@ def with_bad_first(n_sensors: int) -> FloatArray:
 
 class Outcome(NamedTuple):
     """One simulated rig: errors (P, 6) of all pairs of sensors in sigmas, squared errors of the rig
-    and of the answers for neighbours alone (S - 2, 6), found over true sigmas of white noise (S,
-    2), by how much the answers for two sensors at a time miss closing (m).
+    and of the answers for neighbours alone (S - 2, 6), by how much the answers for two sensors at a
+    time miss closing (m).
     """
 
     in_sigmas: FloatArray
     squares: FloatArray
     pairwise_squares: FloatArray
-    noise: FloatArray
     closes_m: float
 
 
@@ -113,12 +112,10 @@ def outcome(rig: Rig) -> Outcome:
         se3.log(se3.inverse(rig.Xs[at + 1]) @ rig.Xs[at] @ each.T_parent_child)
         for at, each in enumerate(found.neighbours, start=1)
     ]
-    sigmas = [[each.translation_white, each.rotation_white] for each in found.noise.values()]
     return Outcome(
         np.array([*errors.values()]) / np.sqrt(own),
         np.array([errors[at, at + 1] for at in range(1, len(names) - 1)]) ** 2,
         np.array(pairwise) ** 2,
-        np.array(sigmas) / rig.errors[:, :2],
         max(each.translation_m for each in found.closures),
     )
 
@@ -147,20 +144,12 @@ def _row(found: Sequence[Outcome]) -> dict[str, str]:
         np.array([getattr(each, name) for each in found]).mean(axis=0)
         for name in ("squares", "pairwise_squares")
     )
-    noise = np.median([each.noise for each in found], axis=0)
     inside = np.mean([np.abs(each.in_sigmas) < QUANTILE_90 for each in found])
     return {
-        "White error: worst sensor": _worst(noise),
         "Neighbours: error / own answer": f"{np.sqrt(np.mean(squares / pairwise)):.2f}",
         "Within 90 % interval": f"{100 * inside:.0f} %",
         "Answers miss closing by (mm)": f"{1e3 * np.median([each.closes_m for each in found]):.2f}",
     }
-
-
-def _worst(ratios: FloatArray) -> str:
-    """The ratio that is farthest from one, as a change in per cent."""
-    worst = ratios.flat[int(np.argmax(np.abs(np.log(ratios))))]
-    return f"{100 * (worst - 1):+.0f} %"
 
 
 def real_rigs(folder: Path) -> Iterator[tuple[str, RigCalibration]]:

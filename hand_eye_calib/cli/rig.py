@@ -85,7 +85,7 @@ def _calibrate(
 
 
 def as_lines(rig: "RigCalibration") -> list[str]:
-    """What a person needs to see of a rig: tree, extrinsics, closure, noise."""
+    """What a person needs to see of a rig: tree, extrinsics, closure."""
     lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", "", *rig.tree(), ""]
     for each in rig.calibrations:
         lines += [f"{each.child_frame} in {each.parent_frame}: {each.headline}"]
@@ -94,13 +94,7 @@ def as_lines(rig: "RigCalibration") -> list[str]:
         for text in each.warnings:
             lines += wrapped(f"Note: {text}", "", "  ")
         lines += [*transform_lines(each.to_dict()["T_parent_child"]), ""]
-    closures = [each.sentence for each in rig.closures]
-    sections = {
-        "Results for two sensors at a time": closures,
-        "Noise of every sensor": rig.noise_in_words(),
-    }
-    for title, texts in sections.items():
-        if not texts:
-            continue
-        lines += [title, *(line for text in texts for line in wrapped(text, "  ", "    ")), ""]
-    return lines[:-1]
+    lines += ["Results for two sensors at a time"]
+    for one in rig.closures:
+        lines += wrapped(one.sentence, "  ", "    ")
+    return lines

@@ -37,7 +37,7 @@ _TO_SHOWN = np.repeat([1000.0, np.degrees(1.0)], 3)
 _BAND = 2.0
 _GRAVITY = ("bad", "warn", "good")
 # More would make the page too large for a browser; rows.csv has all.
-_MOST_ROWS, _MOST_FIGURES = 2000, 40
+_MOST_ROWS, _MOST_VEHICLES, _MOST_FIGURES = 1000, 40, 12
 
 
 def render_batch(
@@ -75,8 +75,8 @@ def render_batch(
         listing([f"{count} {verdict}" for verdict, count in counts.most_common()]),
         batch=title.rpartition("/")[2],
         left_out=max(0, len(rows) - _MOST_ROWS),
-        vehicles_left_out=max(0, len(ordered) - _MOST_FIGURES),
-        vehicles=[_vehicle(*one, n) for n, one in enumerate(ordered[:_MOST_FIGURES], start=1)],
+        vehicles_left_out=max(0, len(ordered) - _MOST_VEHICLES),
+        vehicles=[_vehicle(*one, n) for n, one in enumerate(ordered[:_MOST_VEHICLES], start=1)],
         rows=cells[:_MOST_ROWS],
         with_vehicles=len({row["vehicle"] for row in rows}) > 1,
         headings=[f"{name} {unit}" for name, unit in _AXES.items()],
@@ -92,7 +92,7 @@ def _vehicle(name: str, result: Calibration, number: int) -> dict[str, Any]:
         "said": "Difference of each recording from the common value along and about the parent's "
         "axes, with its standard deviation. The band is two standard deviations of the common "
         "value. Squares do not belong to the others.",
-        "svg": draw_trend(result, number),
+        "svg": draw_trend(result, number) if number <= _MOST_FIGURES else None,
     }
     return {
         "title": name,
@@ -109,7 +109,7 @@ def _vehicle(name: str, result: Calibration, number: int) -> dict[str, Any]:
         "values": list(
             zip([f"{axis}, {unit}" for axis, unit in _AXES.items()], _values(row), strict=True)
         ),
-        "figures": [figure],
+        "figures": [figure] if figure["svg"] else [],
     }
 
 

@@ -1,5 +1,5 @@
-"""``report.html`` of a rig: the tree of its sensors, drawn and in numbers, the noise of every
-sensor, and whether results for two sensors at a time close.
+"""``report.html`` of a rig: the tree of its sensors, drawn and in numbers, and whether results for
+two sensors at a time close.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from hand_eye_calib.report.style import (
 )
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.rig.result import RigCalibration
-from hand_eye_calib.text import angle, counted, length, with_sigma
+from hand_eye_calib.text import counted, with_sigma
 
 _VIEWS = ((0, 1), (0, 2))
 # Of the figure's extent: the axes of a sensor; the least extent, m.
@@ -59,7 +59,6 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
         figures=[{"name": "rig", "title": "Where they are", "said": _SAID, "svg": draw_rig(rig)}],
         closures=[each.sentence for each in rig.closures],
         closes=all(each.closes for each in rig.closures),
-        noise=_noise(rig),
     )
 
 
@@ -74,20 +73,6 @@ def _sensor(calibration: Calibration) -> dict[str, Any]:
         "reasons": [f"{each.sentence}: {each.what_to_do}" for each in calibration.reasons],
         "values": values,
     }
-
-
-def _noise(rig: RigCalibration) -> list[tuple[str, ...]]:
-    """A row for every sensor."""
-    return [
-        (
-            name,
-            length(noise.translation_white),
-            angle(noise.rotation_white),
-            length(noise.translation_drift),
-            angle(noise.rotation_drift),
-        )
-        for name, noise in rig.noise.items()
-    ]
 
 
 def draw_rig(rig: RigCalibration) -> str:

@@ -1,4 +1,4 @@
-"""The result for a rig: a tree of extrinsics, the noise of every sensor, and the closure test."""
+"""The result for a rig: a tree of extrinsics, and the closure test."""
 
 from __future__ import annotations
 
@@ -26,14 +26,6 @@ _MOST_SHARED = 0.9
 
 # Variance (m^2, rad^2) that no answer is better than: that of poses without noise is zero.
 _ROUNDING = 1e-16
-
-# Of every sensor's noise, as an adaptive answer for two sensors has them.
-_LEVELS = (
-    "rotation_white_rad",
-    "translation_white_m",
-    "rotation_drift_rad_after_a_metre",
-    "translation_drift_m_after_a_metre",
-)
 
 _GRAVITY = (Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE, Verdict.USE)
 
@@ -75,24 +67,6 @@ class Closure:
             f"{angle(self.rotation_rad)}, chi-square {self.chi2:.1f} with "
             f"{self.dof} degrees of freedom"
         )
-
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviations per axis of the errors of one sensor's trajectory.
-
-    Attributes
-    ----------
-    rotation_white, translation_white : float
-        Independent error of each pose, rad and m.
-    rotation_drift, translation_drift : float
-        What an error that stays grows to within a metre, rad and m.
-    """
-
-    rotation_white: float
-    translation_white: float
-    rotation_drift: float
-    translation_drift: float
 
 
 @dataclass(frozen=True)
@@ -226,26 +200,6 @@ class RigCalibration:
         to_second = se3.adjoint(se3.inverse(self.Xs[after]))
         return to_second @ in_first @ to_second.T
 
-    @property
-    def noise(self) -> dict[str, SensorNoise]:
-        """Noise of every sensor: what the pairs' noises, each the sum of two sensors', ask for.
-        None where an answer is not the adaptive estimator's.
-        """
-        answers = (*self.calibrations, *self.neighbours)
-        found = [each.noise for each in answers if each.noise is not None]
-        if len(found) < len(answers):
-            return {}
-        S = len(self.sensors)
-        of_pairs = [*((0, at) for at in range(1, S)), *((at - 1, at) for at in range(2, S))]
-        design = np.zeros((len(of_pairs), S))
-        for row, pair in zip(design, of_pairs, strict=True):
-            row[[*pair]] = 1.0
-        variances = np.array([[getattr(noise, name) ** 2 for name in _LEVELS] for noise in found])
-        scale = 1.0 / np.sqrt(variances.mean(axis=0))
-        own = np.linalg.lstsq(design, variances * scale**2, rcond=None)[0]
-        rows = (np.sqrt(np.maximum(own, 0.0)) / scale).tolist()
-        return {name: SensorNoise(*row) for name, row in zip(self.sensors, rows, strict=True)}
-
     def tree(self) -> list[str]:
         """The sensors and where they are, one a line."""
         lines = [self.sensors[0]]
@@ -260,15 +214,6 @@ class RigCalibration:
             )
         return lines
 
-    def noise_in_words(self) -> list[str]:
-        """A line for every sensor."""
-        return [
-            f"{name}: {length(noise.translation_white)} and {angle(noise.rotation_white)} per axis "
-            f"of each pose. Drift: {length(noise.translation_drift)} and "
-            f"{angle(noise.rotation_drift)} after 1 m."
-            for name, noise in self.noise.items()
-        ]
-
     def to_dict(self) -> dict[str, Any]:
         """Everything in plain values."""
         return {
@@ -276,7 +221,6 @@ class RigCalibration:
             "version": _VERSION,
             "sensors": list(self.sensors),
             "verdict": self.verdict.value,
-            "noise": {name: asdict(noise) for name, noise in self.noise.items()},
             "closures": [
                 asdict(each) | {"sensors": list(each.sensors), "closes": each.closes}
                 for each in self.closures

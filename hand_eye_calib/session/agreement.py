@@ -9,8 +9,8 @@ meta-analysis using the bayesmeta R package*, 2020). Information is added, so th
 recording does not reveal comes from another.
 
 Before that, two explanations of a contradiction are tried: one recording is off, or the mount has
-moved at some time. The better one is accepted if chance rarely makes one as good; if the others
-still scatter more than usual, by an F test against their own scatter.
+moved at some time. The better one is accepted if chance rarely makes one as good, both with the
+usual scatter and, by an F test, with that of the others.
 
 Everything is along and about the axes of the parent. What motion on a plane does not reveal is the
 same direction there in every recording.
@@ -31,9 +31,9 @@ from hand_eye_calib.text import amount, axes_in_words, listing
 
 # A direction with a larger standard deviation (m, rad) is unknown; its variance then.
 _UNKNOWN, _UNKNOWN_VARIANCE = 0.3, 1e4
-_ROUNDS = 3
-# Probability of a false alarm; and of a scatter that is no more than stated.
-_LEVEL, _ORDINARY = 0.01, 0.05
+_ROUNDS = 2
+# Probability of a false alarm.
+_LEVEL = 0.01
 # Factors of the usual scatter.
 _FACTORS = np.geomspace(1 / 16, 16, 9)
 
@@ -261,10 +261,10 @@ def _explanation(
     others = [one.sum(axis=0) - some for one, some in zip(each, alone_since, strict=True)]
     chi2, dof = np.add(_left(*alone_since), _left(*others))
     gained, spent = all_chi2 - chi2, all_dof - dof
+    p_values = chdtrc(spent, gained)
     with np.errstate(divide="ignore", invalid="ignore"):
-        p_values = fdtrc(spent, dof, gained / spent / (chi2 / dof))
-    is_ordinary = (dof == 0) | (chdtrc(dof, chi2) > _ORDINARY)
-    p_values = np.where(is_ordinary, chdtrc(spent, gained), p_values)
+        by_others = fdtrc(spent, dof, gained / spent / (chi2 / dof))
+    p_values = np.where(dof > 0, np.fmax(p_values, by_others), p_values)
     p_values[spent <= 0] = 1.0
     best = int(np.argmin(p_values))
     if len(p_values) * p_values[best] < level:

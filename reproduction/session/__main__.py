@@ -1,7 +1,7 @@
 """``python -m reproduction.session``: the studies of docs/measurements.md.
 
-stop: is a session that is told to stop good enough? compare: do recordings of one rig agree, and
-are shifts found? alarms, delays, loops: of the mount monitor.
+stop: is a session that is told to stop good enough? together: several recordings of one rig, for
+one result. alarms, delays, loops: of the mount monitor.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from hand_eye_calib.cli.main import exit_code_of
 from hand_eye_calib.errors import ConfigError
 from reproduction.recordings import Rig, real_rigs
 from reproduction.runner import Store, in_parallel, solve
-from reproduction.session import mount, pairs, stop
+from reproduction.session import mount, stop, together
 from reproduction.writing import markdown_table, show, study_parser
 
 
@@ -32,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="where results are kept; what is there is not solved again. Default: reproduced",
     )
     parser.add_argument("--seeds", type=int, default=4, help="recordings of a class. Default: 4")
+    parser.add_argument("--first-seed", type=int, default=0, help="fresh recordings. Default: 0")
     parser.add_argument(
         "--hours", type=float, default=5.0, help="simulated hours of a class. Default: 5"
     )
@@ -69,12 +70,18 @@ def _stop(arguments: argparse.Namespace) -> str:
     return "\n\n".join(["Simulated:", tables[0], "Real, cut off in the same way:", tables[1]])
 
 
-def _compare(arguments: argparse.Namespace) -> str:
-    rigs = [rig for rig in _rigs(arguments) if not rig.is_refused]
-    store = Store(arguments.rows / "compare.jsonl", {"study": "compare"})
-    tasks = {f"{rig.name} {name}": (rig, name) for rig in rigs for name in rig.recordings}
-    found = pairs.compared(solve(pairs.solved, tasks, arguments.jobs, store).values())
-    return f"{pairs.summary(found)}\n\n{pairs.table(found)}"
+def _together(arguments: argparse.Namespace) -> str:
+    store = Store(arguments.rows / "together.jsonl", {"study": "together"})
+    tasks = {
+        f"{name} {seed}": (name, seed)
+        for name in together.SIMULATED
+        for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    }
+    simulated = solve(together.simulated, tasks, arguments.jobs, store)
+    rigs = [rig for rig in _rigs(arguments) if not rig.is_refused and len(rig.recordings) > 1]
+    recorded = {f"{rig.name} {name}": (rig, name) for rig in rigs for name in rig.recordings}
+    found = solve(together.real, recorded, arguments.jobs, store)
+    return together.tables([*together.rigs_of(simulated, rigs, found)], arguments.first_seed)
 
 
 def _alarms(arguments: argparse.Namespace) -> str:
@@ -147,7 +154,7 @@ def _delay_row(found: Sequence[mount.Delay]) -> dict[str, object]:
 
 STUDIES: dict[str, Callable[[argparse.Namespace], str]] = {
     "stop": _stop,
-    "compare": _compare,
+    "together": _together,
     "alarms": _alarms,
     "loops": _loops,
     "delays": _delays,

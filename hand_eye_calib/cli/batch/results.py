@@ -3,12 +3,11 @@ of plain values for each recording, for tables of other programs.
 """
 
 import csv
-import hashlib
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from datetime import UTC, datetime
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.cli.batch.tasks import STATE, Task
@@ -24,7 +23,7 @@ Row = dict[str, Any]
 
 _VALUES = [*(f"{axis}_m" for axis in "xyz"), *(f"{axis}_deg" for axis in ("roll", "pitch", "yaw"))]
 COLUMNS = (
-    *("name", "vehicle", "bags", "start", "sha256", "start_ns", "duration_s", "bytes"),
+    *("name", "vehicle", "bags", "start", "start_ns", "duration_s", "bytes"),
     *TAKEN[:5],
     *(
         name
@@ -121,21 +120,8 @@ def row_of(outcome: Outcome) -> Row:
         row |= {"start_ns": start_ns, "duration_s": (end_ns - start_ns) * 1e-9}
         row["start"] = date.isoformat(timespec="seconds")
     if files := outcome["inputs"].get("files"):
-        row |= {"sha256": content_hash(files), "bytes": sum(file["bytes"] for file in files)}
+        row["bytes"] = sum(file["bytes"] for file in files)
     row["findings"] = " ".join(finding["code"] for finding in outcome["findings"])
     if calibration := outcome["calibration"]:
         row |= row_of_result(calibration) | {"warnings": "; ".join(calibration["warnings"])}
     return row
-
-
-def content_hash(files: Sequence[Mapping[str, Any]]) -> str:
-    """Digest of the files of a recording.
-
-    That of a single file is its SHA-256; that of several is what ``sha256sum FILE ... | sha256sum``
-    prints in their folder, for the files in the order of their names.
-    """
-    if len(files) == 1:
-        return str(files[0]["sha256"])
-    lines = sorted((PurePath(file["file"]).name, file["sha256"]) for file in files)
-    text = "".join(f"{digest}  {name}\n" for name, digest in lines)
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -8,7 +8,7 @@ import json
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +46,7 @@ class _Done(NamedTuple):
     row: Row
     text: str
     code: int
+    is_new: bool
 
     @property
     def outcome(self) -> Outcome:
@@ -79,13 +80,16 @@ def run_batch(arguments: argparse.Namespace) -> int:
         if one.row["vehicle"] and one.row["verdict"]:
             rigs.setdefault(one.rig, []).append(one)
     vehicles = {}
+    changed = set()
     for rig, group in sorted(rigs.items()):
         name = rig[0] if rig[0] not in vehicles else " ".join(rig)
         with contextlib.suppress(InputError):  # no recording of it can be used
             if len(group) > 1:
                 vehicles[name] = _together(group)
+        if any(one.is_new for one in group):
+            changed.add(name)
     if out:
-        _write_summary(out, title, done, vehicles)
+        _write_summary(out, title, done, vehicles, changed)
     if arguments.json:
         _print_document(title, done, vehicles)
     else:
@@ -143,7 +147,7 @@ def _all_done(tasks: Sequence[Task], arguments: argparse.Namespace) -> list[_Don
     if out:
         for task in with_progress(tasks, len(tasks), "looking for earlier results"):
             if outcome := stored(task, out):
-                found[task.name] = _done(outcome)
+                found[task.name] = _done(outcome, is_new=False)
     if found:
         note(f"{len(found)} of {len(tasks)} bags are done already; their results are in {out}")
     waiting = [task for task in tasks if task.name not in found]
@@ -151,7 +155,7 @@ def _all_done(tasks: Sequence[Task], arguments: argparse.Namespace) -> list[_Don
     with on_dask(arguments.dask) if arguments.dask else on_cores(jobs) as do:
         for task, outcome in with_progress(do(waiting), len(waiting), "calibrating"):
             page = outcome.pop("page", None)
-            found[task.name] = one = _done(outcome)
+            found[task.name] = one = _done(outcome, is_new=True)
             if out:
                 store(task, outcome, page, out)
             if not sys.stderr.isatty():
@@ -160,7 +164,7 @@ def _all_done(tasks: Sequence[Task], arguments: argparse.Namespace) -> list[_Don
     return [found[task.name] for task in tasks]
 
 
-def _done(outcome: Outcome) -> _Done:
+def _done(outcome: Outcome, is_new: bool) -> _Done:
     calibration, code = outcome["calibration"], 0
     if outcome["error"] or not calibration:
         code = _EXIT_FAILED
@@ -172,7 +176,7 @@ def _done(outcome: Outcome) -> _Done:
         )
         is_poor = calibration["verdict"] == Verdict.DO_NOT_USE.value
         code = _EXIT_NOT_ALL if hidden or is_poor else 0
-    return _Done(row_of(outcome), json.dumps(outcome, separators=(",", ":")), code)
+    return _Done(row_of(outcome), json.dumps(outcome, separators=(",", ":")), code, is_new)
 
 
 def _together(group: Sequence[_Done]) -> Calibration:
@@ -213,9 +217,13 @@ def _print_document(title: str, done: Sequence[_Done], vehicles: Mapping[str, Ca
 
 
 def _write_summary(
-    directory: Path, title: str, done: Sequence[_Done], vehicles: Mapping[str, Calibration]
+    directory: Path,
+    title: str,
+    done: Sequence[_Done],
+    vehicles: Mapping[str, Calibration],
+    changed: Collection[str],
 ) -> None:
-    """Write everything that is said of all together, and the result of each vehicle.
+    """Write everything that is said of all together, and the results of vehicles that changed.
 
     Raises
     ------
@@ -228,7 +236,9 @@ def _write_summary(
         text = json_text(_document(title, done, vehicles)) + "\n"
         save_text(directory / SUMMARY, text)
         for name, each in vehicles.items():
-            save_result(each, directory / VEHICLES / name.replace("/", "_"))
+            folder = directory / VEHICLES / name.replace("/", "_")
+            if name in changed or not folder.exists():
+                save_result(each, folder)
         _write_rows_and_page(directory, title, done, vehicles, INDEX)
 
 

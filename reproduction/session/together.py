@@ -1,0 +1,159 @@
+"""Several recordings of one rig: how much better is their common result, is its interval honest,
+and is a recording that does not belong named?
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.metrics import deviation
+from hand_eye_calib.engine.offline import calibrate
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.session.compare import Change, compare
+from hand_eye_calib.session.together import together
+from reproduction.coverage.classes import CLASSES, simulate
+from reproduction.recordings import Rig, Truth
+from reproduction.writing import markdown_table
+
+# Simulated rigs: recordings of so many seconds, whose mounts differ by this (m, rad) per axis times
+# a factor between 1/2 and 2 that is drawn for each rig.
+SIMULATED = ("hand_vio_walk", "agv_ramps", "drone_gnss_vio", "car_ins_lidar")
+_SECONDS, _RECORDINGS = 90.0, 6
+_SCATTER = np.repeat([0.008, np.radians(0.12)], 3)
+# A recording that does not belong: of a mount that was knocked, in a direction that is drawn.
+_KNOCK_M, _KNOCK_RAD = 0.05, np.radians(2.0)
+_NORMAL_90 = 1.645
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Results of the recordings of one rig by their names, and what is known of it."""
+
+    rig: str
+    results: Mapping[str, Calibration]
+    truth: Truth | None
+
+
+def simulated(name: str, seed: int) -> dict[str, Any]:
+    """Plain results of the recordings of a simulated rig, and its extrinsic."""
+    kind = dataclasses.replace(CLASSES[name], duration_s=_SECONDS)
+    rng = np.random.default_rng((31, seed, sorted(CLASSES).index(name)))
+    X = simulate(dataclasses.replace(kind, duration_s=5.0), (32, seed)).T_parent_child
+    scatter = 2.0 ** rng.uniform(-1.0, 1.0) * _SCATTER
+    results = {}
+    for number in range(_RECORDINGS):
+        made = simulate(kind, (33, seed, number, sorted(CLASSES).index(name)), X)
+        found = calibrate(made.parent, made.child, checks=False)
+        own = se3.exp(scatter * rng.standard_normal(6))
+        found = dataclasses.replace(found, T_parent_child=found.T_parent_child @ own)
+        results[str(number)] = found.to_dict()
+    return {"results": results, "truth": X.tolist()}
+
+
+def real(rig: Rig, name: str) -> dict[str, Any]:
+    """Plain result of a recording."""
+    recording = rig.recordings[name]
+    return calibrate(recording.parent, recording.child, method="auto", **rig.options).to_dict()
+
+
+def rigs_of(
+    solved: Mapping[str, Mapping[str, Any]], rigs: Iterable[Rig], found: Mapping[str, Any]
+) -> Iterator[Recorded]:
+    """The rigs from what was solved: simulated ones by their names, recordings by ``RIG NAME``."""
+    for name, plain in solved.items():
+        results = {key: Calibration.from_dict(each) for key, each in plain["results"].items()}
+        exact = Truth.within(np.array(plain["truth"]), 0.0, 0.0)
+        yield Recorded(f"simulated {name.split()[0]}", results, exact)
+    euroc: dict[str, Calibration] = {}
+    truth = None
+    for rig in rigs:
+        results = {
+            name: Calibration.from_dict(found[f"{rig.name} {name}"]) for name in rig.recordings
+        }
+        yield Recorded(rig.name, results, rig.truth)
+        if rig.name.startswith("euroc"):
+            truth = rig.truth
+            euroc |= {f"{rig.name} {name}": each for name, each in results.items()}
+    if euroc:
+        yield Recorded("euroc, both", euroc, truth)
+
+
+def tables(rigs: Sequence[Recorded], seed: int) -> str:
+    """Errors and coverage by rig; and what is said of recordings that belong, and that do not."""
+    rng = np.random.default_rng((34, seed))
+    kinds = dict.fromkeys(each.rig for each in rigs if each.truth)
+    rows = [_row(kind, [each for each in rigs if each.rig == kind]) for kind in kinds]
+    named = wrong = cases = accused = several = moved = pairs = 0
+    for each in rigs:
+        whole = [each.results] if len(each.results) > 3 else []
+        for some in (*whole, *_subsets(each.results, 3)[:2]):
+            said = together(some).together
+            several += 1
+            accused += said is not None and said.kind in ("one off", "moved")
+            foreign = str(rng.choice([*some]))
+            out = _left_out(dict(some) | {foreign: _knocked(some[foreign], rng)})
+            cases, named = cases + 1, named + (out == {foreign})
+            wrong += bool(out - {foreign})
+        for couple in combinations(each.results.values(), 2):
+            pairs, moved = pairs + 1, moved + (compare(couple).verdict is Change.MOVED)
+    return (
+        f"{markdown_table(rows)}\n\nOf {cases} sets of three or six recordings, one of them with "
+        f"the mount knocked by {100 * _KNOCK_M:g} cm and {np.degrees(_KNOCK_RAD):g} deg, that one "
+        f"is named in {named}, another in {wrong}. Of {several} sets as they are, one or more is "
+        f"named in {accused}. `compare` calls {moved} of {pairs} pairs moved."
+    )
+
+
+def _subsets(results: Mapping[str, Calibration], count: int) -> list[dict[str, Calibration]]:
+    return [{name: results[name] for name in some} for some in combinations(results, count)]
+
+
+def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
+    row: dict[str, object] = {"rig": f"{kind} ({len(rigs)})"}
+    for count, title in ((1, "one"), (3, "three"), (6, "six")):
+        errors: list[list[float]] = []
+        inside: list[bool] = []
+        for each in rigs:
+            assert each.truth is not None
+            for some in _subsets(each.results, count):
+                joint = together(some) if count > 1 else next(iter(some.values()))
+                known = np.isfinite(each.truth.sigmas) & np.isfinite(joint.sigmas)
+                error = deviation(joint.T_parent_child, each.truth.T_parent_child)
+                stated = joint.sigmas if "simulated" in kind else joint.sigmas_with_floor
+                sigmas = np.hypot(stated, each.truth.sigmas)
+                inside.extend((np.abs(error) < _NORMAL_90 * sigmas)[known])
+                errors.append(
+                    [
+                        float(np.linalg.norm((error * known)[part]))
+                        for part in (slice(3), slice(3, 6))
+                    ]
+                )
+        told = ("-", "-")
+        if errors:
+            metres, radians = np.median(errors, axis=0)
+            told = (
+                f"{1e3 * metres:.1f} mm, {np.degrees(radians):.3f} deg",
+                f"{100 * np.mean(inside):.0f} %",
+            )
+        row |= {f"error of {title}": told[0], f"90 % covers, {title}": told[1]}
+    return row
+
+
+def _left_out(results: Mapping[str, Calibration]) -> set[str]:
+    said = together(results).together
+    assert said is not None
+    return {each.name for each in said.recordings if each.left_out}
+
+
+def _knocked(result: Calibration, rng: np.random.Generator) -> Calibration:
+    """The result that a recording would have given after a knock."""
+    directions: FloatArray = rng.standard_normal((2, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    xi = np.concatenate([_KNOCK_M * directions[0], _KNOCK_RAD * directions[1]])
+    return dataclasses.replace(result, T_parent_child=result.T_parent_child @ se3.exp(xi))
