@@ -1,8 +1,9 @@
 """Extrinsic calibration of two sensors from their motion alone: the public Python API.
 
 >>> import hand_eye_calib as hec
->>> parent, child = hec.read_trajectory("lidar.txt"), hec.read_trajectory("camera.txt")
->>> hec.calibrate(parent, child, method="dnlo", reference="B5").T_parent_child
+>>> result = hec.calibrate("lidar.tum", "camera.tum")
+>>> result.T_parent_child.shape, result.verdict.value
+((4, 4), 'USE')
 
 Names are imported when they are first used, so that importing the package takes no time and needs
 nothing but Python.
@@ -36,6 +37,7 @@ _HOMES = {
     "read_arm_samples": "io.stops",
     "read_trajectory": "io.trajectory_files.reading",
     "save": "io.results",
+    "simulate": "simulation.drive",
     "write_trajectory": "io.trajectory_files.writing",
 }
 _ORIGINAL_NAMES = {"load": "load_result", "save": "save_result"}
@@ -65,6 +67,7 @@ __all__ = [
     "read_arm_samples",
     "read_trajectory",
     "save",
+    "simulate",
     "write_trajectory",
 ]
 
@@ -90,6 +93,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.rig.result import RigCalibration
     from hand_eye_calib.session.compare import compare
     from hand_eye_calib.session.together import calibrate_many, calibrate_together
+    from hand_eye_calib.simulation.drive import simulate
 
     __version__: str
 else:

@@ -19,7 +19,16 @@ def printable(text: str) -> str:
 
 
 class HandEyeCalibError(Exception):
-    """Base of all errors that a caller is expected to handle."""
+    """Base of all errors that a caller is expected to handle.
+
+    Examples
+    --------
+    >>> try:
+    ...     hec.load("absent")
+    ... except hec.HandEyeCalibError as error:
+    ...     print(error)
+    cannot read absent: No such file or directory
+    """
 
     def __str__(self) -> str:
         return printable(super().__str__())

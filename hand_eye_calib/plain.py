@@ -18,10 +18,10 @@ def plain(value: Any) -> Any:
     """A value with all that it holds as mappings, lists, texts, bools and numbers.
 
     A dataclass becomes a mapping of its fields, numbers and arrays of NumPy those of Python, an
-    enum its value. Infinity and NaN, which JSON does not have, become None.
+    enum its value without spaces. Infinity and NaN, which JSON does not have, become None.
     """
     if isinstance(value, Enum):
-        value = value.value
+        return str(value.value).replace(" ", "_")
     if is_dataclass(value) and not isinstance(value, type):
         value = {each.name: getattr(value, each.name) for each in fields(value)}
     if isinstance(value, Mapping):
@@ -71,7 +71,7 @@ def from_plain(kind: Any, value: Any) -> Any:
     if kind is float:
         return _number(value)
     if issubclass(kind, Enum):
-        return kind(value)
+        return {plain(each): each for each in kind}.get(value) or kind(value)
     if isinstance(value, bool) and kind is not bool:
         raise TypeError(f"a {kind.__name__} is true or false")
     return _of_type(kind, value)

@@ -5,6 +5,7 @@ and as they type them. Every place that prints or reads a quantity takes it from
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TypeAlias
 
 from hand_eye_calib.errors import ConfigError
@@ -73,6 +74,15 @@ def with_sigma(value: float | None, sigma: float | None, least_decimals: int = 2
     return f"{fixed(value, decimals)} +/- {fixed(sigma, decimals)}"
 
 
+def printed_angle(degrees: float | None, sigma: float | None) -> str:
+    """An angle and its standard deviation; near gimbal lock roll and yaw are known and have none of
+    their own.
+    """
+    if degrees is not None and sigma is None:
+        return fixed(degrees, 2)
+    return with_sigma(degrees, sigma, 2)
+
+
 def decimals_of(sigma: float) -> int:
     """Decimals that show two digits of a standard deviation."""
     if not sigma > 0:
@@ -121,6 +131,16 @@ def share(value: float) -> str:
 def listing(words: Sequence[str]) -> str:
     """One, two and three."""
     return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+def names_of_files(paths: Sequence[Path]) -> list[str]:
+    """A name for each of some files: their stems or, if those are equal, their folders; none if
+    those are equal, too.
+    """
+    for names in ([path.stem for path in paths], [path.parent.name for path in paths]):
+        if all(names) and len({*names}) == len(paths):
+            return names
+    return [""] * len(paths)
 
 
 def counted(count: int, noun: str) -> str:

@@ -18,8 +18,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.offline import calibrate
+from hand_eye_calib.engine.offline import MethodName, calibrate
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -32,7 +31,7 @@ from reproduction.recordings import Rig, real_rigs
 from reproduction.runner import Store, solve
 from reproduction.writing import counted, markdown_table, put_into_page
 
-METHODS = ("dnlo", "auto")
+METHODS: tuple[MethodName, ...] = ("dnlo", "auto")
 _SEEDS = (0, 1, 2)
 _NOISE = NoiseConfig(gaussian=0.003)
 _TANGO = ("tango_caligula_mars", "tango_mars_nero")
@@ -63,7 +62,7 @@ class Case:
     fault: str
     severity: int
     recording: str
-    method: str
+    method: MethodName
 
     @property
     def key(self) -> str:
@@ -127,11 +126,11 @@ def cases(folder: Path | None) -> list[Case]:
 
 def clean_cases(folder: Path | None) -> list[Case]:
     """The clean recordings, by the default method."""
-    return _cases(_CLEAN, 1, clean_recordings.names(folder), (CalibratorConfig.method,))
+    return _cases(_CLEAN, 1, clean_recordings.names(folder), ("auto",))
 
 
 def _cases(
-    fault: str, n_severities: int, names: Sequence[str], methods: Sequence[str] = METHODS
+    fault: str, n_severities: int, names: Sequence[str], methods: Sequence[MethodName] = METHODS
 ) -> list[Case]:
     return [
         Case(fault=fault, severity=severity, recording=name, method=method)
@@ -200,7 +199,7 @@ _Sound = tuple[Trajectory, Trajectory, FloatArray, dict[str, Any]]
 
 
 @cache
-def _sound(name: str, method: str, folder: Path | None) -> _Sound:
+def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
     """A recording without a fault, its answer and the options that it needs."""
     if name.startswith("hilly"):
         drive = simulate_drive(int(name.rsplit("_", 1)[1]), HILLY_DRIVE, _NOISE)

@@ -15,10 +15,8 @@ from hand_eye_calib.cli.options import (
     add_config_arguments,
     add_input_arguments,
     add_output_arguments,
-    add_topics_argument,
     at_least,
 )
-from hand_eye_calib.cli.robot import add_robot_arguments
 from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
@@ -32,7 +30,7 @@ examples:
   hand_eye_calib calibrate my_bag --list
   hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
   hand_eye_calib calibrate my_bag --parent-tf odom:lidar --child-topic /vio --out result
-  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
+  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+-0.02
   hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
   hand_eye_calib calibrate monday/bag tuesday/bag wednesday/bag --out together
   hand_eye_calib calibrate --batch 'fleet/**' --vehicle 'fleet/{vehicle}/' --out results
@@ -53,7 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ".db3 or .bag file, or the URL of one, as s3://..., of which several are the parts of one "
         "recording; or the journal of a node's session, or the output directory that holds it",
     )
-    add_topics_argument(parser)
+    parser.add_argument(
+        "--topics",
+        metavar="TOPIC",
+        nargs="+",
+        help="poses of three sensors or more, or frames as odom:lidar: all are solved together, in "
+        "the frame of the first",
+    )
     parser.add_argument(
         "--list",
         action="store_true",
@@ -115,7 +119,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_config_arguments(parser)
     add_output_arguments(parser)
-    add_robot_arguments(parser)
+    robot = parser.add_argument_group("what is installed")
+    robot.add_argument(
+        "--installed",
+        metavar="SOURCE",
+        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a bag with "
+        '/tf_static, or "X Y Z ROLL PITCH YAW" in m and rad',
+    )
+    robot.add_argument(
+        "--base-frame",
+        metavar="FRAME",
+        help="state the child's pose in this frame too, as the URDF of --installed or the bag's "
+        "/tf_static has it",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -52,31 +52,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
+    from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import answered, gravest_first
     from hand_eye_calib.checks.streams import summarise
     from hand_eye_calib.cli.present import show
     from hand_eye_calib.cli.reading import are_bags
+    from hand_eye_calib.cli.reporting import CHECK, write_page
+    from hand_eye_calib.engine.checking import check_partial
+    from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
-    if not 1 <= len(arguments.paths) <= 2:
-        raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.paths)}")
-    config = config_from(arguments)
     is_bag = are_bags(arguments.paths)
-    if is_bag and len(arguments.paths) > 1:
-        raise ConfigError("expected one bag or two trajectory files; got two bags")
-    trajectories, sources, of_files = _read_bag(arguments) if is_bag else _read_files(arguments)
-    parent, child = trajectories.values()
+    if len(arguments.paths) != 2 - is_bag:
+        raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.paths)}")
+    read, sources, of_files = _read_bag(arguments) if is_bag else _read_files(arguments)
+    first, second = read.values()
+    config = offline_config(first, second, options_from(arguments))
+    snapshot = whole_snapshot(config, first, second)
+    parent, child = snapshot.parent, snapshot.child
     # What is to be estimated is not known yet: the checks say what it is.
     offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
     scale = config.scale if isinstance(config.scale, float) else 1.0
     with waiting_for("checking the streams"):
-        checked = _checked(parent, child, (offset_s, scale), arguments)
+        if {parent.measures, child.measures} == {"poses"}:
+            checked = check_streams(parent, child, offset_s, scale, config.max_gap)
+        else:
+            checked = check_partial(snapshot)
     findings = gravest_first(answered([*checked.findings, *of_files], config))
-    streams = {name: summarise(one) for name, one in trajectories.items() if len(one) > 1}
+    streams = {
+        name: summarise(one)
+        for name, one in zip(STREAMS, (parent, child), strict=True)
+        if len(one) > 1
+    }
     said = _verdict(findings)
 
     def finish() -> None:
-        from hand_eye_calib.cli.reporting import CHECK, write_page
-
         if arguments.out:
             corrected = child.shifted(offset_s).scaled(scale)
             names = [
@@ -98,24 +107,6 @@ def run(arguments: argparse.Namespace) -> int:
         errors=errors,
         code=len(errors),
     )
-
-
-def _checked(
-    parent: "Trajectory",
-    child: "Trajectory",
-    known: tuple[float, float],
-    arguments: argparse.Namespace,
-) -> "CheckResult":
-    """What the checks say of two streams with a ``known`` time offset and scale."""
-    if {parent.measures, child.measures} == {"poses"}:
-        from hand_eye_calib.checks.check import check_streams
-
-        return check_streams(parent, child, *known, config_from(arguments).max_gap)
-    from hand_eye_calib.engine.checking import check_partial
-    from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-
-    config = offline_config(parent, child, options_from(arguments))
-    return check_partial(whole_snapshot(config, parent, child))
 
 
 def _read_files(arguments: argparse.Namespace) -> _Read:
@@ -162,19 +153,15 @@ def _document(
     findings: "Sequence[Finding]",
     checked: "CheckResult",
 ) -> dict[str, Any]:
-    from hand_eye_calib.plain import plain
-
+    found = checked.correlation
+    turning = {"time_offset_s": found.offset_s, "correlation": found.correlation}
+    turning |= {"distinctness": found.distinctness}
     return {
         "streams": {
             name: {"source": sources[name], **vars(summary)} for name, summary in streams.items()
         },
-        "turning": {
-            "time_offset_s": checked.correlation.offset_s,
-            "correlation": checked.correlation.correlation,
-            "distinctness": checked.correlation.distinctness,
-            "rms_rad_in_3_s": checked.rms_rotation,
-        },
-        "findings": plain(findings),
+        "turning": turning | {"rms_rad_in_3_s": checked.rms_rotation},
+        "findings": findings,
     }
 
 

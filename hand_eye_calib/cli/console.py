@@ -8,19 +8,19 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from hand_eye_calib.config import CalibratorConfig, option_name
 from hand_eye_calib.errors import printable
-
-if TYPE_CHECKING:
-    pass
 
 _Item = TypeVar("_Item")
 
 _CLEAR_LINE = "\r\033[K"
 # Columns of a table that does not go to a terminal: its lines stay whole.
 _WIDTH_IN_A_FILE = 240
+
+# How a terminal shows the verdict that a line begins with.
+_STYLES = {"USE": "bold green", "USE WITH CARE": "bold yellow", "DO NOT USE": "bold red"}
 
 # Notes and progress are left out: work for a batch, of which only the result is of interest.
 _IS_SILENT = ContextVar("is_silent", default=False)
@@ -135,6 +135,20 @@ def with_progress(
         for item in items:
             yield item
             progress.advance(task, size(item))
+
+
+def print_result(text: str) -> None:
+    """Print what a command found; on a terminal, the verdict that it begins with in its colour."""
+    verdict, colon, rest = text.partition(":")
+    if not (sys.stdout.isatty() and verdict in _STYLES):
+        print(text)
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    Console(highlight=False).print(
+        Text.assemble((verdict, _STYLES[verdict]), colon, rest), soft_wrap=True
+    )
 
 
 def print_table(title: str, headings: Iterable[str], rows: Iterable[Iterable[str]]) -> None:

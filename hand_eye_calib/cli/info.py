@@ -1,16 +1,11 @@
-"""``info RESULT``: show a saved calibration, pack it for a report, or move a trajectory by it."""
+"""``info RESULT``: show a saved calibration, or move a trajectory by it."""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import note
+from hand_eye_calib.cli.console import note, print_result
 from hand_eye_calib.cli.options import add_json_argument, add_verbose_argument
-from hand_eye_calib.cli.robot import (
-    add_description_arguments,
-    require_description,
-    write_description,
-)
 from hand_eye_calib.config import EXPORT_FORMATS
 from hand_eye_calib.errors import ConfigError
 
@@ -25,7 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json\n"
         "  hand_eye_calib info result --as kalibr > camchain-imucam.yaml\n"
-        "  hand_eye_calib info result --bundle wrong_answer.zip\n"
         "  hand_eye_calib info result --move camera.tum --to camera_as_lidar.tum"
     )
     parser.add_argument(
@@ -37,14 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=EXPORT_FORMATS,
         metavar="FORMAT",
         help=f"print it as the file of another program instead: {', '.join(EXPORT_FORMATS)}",
-    )
-    add_description_arguments(parser)
-    parser.add_argument(
-        "--bundle",
-        metavar="FILE",
-        type=Path,
-        help="write what a report of a wrong answer needs to a zip file: versions, options, "
-        "findings, the result and 200 kB of downsampled poses without their place; nothing else",
     )
     parser.add_argument(
         "--move",
@@ -68,23 +54,14 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.io.results import load_result
     from hand_eye_calib.plain import json_text
 
-    require_description(arguments)
-    if arguments.urdf and not arguments.write:
-        raise ConfigError("--urdf needs --write: where to write the changed description")
     calibration = load_result(arguments.result)
     _move(calibration, arguments)
-    if arguments.bundle:
-        from hand_eye_calib.cli.bundle import write_bundle
-
-        for text in write_bundle(arguments.result, arguments.bundle):
-            note(text)
-        note(f"wrote {arguments.bundle}")
     if arguments.format:
         print(calibration.export(arguments.format), end="")
+    elif arguments.json:
+        print(json_text(calibration.to_dict()))
     else:
-        text = as_text(calibration, with_details=arguments.verbose)
-        print(json_text(calibration.to_dict()) if arguments.json else text)
-    write_description(calibration, arguments)
+        print_result(as_text(calibration, with_details=arguments.verbose))
     return 0
 
 

@@ -5,11 +5,12 @@ when it is asked for, so that a missing optional package breaks no other command
 """
 
 import argparse
+import contextlib
 import errno
-import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
@@ -35,14 +36,13 @@ COMMANDS = {
     "compare": "compare results with what is installed, or with each other",
     "info": "show a saved result",
     "simulate": "simulate trajectories or a bag with known truth",
-    "completion": "print what a shell needs to complete commands and options",
     "demo": "simulate a recording and calibrate from it, offline and live",
 }
 
 _EPILOG = """\
 examples:
+  hand_eye_calib calibrate lidar.tum camera.tum  calibrate from two trajectory files
   hand_eye_calib calibrate my_bag --out result   calibrate from a bag, with report.html
-  hand_eye_calib check my_bag                    check both pose streams first
   hand_eye_calib COMMAND --help                  options and examples of a command
 
 exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
@@ -62,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv : list of str, optional
-        Arguments after the program's name; by default those of the process.
+        Arguments after the program's name; by default those of the process. Without any, the help
+        is printed.
 
     Returns
     -------
@@ -90,16 +91,24 @@ def exit_code_of(run: Callable[[], int]) -> int:
         code = run()
         sys.stdout.flush()
         return code
-    except ConfigError as error:
-        return fail(error, EXIT_USAGE)
     except HandEyeCalibError as error:
-        return fail(error, EXIT_FAILED)
+        return fail(error, EXIT_USAGE if isinstance(error, ConfigError) else EXIT_FAILED)
     except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] == "hand_eye_calib":
+        name = error.name or "hand_eye_calib"
+        package = name.partition(".")[0]
+        if package == "hand_eye_calib":
             raise
-        return fail(_what_to_install(error.name), EXIT_FAILED)
+        if package.endswith(_OF_ROS):
+            text = (
+                f"this needs ROS 2's Python packages ({name} is missing): source the setup file of "
+                "a ROS 2 installation, or pip install 'hand_eye_calib[ros]'"
+            )
+            return fail(text, EXIT_FAILED)
+        text = f"this needs the Python package {name!r}, which is not installed; install it"
+        return fail(f"{text}, try again", EXIT_FAILED)
     except BrokenPipeError:
-        _discard_stdout()
+        # Keeps the interpreter from complaining when it flushes at exit: the reader has gone.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:
@@ -112,17 +121,7 @@ def exit_code_of(run: Callable[[], int]) -> int:
 
 def module_of(command: str) -> ModuleType:
     """The module of a command, with ``add_arguments`` and ``run``."""
-    return importlib.import_module(f"hand_eye_calib.cli.{_MODULES.get(command, command)}")
-
-
-def _what_to_install(name: str) -> str:
-    """The line about a Python package that is missing."""
-    if name.partition(".")[0].endswith(_OF_ROS):
-        return (
-            f"this needs ROS 2's Python packages ({name} is missing): source the setup file of a "
-            "ROS 2 installation, or pip install 'hand_eye_calib[ros]'"
-        )
-    return f"this needs the Python package {name!r}, which is not installed; install it, try again"
+    return import_module(f"hand_eye_calib.cli.{_MODULES.get(command, command)}")
 
 
 def named_command() -> int:
@@ -172,7 +171,7 @@ def _run(argv: Sequence[str]) -> int:
     if command is not None and command not in COMMANDS:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=bool(argv))
     module: Any = None
     of_command = parser
     for name, summary in COMMANDS.items():
@@ -182,10 +181,14 @@ def _run(argv: Sequence[str]) -> int:
             module.add_arguments(added)
             added.shorten_usage()
     if _COMPLETING in os.environ:
-        import argcomplete
+        with contextlib.suppress(ModuleNotFoundError):
+            import argcomplete
 
-        argcomplete.autocomplete(parser)  # tells the shell, and ends the process
+            argcomplete.autocomplete(parser)  # tells the shell, and ends the process
     arguments, rest = parser.parse_known_args(argv)
+    if command is None:
+        parser.print_help()
+        return 0
     if rest and command != "calibrator":
         of_command.refuse(rest)
     arguments.passed_on, arguments.typed = rest, list(argv)
@@ -200,8 +203,3 @@ class _Version(argparse.Action):
 
         print(f"hand_eye_calib {package_version()}")
         parser.exit()
-
-
-def _discard_stdout() -> None:
-    """Keep the interpreter from complaining when it flushes at exit: the reader has gone."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

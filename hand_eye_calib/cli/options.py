@@ -8,7 +8,7 @@ import argparse
 import contextlib
 import dataclasses
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from hand_eye_calib.config import (
     did_you_mean,
     option_name,
 )
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.transforms import TfSource
@@ -33,7 +33,7 @@ STREAMS = ("parent", "child")
 
 _NODE_OPTIONS = {option_name(field) for field in dataclasses.fields(NodeConfig)}
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
-_NODE_NAMES = ("calibrator", "**", "*")
+_NODES = ("calibrator", "**", "*", "ros__parameters")
 _DEST = "option "
 _PRIOR = "prior."
 _AXES = ", ".join(name.removeprefix(_PRIOR) for name in OPTION_FIELDS if _PRIOR in name)
@@ -90,28 +90,23 @@ def at_least(minimum: int) -> Callable[[str], int]:
     return argument_type(parse)
 
 
-def offer(action: argparse.Action, values: Callable[[argparse.Namespace], Sequence[str]]) -> None:
-    """Let a shell offer values for an option, given what has been typed before."""
-    setattr(action, "completer", lambda parsed_args, **_: values(parsed_args))  # noqa: B010
-
-
 # ------------------------------------------------------- options of the engine
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--config`` and an option for every field of CalibratorConfig."""
-    # argparse takes -1e-3, -90deg+/-2deg and the like for options otherwise.
+    # argparse takes -1e-3, -90deg+-2deg and the like for options otherwise.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
     for name in _COMMON:
         _add_option(group, name)
     group.add_argument(
         "--prior",
-        metavar="AXIS=VALUE+/-SIGMA",
+        metavar="AXIS=VALUE+-SIGMA",
         action="append",
         type=_prior_argument,
         default=argparse.SUPPRESS,
-        help="what is known of an axis beforehand, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; "
+        help="what is known of an axis beforehand, such as z=1.85+-0.02 (m) or yaw=-90deg+-2deg; "
         f"AXIS is one of {_AXES}; may be repeated",
     )
     group.add_argument(
@@ -132,7 +127,7 @@ def _add_option(group: argparse._ArgumentGroup, name: str) -> None:
     unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
     default = "" if field.default == "" else f" Default: {field.default}."
     value = "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
-    action = group.add_argument(
+    group.add_argument(
         f"--{flag(name)}",
         dest=_DEST + name,
         default=argparse.SUPPRESS,
@@ -140,15 +135,13 @@ def _add_option(group: argparse._ArgumentGroup, name: str) -> None:
         metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
         help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
     )
-    if words := [*(meta["choices"] or ()), *meta["words"]]:
-        offer(action, lambda _: words)
 
 
 @argument_type
 def _prior_argument(text: str) -> tuple[str, Any]:
     axis, equals, value = text.partition("=")
     if not equals or _PRIOR + axis not in OPTION_FIELDS:
-        raise ConfigError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_AXES}; got {text!r}")
+        raise ConfigError(f"expected AXIS=VALUE+-SIGMA with AXIS one of {_AXES}; got {text!r}")
     return _PRIOR + axis, check_value(OPTION_FIELDS[_PRIOR + axis], value)
 
 
@@ -222,38 +215,31 @@ def _read_config(path: Path) -> Options:
 
 def _parameters(path: Path, document: Mapping[str, Any]) -> Mapping[str, Any]:
     """Of a ROS parameter file what is meant for the node ``calibrator``, of any other file all."""
-    sections = dict(_ros_sections(path, document))
+    key, ending = "ros__parameters", ".ros__parameters"
+    flat = _flatten(document, until=key)
+    sections = {name.removesuffix(ending): each for name, each in flat.items() if key in name}
+    for node, each in sections.items():
+        if not isinstance(each, dict | None):
+            raise ConfigError(f"{path}: {node}: {key} must be a mapping of names to values")
     if not sections:
         return document
-    ours = [each for node, each in sections.items() if node.rpartition("/")[2] in _NODE_NAMES]
+    ours = [each or {} for node, each in sections.items() if re.split("[./]", node)[-1] in _NODES]
     if not ours:
+        found = ", ".join(f"/{node.strip('/').replace('.', '/')}" for node in sections)
         raise ConfigError(
-            f"{path}: no parameters for a node named calibrator; found some for "
-            f"{', '.join(sections)}"
+            f"{path}: no parameters for a node named calibrator; found some for {found}"
         )
-    return {name: value for parameters in ours for name, value in _flatten(parameters).items()}
+    return {name: value for each in ours for name, value in _flatten(each).items()}
 
 
-def _ros_sections(
-    path: Path, mapping: Mapping[str, Any], node: str = ""
-) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    for name, value in mapping.items():
-        if name == "ros__parameters":
-            if not isinstance(value, (dict, type(None))):
-                raise ConfigError(
-                    f"{path}: {node or '/'}: ros__parameters must be a mapping of names to values"
-                )
-            yield node, value or {}
-        elif isinstance(value, dict):
-            yield from _ros_sections(path, value, f"{node}/{str(name).strip('/')}")
-
-
-def _flatten(mapping: Mapping[str, Any], prefix: str = "") -> Options:
-    """Nested mappings to dotted names."""
+def _flatten(mapping: Mapping[str, Any], prefix: str = "", until: str = "") -> Options:
+    """Nested mappings to dotted names, but for what lies below the name ``until``."""
     flat: Options = {}
     for name, value in mapping.items():
-        nested = _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else None
-        flat |= {f"{prefix}{name}": value} if nested is None else nested
+        if isinstance(value, dict) and name != until:
+            flat |= _flatten(value, f"{prefix}{name}.", until)
+        else:
+            flat[f"{prefix}{name}"] = value
     return flat
 
 
@@ -270,12 +256,11 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
     )
     for stream in STREAMS:
         source = group.add_mutually_exclusive_group()
-        topic = source.add_argument(
+        source.add_argument(
             f"--{stream}-topic",
             metavar="TOPIC",
             help=f"poses of the {stream} sensor, of any type, or FIX+IMU of two topics",
         )
-        offer(topic, _topics_of)
         source.add_argument(
             f"--{stream}-tf",
             metavar="WORLD:SENSOR",
@@ -297,18 +282,6 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         for stream in STREAMS:
             of_one = settings | {"help": f"the same for {stream.upper()} only"}
             group.add_argument(f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **of_one)
-
-
-def add_topics_argument(parser: argparse.ArgumentParser) -> None:
-    """Add ``--topics``, of three sensors or more."""
-    several = parser.add_argument(
-        "--topics",
-        metavar="TOPIC",
-        nargs="+",
-        help="poses of three sensors or more, or frames as odom:lidar: all are solved together, in "
-        "the frame of the first",
-    )
-    offer(several, _topics_of)
 
 
 def _label(text: str) -> tuple[str, str]:
@@ -353,18 +326,6 @@ def add_verbose_argument(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "-v", "--verbose", action="store_true", help="print details of the solution, too"
     )
-
-
-def _topics_of(typed: argparse.Namespace) -> list[str]:
-    """Topics of a bag with poses; none if it cannot be read."""
-    from hand_eye_calib.io.bags import PoseBag
-    from hand_eye_calib.io.bags.messages import SENSOR_TYPES
-
-    try:
-        with PoseBag(*typed.paths) as bag:
-            return [topic.name for topic in bag.topics.values() if topic.type in SENSOR_TYPES]
-    except HandEyeCalibError:
-        return []
 
 
 def _path(text: str) -> Path | str:

@@ -5,15 +5,20 @@ import shlex
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from hand_eye_calib.cli.console import as_typed, fail, note, typed_options, waiting_for
+from hand_eye_calib.cli.console import (
+    as_typed,
+    fail,
+    note,
+    print_result,
+    typed_options,
+    waiting_for,
+)
 from hand_eye_calib.cli.reporting import static_transform_command, with_cross_check, write_report
-from hand_eye_calib.cli.robot import with_robot, write_description
-from hand_eye_calib.errors import printable
+from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
@@ -23,6 +28,7 @@ from hand_eye_calib.text import (
     axes_in_words,
     given_or_estimated,
     listing,
+    printed_angle,
     with_sigma,
 )
 
@@ -31,18 +37,15 @@ if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
 
 _EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
-
 _WIDTH = 100
-
 _ROTATIONS = ("roll", "pitch", "yaw")
-_OBSERVED = {"prior": "mostly from the prior"}
 _PROOF = {
     "yes": ", proved to be the global minimum over them",
     "no": ", not proved to be the global minimum over them",
 }
 _SCATTER = {
-    "of_methods": "scatter of other methods and references about it",
-    "of_halves": "scatter of the two halves of the recording about it",
+    "of_methods": "scatter of other methods and references",
+    "of_halves": "scatter of the two halves of the recording",
 }
 
 
@@ -58,7 +61,7 @@ def deliver(
     ----------
     calibration : Calibration
     arguments : argparse.Namespace
-        With ``json``, ``out`` and ``verbose``.
+        With ``json``, ``out``, ``verbose``, ``installed`` and ``base_frame``.
     inputs : dict
         Where the data came from, in plain values: part of the JSON document and of the saved file's
         provenance.
@@ -66,7 +69,7 @@ def deliver(
         The poses and options that gave it. With them, ``--out`` also runs the cross-checks and
         writes the report. None for stops.
     """
-    calibration = with_robot(calibration, arguments)
+    calibration = _with_robot(calibration, arguments)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
     evidence: Evidence | None = None
@@ -81,7 +84,6 @@ def deliver(
         return save_result(calibration, arguments.out, inputs)
 
     def finish() -> None:
-        write_description(calibration, arguments)
         if evidence is not None and snapshot:
             write_report(arguments.out, calibration, evidence, snapshot.config, inputs)
 
@@ -98,6 +100,33 @@ def deliver(
         errors=[f"{one.sentence}; do not use this result, {one.what_to_do}" for one in reasons],
         code=code,
     )
+
+
+def _with_robot(calibration: Calibration, arguments: argparse.Namespace) -> Calibration:
+    """The result with its comparison with what is installed, and its pose in the base frame, if
+    they were asked for.
+    """
+    installed, base = arguments.installed, arguments.base_frame
+    if calibration.status.failure or not (installed or base):
+        return calibration
+    from hand_eye_calib.io.installed import frames_of_bag, read_installed
+    from hand_eye_calib.io.urdf import RobotDescription
+    from hand_eye_calib.session.compare import with_comparison
+
+    if installed:
+        frames = calibration.parent_frame, calibration.child_frame
+        with waiting_for(f"reading {installed}"):
+            calibration = with_comparison(calibration, read_installed(installed, *frames))
+    if not base:
+        return calibration
+    if installed and Path(installed).suffix == ".urdf":
+        tree = RobotDescription(Path(installed)).frames
+    elif getattr(arguments, "is_of_bags", False):
+        tree = frames_of_bag(arguments.paths[0])
+    else:
+        raise ConfigError("--base-frame needs --installed ROBOT.urdf: a description with the frame")
+    T_base_parent = tree.pose(base, calibration.parent_frame)
+    return replace(calibration, base_frame=base, T_base_parent=T_base_parent)
 
 
 def show(
@@ -129,7 +158,10 @@ def show(
     """
     if arguments.out and save is not None:
         note(f"wrote {save()}")
-    print(json_text(document()) if arguments.json else text())
+    if arguments.json:
+        print(json_text(document()))
+    else:
+        print_result(text())
     sys.stdout.flush()
     if finish is not None:
         finish()
@@ -148,16 +180,16 @@ def exit_code(calibration: Calibration) -> int:
 
 
 def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False) -> str:
-    """Everything a person needs to see: verdict and reasons, the extrinsic in both directions, what
-    to do next.
+    """What a person needs to see: verdict and reasons, the extrinsic in both directions, what to do
+    next.
 
     Parameters
     ----------
     calibration : Calibration
     steps : sequence of str
-        What to do next: sentences, and commands that are indented.
+        What to do next: sentences and commands.
     with_details : bool
-        Also how it was solved.
+        Also quaternions, and how it was solved.
     """
     parent, child = calibration.parent_frame, calibration.child_frame
     document, reach = calibration.to_dict(), calibration.out_of_reach
@@ -170,25 +202,26 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
         lines += wrapped(reason.what_to_do + (options and f": {options}"), "  -> ", "     ")
     for warning in calibration.warnings:
         lines += wrapped(f"Note: {warning}", "", "  ")
-    for source, target, key in ((child, parent, "child"), (parent, child, "parent")):
-        lines += ["", f"{source} in {target}: maps coordinates of {source} into {target}"]
-        transform = document["T_parent_child" if key == "child" else "T_child_parent"]
-        lines += transform_lines(transform, reach)
+    transforms = [
+        (child, parent, document["T_parent_child"], reach),
+        (parent, child, document["T_child_parent"], reach),
+    ]
     if calibration.T_world_world is not None:
-        worlds = f"{calibration.child_world_frame} in {calibration.parent_world_frame}"
-        lines += ["", worlds, *transform_lines(document["T_world_world"])]
+        worlds = calibration.child_world_frame, calibration.parent_world_frame
+        transforms.append((*worlds, document["T_world_world"], ()))
     if calibration.T_base_child is not None:
-        lines += ["", f"{child} in {calibration.base_frame}"]
-        lines += transform_lines(document["T_base_child"], reach)
-    if steps:
-        lines += ["", "Next", *(f"  {step}" for step in steps)]
+        transforms.append((child, calibration.base_frame, document["T_base_child"], reach))
+    for source, target, transform, out_of_reach in transforms:
+        lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
+        lines += transform_lines(transform, out_of_reach, with_details)
+    lines += ["Next", *(f"  {step}" for step in steps)] if steps else []
     if command := static_transform_command(calibration):
         by_hand = [each for each in calibration.usable_numbers().values() if isinstance(each, str)]
         condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
-        lines += ["", f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
-    details = _details(calibration) if with_details else _comparisons(calibration)
-    texts = [line for detail in details for line in wrapped(detail, "  ", "    ")]
-    lines += ["", "Details", *texts] if texts else []
+        lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
+    details = list(_details(calibration) if with_details else _comparisons(calibration))
+    lines += ["Details"] if details else []
+    lines += [line for detail in details for line in wrapped(detail, "  ", "    ")]
     return "\n".join(printable(line) for line in lines)
 
 
@@ -208,26 +241,23 @@ def next_steps(
     calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot | None"
 ) -> list[str]:
     """What to do next, in sentences and commands; empty if the result may be used."""
-    is_poor = calibration.verdict is Verdict.DO_NOT_USE
-    is_of_poses = calibration.measured == "poses"
     if calibration.verdict is Verdict.USE:
         return []
+    is_poor = calibration.verdict is Verdict.DO_NOT_USE
+    is_of_poses = calibration.measured == "poses" and snapshot is not None
     steps = []
-    if snapshot and is_of_poses and not is_poor and not calibration.status.failure:
+    if is_of_poses and not is_poor and snapshot:
         from hand_eye_calib.assessment.excitation import excitation, what_is_missing
 
         motion = what_is_missing(excitation(snapshot.pose_pairs()), calibration)
         steps += [motion] if motion else []
-    extra = [
-        typed_options([option])
-        for reason in shown(calibration.reasons)
-        for option in reason.options.items()
-    ]
+    options = [each for one in shown(calibration.reasons) for each in one.options.items()]
+    extra = [typed_options([each]) for each in options]
     if not is_poor:
         reach = calibration.out_of_reach
         hidden = [axis for axis in calibration.unobservable() if axis not in reach]
-        extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in hidden[:3]]
-        if not extra and not arguments.out and is_of_poses and snapshot:
+        extra += [f"--prior {axis}=VALUE+-SIGMA" for axis in hidden[:3]]
+        if not extra and not arguments.out and is_of_poses:
             extra = ["--out result"]  # figures that show where the disagreement comes from
     if extra:
         typed = shlex.join(arguments.typed)
@@ -236,92 +266,55 @@ def next_steps(
 
 
 def transform_lines(
-    transform: Mapping[str, Any], out_of_reach: tuple[str, ...] = ()
+    transform: Mapping[str, Any], out_of_reach: Sequence[str] = (), with_quaternion: bool = False
 ) -> Iterator[str]:
-    """A row for each number that is printed, with one standard deviation."""
-    if set(out_of_reach) & set("xyz"):
-        yield "  x, y and z are not estimated"
-    else:
-        sigmas_m = transform["sigma_translation"]
-        for name, value, sigma in zip("xyz", transform["translation"], sigmas_m, strict=True):
-            yield f"  {name:<6} {with_sigma(value, sigma, 3):>24} m"
-    if set(out_of_reach) & set(_ROTATIONS):
-        yield "  roll, pitch and yaw are not estimated"
-        return
-    names, kind = _ROTATIONS, "rpy"
-    if "rotation_vector_deg" in transform:
-        names, kind = ("rx", "ry", "rz"), "rotation_vector"
-        yield "  rotation vector: pitch is near +/-90 deg, where roll and yaw mean nothing"
-    angles, sigmas = transform[f"{kind}_deg"], transform[f"sigma_{kind}_deg"]
-    for name, value, sigma in zip(names, angles, sigmas, strict=True):
-        yield f"  {name:<6} {with_sigma(value, sigma, 2):>24} deg"
-    quaternion = transform["quat_xyzw"] or ()
-    told = " ".join(f"{name} {value:.6f}" for name, value in zip("xyzw", quaternion, strict=False))
-    yield f"  quaternion {told or 'unknown'}"
+    """A row for each axis: the translation along it and an angle, with one standard deviation."""
+    sigmas_m, sigmas_deg = transform["sigma_total_translation"], transform["sigma_total_rpy_deg"]
+    left = ["", "x, y and z are not estimated", ""]
+    if not {*out_of_reach} & {*"xyz"}:
+        rows = zip("xyz", transform["translation"], sigmas_m, strict=True)
+        left = [f"{name} {with_sigma(value, sigma, 3):>22} m" for name, value, sigma in rows]
+    right = ["", "roll, pitch and yaw are not estimated", ""]
+    if not {*out_of_reach} & {*_ROTATIONS}:
+        rows = zip(_ROTATIONS, transform["rpy_deg"], sigmas_deg, strict=True)
+        right = [f"{name:<5} {printed_angle(value, sigma):>20} deg" for name, value, sigma in rows]
+    for metres, degrees in zip(left, right, strict=True):
+        yield f"  {metres:<30}  {degrees}".rstrip()
+    if with_quaternion:
+        named = zip("xyzw", transform["quat_xyzw"] or (), strict=False)
+        told = " ".join(f"{name} {value:.6f}" for name, value in named)
+        yield f"  quaternion {told or 'unknown'}"
 
 
 # --------------------------------------------------------------------- details
 
 
 def _details(calibration: Calibration) -> Iterator[str]:
-    yield f"along and about the axes of {calibration.parent_frame}: {_observability(calibration)}"
-    yield from _floor(calibration)
-    for kind, title in _SCATTER.items() if calibration.cross_check else ():
-        told = [
-            f"{axis} {amount(axis, getattr(row, kind))}"
-            for axis, row in (calibration.cross_check or {}).items()
-            if getattr(row, kind) is not None
-        ]
-        if told:
-            yield f"{title}: {', '.join(told)}"
-    yield from _comparisons(calibration)
-    yield from _solution(calibration)
-
-
-def _observability(calibration: Calibration) -> str:
-    """Axes by verdict: ``x, y and yaw observed; z unobservable``."""
     groups: dict[str, list[str]] = {}
     for dof in calibration.observability:
-        if dof.name not in calibration.out_of_reach:
-            word = _OBSERVED.get(dof.verdict.value, dof.verdict.value)
-            groups.setdefault(word, []).append(dof.name)
-    if calibration.out_of_reach:
-        groups["out of reach"] = [*calibration.out_of_reach]
-    return "; ".join(f"{listing(names)} {words}" for words, names in groups.items())
-
-
-def _floor(calibration: Calibration) -> Iterator[str]:
-    """Errors that nothing in the recording shows."""
-    if calibration.floor is not None and np.isfinite(calibration.sigmas).any():
-        sigmas = zip(calibration.observability, calibration.sigmas_with_floor, strict=True)
-        told = [
-            f"{axes_in_words([dof.name])} {amount(dof.name, sigma)}"
-            for dof, sigma in sigmas
-            if np.isfinite(dof.sigma)
+        word = {"prior": "mostly from the prior"}.get(dof.verdict.value, dof.verdict.value)
+        word = "out of reach" if dof.name in calibration.out_of_reach else word
+        groups.setdefault(word, []).append(dof.name)
+    told = "; ".join(f"{axes_in_words(names)} {words}" for words, names in groups.items())
+    yield f"along and about the axes of {calibration.parent_frame}: {told}"
+    alone = [
+        f"{axes_in_words([dof.name])} {amount(dof.name, dof.sigma)}"
+        for dof in calibration.observability
+        if dof.name not in calibration.out_of_reach
+    ]
+    yield f"standard deviations without the common-mode uncertainty: {', '.join(alone)}"
+    for kind, title in _SCATTER.items():
+        scatter = {
+            axis: getattr(row, kind) for axis, row in (calibration.cross_check or {}).items()
+        }
+        far = [
+            f"{axes_in_words([axis])} {amount(axis, value)}"
+            for axis, value in scatter.items()
+            if value is not None
         ]
-        yield (
-            "standard deviations with constant odometry errors, which no recording shows: "
-            f"{', '.join(told)}"
-        )
-
-
-def _comparisons(calibration: Calibration) -> Iterator[str]:
-    """The recordings, the goal of the session, and the comparison with what is installed."""
-    if calibration.together:
-        yield calibration.together.sentence
-        for one in calibration.together.recordings:
-            told = f"left out, {one.left_out}" if one.left_out else one.headline
-            yield f"{one.name}: {told}"
-    if calibration.goal:
-        yield f"the session: {calibration.goal.sentence}"
-    if calibration.comparison:
-        yield (
-            f"compared with what is installed ({calibration.comparison.installed}): "
-            f"{calibration.comparison.sentence}"
-        )
-
-
-def _solution(calibration: Calibration) -> Iterator[str]:
+        if far:
+            yield f"{title}: {', '.join(far)}"
+    yield from _comparisons(calibration)
     on = f"on reference {calibration.reference}"
     if not METHODS[calibration.method].uses_reference:
         on = "on all poses"
@@ -340,3 +333,19 @@ def _solution(calibration: Calibration) -> Iterator[str]:
     yield f"time offset {given_or_estimated(*offset, 's')}; scale {given_or_estimated(*scale, '')}"
     if (rate := calibration.clock_rate) and rate.is_used:
         yield f"the child's clock is {rate}: the time offset holds at {rate.at_ns * 1e-9:.3f} s"
+
+
+def _comparisons(calibration: Calibration) -> Iterator[str]:
+    """The recordings, the goal of the session, and the comparison with what is installed."""
+    if calibration.together:
+        yield calibration.together.sentence
+        for one in calibration.together.recordings:
+            told = f"left out, {one.left_out}" if one.left_out else one.headline
+            yield f"{one.name}: {told}"
+    if calibration.goal:
+        yield f"the session: {calibration.goal.sentence}"
+    if calibration.comparison:
+        yield (
+            f"compared with what is installed ({calibration.comparison.installed}): "
+            f"{calibration.comparison.sentence}"
+        )

@@ -22,6 +22,7 @@ from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.text import names_of_files
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.bags import PoseBag, PoseBlock
@@ -212,7 +213,12 @@ def read_files(arguments: Namespace) -> tuple[dict[str, Trajectory], list[str]]:
         for index, stream in enumerate(STREAMS)
     ]
     trajectories, repairs = _read(arguments.paths, settings, [f"{each}_" for each in STREAMS])
-    return dict(zip(STREAMS, trajectories, strict=True)), repairs
+    names = names_of_files([Path(path) for path in arguments.paths])
+    named = [
+        dataclasses.replace(each, sensor_frame=each.sensor_frame or name)
+        for each, name in zip(trajectories, names, strict=True)
+    ]
+    return dict(zip(STREAMS, named, strict=True)), repairs
 
 
 def read_rig_files(arguments: Namespace) -> dict[str, Trajectory]:
@@ -347,6 +353,9 @@ def read_bags(
         expected = bag.expected(parent, child)
         shown = with_progress(chain(first, blocks), expected, f"reading {bag}", len)
         found = feed(calibrator, shown, sources) + bag.n_left_out
+        for stream, source in sources.items():
+            if not calibrator.frame(stream):
+                calibrator.set_frame(stream, str(source).strip("/"))
         with waiting_for("comparing the bags"):
             kinds = {source: measures[stream] for stream, source in sources.items()}
             refuse_recordings(bag, kinds, config.max_gap)

@@ -58,7 +58,7 @@ def _calibrate(
     from hand_eye_calib.io.rig_files import save_rig
     from hand_eye_calib.rig.calibrate import solve_rig
 
-    for name in ("installed", "urdf", "write", "base_frame"):
+    for name in ("installed", "base_frame"):
         if getattr(arguments, name):
             raise ConfigError(f"--{name.replace('_', '-')} is of two sensors, not of a rig")
     options = options_from(arguments)

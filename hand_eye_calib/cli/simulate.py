@@ -44,27 +44,14 @@ TUM format:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = _EPILOG
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        required=True,
-        help="directory to make; it must be empty or not exist",
-    )
-    parser.add_argument(
-        "--runs", type=at_least(1), default=1, metavar="N", help="number of recordings. Default: 1"
-    )
-    parser.add_argument(
-        "--seed",
-        type=at_least(0),
-        default=0,
-        help="the same seed gives the same recordings. Default: 0",
-    )
-    parser.add_argument(
-        "--bag",
-        choices=("mcap", "sqlite3", "rosbag1"),
-        help="also write a bag of every recording, in this storage format",
-    )
+    add = parser.add_argument
+    out = "directory to make; it must be empty or not exist"
+    add("--out", metavar="DIR", type=Path, required=True, help=out)
+    add("--runs", type=at_least(1), default=1, metavar="N", help="number of recordings. Default: 1")
+    seed = "the same seed gives the same recordings. Default: 0"
+    add("--seed", type=at_least(0), default=0, help=seed)
+    bag = "also write a bag of every recording, in this storage format"
+    add("--bag", choices=("mcap", "sqlite3", "rosbag1"), help=bag)
     add_json_argument(parser)
     group = parser.add_argument_group("motion")
     group.add_argument(
@@ -74,27 +61,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="published: 10 s at 0.5 m/s, both sensors at 10 Hz with equal stamps, as in the "
         "paper. hilly: two minutes at 1.5 m/s, 10 and 20 Hz, no common stamps. Default: published",
     )
-    group.add_argument(
-        "--poses",
-        type=int,
-        metavar="N",
-        help="poses of the parent sensor. Default: 100 (published), 1200 (hilly)",
-    )
-    _add_noise_arguments(parser)
-
-
-def _add_noise_arguments(parser: argparse.ArgumentParser) -> None:
+    poses = "poses of the parent sensor. Default: 100 (published), 1200 (hilly)"
+    group.add_argument("--poses", type=int, metavar="N", help=poses)
     group = parser.add_argument_group("noise")
     fields = {field.name: field for field in dataclasses.fields(NoiseConfig)}
     for option, name in _NOISE_OPTIONS.items():
-        meta = fields[name].metadata
+        meta, default = fields[name].metadata, getattr(REALISTIC, name)
         unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
-        group.add_argument(
-            f"--{option}",
-            type=float,
-            metavar=option.upper(),
-            help=f"{meta['doc']}{unit} Default: {getattr(REALISTIC, name)}.",
-        )
+        text = f"{meta['doc']}{unit} Default: {default}."
+        group.add_argument(f"--{option}", type=float, metavar=option.upper(), help=text)
     level = group.add_mutually_exclusive_group()
     level.add_argument(
         "--noise-free",

@@ -60,6 +60,12 @@ class Calibrator:
     ----------
     config : CalibratorConfig, optional
     limits : BufferLimits, optional
+
+    Examples
+    --------
+    >>> calibrator = hec.Calibrator(hec.CalibratorConfig(reference="B5"))
+    >>> calibrator.add_pose("parent", 1_700_000_000_000_000_000, [0, 0, 0], [0, 0, 0, 1])
+    True
     """
 
     def __init__(

@@ -1,32 +1,56 @@
 """Two whole trajectories in, the extrinsic out: the Python function :func:`calibrate`."""
 
+import inspect
+import textwrap
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import fields, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeAlias, cast
+
+import numpy as np
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import OtherAnswers, compare_answers
 from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import CrossCheck
-from hand_eye_calib.text import AXIS_UNITS, Prior
+from hand_eye_calib.text import AXIS_UNITS, Prior, names_of_files
+from hand_eye_calib.upstairs import upstairs
 
 # Pose pairs that are used unless an option says otherwise: the noise model takes 8 kB for each, and
 # hours at ten a second hold as many.
 _MOST_PAIRS = 100_000
 
 
+class Table(Protocol):
+    """``pandas.DataFrame``, or another table with named columns."""
+
+    columns: Any
+
+
+#: A trajectory, or what :func:`hand_eye_calib.read_trajectory` makes one of: a path, rows, a table.
+TrajectoryLike: TypeAlias = Trajectory | str | PathLike[str] | np.ndarray | Table
+MethodName: TypeAlias = Literal[
+    "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive"
+]
+_Measures: TypeAlias = Literal["auto", "poses", "positions", "rotations", "rates"]
+_Invert: TypeAlias = Literal["none", "poses", "orientations"]
+_Kind: TypeAlias = Literal["odometry", "exact"]
+_Order: TypeAlias = Literal["xyzw", "wxyz"]
+
+
 def calibrate(
-    parent: Trajectory,
-    child: Trajectory,
+    parent: TrajectoryLike,
+    child: TrajectoryLike,
     *,
-    method: str | None = None,
+    method: MethodName | None = None,
     reference: str | None = None,
-    backend: str | None = None,
+    backend: Literal["fast", "ipopt"] | None = None,
     threshold: float | None = None,
     min_inlier_fraction: float | None = None,
     min_pairs: int | None = None,
@@ -35,17 +59,17 @@ def calibrate(
     keyframe_min_rotation: float | None = None,
     keyframe_min_interval: float | None = None,
     max_gap: float | None = None,
-    time_offset: float | str | None = None,
-    scale: float | str | None = None,
+    time_offset: float | Literal["estimate"] | None = None,
+    scale: float | Literal["none", "auto", "estimate"] | None = None,
     parent_scale: float | None = None,
-    parent_measures: str | None = None,
-    child_measures: str | None = None,
-    parent_invert: str | None = None,
-    child_invert: str | None = None,
-    parent_quaternion: str | None = None,
-    child_quaternion: str | None = None,
-    parent_kind: str | None = None,
-    child_kind: str | None = None,
+    parent_measures: _Measures | None = None,
+    child_measures: _Measures | None = None,
+    parent_invert: _Invert | None = None,
+    child_invert: _Invert | None = None,
+    parent_quaternion: _Order | None = None,
+    child_quaternion: _Order | None = None,
+    parent_kind: _Kind | None = None,
+    child_kind: _Kind | None = None,
     prior: Prior | None = None,
     target_translation: float | None = None,
     target_rotation: float | None = None,
@@ -57,21 +81,18 @@ def calibrate(
 ) -> Calibration:
     """Estimate the pose of the child sensor in the parent sensor's frame from two trajectories.
 
-    Each keyword is the option of :class:`~hand_eye_calib.config.CalibratorConfig` of that name,
-    which has its meaning, unit, range and default; None stands for the default. All pose pairs are
-    used, up to 100,000, unless ``max_pairs`` is given. The streams are checked, too: if a check is
-    certain of the time offset or of the scale, and it was not given, it is estimated, and a warning
-    says so.
+    All pose pairs are used, up to 100,000, unless ``max_pairs`` is given. The streams are checked,
+    too: what a check is sure of, such as a clock offset, a unit or inverse poses, is used if it was
+    not given, and a warning says so.
 
     Parameters
     ----------
-    parent, child : Trajectory
-        Poses of each sensor in its own world. One of them may be positions
-        (:meth:`Trajectory.from_positions`): the result is the lever arm. Either may be rotations or
-        angular rates (:meth:`Trajectory.from_rates`): the result is the rotation, with the bias of
-        the rates.
-    parent_measures, child_measures : str, optional
-        What counts of a trajectory of poses: "positions" or "rotations" alone.
+    parent, child : Trajectory, path, array or DataFrame
+        Poses of each sensor in its own world, m; what is no Trajectory is read as
+        :func:`hand_eye_calib.read_trajectory` does, and sensors are named after their files. One
+        of them may be positions (:meth:`Trajectory.from_positions`): the result is the lever arm.
+        Either may be rotations or angular rates (:meth:`Trajectory.from_rates`): the result is the
+        rotation, with the bias of the rates.
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.text.Prior`.
@@ -81,34 +102,67 @@ def calibrate(
         a reference is given, which leaves that out otherwise.
     progress : callable, optional
         Called with the share that is done, 0 to 1, and the step that begins.
+    OPTIONS
 
     Raises
     ------
     ConfigError
         If an option has a value that is not allowed.
     InputError
-        If an argument is no Trajectory or both are of one sensor frame.
+        If an argument is no trajectory or both are of one sensor frame.
     NotEnoughDataError
         If too few poses can be paired.
+
+    Examples
+    --------
+    >>> result = hec.calibrate("lidar.tum", "camera.tum", prior={"z": (0.5, 0.05)})
+    >>> result.parent_frame, result.child_frame
+    ('lidar', 'camera')
     """
     options = dict(locals())
-    _require_trajectories(parent, child)
     for name in ("parent", "child", "prior", "checks", "progress"):
         del options[name]
     options = {name: value for name, value in options.items() if value is not None}
-    options = _of_streams(parent, child) | options | prior_fields(prior or {})
-    config = CalibratorConfig(**options)
-    snapshot = whole_snapshot(config, parent, child)
-    return run(snapshot, checks=checks, progress=progress).calibration
+    first, second = _as_trajectories(parent, child)
+    options = _of_streams(first, second) | options | prior_fields(prior or {})
+    snapshot = whole_snapshot(CalibratorConfig(**options), first, second)
+    found = run(snapshot, checks=checks, progress=progress)
+    return replace(found.calibration, recording=found.snapshot)
 
 
-def _require_trajectories(parent: object, child: object) -> None:
-    for name, given in (("parent", parent), ("child", child)):
-        if not isinstance(given, Trajectory):
-            raise InputError(
-                f"{name} must be a Trajectory; found {type(given).__name__}: build one with "
-                "hec.Trajectory(stamps_ns, poses) or hec.read_trajectory(path)"
-            )
+def _options_in_words() -> str:
+    """The options of :func:`calibrate` for its docstring, from where they are declared."""
+    names, lines = inspect.signature(calibrate).parameters, []
+    for field in fields(CalibratorConfig):
+        if field.name in names:
+            meta, default = field.metadata, repr(field.default) if field.default != "" else "none"
+            unit = f" {meta['unit']}" if meta["unit"] else ""
+            kind = " or ".join(map(repr, meta["choices"] or ())) or type(field.default).__name__
+            lines += [f"{field.name} : {kind}, optional"]
+            lines += textwrap.wrap(f"{meta['doc']} Default: {default}{unit}.", 92)
+    return "\n    ".join(f"{'' if ' : ' in line else '    '}{line}" for line in lines)
+
+
+if calibrate.__doc__:  # not with python -OO
+    calibrate.__doc__ = calibrate.__doc__.replace("OPTIONS", _options_in_words())
+
+
+def _as_trajectories(*given: object) -> list[Trajectory]:
+    """Trajectories from what :data:`TrajectoryLike` names."""
+    read = [each if isinstance(each, Trajectory) else _read(each) for each in given]
+    if not all(isinstance(each, str | PathLike) for each in given):
+        return read
+    names = names_of_files([Path(str(each)) for each in given])
+    return [
+        replace(each, sensor_frame=each.sensor_frame or name)
+        for each, name in zip(read, names, strict=True)
+    ]
+
+
+def _read(source: object) -> Trajectory:
+    is_path = isinstance(source, str | PathLike)
+    read = upstairs("io.trajectory_files.reading", "read_trajectory")
+    return cast(Trajectory, read(source, "auto") if is_path else read(source))
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:
@@ -203,6 +257,12 @@ def cross_check(
         If a stream is not one of poses.
     NotEnoughDataError
         If too few poses can be paired.
+
+    Examples
+    --------
+    >>> scatter = hec.cross_check(result, parent, child)
+    >>> list(scatter)
+    ['x', 'y', 'z', 'roll', 'pitch', 'yaw']
     """
     config = config or offline_config(parent, child, {"method": calibration.method})
     config.require_poses("a cross-check")

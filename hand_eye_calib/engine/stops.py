@@ -59,6 +59,12 @@ def calibrate_stops(
     ------
     NotEnoughDataError
         If there are fewer than three stops.
+
+    Examples
+    --------
+    >>> hand, camera = parent.at(child.stamps_ns[10:800:20]), child[10:800:20]
+    >>> hec.calibrate_stops(hand, camera.poses).T_world_world.shape
+    (4, 4)
     """
     config = config or CalibratorConfig()
     fit = solve(Stops.of_one(Ts_world_parent, Ts_world_child))
@@ -92,6 +98,12 @@ def calibrate_arm(
     Calibration
         The camera in the hand, and the target in the base; or the camera in the base, and the
         target in the hand.
+
+    Examples
+    --------
+    >>> samples = hec.read_arm_samples("samples.yaml")
+    >>> hec.calibrate_arm(samples.robot, samples.tracking).n_poses
+    40
     """
     named = {name: name for name in ("base", "hand", "camera", "target")} | dict(names or {})
     Ts_target_camera = se3.inverse(tracking)

@@ -7,9 +7,6 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 
-ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
-ROTATION_VECTOR = ("rx", "ry", "rz")
-
 # Standard deviations above this (rad) count as unknown: the derivative does not hold that far.
 _UNKNOWN_ANGLE = 0.3
 
@@ -54,48 +51,6 @@ class Extrinsic:
         """(6, 6) array: covariance of the errors along and about the axes of the parent's frame."""
         to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
         return np.asarray(to_parent @ self.covariance @ to_parent.T)
-
-
-@dataclass(frozen=True)
-class PrintedRotation:
-    """A rotation as three printed values, each with its standard deviation.
-
-    Attributes
-    ----------
-    names : tuple of str
-        roll, pitch and yaw about fixed axes; near gimbal lock rx, ry and rz of the rotation vector.
-    values, sigmas : (3,) arrays
-        rad; the standard deviation is infinite for what is unknown.
-    is_near_gimbal_lock : bool
-    """
-
-    names: tuple[str, str, str]
-    values: FloatArray
-    sigmas: FloatArray
-    is_near_gimbal_lock: bool
-
-
-def printed_rotation(T_target_source: FloatArray, covariance: FloatArray) -> PrintedRotation:
-    """The rotation of a transform as it is printed, with standard deviations.
-
-    Parameters
-    ----------
-    T_target_source : (4, 4) array
-    covariance : (6, 6) array
-        Of xi = (rho, phi) in ``T_target_source @ exp(xi)``, m and rad.
-
-    Returns
-    -------
-    PrintedRotation
-        The rotation vector near gimbal lock, otherwise roll, pitch and yaw.
-    """
-    rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
-    if is_near_gimbal_lock(rotation, covariance):
-        vector = se3.rotation_log(rotation)
-        sigmas = _sigmas(_vector_jacobian(vector), covariance)
-        return PrintedRotation(ROTATION_VECTOR, vector, sigmas, True)
-    rpy = se3.rotation_to_rpy(rotation)
-    return PrintedRotation(ROLL_PITCH_YAW, rpy, sigmas_rpy(T_target_source, covariance), False)
 
 
 def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -181,13 +136,3 @@ def _rpy_jacobian(roll: float, pitch: float) -> FloatArray:
             [0.0, sine / np.cos(pitch), cosine / np.cos(pitch)],
         ]
     )
-
-
-def _vector_jacobian(vector: FloatArray) -> FloatArray:
-    """Derivative (3, 3) of the rotation vector with respect to phi in ``exp(vector) exp(phi)``: the
-    inverse of the right Jacobian of SO(3).
-    """
-    angle = float(np.linalg.norm(vector))
-    cross = se3.skew(vector)
-    factor = 1 / 12 if angle < 1e-4 else (1 - angle / 2 / np.tan(angle / 2)) / angle**2
-    return np.eye(3) + cross / 2 + factor * cross @ cross

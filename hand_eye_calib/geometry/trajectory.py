@@ -104,6 +104,12 @@ class Trajectory:
     ------
     InputError
         If shapes, stamps or poses are unusable; the message names the first such pose.
+
+    Examples
+    --------
+    >>> stamps_ns = np.array([0, 100_000_000])
+    >>> hec.Trajectory(stamps_ns, np.repeat(np.eye(4)[None], 2, axis=0), "lidar")
+    Trajectory(2 poses over 0.100 s, sensor_frame='lidar')
     """
 
     stamps_ns: IntArray

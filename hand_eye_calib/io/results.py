@@ -53,6 +53,11 @@ def save_result(
     ------
     InputError
         If they cannot be written.
+
+    Examples
+    --------
+    >>> hec.save(result, "saved")
+    PosixPath('saved/extrinsic.yaml')
     """
     document = calibration.to_dict() | {"provenance": provenance(inputs or {})}
     texts = {FILE_NAME: yaml_text(document)}
@@ -140,6 +145,12 @@ def load_result(path: str | Path) -> Calibration:
     ------
     InputError
         If it cannot be read, is no calibration or is of an unknown version.
+
+    Examples
+    --------
+    >>> path = hec.save(result, "saved")
+    >>> hec.load(path) == result
+    True
     """
     path = Path(path)
     if path.is_dir():

@@ -74,6 +74,11 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     ------
     InputError
         If the file cannot be read or has no samples; one line that names the file.
+
+    Examples
+    --------
+    >>> hec.read_arm_samples("samples.yaml").robot.shape
+    (40, 4, 4)
     """
     path = Path(path)
     if path.suffix == ".npz":

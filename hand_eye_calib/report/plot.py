@@ -51,6 +51,10 @@ def plot(calibration: Calibration) -> Figure:
     -------
     matplotlib.figure.Figure
         Notebooks show it; ``savefig`` writes it to a file.
+
+    Examples
+    --------
+    >>> hec.plot(result).savefig("result.png")
     """
     with page_style(figure_facecolor="white", savefig_facecolor="white"):
         figure = ShownFigure(figsize=(WIDTH, 3.3), layout="constrained")

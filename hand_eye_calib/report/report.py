@@ -33,6 +33,7 @@ from hand_eye_calib.text import (
     in_words,
     length,
     listing,
+    printed_angle,
     with_sigma,
 )
 
@@ -204,25 +205,22 @@ def _reason(reason: Reason) -> dict[str, str]:
 
 def _direction(transform: Plain, unknown: set[str]) -> dict[str, Any]:
     """A transform as rows: each printed number with its standard deviation."""
-    is_locked = "rotation_vector_deg" in transform
-    kind = "rotation_vector" if is_locked else "rpy"
-    turned = ("rx", "ry", "rz") if is_locked else ROTATIONS
     rows = []
-    for axes, names, values, sigmas, unit, decimals in (
-        (TRANSLATIONS, "xyz", "translation", "sigma_translation", " m", 3),
-        (ROTATIONS, turned, f"{kind}_deg", f"sigma_{kind}_deg", "°", 2),
+    for axes, names, values, sigmas, unit in (
+        (TRANSLATIONS, "xyz", "translation", "sigma_total_translation", " m"),
+        (ROTATIONS, ROTATIONS, "rpy_deg", "sigma_total_rpy_deg", "°"),
     ):
         if unknown & {*axes}:
             rows.append({"name": ", ".join(axes), "value": "not shown by these streams"})
             continue
         for name, value, sigma in zip(names, transform[values], transform[sigmas], strict=True):
-            text = with_sigma(value, sigma, decimals).replace("+/-", "±")
+            text = with_sigma(value, sigma, 3) if unit == " m" else printed_angle(value, sigma)
+            text = text.replace("+/-", "±")
             rows.append({"name": name, "value": text + (text != "unknown") * unit})
     return {
         "maps": printable(transform["maps"]),
         "rows": rows,
         "quat_xyzw": transform["quat_xyzw"],
-        "is_locked": is_locked,
     }
 
 

@@ -1,9 +1,10 @@
 """The result of a calibration: the extrinsic, its covariance, and what to know before using it."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, cast, get_type_hints
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
@@ -12,18 +13,17 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import (
     inverse_covariance,
-    is_near_gimbal_lock,
-    printed_rotation,
     sigmas_rpy,
     sigmas_translation,
 )
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.plain import from_plain, plain
-from hand_eye_calib.results.document import check_values, covariance_of, transform_of
+from hand_eye_calib.plain import plain
+from hand_eye_calib.results.document import MATRICES, NOT_IN_FILES, values_of
 from hand_eye_calib.results.finding import Finding
 from hand_eye_calib.results.records import Residuals
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import (
+    AXES,
     ROTATIONS,
     TRANSLATIONS,
     DofObservability,
@@ -33,6 +33,7 @@ from hand_eye_calib.results.status import (
 )
 from hand_eye_calib.results.tables import data_frame, html_table
 from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
+from hand_eye_calib.upstairs import upstairs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,32 +53,49 @@ __all__ = [
 _FORMAT = "hand_eye_calib/extrinsic"
 _VERSION = 1
 
-# Fields that a document has under other names, as matrices; and those that files do not have.
-_MATRICES = (
-    "T_parent_child",
-    "T_method",
-    "covariance",
-    "floor",
-    "T_base_parent",
-    "T_world_world",
-    "cov_world_world",
-)
-_NOT_IN_FILES = ("motion_residuals", "model")
-
 # An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
 _SHARED = 0.02
+
+# What has a direction and is left out when both sensors change their roles.
+_OF_THIS_DIRECTION = (
+    "cross_check",
+    "comparison",
+    "motion_residuals",
+    "model",
+    "recording",
+    "T_base_parent",
+)
 
 # With a direction unobservable, a larger standard deviation (m) of the inverse comes from that.
 _UNKNOWN_M = 0.9
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration(Result):
     """An extrinsic with its quality: the values of
     :class:`~hand_eye_calib.results.result.Result`, and what follows from them.
 
-    :attr:`verdict` says whether it may be used, and :attr:`reasons` why not.
+    :attr:`verdict` says whether it may be used, and :attr:`reasons` why not. Two are equal if their
+    documents are.
+
+    Examples
+    --------
+    >>> result.verdict.value
+    'USE'
+    >>> result.translation.round(2), result.rotation.as_quat().shape  # m; SciPy's Rotation
+    (array([ 0.11, -0.29,  0.48]), (4,))
+    >>> result.inverse().parent_frame, result == hec.Calibration.from_dict(result.to_dict())
+    ('camera', True)
+    >>> result.save("saved"), result.report("saved/report.html")
+    (PosixPath('saved/extrinsic.yaml'), PosixPath('saved/report.html'))
     """
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Calibration):
+            return NotImplemented
+        return self is other or self.to_dict() == other.to_dict()
+
+    __hash__ = object.__hash__
 
     def __repr__(self) -> str:
         frames = f"{self.child_frame} in {self.parent_frame}"
@@ -133,6 +151,65 @@ class Calibration(Result):
                 self.observability, self._printed(), sigmas, 3 * ["m"] + 3 * ["rad"], strict=True
             )
         }
+
+    def inverse(self) -> "Calibration":
+        """The result with the roles of both sensors exchanged: the pose of the parent sensor in the
+        child sensor's frame. What was compared with it is left out.
+        """
+        to_child = np.kron(np.eye(2), self.T_child_parent[:3, :3])
+        covariance, floor = (
+            inverse_covariance(self.T_parent_child, each) for each in (self.covariance, self._floor)
+        )
+        variances = np.diag(to_child @ covariance @ to_child.T)
+        sigmas = np.sqrt(np.maximum(variances, 0.0))
+        unknown = bool(self.unobservable()) & (sigmas > _UNKNOWN_M)
+        axes = tuple(
+            DofObservability(name, DofVerdict.UNOBSERVABLE, np.inf)
+            if is_unknown
+            else DofObservability(name, DofVerdict.OBSERVED, float(sigma))
+            for name, sigma, is_unknown in zip(AXES, sigmas, unknown, strict=True)
+        )
+        worlds: dict[str, Any] = {}
+        if self.T_world_world is not None and self.cov_world_world is not None:
+            worlds = {
+                "T_world_world": se3.inverse(self.T_world_world),
+                "cov_world_world": inverse_covariance(self.T_world_world, self.cov_world_world),
+            }
+        exchanged: dict[str, Any] = {
+            "T_parent_child": self.T_child_parent,
+            "T_method": None if self.T_method is None else se3.inverse(self.T_method),
+            "covariance": covariance,
+            "floor": None if self.floor is None else floor,
+            "observability": axes,
+            "parent_frame": self.child_frame,
+            "child_frame": self.parent_frame,
+            "parent_world_frame": self.child_world_frame,
+            "child_world_frame": self.parent_world_frame,
+            "time_offset_s": 0.0 - self.time_offset_s,
+            "scale": 1.0 / self.scale,
+            "scale_sigma": self.scale_sigma / self.scale**2,
+        }
+        left_out: dict[str, Any] = dict.fromkeys(_OF_THIS_DIRECTION)
+        return replace(self, **exchanged, **worlds, **left_out)
+
+    def save(self, directory: str | Path) -> Path:
+        """Write ``extrinsic.yaml`` and the files for robots; see :func:`hand_eye_calib.save`."""
+        return cast(Path, upstairs("io.results", "save_result")(self, directory))
+
+    def plot(self) -> Any:
+        """Draw the result: a figure of Matplotlib; see :func:`hand_eye_calib.plot`."""
+        return upstairs("report.plot", "plot")(self)
+
+    def report(self, path: str | Path) -> Path:
+        """Cross-check the result with other methods and both halves of its recording, and write the
+        report as one HTML file; a directory gets ``report.html``.
+
+        Raises
+        ------
+        InputError
+            If the result was read from a file, which has no poses.
+        """
+        return cast(Path, upstairs("report.of_result", "write_report")(self, Path(path)))
 
     def child_as_parent(self, child: Trajectory) -> Trajectory:
         """The trajectory that the parent sensor has according to the child's: with the time offset
@@ -283,7 +360,8 @@ class Calibration(Result):
                 "matrix": self.covariance,
             },
             "observability": [
-                vars(dof) | {"frame": self.parent_frame} for dof in self.observability
+                vars(dof) | {"sigma_total": total, "frame": self.parent_frame}
+                for dof, total in zip(self.observability, self.sigmas_with_floor, strict=True)
             ],
         }
         if self.T_base_child is not None:
@@ -301,6 +379,7 @@ class Calibration(Result):
                 self.child_world_frame,
                 np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m),
                 self.cov_world_world,
+                np.zeros((6, 6)),
             )
             document["cov_world_world"] = {
                 "of": "error xi in T_world_world @ exp(xi)",
@@ -321,30 +400,31 @@ class Calibration(Result):
         document |= {
             name: getattr(self, name)
             for name in self.__dataclass_fields__
-            if name not in (*_MATRICES, *_NOT_IN_FILES, *document)
+            if name not in (*MATRICES, *NOT_IN_FILES, *document)
         }
         return cast(dict[str, Any], plain(document))
 
     def _transform_dict(self) -> dict[str, Any]:
         frames = self.parent_frame, self.child_frame
-        return self._printed_dict(self.T_parent_child, *frames, self.sigmas[:3], self.covariance)
+        return self._printed_dict(self.T_parent_child, *frames, self.sigmas[:3])
 
     def _base_dict(self, T_base_child: FloatArray) -> dict[str, Any]:
         sigmas_m = sigmas_translation(T_base_child, self.covariance)
         if self.unobservable():
             sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
-        frames = self.base_frame, self.child_frame
-        return self._printed_dict(T_base_child, *frames, sigmas_m, self.covariance)
+        return self._printed_dict(T_base_child, self.base_frame, self.child_frame, sigmas_m)
 
     def _inverse_dict(self) -> dict[str, Any]:
-        covariance = inverse_covariance(self.T_parent_child, self.covariance)
+        covariance, floor = (
+            inverse_covariance(self.T_parent_child, each) for each in (self.covariance, self._floor)
+        )
         sigmas_m = sigmas_translation(self.T_child_parent, covariance)
         if {*ROTATIONS} <= {*self.out_of_reach}:
             sigmas_m = self.sigmas[:3]  # the axes of both sensors are the same by convention
         elif self.unobservable():
             sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
         frames = self.child_frame, self.parent_frame
-        return self._printed_dict(self.T_child_parent, *frames, sigmas_m, covariance)
+        return self._printed_dict(self.T_child_parent, *frames, sigmas_m, covariance, floor)
 
     def _printed_dict(
         self,
@@ -352,33 +432,32 @@ class Calibration(Result):
         target: str,
         source: str,
         sigmas_m: FloatArray,
-        covariance: FloatArray,
+        covariance: FloatArray | None = None,
+        floor: FloatArray | None = None,
     ) -> dict[str, Any]:
         """A transform in the notations people and programs use, with the standard deviation of each
-        number that is printed; infinite, and no number, for what is unknown.
+        number that is printed, without and with the common-mode uncertainty; infinite, and no
+        number, for what is unknown. Covariances are the result's unless others are given.
         """
-        rotation = T_target_source[:3, :3]
+        covariance = self.covariance if covariance is None else covariance
+        floor = self._floor if floor is None else floor
         is_turn_known = not {*ROTATIONS} & {*self.unobservable()}
-        rpy, sigmas = se3.rotation_to_rpy(rotation), sigmas_rpy(T_target_source, covariance)
+        rpy = se3.rotation_to_rpy(T_target_source[:3, :3])
+        sigmas, of_floor = (sigmas_rpy(T_target_source, each) for each in (covariance, floor))
         # Near gimbal lock roll and yaw have no standard deviation and are known.
         known = np.isfinite(sigmas) | is_turn_known
-        document: dict[str, Any] = {
+        total_m = np.hypot(sigmas_m, sigmas_translation(T_target_source, floor))
+        return {
             "maps": f"coordinates of {source} into {target}",
             "translation": np.where(np.isfinite(sigmas_m), T_target_source[:3, 3], np.nan),
             "sigma_translation": sigmas_m,
+            "sigma_total_translation": total_m,
             "quat_xyzw": se3.to_quat_xyzw(T_target_source) if is_turn_known else None,
             "rpy_deg": np.degrees(np.where(known, rpy, np.nan)),
             "sigma_rpy_deg": np.degrees(sigmas),
+            "sigma_total_rpy_deg": np.degrees(np.hypot(sigmas, of_floor)),
             "matrix": T_target_source,
         }
-        if is_near_gimbal_lock(rotation, covariance):
-            # Roll and yaw have no meaning of their own here.
-            printed = printed_rotation(T_target_source, covariance)
-            known = np.isfinite(printed.sigmas) | is_turn_known
-            vector = np.where(known, printed.values, np.nan)
-            document["rotation_vector_deg"] = np.degrees(vector)
-            document["sigma_rotation_vector_deg"] = np.degrees(printed.sigmas)
-        return document
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -400,39 +479,10 @@ class Calibration(Result):
         # Version 0.1 had another name for it.
         data = {"cross_check": data.get("consistency")} | dict(data)
         try:
-            return cls(**_values(cls, data))
+            return cls(**values_of(cls, data))
         except KeyError as error:
             raise InputError(f"the calibration has no {error}: restore or repeat it") from None
         except (TypeError, ValueError) as error:
             raise InputError(
                 f"the calibration was changed after it was written: {error}; restore or repeat it"
             ) from None
-
-
-def _values(of: type[Calibration], data: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a calibration from its document."""
-    values = {
-        "T_parent_child": transform_of(data["T_parent_child"]),
-        "covariance": covariance_of(data["covariance"]),
-    }
-    if "T_method" in data:
-        values["T_method"] = transform_of(data["T_method"])
-    if "T_world_world" in data:
-        values["T_world_world"] = transform_of(data["T_world_world"])
-        values["cov_world_world"] = covariance_of(data["cov_world_world"])
-    if "floor" in data:
-        values["floor"] = covariance_of(data["floor"], is_known=True)
-    if "T_base_child" in data:
-        T_child_parent = se3.inverse(values["T_parent_child"])
-        values["T_base_parent"] = transform_of(data["T_base_child"]) @ T_child_parent
-    hints = get_type_hints(of)
-    for name, each in of.__dataclass_fields__.items():
-        if name in data and name not in (*_MATRICES, *_NOT_IN_FILES):
-            try:
-                values[name] = from_plain(hints[name], data[name])
-            except TypeError as error:
-                raise TypeError(f"{name}: {error}") from None
-        elif name not in values and each.default is each.default_factory is MISSING:
-            raise KeyError(name)
-    check_values(values)
-    return values

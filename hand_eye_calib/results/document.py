@@ -6,21 +6,64 @@ in words.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import MISSING
+from typing import Any, get_type_hints
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import from_plain
 from hand_eye_calib.results.status import AXES
 
+# Fields that a document has under other names, as matrices; and those that files do not have.
+MATRICES = (
+    "T_parent_child",
+    "T_method",
+    "covariance",
+    "floor",
+    "T_base_parent",
+    "T_world_world",
+    "cov_world_world",
+)
+NOT_IN_FILES = ("motion_residuals", "model", "recording")
+
 # No standard deviation of a result is as large (m, rad).
 _LARGEST_SIGMA = 1e4
 
 
-def check_values(values: Mapping[str, Any]) -> None:
+def values_of(of: type[Any], data: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a calibration from its document."""
+    values = {
+        "T_parent_child": _transform_of(data["T_parent_child"]),
+        "covariance": _covariance_of(data["covariance"]),
+    }
+    if "T_method" in data:
+        values["T_method"] = _transform_of(data["T_method"])
+    if "T_world_world" in data:
+        values["T_world_world"] = _transform_of(data["T_world_world"])
+        values["cov_world_world"] = _covariance_of(data["cov_world_world"])
+    if "floor" in data:
+        values["floor"] = _covariance_of(data["floor"], is_known=True)
+    if "T_base_child" in data:
+        T_child_parent = se3.inverse(values["T_parent_child"])
+        values["T_base_parent"] = _transform_of(data["T_base_child"]) @ T_child_parent
+    hints = get_type_hints(of)
+    for name, each in of.__dataclass_fields__.items():
+        if name in data and name not in (*MATRICES, *NOT_IN_FILES):
+            try:
+                values[name] = from_plain(hints[name], data[name])
+            except TypeError as error:
+                raise TypeError(f"{name}: {error}") from None
+        elif name not in values and each.default is each.default_factory is MISSING:
+            raise KeyError(name)
+    _check_values(values)
+    return values
+
+
+def _check_values(values: Mapping[str, Any]) -> None:
     """Refuse fields of a calibration that cannot belong to one."""
     if tuple(dof.name for dof in values["observability"]) != AXES:
         raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
@@ -31,7 +74,7 @@ def check_values(values: Mapping[str, Any]) -> None:
         raise ValueError(f"method {values['method']} is not known")
 
 
-def transform_of(data: Mapping[str, Any]) -> FloatArray:
+def _transform_of(data: Mapping[str, Any]) -> FloatArray:
     """Transform (4, 4) of a document."""
     matrix = _matrix(data, 4)
     rotation = matrix[:3, :3]
@@ -41,7 +84,7 @@ def transform_of(data: Mapping[str, Any]) -> FloatArray:
     return matrix
 
 
-def covariance_of(data: Mapping[str, Any], is_known: bool = False) -> FloatArray:
+def _covariance_of(data: Mapping[str, Any], is_known: bool = False) -> FloatArray:
     """Covariance (6, 6) of a document; infinite for what is unknown, unless all is known."""
     matrix = _matrix(data, 6)
     known = np.isfinite(matrix)

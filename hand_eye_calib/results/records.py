@@ -33,6 +33,12 @@ class Residuals:
         Weights of the pairs in the solution, 0 to 1.
     start_ns, end_ns : (K,) int64 arrays
         Stamps of both ends of each pair, parent clock.
+
+    Examples
+    --------
+    >>> residuals = result.residuals()
+    >>> residuals.translation.shape == (len(residuals), 3)
+    True
     """
 
     translation: FloatArray

@@ -111,6 +111,8 @@ class Result:
         What a person should know before using the result.
     model : object
         The adaptive estimator's solution, for the stream checks. Not part of files.
+    recording : object
+        The poses and options that gave it, for :meth:`Calibration.report`. Not part of files.
 
     Context
 
@@ -170,6 +172,7 @@ class Result:
     cross_check: CrossCheck | None = None
     warnings: tuple[str, ...] = ()
     model: object = field(default=None, repr=False, compare=False)
+    recording: object = field(default=None, repr=False, compare=False)
 
     parent_frame: str = "parent"
     child_frame: str = "child"
@@ -242,17 +245,19 @@ class Result:
     @property
     def covariance_with_floor(self) -> FloatArray:
         """(6, 6) array: covariance and common-mode uncertainty together."""
-        return self.covariance + (np.zeros((6, 6)) if self.floor is None else self.floor)
+        return self.covariance + self._floor
+
+    @property
+    def _floor(self) -> FloatArray:
+        return np.zeros((6, 6)) if self.floor is None else self.floor
 
     @property
     def sigmas_of_floor(self) -> FloatArray:
         """(6,) array: common-mode standard deviations along (m) and about (rad) the axes of the
         parent sensor's frame.
         """
-        if self.floor is None:
-            return np.zeros(6)
         to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
-        variances = np.diag(to_parent @ self.floor @ to_parent.T)
+        variances = np.diag(to_parent @ self._floor @ to_parent.T)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
     @property

@@ -12,6 +12,11 @@ class SolveStatus(str, Enum):
 
     Of an UNOBSERVABLE one the other directions may be used. NOT_CONVERGED and CONTRADICTED (a prior
     contradicts the motion) are failures.
+
+    Examples
+    --------
+    >>> result.status is hec.SolveStatus.OK
+    True
     """
 
     OK = "ok"

@@ -18,7 +18,13 @@ from hand_eye_calib.text import amount, axes_in_words, listing
 
 
 class Verdict(str, Enum):
-    """Whether a result may be used."""
+    """Whether a result may be used.
+
+    Examples
+    --------
+    >>> result.verdict is hec.Verdict.USE
+    True
+    """
 
     USE = "USE"
     USE_WITH_CARE = "USE WITH CARE"
@@ -44,6 +50,12 @@ class Reason:
         x, y, z, roll, pitch, yaw; empty if it is about the whole result.
     options : mapping
         Options that mend it, by their public names.
+
+    Examples
+    --------
+    >>> strict = hec.calibrate(parent, child, target_translation=1e-5, checks=False)
+    >>> [reason.rule for reason in strict.reasons]
+    ['target']
     """
 
     rule: str

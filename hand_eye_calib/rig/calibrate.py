@@ -60,6 +60,12 @@ def calibrate_rig(
         If there are fewer than three trajectories.
     NotEnoughDataError
         If too few instants have poses of two sensors.
+
+    Examples
+    --------
+    >>> rig = hec.calibrate_rig({"lidar": parent, "camera": child, "rear": other})
+    >>> len(rig.calibrations)
+    2
     """
     options = {
         "method": method,

@@ -83,6 +83,12 @@ class RigCalibration:
         Of every sensor from the third one on in the frame of the one before it: S - 2.
     closures : tuple of Closure
         Of answers for two sensors at a time: the first and two neighbours in the list each.
+
+    Examples
+    --------
+    >>> sensors = {"lidar": parent, "camera": child, "rear": other}
+    >>> hec.calibrate_rig(sensors).sensors
+    ('lidar', 'camera', 'rear')
     """
 
     sensors: tuple[str, ...]

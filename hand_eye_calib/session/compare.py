@@ -119,6 +119,11 @@ def compare(
     ------
     InputError
         If there is nothing to compare, or the results are of different frames.
+
+    Examples
+    --------
+    >>> hec.compare([result], installed=result).verdict.value
+    'same'
     """
     called = list(names) if names else [f"result {i}" for i in range(1, len(results) + 1)]
     if len(called) != len(results) or len(set(called)) != len(called):

@@ -53,7 +53,7 @@ def calibrate_together(
 
     Parameters
     ----------
-    recordings : iterable of (Trajectory, Trajectory)
+    recordings : iterable of (Trajectory, Trajectory), or of what can be read as one
         Poses of parent and child in each.
     names : sequence of str, optional
         What to call the recordings; numbered by default.
@@ -71,6 +71,12 @@ def calibrate_together(
         If no recording can be used, or they are of different frames.
     HandEyeCalibError
         As ``calibrate`` does, with the name of the recording.
+
+    Examples
+    --------
+    >>> found = hec.calibrate_together([(parent[:300], child), (parent[300:], child)])
+    >>> len(found.together.recordings)
+    2
     """
     results: dict[str, Calibration] = {}
     for name, (parent, child) in zip(_named(names), recordings, strict=False):
@@ -107,6 +113,12 @@ def calibrate_many(
     ------
     MissingDependencyError
         Without pandas.
+
+    Examples
+    --------
+    >>> table = hec.calibrate_many([(parent, child)], ["monday"], checks=False)
+    >>> "headline" in table.columns
+    True
     """
     work = partial(_row_of_pair, options=options)
     if jobs == 1:
@@ -136,6 +148,7 @@ def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
     """The row of a result, from what its ``to_dict`` gave; what is not known is None."""
     transform = calibration["T_parent_child"]
     row: dict[str, Any] = {name: calibration[name] for name in TAKEN[:5]}
+    row["verdict"] = str(calibration["verdict"]).replace("_", " ")
     for names, values, sigmas, unit in (
         (_LENGTHS, transform["translation"], transform["sigma_translation"], "m"),
         (_ANGLES, transform["rpy_deg"], transform["sigma_rpy_deg"], "deg"),

@@ -1,7 +1,8 @@
 """A ground vehicle with two sensors drives over hills (Välimäki et al. 2023, section 4.1)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,7 +11,13 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.simulation.noise import add_noise
-from hand_eye_calib.simulation.options import PUBLISHED_DRIVE, DriveConfig, NoiseConfig
+from hand_eye_calib.simulation.options import (
+    HILLY_DRIVE,
+    PUBLISHED_DRIVE,
+    REALISTIC,
+    DriveConfig,
+    NoiseConfig,
+)
 
 # Start of the published drives, heading along x; in units of the surface's arguments.
 _START = np.array([0.0, 0.5])
@@ -37,6 +44,50 @@ class SimulatedDrive:
     child: Trajectory
     T_parent_child: FloatArray
     T_pw_cw: FloatArray
+
+
+def simulate(
+    seed: int = 0,
+    *,
+    drive: Literal["hilly", "published"] = "hilly",
+    poses: int = 600,
+    gaussian: float = REALISTIC.gaussian,
+    outliers: float = REALISTIC.outliers,
+    drift: float = REALISTIC.drift,
+) -> SimulatedDrive:
+    """Simulate two sensors on one vehicle with a known extrinsic.
+
+    Parameters
+    ----------
+    seed : int
+        The same seed gives the same drive. Default: 0.
+    drive : {"hilly", "published"}
+        A robot outdoors at 1.5 m/s, sensors at 10 and 20 Hz without common stamps (default), or
+        the drive of the article: 0.5 m/s, 10 Hz, equal stamps.
+    poses : int
+        Poses of the parent sensor. Default: 600, a minute.
+    gaussian : float
+        Standard deviation of each pose's translation error per axis. Default: 0.002 m.
+    outliers : float
+        Share of the poses at which a trajectory jumps. Default: 0.005.
+    drift : float
+        Drift of the child per metre, m/m. Default: 0.002.
+
+    Returns
+    -------
+    SimulatedDrive
+        With ``parent``, ``child`` and ``T_parent_child``.
+
+    Examples
+    --------
+    >>> drive = hec.simulate(3, poses=100)
+    >>> drive.parent
+    Trajectory(100 poses over 9.900 s, sensor_frame='lidar', world_frame='lidar_odom')
+    """
+    config = HILLY_DRIVE if drive == "hilly" else PUBLISHED_DRIVE
+    config = replace(config, poses=poses, parent_frame="lidar", child_frame="camera")
+    noise = replace(REALISTIC, gaussian=gaussian, outliers=outliers, drift=drift)
+    return simulate_drive(seed, config, noise)
 
 
 def simulate_drive(

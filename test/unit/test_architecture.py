@@ -14,16 +14,29 @@ from hand_eye_calib.simulation.options import NoiseConfig
 
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
 # public Python API. In the engine each room sees only rooms before it.
-GROUND = {"errors", "text", "config", "methods", "arrays", "stats", "plain", "version"}
+GROUND = {
+    "errors",
+    "text",
+    "config",
+    "methods",
+    "arrays",
+    "stats",
+    "plain",
+    "version",
+    "upstairs",
+    "option",
+}
 ENGINE = {
     "errors": set(),
     "arrays": set(),
     "stats": {"arrays"},
     "plain": set(),
     "version": set(),
+    "upstairs": set(),
     "text": {"errors"},
     "methods": {"errors"},
-    "config": {"errors", "methods", "text"},
+    "option": {"errors", "text"},
+    "config": {"errors", "methods", "text", "option"},
     "geometry": GROUND,
     "results": GROUND | {"geometry"},
     "pairing": GROUND | {"geometry"},
@@ -40,7 +53,8 @@ ALLOWED = ENGINE | {
     "io": GROUND | {"geometry", "results"},
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
-    "root": GROUND | {"geometry", "results", "engine", "rig", "session", "io", "report"},
+    "root": GROUND
+    | {"geometry", "results", "engine", "rig", "session", "io", "report", "simulation"},
     "live": {"io", *ENGINE},
     "watch": {"errors", "text", "results", "live"},
     "ros": {"io", "live", "watch", *ENGINE},

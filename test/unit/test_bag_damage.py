@@ -116,7 +116,7 @@ def test_cut_off_anywhere(bag, capsys):
         document = replay(path, capsys) if number % 20 == 0 else None
         if document is not None:
             assert any("lost" in warning for warning in document["warnings"])
-            if document["verdict"] != "DO NOT USE":
+            if document["verdict"] != "DO_NOT_USE":
                 found = document["T_parent_child"]["matrix"]
                 np.testing.assert_allclose(found, T_PARENT_CHILD, atol=1e-6)
     assert outcomes == ({"refused", "recovered"} if path.suffix == ".mcap" else {"refused"})

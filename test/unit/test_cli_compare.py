@@ -87,24 +87,6 @@ def test_what_cannot_be_compared_is_one_line(saved, run, words, code, text):
     assert len(err) < 400
 
 
-def test_info_writes_the_result_into_the_description(saved, run):
-    words = ("info", "third", "--urdf", "robot.urdf", "--write", "patched.urdf")
-    code, _, err = run(*words)
-    assert (code, err) == (0, "hand_eye_calib: note: wrote patched.urdf: joint b changed\n")
-    assert run("compare", "third", "--with", "patched.urdf")[0] == 0
-    before, after = (saved / name for name in ("robot.urdf", "patched.urdf"))
-    changed = zip(before.read_text().splitlines(), after.read_text().splitlines(), strict=True)
-    assert [old.startswith("xyz=") for old, new in changed if old != new] == [True]
-
-
-def test_an_axis_that_is_not_known_is_not_written(saved, run):
-    words = ("info", "flat", "--urdf", "robot.urdf", "--write", "patched.urdf")
-    code, _, err = run(*words)
-    assert (code, (saved / "patched.urdf").exists()) == (1, False)
-    assert "z not known" in err
-    assert run("info", "first", "--write", "p.urdf")[0] == 2
-
-
 def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, run):
     assert run("simulate", "--out", "drive")[0] == 0
     drive = saved / "drive" / "run_01"
@@ -112,7 +94,7 @@ def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, run):
     T = se3.from_quat_xyzw(truth[1:4], truth[4:])
     (saved / "true.urdf").write_text(urdf_of(T))
     code, out, _ = run(
-        "calibrate", drive / "T_S1_W1.txt", drive / "T_S2_W2.txt", "--urdf", "true.urdf",
+        "calibrate", drive / "T_S1_W1.txt", drive / "T_S2_W2.txt", "--installed", "true.urdf",
         "--parent-frame", "lidar", "--child-frame", "camera", "--base-frame", "base", "--json",
     )  # fmt: skip
     document = json.loads(out)

@@ -159,7 +159,7 @@ def test_numbers_are_the_calibrations(drive, request):
     for transform in (document["T_parent_child"], document["T_child_parent"]):
         for value in transform["quat_xyzw"]:
             assert f"{round(value, 4) + 0.0:.4f}" in page.text
-        sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
+        sigmas = [*transform["sigma_total_translation"], *transform["sigma_total_rpy_deg"]]
         values = [*transform["translation"], *transform["rpy_deg"]]
         for value, sigma, decimals in zip(values, sigmas, (3, 3, 3, 2, 2, 2), strict=True):
             assert with_sigma(value, sigma, decimals).replace("+/-", "±") in page.text
@@ -238,7 +238,8 @@ def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(pa
     calibration, _, page = partial["positions"]
     assert "Along the axes of antenna: positions have none of their own." in page.text
     lever_arm = calibration.to_dict()["T_child_parent"]
-    for value, sigma in zip(lever_arm["translation"], lever_arm["sigma_translation"], strict=True):
+    sigmas = lever_arm["sigma_total_translation"]
+    for value, sigma in zip(lever_arm["translation"], sigmas, strict=True):
         assert sigma < 1.0
         assert with_sigma(value, sigma, 3).replace("+/-", "±") in page.text
     assert "The path of lidar" in page.text

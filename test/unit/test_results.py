@@ -7,6 +7,7 @@ import json
 import os
 import re
 import stat
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -32,6 +33,7 @@ from hand_eye_calib.results.calibration import (
 )
 from hand_eye_calib.results.records import AxisProgress, CorrelatedError, Noise, Progress, RateBias
 
+ROOT = Path(__file__).resolve().parents[2]
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 
 
@@ -280,7 +282,7 @@ def test_under_do_not_use_there_is_nothing_for_a_robot(tmp_path):
     save_result(good_calibration(status=SolveStatus.NOT_CONVERGED), tmp_path)
     assert os.listdir(tmp_path) == ["extrinsic.yaml"]
     text = (tmp_path / "extrinsic.yaml").read_text(encoding="utf-8")
-    assert text.startswith("verdict: DO NOT USE\nheadline: ")
+    assert text.startswith("verdict: DO_NOT_USE\nheadline: ")
 
 
 def test_saving_again_replaces_the_file_and_leaves_nothing_else(tmp_path):
@@ -360,3 +362,26 @@ def test_files_that_cannot_be_read(tmp_path):
     (tmp_path / "extrinsic.yaml").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(InputError, match="not a text file; expected YAML"):
         load_result(tmp_path)
+
+
+@pytest.mark.parametrize("changes", [{}, {"warnings": ()}, {"floor": 1e-6 * np.eye(6)}], ids=str)
+def test_documents_follow_the_schema(changes, tmp_path):
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads((ROOT / "docs" / "extrinsic.schema.json").read_text(encoding="utf-8"))
+    result = calibration(**changes)
+    path = save_result(result, tmp_path)
+    for document in (json.loads(json_text(result.to_dict())), yaml.safe_load(path.read_text())):
+        jsonschema.validate(document, schema)
+    assert document["T_parent_child"]["translation"][2] is None
+    assert document["observability"][2]["sigma_total"] is None
+    assert document["verdict"] == "USE_WITH_CARE"
+
+
+def test_the_total_has_the_floor():
+    document = calibration(floor=1e-6 * np.eye(6)).to_dict()
+    for name in ("translation", "rpy_deg"):
+        alone, total = (
+            document["T_parent_child"][f"{each}_{name}"] for each in ("sigma", "sigma_total")
+        )
+        assert all(b is None if a is None else b > a for a, b in zip(alone, total, strict=True))
+    assert document["observability"][0]["sigma_total"] > document["observability"][0]["sigma"]

@@ -333,7 +333,7 @@ class TestCommand:
         main(["calibrate", *paths, "--reference", "B5", "--child-invert", "none", "--json"])
         document = json.loads(capsys.readouterr().out)
         assert document["findings"][0]["code"] == "inverse"
-        assert document["verdict"] == "DO NOT USE"
+        assert document["verdict"] == "DO_NOT_USE"
         assert "inverse poses" in document["reasons"][0]["sentence"]
 
 

@@ -51,6 +51,11 @@ hec.calibrate_rig([parent, child])  # wrong
 moved: hec.Trajectory = result.child_as_parent(child)
 hec.write_trajectory("moved.tum", moved)
 hec.plot(result).savefig("result.png")
+hec.calibrate("lidar.tum", np.zeros((3, 8)), method="dnl", scale=1.0)
+hec.calibrate(parent, child, method="dnlp")  # wrong
+hec.calibrate(parent, child, time_offset="estimat")  # wrong
+back: hec.Calibration = result.inverse()
+truth = hec.simulate(3, poses=100).T_parent_child
 hec.plot(parent)  # wrong
 part = parent[:10].shifted(0.5).scaled(2.0).at(np.array([5]))
 """
@@ -63,7 +68,7 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
     public = {getattr(hec, name).__module__ for name in hec.__all__}
     of_arguments = {"hand_eye_calib.arrays", "hand_eye_calib.io.trajectory_files.objects"}
     of_arguments |= {"hand_eye_calib.results.result", "hand_eye_calib.engine.run"}
-    of_arguments |= {"hand_eye_calib.text"}  # Prior
+    of_arguments |= {"hand_eye_calib.text", "hand_eye_calib.option"}  # Prior, OptionSet
     followed = [hec.__name__, *sorted(public | of_arguments), "numpy", "numpy.*"]
     config.write_text(
         "[mypy]\nfollow_imports = skip\n"

@@ -214,11 +214,11 @@ def test_a_file_keeps_what_the_verdict_comes_from():
     result = good(**CASES["error_finding"] | CASES["target"])
     document = result.to_dict()
     assert list(document)[0] == "verdict"
-    assert document["verdict"] == "DO NOT USE"
+    assert document["verdict"] == "DO_NOT_USE"
     assert Calibration.from_dict(document).reasons == result.reasons
     assert document["reasons"][0] == {
         "rule": "error_finding",
-        "verdict": "DO NOT USE",
+        "verdict": "DO_NOT_USE",
         "kind": "suspicion",
         "axes": [],
         "sentence": "lengths are in mm",

@@ -174,7 +174,7 @@ def _done(outcome: Outcome, is_new: bool) -> _Done:
             dof["verdict"] == "unobservable" and dof["name"] not in silent
             for dof in calibration["observability"]
         )
-        is_poor = calibration["verdict"] == Verdict.DO_NOT_USE.value
+        is_poor = calibration["verdict"] == Verdict.DO_NOT_USE.name
         code = _EXIT_NOT_ALL if hidden or is_poor else 0
     return _Done(row_of(outcome), json.dumps(outcome, separators=(",", ":")), code, is_new)
 

@@ -95,6 +95,14 @@ def read_trajectory(
         was found.
     ConfigError
         For a format or unit that is not known, and options that do not go together.
+
+    Examples
+    --------
+    >>> hec.read_trajectory("lidar.tum").measures
+    'poses'
+    >>> rows = np.array([[0.0, 1, 2, 3, 0, 0, 0, 1], [0.1, 1, 2, 3, 0, 0, 0, 1]])
+    >>> hec.read_trajectory(rows)
+    Trajectory(2 poses over 0.100 s)
     """
     if topic or tf:
         of_text = (format != _USUAL, columns, times is not None, stamp_unit, repair)

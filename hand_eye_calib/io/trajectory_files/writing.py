@@ -34,6 +34,10 @@ def write_trajectory(
         If the file cannot be written, or a bag exists.
     ConfigError
         For any other format.
+
+    Examples
+    --------
+    >>> hec.write_trajectory("moved.tum", result.child_as_parent(child))
     """
     if format != "tum":
         from hand_eye_calib.io.bags import STORAGES, write_bag

@@ -1,0 +1,151 @@
+"""What an option is: a dataclass field that knows its name, unit, range, default and meaning."""
+
+import contextlib
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Self, TypeAlias
+
+from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.text import shown_value
+
+OptionValue: TypeAlias = bool | int | float | str
+OptionField: TypeAlias = dataclasses.Field[Any]
+
+_TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+
+
+def option(
+    default: OptionValue,
+    doc: str,
+    *,
+    unit: str = "",
+    within: tuple[float, float] | None = None,
+    choices: tuple[str, ...] | None = None,
+    pattern: str | None = None,
+    form: str = "",
+    words: tuple[str, ...] = (),
+    name: str | None = None,
+    read_only: bool = False,
+    parse: Callable[[str, str], object] | None = None,
+) -> Any:
+    """Make a dataclass field with everything there is to know about an option.
+
+    Parameters
+    ----------
+    default
+        Its type is the option's type.
+    doc, unit
+        One line for a person who is about to set it; unit of the value, empty for none.
+    within, choices
+        Smallest and largest allowed value; the allowed values.
+    pattern, form
+        Regular expression that the whole value must match, and the same in words.
+    words
+        Words that may stand for a number, such as "none".
+    name, read_only
+        Public name if it differs from the attribute's, such as ``keyframe.min_translation``; the
+        node cannot change the option while it runs.
+    parse
+        For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
+    """
+    metadata = dict(locals())
+    metadata["minimum"], metadata["maximum"] = metadata.pop("within") or (None, None)
+    del metadata["default"]
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def option_name(field: OptionField) -> str:
+    """Public name of an option: the ROS parameter, the YAML key."""
+    name: str = field.metadata["name"] or field.name
+    return name
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """``; did you mean X?`` for a misspelt word; empty if no known word is close."""
+    import difflib
+
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def check_value(field: OptionField, value: object) -> OptionValue:
+    """Check a value of an option and give it the option's own type.
+
+    Raises
+    ------
+    ConfigError
+        If the value has the wrong type, is out of range or is not among the choices; one line that
+        says what is allowed.
+    """
+    meta, name, words = field.metadata, option_name(field), field.metadata["words"]
+    kind: type = float if words else type(field.default)
+    if isinstance(value, str) and (value in words or kind is str):
+        return _checked_text(name, value, meta)
+    if words and isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            value = float(value)
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind or not isinstance(value, bool | int | float):
+        expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[kind]
+        raise ConfigError(
+            f"{name} must be {expected}; got {shown_value(value)}{did_you_mean(str(value), words)}"
+        )
+    if not math.isfinite(value):
+        raise ConfigError(f"{name} must be a finite number; got {value}")
+    unit, least, most = (meta[key] for key in ("unit", "minimum", "maximum"))
+    if least is not None and not least <= value <= most:
+        bound = f"at least {least}" if value < least else f"at most {most}"
+        raise ConfigError(f"{name} must be {f'{bound} {unit}'.rstrip()}; got {value}")
+    return value
+
+
+def _checked_text(name: str, value: str, meta: Mapping[str, Any]) -> str:
+    if meta["choices"] is not None and value not in meta["choices"]:
+        raise ConfigError(
+            f"{name} must be one of {', '.join(meta['choices'])}; got {shown_value(value)}"
+            f"{did_you_mean(value, meta['choices'])}"
+        )
+    if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
+        raise ConfigError(f"{name} must be {meta['form']}; got {shown_value(value)}")
+    if meta["parse"] is not None:
+        meta["parse"](name, value)
+    return value
+
+
+def _fields(options: Any) -> tuple[OptionField, ...]:
+    return dataclasses.fields(options)
+
+
+class OptionSet:
+    """Base of dataclasses made of options: checks every value and knows the public names."""
+
+    given: frozenset[str]
+
+    def __post_init__(self) -> None:
+        for field in _fields(self):
+            object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
+
+    @classmethod
+    def from_options(cls, options: Mapping[str, object]) -> Self:
+        """Build from a mapping of public names to values.
+
+        Raises
+        ------
+        ConfigError
+            If a name is unknown, with a list of the known ones, or a value is not allowed.
+        """
+        known = {option_name(field): field.name for field in _fields(cls)}
+        unknown = [name for name in options if name not in known]
+        if unknown:
+            raise ConfigError(
+                f"unknown option {unknown[0]!r}{did_you_mean(unknown[0], known)}; known are "
+                f"{', '.join(sorted(known))}"
+            )
+        return cls(**{known[name]: value for name, value in options.items()})
+
+    def to_options(self) -> dict[str, OptionValue]:
+        """Mapping of public names to values."""
+        return {option_name(field): getattr(self, field.name) for field in _fields(self)}
