@@ -123,8 +123,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     robot.add_argument(
         "--installed",
         metavar="SOURCE",
-        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a bag with "
-        '/tf_static, or "X Y Z ROLL PITCH YAW" in m and rad',
+        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
+        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad',
     )
     robot.add_argument(
         "--base-frame",
