@@ -124,11 +124,6 @@ class AngularRates:
     step_s: float
     values: FloatArray
 
-    @property
-    def covered_s(self) -> float:
-        """Seconds without the gaps."""
-        return float(np.isfinite(self.values).sum() * self.step_s)
-
 
 def correlate_rates(
     parent: Trajectory,
@@ -167,7 +162,8 @@ def correlate_rates(
     of_parent, of_child = (
         angular_rates(each, window_s, step_s, max_gap_s, of_speed) for each in (parent, child)
     )
-    if min(of_parent.covered_s, of_child.covered_s) < _MIN_OVERLAP_S:
+    seen = min(int(np.isfinite(each.values).sum()) for each in (of_parent, of_child))
+    if seen * step_s < _MIN_OVERLAP_S:
         return NO_CORRELATION
     lags, coefficients, overlaps = _masked_correlation(
         *(_compressed(each.values) for each in (of_parent, of_child))

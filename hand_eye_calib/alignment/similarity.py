@@ -99,14 +99,6 @@ class SimilarityFit:
         return float(np.hypot(self.unexplained_translation, of_rotation))
 
     @property
-    def log_volume(self) -> float:
-        """Logarithm of the volume that the residuals spread over, in the smaller unit of length:
-        small for a good fit.
-        """
-        sigma_t = self.sigma_translation / min(self.scale, 1.0)
-        return float(np.log(sigma_t) + np.log(self.sigma_rotation))
-
-    @property
     def unexplained_translation(self) -> float:
         """Unexplained share of the translations."""
         return self.sigma_translation / max(self.rms_translation, 1e-12)
@@ -159,7 +151,8 @@ def fit_similarity(
         fits.append(problem.describe(*problem.refine(T, 1.0 if same_unit else scale)))
         if fits[-1].unexplained < EXPLAINED:
             break
-    return min(fits, key=lambda fit: fit.log_volume)
+    # The volume that the residuals spread over, in the smaller unit of length.
+    return min(fits, key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1))
 
 
 def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:

@@ -34,8 +34,8 @@ _LEAST_SPAN_S, _MOST_SPAN_S, _SPAN_INTERVALS, _SPAN_OF_NOISE = 0.05, 0.3, 2.0, 1
 _MAX_ROUNDS, _SETTLED_S = 8, 2e-5
 
 # A rate of the clock is known to this beforehand (75 ppm are usual for USB devices); one beyond so
-# many standard deviations is used. Over this many blocks of time it is a line.
-_RATE_PRIOR, _PLAIN_RATE, _LEAST_BLOCKS = 1e-4, 4.0, 5
+# many standard deviations is there. Over this many blocks of time it is a line.
+_RATE_PRIOR, PLAIN_RATE, _LEAST_BLOCKS = 1e-4, 4.0, 5
 
 # Most that the fine offset may differ from the coarse one: seconds, or intervals of the slower
 # stream if those are longer.
@@ -85,10 +85,13 @@ class TimeOffset:
 
 
 def estimate_time_offset(
-    parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
+    parent: Trajectory,
+    child: Trajectory,
+    max_gap_s: float = CalibratorConfig.max_gap,
+    of_speed: bool = False,
 ) -> TimeOffset:
-    """Estimate the offset of the child's clock: coarse from the angular rates, or near zero if they
-    leave it open and the streams agree there; then fine together with X and the scale.
+    """Estimate the offset of the child's clock: coarse from the angular rates or, if they leave it
+    open, where the paths agree best; then fine together with X and the scale.
 
     Parameters
     ----------
@@ -96,10 +99,8 @@ def estimate_time_offset(
         Their time ranges need not overlap.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
-
-    Returns
-    -------
-    TimeOffset
+    of_speed : bool
+        From the speeds of both sensors alone, coarsely: one of them has no orientation.
 
     Raises
     ------
@@ -111,54 +112,35 @@ def estimate_time_offset(
     for name, stream in (("parent", parent), ("child", child)):
         if leap := find_leap(stream.stamps_ns):
             raise InputError(f"the {name} stream's {leap.what}; {leap.advice}")
-    correlation = correlate_rates(parent, child, max_gap_s)
+    correlation = correlate_rates(parent, child, max_gap_s, of_speed)
+    if correlation.is_clear and of_speed:
+        sigma_s = max(parent.interval_s, child.interval_s) / 5
+        return TimeOffset(correlation.offset_s, sigma_s, correlation, None)
     if correlation.is_clear:
         return refine_time_offset(parent, child, correlation, max_gap_s)
-    if correlation.is_ambiguous:
+    if correlation.is_ambiguous and not of_speed:
         # Rhythmic motion matches at many offsets; clocks of one machine are hardly apart.
         near_s = correlation.offset_s if abs(correlation.offset_s) < _FINE_RANGE_S else 0.0
         tried = [
             refine_time_offset(parent, child, replace(correlation, offset_s=at_s), max_gap_s)
             for at_s in {near_s, correlation.offset_s, *correlation.others_s}
         ]
-        left = np.array([each.fit.unexplained if each.fit else np.inf for each in tried])
-        order = np.argsort(left)
-        best = tried[order[0]]
-        rivals = [
-            share
-            for share, each in zip(left, tried, strict=True)
-            if abs(each.seconds - best.seconds) > _FINE_RANGE_S
-        ]
-        is_near = abs(best.seconds) < 2 * _FINE_RANGE_S
-        limit = _EXPLAINED_NEAR if is_near else min(_EXPLAINED_NEAR, _FAR_BETTER * min(rivals))
-        if left.min() < limit:
+        left = [each.fit.unexplained if each.fit else np.inf for each in tried]
+        best, least = min(zip(tried, left, strict=True), key=lambda each: each[1])
+        limit = _EXPLAINED_NEAR
+        for each, share in zip(tried, left, strict=True):
+            is_rival = abs(each.seconds - best.seconds) > _FINE_RANGE_S
+            if is_rival and abs(best.seconds) > 2 * _FINE_RANGE_S:
+                limit = min(limit, _FAR_BETTER * share)
+        if least < limit:
             return best
+    doubt, motion = correlation.doubt(), "varied turns"
+    if of_speed:
+        doubt, motion = doubt.replace("angular rates", "speeds"), "changes of speed"
     raise NotEnoughDataError(
-        f"the time offset cannot be estimated: {correlation.doubt()}; "
-        "drive more varied turns, or give time_offset in seconds"
+        f"the time offset cannot be estimated: {doubt}; "
+        f"drive more {motion}, or give time_offset in seconds"
     )
-
-
-def time_offset_of_speeds(
-    parent: Trajectory, child: Trajectory, max_gap_s: float = CalibratorConfig.max_gap
-) -> TimeOffset:
-    """Estimate the offset of the child's clock, coarsely, from the speeds of both sensors: one of
-    them has no orientation.
-
-    Raises
-    ------
-    NotEnoughDataError
-        If the evidence is weak; the message says why.
-    """
-    correlation = correlate_rates(parent, child, max_gap_s, of_speed=True)
-    if not correlation.is_clear:
-        raise NotEnoughDataError(
-            "the time offset cannot be estimated from the speeds of both sensors: "
-            f"{correlation.doubt().replace('angular rates', 'speeds')}; drive with more changes of "
-            "speed, or give time_offset in seconds"
-        )
-    sigma_s = max(parent.interval_s, child.interval_s) / 5
-    return TimeOffset(correlation.offset_s, sigma_s, correlation, None)
 
 
 def refine_time_offset(
@@ -265,7 +247,7 @@ def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRa
     variance = float(weights @ residuals_s**2) / (len(offsets_s) - 2) / spread
     total = (before.used + slope) * _RATE_PRIOR**2 / (_RATE_PRIOR**2 + variance)
     sigma = float(np.sqrt(variance))
-    is_used = abs(total) > _PLAIN_RATE * sigma
+    is_used = abs(total) > PLAIN_RATE * sigma
     return replace(before, ppm=1e6 * total, sigma_ppm=1e6 * sigma, is_used=is_used)
 
 

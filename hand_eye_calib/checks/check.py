@@ -327,6 +327,7 @@ def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
             size_s=abs(found.seconds),
             sigma_s=found.sigma_s,
             direction="behind" if found.seconds > 0 else "ahead of",
+            beyond=f" beyond the {known_s:.4f} s that were added" if known_s else "",
         )
     ]
 

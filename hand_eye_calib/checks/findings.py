@@ -220,8 +220,8 @@ _ROWS = {
         "(which is what a fixed camera beside an arm needs)",
     ),
     "time_offset": _Row(
-        "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's",
-        "add {total_s} s to the child's stamps, or have it estimated",
+        "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's{beyond}",
+        "add {total_s} s in all to the child's stamps, or have it estimated",
         evidence=("offset_s", "sigma_s"),
         confidence=_CERTAIN,
     ),

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from hand_eye_calib.alignment.scale import horizontal_factors
+from hand_eye_calib.alignment.time_offset import PLAIN_RATE
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_lever_arm, assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
@@ -143,7 +144,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
             ppm=1e6 * sign * solution.clock_rate,
             sigma_ppm=1e6 * solution.clock_rate_sigma,
             at_ns=middle_ns - round((float(config.time_offset) + offset_s) * 1e9),
-            is_used=True,
+            is_used=abs(solution.clock_rate) > PLAIN_RATE * solution.clock_rate_sigma,
         ),
         scale=given * scale,
         scale_sigma=solution.scale_sigma * scale**2,

@@ -11,11 +11,7 @@ from hand_eye_calib.alignment.angular_rates import (
     Correlation,
     correlate_rates,
 )
-from hand_eye_calib.alignment.time_offset import (
-    TimeOffset,
-    estimate_time_offset,
-    time_offset_of_speeds,
-)
+from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import ESTIMATORS, cross_checked
 from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
@@ -307,17 +303,9 @@ def name_frames(
 def estimated_time_offset(
     config: CalibratorConfig, parent: Trajectory, child: Trajectory
 ) -> TimeOffset:
-    """The time offset of two streams: from their angular rates or, if one of them has only
-    positions, from their speeds.
-
-    Raises
-    ------
-    NotEnoughDataError
-        If the evidence is weak; the message says why.
-    """
-    if config.measured == "positions":
-        return time_offset_of_speeds(parent, child, config.max_gap)
-    return estimate_time_offset(parent, child, config.max_gap)
+    """The time offset of two streams, from what the options say that both measure."""
+    of_speed = config.measured == "positions"
+    return estimate_time_offset(parent, child, config.max_gap, of_speed)
 
 
 def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
