@@ -381,6 +381,18 @@ def fast_clock(child: Trajectory, ppm: float, random: Random) -> Trajectory:
     return Trajectory(child.stamps_ns + late_ns, child.poses)
 
 
+def turned_positions(stream: Trajectory, degrees: float, _: Random) -> Trajectory:
+    """Positions in a world that is turned about z against that of the orientations."""
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    return with_parts(stream, positions=positions_of(stream) @ turn.T)
+
+
+def late_heights(stream: Trajectory, tau_s: float, _: Random) -> Trajectory:
+    positions = positions_of(stream).copy()
+    positions[:, 2] = filtered(positions[:, 2], stream.stamps_ns, tau_s)
+    return with_parts(stream, positions=positions)
+
+
 def heightless(parent: Trajectory, child: Trajectory, which: float, random: Random) -> Streams:
     """The parent's, those of both, and both upright besides."""
     flat = higher(parent, 0.0), higher(child, 0.0)

@@ -186,10 +186,37 @@ LAST = (
     _of_child("W10", "stamps of arrival, in bursts", (0.1, 0.3, 1.0), "s", damage.in_bursts),
 )  # fmt: skip
 
+SILENT = (
+    _of_child(
+        "X1", "positions turned against orientations", (1.5, 2.5, 4.0), "deg",
+        damage.turned_positions, "worlds_turned",
+    ),
+    Fault(
+        "X2", "the parent's turned", (1.5, 2.5, 4.0), "deg",
+        lambda parent, child, degrees, random: (
+            damage.turned_positions(parent, degrees, random), child
+        ),
+        frozenset({"worlds_turned"}),
+    ),
+    _of_child(
+        "X3", "heights in another unit", (1.02, 1.1, 3.28084), "",
+        lambda child, factor, _: damage.higher(child, factor), "axis_scale",
+    ),
+    _of_child(
+        "X4", "heights of a barometer", (0.3, 1.0, 3.0), "s",
+        damage.late_heights, "axis_lag axis_scale",
+    ),
+    _of_child(
+        "X5", "heights constant", (0.0,), "",
+        lambda child, factor, _: damage.higher(child, factor), "constant_coordinate",
+    ),
+)  # fmt: skip
+
 # Groups of the page: title to faults.
 GROUPS = {
     "Faults": FAULTS,
     "Twelve faults that were built without a limit for them": UNTUNED,
     "Ten faults that were built after those": UNSEEN,
     "Ten faults that were built when all was done, as they came": LAST,
+    "Five faults that were silent before their columns": SILENT,
 }

@@ -51,6 +51,9 @@ _TURNED = (float(np.radians(0.5)), float(np.radians(1.5)))
 # A coordinate that follows the motion by less than this share is constant.
 _CONSTANT = 0.05
 
+# A coordinate explains why streams disagree if it takes away this share of the squared residuals.
+_MOST = 0.3
+
 # Smallest delay (s), and smoothing (s^2), that count. Shifts (m) by
 # either where a warning and an error begin.
 _DELAY_S, _SHIFTS_M = 0.003, (0.008, 0.05)
@@ -79,7 +82,7 @@ _SHARE = 0.9
 
 # Interpolation adds errors of its own, so that the instants nearest to a pose of both streams are
 # compared: this share of them, at least and at most so many.
-_NEAREST, _FEWEST, _MOST = 0.01, 40, 1000
+_NEAREST, _FEWEST_NEAR, _MOST_NEAR = 0.01, 40, 1000
 
 
 def check_agreement(
@@ -103,6 +106,14 @@ def check_agreement(
     found = sorted(_of_response(pose_pairs, motions, T_parent_child), key=lambda each: -each[0])
     # One fault shows in several groups of columns: the one that explains most is it.
     return [each for _, each in found[:1]] + _check_mount(pose_pairs, T_parent_child)
+
+
+def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
+    """Finding about a coordinate that explains why two streams with the same rotations disagree."""
+    X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
+    slow, _ = long_response(pose_pairs, motions, X)
+    found = [each for each in _axis_gains(slow) if each[0] > _MOST]
+    return [max(found, key=lambda each: each[0])[1]] if found else []
 
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
@@ -423,9 +434,9 @@ def _disagreement(slow: Trajectory, fast: Trajectory, straight: bool) -> float:
         return np.inf
     after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[indices]), 1, len(fast) - 1)
     around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[indices]).min(axis=0)
-    n_nearest = min(max(_FEWEST, round(_NEAREST * len(indices))), len(indices))
+    n_nearest = min(max(_FEWEST_NEAR, round(_NEAREST * len(indices))), len(indices))
     indices = indices[around <= np.partition(around, n_nearest - 1)[n_nearest - 1]]
-    indices = indices[:: -(-len(indices) // _MOST)]
+    indices = indices[:: -(-len(indices) // _MOST_NEAR)]
     between = fast.at(slow.stamps_ns[indices], straight=straight)
     start = np.arange(len(indices) - 1)
     pairs = pairs_between(between, slow.poses[indices], start, start + 1)

@@ -29,6 +29,7 @@ from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks.agreement import (
     Known,
     check_agreement,
+    check_coordinates,
     check_independent,
     check_same,
 )
@@ -149,7 +150,12 @@ def check_streams(
         return CheckResult(gravest_first([*findings, *flat]), correlation)
     try:
         explanation = explain(aligned, thorough=correlation.is_clear)
-        findings += explanation.findings if correlation.is_clear or explanation.holds else ()
+        if correlation.is_clear and not explanation.holds:
+            pose_pairs = synchronise(aligned.parent, aligned.child, max_gap_s)
+            motions = _motions(pose_pairs, _MAX_MOTIONS)
+            findings += check_coordinates(pose_pairs, motions) or explanation.findings
+        elif explanation.holds:
+            findings += explanation.findings
     except NotEnoughDataError as error:
         explanation = None
         findings += [finding("too_short", text=str(error))] if correlation.is_clear else []

@@ -178,7 +178,11 @@ class Calibrator:
             raise _what_is_wrong(position, quat_xyzw)
         buffer = self._buffers[stream]
         if buffer.is_full:
-            self._make_room()
+            self._make_pairs(1 - self._limits.share_kept)
+            for each in self._buffers.values():
+                if each.is_full:
+                    # The other stream has no poses at these times: they cannot be paired.
+                    each.drop(each.stamp_at(0.5), unpaired=True)
         elif buffer.pairing_is_due:
             self._make_pairs()
         return buffer.add(stamp_ns, position, quat_xyzw)
@@ -236,16 +240,13 @@ class Calibrator:
                 if len(part):
                     self._buffers[name].extend(stamps_ns[part], poses[part])
             if stop < len(stamps_ns):
-                taken[stop] = self._add_row(stop, str(names[stop]), stamps_ns, poses)
+                stamp_ns, pose = int(stamps_ns[stop]), poses[stop].tolist()
+                try:
+                    taken[stop] = self.add_pose(str(names[stop]), stamp_ns, pose[:3], pose[3:])
+                except InputError as error:
+                    raise UnusablePose(stop, error) from None
             first = stop + 1
         return taken
-
-    def _add_row(self, row: int, stream: str, stamps_ns: IntArray, poses: FloatArray) -> bool:
-        pose = poses[row].tolist()
-        try:
-            return self.add_pose(stream, int(stamps_ns[row]), pose[:3], pose[3:])
-        except InputError as error:
-            raise UnusablePose(row, error) from None
 
     def snapshot(self) -> Snapshot:
         """All that is known now, for an estimate in this or another thread."""
@@ -283,14 +284,6 @@ class Calibrator:
         """
         self._proposed_offset = found or self._proposed_offset
 
-    def _make_room(self) -> None:
-        """Make room in a full buffer."""
-        self._make_pairs(1 - self._limits.share_kept)
-        for buffer in self._buffers.values():
-            if buffer.is_full:
-                # The other stream has no poses at these times: they cannot be paired.
-                buffer.drop(buffer.stamp_at(0.5), unpaired=True)
-
     def _make_pairs(self, settled_share: float | None = None) -> None:
         """Make the oldest poses into pairs, keep the pairs, and drop the poses.
 
@@ -308,8 +301,11 @@ class Calibrator:
             self._settled_until_ns(parent, settled_share),
             self._settled_until_ns(child, settled_share) + offset_ns,
         )
-        if settled_share is None and not self._is_worth_it(horizon_ns, offset_ns):
-            return
+        if settled_share is None:
+            # At least half a batch of the longer buffer is settled.
+            longer, ahead_ns = (parent, 0) if len(parent) >= len(child) else (child, offset_ns)
+            if horizon_ns < longer.stamp_of(self._limits.batch // 2) + ahead_ns:
+                return
         if self._paired_at is None:
             self._paired_at = slower_stream(parent.stamps_ns, child.stamps_ns)
         of_child = child.poses(horizon_ns - offset_ns).trajectory
@@ -320,7 +316,11 @@ class Calibrator:
             self._paired_at,
             self._kept_parts[-1],
         )
-        self._keep(made[made.stamps_ns <= horizon_ns])
+        made = made[made.stamps_ns <= horizon_ns]
+        if len(made):
+            self._kept_parts.append(made)
+            if sum(map(len, self._kept_parts)) > self._config.max_pairs:
+                self._kept_parts = [downsample(self._kept, self._config.max_pairs)]
         unpaired = parent.stamp_of(0) > horizon_ns or child.stamp_of(0) + offset_ns > horizon_ns
         parent.drop(horizon_ns, unpaired=unpaired)
         child.drop(horizon_ns - offset_ns, unpaired=unpaired)
@@ -332,20 +332,6 @@ class Calibrator:
         else:
             settled_ns = buffer.stamp_at(settled_share)
         return min(settled_ns, buffer.stamp_of(self._limits.batch))
-
-    def _is_worth_it(self, horizon_ns: int, offset_ns: int) -> bool:
-        """Whether at least half a batch of the longer buffer is settled."""
-        parent, child = self._buffers["parent"], self._buffers["child"]
-        if len(parent) >= len(child):
-            return horizon_ns >= parent.stamp_of(self._limits.batch // 2)
-        return horizon_ns >= child.stamp_of(self._limits.batch // 2) + offset_ns
-
-    def _keep(self, made: PosePairs) -> None:
-        if not len(made):
-            return
-        self._kept_parts.append(made)
-        if sum(map(len, self._kept_parts)) > self._config.max_pairs:
-            self._kept_parts = [downsample(self._kept, self._config.max_pairs)]
 
     @property
     def _kept(self) -> PosePairs:

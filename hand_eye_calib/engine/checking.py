@@ -4,7 +4,7 @@ Of streams that have only positions, rotations or angular rates, what they have 
 solve, which is quick: whether they are of one body, in one unit of length, and on one clock.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +16,6 @@ from hand_eye_calib.alignment.angular_rates import (
     correlate_rates,
 )
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.checks.agreement import Known
 from hand_eye_calib.checks.check import (
     CheckResult,
     check_offset,
@@ -25,7 +23,7 @@ from hand_eye_calib.checks.check import (
     check_streams,
     unrelated_rates,
 )
-from hand_eye_calib.checks.findings import Finding, Severity, answered, gravest_first
+from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
@@ -55,35 +53,27 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         return CheckResult(gravest_first(_check_parts(snapshot, calibration)))
     offset_s = calibration.time_offset_s if calibration else snapshot.config.time_offset
     scale = calibration.scale if calibration else snapshot.config.scale
+    known = None
+    if calibration and not calibration.unobservable():
+        known = calibration.T_parent_child, np.sqrt(np.diag(calibration.covariance))
     result = check_streams(
         *snapshot.streams,
         time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
         scale=1.0 if isinstance(scale, str) else scale,
         max_gap_s=snapshot.max_gap_s,
         correlation=snapshot.correlation,
-        known=_known(calibration),
+        known=known,
     )
     obsolete = set()
     if len(snapshot.kept):
         obsolete.add("gaps")  # pairs may have gaps where the streams have none
-    if calibration and not _hides_a_translation(calibration):
+    if calibration and all(
+        dof.verdict not in (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
+        for dof in calibration.observability[:3]
+    ):
         obsolete.add("one_axis")  # the result has shown otherwise
     findings = [found for found in result.findings if found.code not in obsolete]
     return replace(result, findings=gravest_first(answered(findings, snapshot.config)))
-
-
-def _known(calibration: Calibration | None) -> Known | None:
-    """X of a result that knows all of it, and its standard deviations."""
-    if calibration is None or calibration.unobservable():
-        return None
-    return calibration.T_parent_child, np.sqrt(np.diag(calibration.covariance))
-
-
-def _hides_a_translation(calibration: Calibration) -> bool:
-    return any(
-        dof.verdict in (DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR)
-        for dof in calibration.observability[:3]
-    )
 
 
 def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Finding]:
@@ -129,7 +119,7 @@ def check_partial(snapshot: Snapshot) -> CheckResult:
     config = snapshot.config
     known_s = 0.0 if isinstance(config.time_offset, str) else config.time_offset
     before = check(replace(snapshot, config=replace(config, time_offset=known_s)))
-    if any(finding.makes_unusable for finding in before.findings):
+    if any(each.makes_unusable for each in before.findings):
         return before
     correlation = _correlated(snapshot, known_s)
     offset_s = known_s
@@ -138,18 +128,13 @@ def check_partial(snapshot: Snapshot) -> CheckResult:
     try:
         found = _of_solve(snapshot, correlation, known_s, {"time_offset": offset_s})
     except NotEnoughDataError as error:
-        found = [*before.findings, _of_no_solve(config.measured, correlation, error)]
+        quantity = "speeds" if config.measured == "positions" else "angular rates"
+        is_short = correlation.is_clear or not correlation.overlap_s
+        short = finding("too_short", text=str(error))
+        found = [*before.findings, short if is_short else unrelated_rates(correlation, quantity)]
     except InputError as error:
-        found = [*before.findings, _unsolved(str(error))]
+        found = [*before.findings, finding("unsolved", text=str(error), units="the units")]
     return CheckResult(gravest_first(found), correlation)
-
-
-def _of_no_solve(measured: str, correlation: Correlation, error: NotEnoughDataError) -> Finding:
-    """What is wrong with streams that have nothing in common to be solved."""
-    if correlation.is_clear or not correlation.overlap_s:
-        return wording.finding("too_short", text=str(error))
-    quantity = "speeds" if measured == "positions" else "angular rates"
-    return unrelated_rates(correlation, quantity)
 
 
 def _of_solve(
@@ -166,7 +151,7 @@ def _of_solve(
         is_still = correlation.overlap_s > 0 and correlation.variation < MIN_VARIATION
         is_in_unit = all(each.code != "rate_unit" for each in found)
         if is_still and is_in_unit and result.measured == "rotations":
-            return [wording.finding("no_turning")]
+            return [finding("no_turning")]
         return found
     return [*found, *_of_result(result, correlation, known_s)]
 
@@ -176,24 +161,16 @@ def _of_result(result: Calibration, correlation: Correlation, known_s: float) ->
     within_reach = [dof.name for dof in result.observability if dof.name not in result.out_of_reach]
     hidden = [axis for axis in within_reach if axis in result.unobservable()]
     if result.status is SolveStatus.NOT_CONVERGED:
-        return [_unsolved("the solve of these streams does not converge")]
+        text = "the solve of these streams does not converge"
+        return [finding("unsolved", text=text, units="the units")]
     if hidden == within_reach:
-        return [wording.finding("no_turning")]
+        return [finding("no_turning")]
     offset_s, sigma_s = result.time_offset_s - known_s, result.time_offset_sigma_s
-    clocks = check_offset(TimeOffset(offset_s, sigma_s, correlation, None), known_s)
+    found = check_offset(TimeOffset(offset_s, sigma_s, correlation, None), known_s)
     if abs(offset_s) < _FOUND_BY_SOLVE_S:
-        clocks = [replace(finding, severity=Severity.NOTE) for finding in clocks]
-    return [
-        *clocks,
-        *([_unseen(hidden)] if hidden else []),
-    ]
-
-
-def _unsolved(text: str) -> Finding:
-    return wording.finding("unsolved", text=text, units="the units")
-
-
-def _unseen(axes: Sequence[str]) -> Finding:
-    options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in axes}
-    it = "it" if len(axes) == 1 else "them"
-    return wording.finding("unseen_axes", options=options, axes=axes_in_words(axes), it=it)
+        found = [replace(each, severity=Severity.NOTE) for each in found]
+    if hidden:
+        options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in hidden}
+        it = "it" if len(hidden) == 1 else "them"
+        found.append(finding("unseen_axes", options=options, axes=axes_in_words(hidden), it=it))
+    return found

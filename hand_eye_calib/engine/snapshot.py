@@ -166,11 +166,20 @@ class Snapshot:
         if len(self._pose_pairs) < self.config.min_pairs:
             raise NotEnoughDataError(self._what_is_missing(len(self._pose_pairs)))
         if self.config.measured != "poses":
-            return self._named(self._estimate_part())
-        solved = solve_poses(self._pose_pairs, self.config, self.time_offset)
-        if not cross_check:
-            return self._named(solved.calibration())
-        return self._named(cross_checked(solved, self.config, self._pose_pairs))
+            result = self._estimate_part()
+        else:
+            solved = solve_poses(self._pose_pairs, self.config, self.time_offset)
+            result = (
+                cross_checked(solved, self.config, self._pose_pairs)
+                if cross_check
+                else solved.calibration()
+            )
+        return replace(
+            result,
+            parent_frame=self.parent_frame,
+            child_frame=self.child_frame,
+            warnings=self.warnings + result.warnings,
+        )
 
     def _estimate_part(self) -> Calibration:
         """The part of the extrinsic that streams without rotations or positions show."""
@@ -189,34 +198,22 @@ class Snapshot:
         moved = replace(self, config=config)._pose_pairs
         return estimate(moved, config) if len(moved) >= self.config.min_pairs else result
 
-    def _named(self, result: Calibration) -> Calibration:
-        """With the frames, and what there is to say of them."""
-        return replace(
-            result,
-            parent_frame=self.parent_frame,
-            child_frame=self.child_frame,
-            warnings=self.warnings + result.warnings,
-        )
-
     @cached_property
     def streams(self) -> tuple[Trajectory, Trajectory]:
         """Trajectories of the whole session, each on its own clock: as they came in, or at the
         stamps of the pairs if some were made.
         """
-        parent, child = self._whole_streams()
-        return (
-            _measuring(parent, self.config.parent_measures),
-            _measuring(child, self.config.child_measures),
-        )
-
-    def _whole_streams(self) -> tuple[Trajectory, Trajectory]:
-        if not len(self.kept):
-            return self.parent, self.child
-        resolved = self.resolved()
-        pairs, offset_s = resolved._pose_pairs, fixed_time_offset(resolved.config)
-        parent = Trajectory(pairs.stamps_ns, pairs.Ts_pw_p)
-        child = Trajectory(pairs.stamps_ns, pairs.Ts_cw_c)
-        return parent, child.shifted(-offset_s)
+        streams = [self.parent, self.child]
+        if len(self.kept):
+            resolved = self.resolved()
+            pairs, offset_s = resolved._pose_pairs, fixed_time_offset(resolved.config)
+            streams = [Trajectory(pairs.stamps_ns, Ts) for Ts in (pairs.Ts_pw_p, pairs.Ts_cw_c)]
+            streams[1] = streams[1].shifted(-offset_s)
+        for k, stream in enumerate(STREAMS):
+            measures = getattr(self.config, f"{stream}_measures")
+            if measures not in ("auto", streams[k].measures):
+                streams[k] = replace(streams[k], measures=measures)
+        return streams[0], streams[1]
 
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
@@ -239,13 +236,6 @@ class Snapshot:
             f"{needed} from {counts} that overlap for {(end_ns - start_ns) * 1e-9:.2f} s; "
             "record longer, or raise max_gap if a stream is slower than that"
         )
-
-
-def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
-    """The trajectory with what the options say that it measures."""
-    if measures in ("auto", trajectory.measures):
-        return trajectory
-    return replace(trajectory, measures=measures)
 
 
 def conventions(config: CalibratorConfig, stream: str) -> dict[str, float | str]:

@@ -256,6 +256,17 @@ class TestClearOffset:
         assert found.calibration.time_offset_s == pytest.approx(0.05, abs=0.003)
 
 
+def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
+    child = late.child.shifted(37.0)
+    found = run(replace(late, buffered_child=child)).calibration
+    assert found.time_offset_s == pytest.approx(-37.0, abs=0.1)
+    assert found.verdict is not Verdict.USE
+    assert {"time_offset"} == {each.code for each in found.findings}
+    given = replace(late.config, time_offset="estimate")
+    asked = run(replace(late, buffered_child=child, config=given)).calibration
+    assert asked.findings == ()
+
+
 def test_the_check_takes_the_correlation_as_it_is(late):
     known, child = 0.049, late.child
     found = check_streams(late.parent, child, known)

@@ -15,7 +15,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
-from reproduction.fault_cases import FAULTS
+from reproduction.fault_cases import FAULTS, SILENT
 
 # Seen by a solve or with no effect at that severity: too little noise, or a part of the tilt.
 STRONGEST = {"S13": 1, "S10b": 2}
@@ -26,7 +26,7 @@ def drive(seed=0):
     return simulate_drive(seed, HILLY_DRIVE, NoiseConfig(gaussian=0.003))
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=[fault.code for fault in FAULTS])
+@pytest.mark.parametrize("fault", [*FAULTS, *SILENT], ids=lambda fault: fault.code)
 def test_every_fault_is_named(fault):
     severity = fault.severities[STRONGEST.get(fault.code, -1)]
     sound = drive()
@@ -127,6 +127,11 @@ class TestOneStreamComputedFromTheOther:
         child = Trajectory(parent.stamps_ns, rounded(child_of(parent.poses), 6)).shifted(-delay_s)
         parent = Trajectory(parent.stamps_ns, rounded(parent.poses, 6))
         assert self.SENTENCE in self.found(parent, child)
+
+    def test_with_a_little_noise_of_its_own(self):
+        parent = drive().parent
+        own = disturbed(child_of(parent.poses), 1, 1e-4, 3e-5)
+        assert self.found(parent, Trajectory(parent.stamps_ns, own)) == [self.SENTENCE]
 
     def test_orientations_alone(self):
         parent, child = _streams(drive())
