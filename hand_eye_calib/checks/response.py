@@ -82,10 +82,16 @@ class Regression:
     columns : mapping of str to (K, r, m) array
     base : sequence of str
         Groups that every fit has.
+    noise : float
+        Variance of noise in each column of the first group, which would make its values too small.
     """
 
     def __init__(
-        self, target: FloatArray, columns: Mapping[str, FloatArray], base: Sequence[str]
+        self,
+        target: FloatArray,
+        columns: Mapping[str, FloatArray],
+        base: Sequence[str],
+        noise: float = 0.0,
     ) -> None:
         self._base = list(base)
         ends = np.cumsum([column.shape[2] for column in columns.values()])
@@ -107,6 +113,8 @@ class Regression:
                     )
                 ]
             )
+            if noise:
+                self.blocks[:, :3, :3] -= _of_noise(self.blocks[:, :3, :3], noise, weights)
             values = _solved(self.blocks.sum(axis=0), known)
             lengths = np.linalg.norm(target - flat[:, :, known] @ values, axis=1)
             sigma = max(median(lengths) / np.sqrt(target.shape[1]), 1e-12)
@@ -139,6 +147,14 @@ class Regression:
         values.
         """
         return np.asarray(self.sigma**2 * self._weight / np.maximum(self.powers(group), 1e-300))
+
+
+def _of_noise(grams: FloatArray, variance: float, weights: FloatArray) -> FloatArray:
+    """What noise adds to sums of products (B, 3, 3) over blocks: at most half of them."""
+    amounts = variance * np.array([part.sum() for part in np.array_split(weights, len(grams))])
+    sizes, directions = np.linalg.eigh(grams)
+    kept = np.minimum(amounts[:, None], 0.5 * np.maximum(sizes, 0.0))
+    return np.asarray((directions * kept[:, None, :]) @ np.swapaxes(directions, 1, 2))
 
 
 def _solved(products: FloatArray, columns: IntArray) -> FloatArray:
@@ -264,7 +280,7 @@ def short_response(
     b_in = _times(to_child[0], b)
     late = -0.5 * (_times(from_parent, faster_p) + _times(from_child, faster_c)) / (2 * h)
     displacements = Regression(
-        b_in - _times(to_parent[0], a) - chords @ T_parent_child[:3, 3],
+        b_in - _times(to_parent[0], a),
         {
             "lever": chords,
             "rotation": se3.skew(b_in),
@@ -275,6 +291,7 @@ def short_response(
             "smooth_parent": -_times(from_parent, bend_a)[:, :, None] / (3 * h**2),
         },
         ("lever", "rotation", "late"),
+        noise=rotations.sigma**2,
     )
     # An error of an orientation turns a displacement and its bend alike.
     lengths = [median(np.linalg.norm(vectors, axis=1)) for vectors in (a, bend_a)]
