@@ -3,6 +3,7 @@ little of the motion unexplained and yet spoil the extrinsic.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -103,17 +104,18 @@ def check_agreement(
     """
     if same := check_same(*known):
         return same
-    found = sorted(_of_response(pose_pairs, motions, T_parent_child), key=lambda each: -each[0])
+    suspects = [*_of_response(pose_pairs, motions, T_parent_child)]
     # One fault shows in several groups of columns: the one that explains most is it.
-    return [each for _, each in found[:1]] + _check_mount(pose_pairs, T_parent_child)
+    found = [max(suspects, key=lambda each: each.share).finding()] if suspects else []
+    return found + _check_mount(pose_pairs, T_parent_child)
 
 
 def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
     """Finding about a coordinate that explains why two streams with the same rotations disagree."""
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
     slow, _ = long_response(pose_pairs, motions, X)
-    found = [each for each in _axis_gains(slow) if each[0] > _MOST]
-    return [max(found, key=lambda each: each[0])[1]] if found else []
+    found = [each for each in _axis_gains(slow) if each.share > _MOST]
+    return [max(found, key=lambda each: each.share).finding()] if found else []
 
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
@@ -142,21 +144,29 @@ def _severity(is_error: bool | np.bool_) -> Severity:
     return Severity.ERROR if is_error else Severity.WARNING
 
 
-_Weighed = Iterator[tuple[float, Finding]]
+@dataclass(frozen=True)
+class _Suspect:
+    """A finding by its key, and the share of the residuals that it explains."""
+
+    share: float
+    key: str
+    stream: str
+    is_error: bool | np.bool_
+    values: dict[str, Any]
+
+    def finding(self) -> Finding:
+        return finding(self.key, self.stream, _severity(self.is_error), **self.values)
 
 
 def _of_response(
     pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
-) -> _Weighed:
-    """Findings about how the child's motion follows the parent's, each with the share of the
-    residuals that it explains.
-    """
+) -> Iterator[_Suspect]:
+    """What is wrong with how the child's motion follows the parent's."""
     slow, axes = long_response(pose_pairs, motions, T_parent_child)
-    gain = np.eye(3)
+    gain, speeds = np.eye(3), _speeds(pose_pairs)
     yield from _rotation_gains(slow, axes, gain)
     yield from _turned(slow)
     yield from _axis_gains(slow)
-    speeds = _speeds(pose_pairs)
     yield from _world_drift(slow, pose_pairs, speeds)
     fast = short_response(pose_pairs, T_parent_child, gain)
     if fast is not None:
@@ -164,52 +174,43 @@ def _of_response(
         yield from _smoothing(*fast, speeds)
 
 
-def _rotation_gains(slow: Regression, axes: FloatArray, gain: FloatArray) -> _Weighed:
+def _rotation_gains(slow: Regression, axes: FloatArray, gain: FloatArray) -> Iterator[_Suspect]:
     """A gain of the child's rotations about an axis, which is put into the matrix ``gain``."""
-    fitted = slow.fit("gain")
+    fitted, powers = slow.fit("gain"), slow.powers("gain")
     sizes = np.abs(fitted.values)
-    biases = slow.biases("gain")
-    limits = np.maximum(_GAINS[0], np.maximum(_SIGMAS * fitted.sigmas, _BIASES * biases))
-    counts = (sizes > limits) & (slow.powers("gain") > LITTLE**2 * slow.powers("gain")[0])
-    if not counts.any():
-        return
-    gain += (axes * np.where(counts, fitted.values, 0.0)) @ axes.T
-    k = int(np.argmax(np.where(counts, sizes / limits, 0.0)))
-    yield (
-        fitted.share,
-        finding(
-            "rotation_gain",
-            "child",
-            _severity(sizes[k] > _GAINS[1]),
-            axis=", ".join(f"{component:.2f}" for component in axes[:, k]),
-            gain=1.0 + fitted.values[k],
-            sigma=fitted.sigmas[k],
-        ),
-    )
+    limits = np.maximum(_SIGMAS * fitted.sigmas, _BIASES * slow.biases("gain"))
+    limits = np.maximum(_GAINS[0], limits)
+    counts = (sizes > limits) & (powers > LITTLE**2 * powers[0])
+    if counts.any():
+        gain += (axes * np.where(counts, fitted.values, 0.0)) @ axes.T
+        k = int(np.argmax(np.where(counts, sizes / limits, 0.0)))
+        axis = ", ".join(f"{component:.2f}" for component in axes[:, k])
+        values: dict[str, Any] = {
+            "axis": axis,
+            "gain": 1.0 + fitted.values[k],
+            "sigma": fitted.sigmas[k],
+        }
+        yield _Suspect(fitted.share, "rotation_gain", "child", sizes[k] > _GAINS[1], values)
 
 
-def _turned(slow: Regression) -> _Weighed:
+def _turned(slow: Regression) -> Iterator[_Suspect]:
     """Positions of a stream that are turned against its orientations, or of both."""
-    tried = [(stream, slow.fit(f"turned_{stream}")) for stream in ("child", "parent")]
-    tried.append(("both", slow.fit("turned_child", "turned_parent")))
-    for stream, fitted in tried:
+    for stream, groups in (("child", 1), ("parent", 1), ("both", 2)):
+        names = ("turned_child", "turned_parent") if groups == 2 else (f"turned_{stream}",)
+        fitted = slow.fit(*names)
         k = int(np.argmax(fitted.significance))
-        size_rad = float(np.abs(fitted.values[k]))
-        if fitted.significance[k] > _SIGMAS and size_rad > _TURNED[0]:
+        size_rad, sigmas = float(np.abs(fitted.values[k])), float(fitted.significance[k])
+        if sigmas > _SIGMAS and size_rad > _TURNED[0]:
             part = fitted.values.reshape(-1, 3)[k // 3]
-            yield (
-                # Six values explain more than three.
-                fitted.share * (0.9 if stream == "both" else 1.0),
-                finding(
-                    "worlds_turned",
-                    stream,
-                    _severity(size_rad > _TURNED[1]),
-                    turned_rad=float(np.linalg.norm(part)),
-                    turned_deg=float(np.degrees(np.linalg.norm(part))),
-                    axis="xyz"[int(np.argmax(np.abs(part)))],
-                    sigmas=float(fitted.significance[k]),
-                ),
-            )
+            turned_rad = float(np.linalg.norm(part))
+            values: dict[str, Any] = {
+                "turned_rad": turned_rad,
+                "turned_deg": float(np.degrees(turned_rad)),
+            }
+            values |= {"axis": "xyz"[int(np.argmax(np.abs(part)))], "sigmas": sigmas}
+            # Six values explain more than three.
+            share = fitted.share * (0.9 if groups == 2 else 1.0)
+            yield _Suspect(share, "worlds_turned", stream, size_rad > _TURNED[1], values)
 
 
 def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
@@ -228,44 +229,34 @@ def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
     return best
 
 
-def _axis_gains(slow: Regression) -> _Weighed:
+def _axis_gains(slow: Regression) -> Iterator[_Suspect]:
     """A coordinate of a stream that has another scale than the others."""
     for stream in ("child", "parent"):
         fitted = slow.fit(f"axes_{stream}", without="scale")
         k, off, sigma = _odd_one(fitted)
         bias = float(slow.biases(f"axes_{stream}")[k])
         if abs(off) > max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * bias):
-            severity = _severity(abs(off) > _AXIS_GAINS[1])
-            code = "constant_coordinate" if 1.0 + off < _CONSTANT else "axis_scale"
+            key = "constant_coordinate" if 1.0 + off < _CONSTANT else "axis_scale"
             values: dict[str, Any] = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
-            yield fitted.share, finding(code, stream, severity, **values)
+            yield _Suspect(fitted.share, key, stream, abs(off) > _AXIS_GAINS[1], values)
 
 
-def _world_drift(slow: Regression, pose_pairs: PosePairs, speeds: FloatArray) -> _Weighed:
+def _world_drift(slow: Regression, pose_pairs: PosePairs, speeds: FloatArray) -> Iterator[_Suspect]:
     """A world that moves against the other."""
     fitted = slow.fit("drift")
-    if fitted.significance.max() < _SIGMAS:
-        return
     positions = pose_pairs.Ts_cw_c[:, :3, 3]
-    velocities = fitted.values[:3] + np.cross(fitted.values[3:], positions - positions.mean(axis=0))
-    share = float(np.sqrt((velocities**2).sum(axis=1).mean())) / max(_rms(speeds), 1e-9)
-    if share > _MOVING:
+    turning = np.cross(fitted.values[3:], positions - positions.mean(axis=0))
+    speed = np.sqrt(((fitted.values[:3] + turning) ** 2).sum(axis=1).mean())
+    share = float(speed) / max(_rms(speeds), 1e-9)
+    if fitted.significance.max() >= _SIGMAS and share > _MOVING:
         speed, rate = (float(np.linalg.norm(part)) for part in np.split(fitted.values, 2))
-        yield (
-            fitted.share,
-            finding(
-                "world_drift",
-                rate_rad_s=rate,
-                deg_per_minute=np.degrees(60 * rate),
-                speed_m_s=speed,
-                m_per_minute=60 * speed,
-                share_of_speed=share,
-                percent=100 * share,
-            ),
-        )
+        values = {"rate_rad_s": rate, "speed_m_s": speed, "share_of_speed": share}
+        values |= {"deg_per_minute": float(np.degrees(60 * rate)), "m_per_minute": 60 * speed}
+        values["percent"] = 100 * share
+        yield _Suspect(fitted.share, "world_drift", "both", False, values)
 
 
-def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) -> _Weighed:
+def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
     """Positions that are late, or early, against orientations of their stream: all, or those along
     one axis of its world.
     """
@@ -278,59 +269,40 @@ def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) ->
     if abs(delay_s) > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
         # Which stream it is cannot be told; hardly a filter makes positions early.
         stream = "child" if delay_s > 0 else "parent"
+        values = {"delay_s": delay_s, "size_s": abs(delay_s), "sigma_s": sigma_s}
+        values["shift_m"] = shift_m
         share = max(of_positions.share, of_rotations.share)
-        yield (
-            share,
-            finding(
-                "position_clock",
-                stream,
-                _severity(shift_m > _SHIFTS_M[1]),
-                delay_s=delay_s,
-                size_s=abs(delay_s),
-                sigma_s=sigma_s,
-                shift_m=shift_m,
-            ),
-        )
+        yield _Suspect(share, "position_clock", stream, shift_m > _SHIFTS_M[1], values)
     for stream, columns in (("child", 0), ("parent", 3)):
         fitted = positions.fit(f"late_axes_{stream}", without="late")
         k, off_s, sigma_s = _odd_one(fitted)
         shift_m = abs(off_s) * float(np.sqrt(np.mean(speeds[:, columns + k] ** 2)))
         # The other stream's coordinate cannot be early.
         if off_s > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
-            values: dict[str, Any] = {
-                "axis": "xyz"[k],
-                "delay_s": off_s,
-                "sigma_s": sigma_s,
-                "shift_m": shift_m,
-            }
-            yield (
-                fitted.share,
-                finding("axis_lag", stream, _severity(shift_m > _SHIFTS_M[1]), **values),
-            )
+            of_axis = {"axis": "xyz"[k], "delay_s": off_s, "sigma_s": sigma_s, "shift_m": shift_m}
+            yield _Suspect(fitted.share, "axis_lag", stream, shift_m > _SHIFTS_M[1], of_axis)
 
 
 def _smoothing(
     rotations: Regression, positions: Regression, least_s2: float, speeds: FloatArray
-) -> _Weighed:
+) -> Iterator[_Suspect]:
     """Smoothing of one part of the poses."""
-    speed = _rms(speeds)
     for part, regression in (("positions", positions), ("orientations", rotations)):
         for stream in ("child", "parent"):
             fitted = regression.fit(f"smooth_{stream}")
             value, sigma = float(fitted.values[0]), float(fitted.sigmas[0])
-            if value < max(_SMOOTHING_S2[part] + least_s2, _SMOOTHING_SIGMAS * sigma):
-                continue
-            shift_m = float(np.sqrt(value)) * speed
-            if shift_m > _SHIFTS_M[0]:
+            smoothing_s = float(np.sqrt(max(value, 0.0)))
+            shift_m = smoothing_s * _rms(speeds)
+            least = max(_SMOOTHING_S2[part] + least_s2, _SMOOTHING_SIGMAS * sigma)
+            if value >= least and shift_m > _SHIFTS_M[0]:
                 values: dict[str, Any] = {
-                    "smoothing_s": float(np.sqrt(value)),
-                    "sigmas": value / max(sigma, 1e-12),
+                    "part": part,
+                    "smoothing_s": smoothing_s,
+                    "shift_m": shift_m,
                 }
-                severity = _severity(shift_m > _SHIFTS_M[1])
-                yield (
-                    fitted.share,
-                    finding("smoothed", stream, severity, part=part, shift_m=shift_m, **values),
-                )
+                values["sigmas"] = value / max(sigma, 1e-12)
+                is_error = shift_m > _SHIFTS_M[1]
+                yield _Suspect(fitted.share, "smoothed", stream, is_error, values)
 
 
 def _speeds(pose_pairs: PosePairs) -> FloatArray:
@@ -406,7 +378,7 @@ def check_independent(parent: Trajectory, child: Trajectory, offset_s: float) ->
     limit_rad = min(_AGREE_RAD, min(rough_p, rough_c) / _BELOW_ROUGHNESS)
     if min(white_p, white_c) > _WHITE:
         limit_rad = max(limit_rad, min(_AGREE_NOISE_RAD, min(rough_p, rough_c) / _BELOW_NOISE))
-    for moved in (child, child.shifted(offset_s)):
+    for moved in (child, child.shifted(offset_s)) if offset_s else (child,):
         # Programs interpolate at the stamps of the new stream, most of them along a straight line.
         for slow, fast in ((moved, parent), (parent, moved)):
             for straight in (True, False):

@@ -236,7 +236,7 @@ def _check_agreeing(
         # What noise may be is no offset: it would look like a delay of one part.
         is_sure = abs(offset.seconds) > _OFFSET_SIGMAS * offset.sigma_s
         offset_s = offset.seconds if is_sure else 0.0
-        if copied := check_independent(streams.parent, streams.child, offset.seconds):
+        if copied := check_independent(streams.parent, streams.child, offset_s):
             findings += [*copied, *check_same(*best)]
         else:
             child = streams.child.shifted(offset_s).scaled(fit.scale)
