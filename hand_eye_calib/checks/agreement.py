@@ -113,8 +113,8 @@ def check_agreement(
 def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
     """Finding about a coordinate that explains why two streams with the same rotations disagree."""
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
-    slow, _ = long_response(pose_pairs, motions, X)
-    found = [each for each in _axis_gains(slow) if each.share > _MOST]
+    slow = long_response(pose_pairs, motions, X)
+    found = [each for each in _axis_gains(slow[0]) if each.share > _MOST] if slow else []
     return [max(found, key=lambda each: each.share).finding()] if found else []
 
 
@@ -162,12 +162,12 @@ def _of_response(
     pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
 ) -> Iterator[_Suspect]:
     """What is wrong with how the child's motion follows the parent's."""
-    slow, axes = long_response(pose_pairs, motions, T_parent_child)
     gain, speeds = np.eye(3), _speeds(pose_pairs)
-    yield from _rotation_gains(slow, axes, gain)
-    yield from _turned(slow)
-    yield from _axis_gains(slow)
-    yield from _world_drift(slow, pose_pairs, speeds)
+    if slow := long_response(pose_pairs, motions, T_parent_child):
+        yield from _rotation_gains(*slow, gain)
+        yield from _turned(slow[0])
+        yield from _axis_gains(slow[0])
+        yield from _world_drift(slow[0], pose_pairs, speeds)
     fast = short_response(pose_pairs, T_parent_child, gain)
     if fast is not None:
         yield from _delays(*fast[:2], speeds)

@@ -114,7 +114,9 @@ class Regression:
                 ]
             )
             if noise:
-                self.blocks[:, :3, :3] -= _of_noise(self.blocks[:, :3, :3], noise, weights)
+                self.blocks[:, :3, :3] -= _of_noise(
+                    self.blocks[:, :3, :3], noise * np.add.reduceat(weights, edges)
+                )
             values = _solved(self.blocks.sum(axis=0), known)
             lengths = np.linalg.norm(target - flat[:, :, known] @ values, axis=1)
             sigma = max(median(lengths) / np.sqrt(target.shape[1]), 1e-12)
@@ -149,9 +151,8 @@ class Regression:
         return np.asarray(self.sigma**2 * self._weight / np.maximum(self.powers(group), 1e-300))
 
 
-def _of_noise(grams: FloatArray, variance: float, weights: FloatArray) -> FloatArray:
+def _of_noise(grams: FloatArray, amounts: FloatArray) -> FloatArray:
     """What noise adds to sums of products (B, 3, 3) over blocks: at most half of them."""
-    amounts = variance * np.array([part.sum() for part in np.array_split(weights, len(grams))])
     sizes, directions = np.linalg.eigh(grams)
     kept = np.minimum(amounts[:, None], 0.5 * np.maximum(sizes, 0.0))
     return np.asarray((directions * kept[:, None, :]) @ np.swapaxes(directions, 1, 2))
@@ -173,9 +174,9 @@ def _cost(products: FloatArray, columns: IntArray) -> float:
 
 def long_response(
     pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
-) -> tuple[Regression, FloatArray]:
+) -> tuple[Regression, FloatArray] | None:
     """Regression of rotations and displacements over seconds, and the principal axes of the
-    rotations (columns, parent's frame).
+    rotations (columns, parent's frame); None if nearly all are near half a turn.
 
     Groups: ``turned_child``, ``turned_parent``: positions turned against orientations, a rotation
     vector in the stream's world; ``axes_child``, ``axes_parent``: factors, less 1, of the
@@ -186,6 +187,8 @@ def long_response(
     A, B = motions.Ts_parenti_parentj, motions.Ts_childi_childj
     x, y = se3.rotation_log(A[:, :3, :3]), se3.rotation_log(B[:, :3, :3]) @ R.T
     keep = np.maximum(np.linalg.norm(x, axis=1), np.linalg.norm(y, axis=1)) < MAX_ROTATION
+    if keep.sum() < _BLOCKS:
+        return None
     motions, A, B, x, y = motions[keep], A[keep], B[keep], x[keep], y[keep]
     a, b = A[:, :3, 3], B[:, :3, 3] @ R.T
     chords = A[:, :3, :3] - np.eye(3)
