@@ -75,7 +75,7 @@ _MOVED_M, _MOVED_RAD = (0.005, 0.02), (float(np.radians(0.2)), float(np.radians(
 # and a slow stream of fast motion is rough without noise. Noise of both streams that is the same
 # shows a copy as well: roughness grows with each further difference as that of white noise does
 # (by 1.9), and what remains is so many times smaller.
-_AGREE_RAD, _BELOW_ROUGHNESS = float(np.radians(0.005)), 50.0
+_AGREE_RAD, _BELOW_ROUGHNESS = float(np.radians(0.008)), 50.0
 _AGREE_NOISE_RAD, _WHITE, _BELOW_NOISE = float(np.radians(0.02)), 1.6, 15.0
 
 # This share of the poses must agree: the rest may be jumps.
