@@ -233,13 +233,10 @@ def _check_agreeing(
     if is_sound:
         of_fit = fit.T_parent_child, np.sqrt(np.diag(fit.covariance)[:6])
         best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
-        # What noise may be is no offset: it would look like a delay of one part.
-        is_sure = abs(offset.seconds) > _OFFSET_SIGMAS * offset.sigma_s
-        offset_s = offset.seconds if is_sure else 0.0
-        if copied := check_independent(streams.parent, streams.child, offset_s):
+        if copied := check_independent(streams.parent, streams.child, offset.seconds):
             findings += [*copied, *check_same(*best)]
         else:
-            child = streams.child.shifted(offset_s).scaled(fit.scale)
+            child = streams.child.shifted(offset.seconds).scaled(fit.scale)
             pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
             motions = _motions(pose_pairs, _MAX_MOTIONS)
             findings += check_agreement(pose_pairs, motions, fit.T_parent_child, best)

@@ -114,9 +114,8 @@ class Regression:
                 ]
             )
             if noise:
-                self.blocks[:, :3, :3] -= _of_noise(
-                    self.blocks[:, :3, :3], noise * np.add.reduceat(weights, edges)
-                )
+                gram = self.blocks.sum(axis=0)[:3, :3]
+                self.blocks[:, :3, :3] -= _of_noise(gram, noise * weights.sum()) / _BLOCKS
             values = _solved(self.blocks.sum(axis=0), known)
             lengths = np.linalg.norm(target - flat[:, :, known] @ values, axis=1)
             sigma = max(median(lengths) / np.sqrt(target.shape[1]), 1e-12)
@@ -151,11 +150,10 @@ class Regression:
         return np.asarray(self.sigma**2 * self._weight / np.maximum(self.powers(group), 1e-300))
 
 
-def _of_noise(grams: FloatArray, amounts: FloatArray) -> FloatArray:
-    """What noise adds to sums of products (B, 3, 3) over blocks: at most half of them."""
-    sizes, directions = np.linalg.eigh(grams)
-    kept = np.minimum(amounts[:, None], 0.5 * np.maximum(sizes, 0.0))
-    return np.asarray((directions * kept[:, None, :]) @ np.swapaxes(directions, 1, 2))
+def _of_noise(gram: FloatArray, amount: float) -> FloatArray:
+    """What noise of this amount adds to sums of products (3, 3): at most half of them."""
+    sizes, directions = np.linalg.eigh(gram)
+    return (directions * np.minimum(amount, 0.5 * np.maximum(sizes, 0.0))) @ directions.T
 
 
 def _solved(products: FloatArray, columns: IntArray) -> FloatArray:
