@@ -50,20 +50,8 @@ def refuse_recordings(
     """Refuse bags that are not parts of one recording, after they were read together.
 
     Parts continue each other, hold different topics, or repeat the same poses, as two recorders do
-    that run side by side.
-
-    Parameters
-    ----------
-    bag : PoseBag
-    sources : mapping of Source to str
-        Topics or pairs of frames, and what the poses of each are read as.
-    max_gap_s : float
-        Poses of two parts may be out of order for so long.
-
-    Raises
-    ------
-    SeveralRecordings
-        The message names two of them and says why.
+    that run side by side. ``sources`` has what the poses of each topic or pair of frames are read
+    as; poses of two parts may be out of order for ``max_gap_s``. Raises SeveralRecordings.
     """
     if len(bag.paths) < 2:
         return

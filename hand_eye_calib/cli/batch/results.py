@@ -42,11 +42,6 @@ _FORMULA = tuple("=+-@＝＋－＠")
 def stored(task: Task, directory: Path) -> Outcome | None:
     """The outcome of an earlier run; None if there is none, it failed, or something has changed
     since.
-
-    Raises
-    ------
-    InputError
-        If the folder of the task is a link that leads out of the directory.
     """
     folder = directory / task.name
     if folder.is_symlink() and not folder.resolve().is_relative_to(directory.resolve()):
@@ -63,13 +58,7 @@ def stored(task: Task, directory: Path) -> Outcome | None:
 
 
 def store(task: Task, outcome: Outcome, page: str | None, directory: Path) -> None:
-    """Write the results of a task into its folder.
-
-    Raises
-    ------
-    InputError
-        If they cannot be written.
-    """
+    """Write the results of a task into its folder."""
     from hand_eye_calib.io.results import save_result
 
     folder = directory / task.name
@@ -83,13 +72,7 @@ def store(task: Task, outcome: Outcome, page: str | None, directory: Path) -> No
 
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:
-    """Write a CSV file of rows: text in quotes, numbers without, None empty.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
+    """Write a CSV file of rows: text in quotes, numbers without, None empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
     writer.writeheader()
@@ -105,10 +88,7 @@ def _as_cell(value: Any) -> Any:
 
 
 def row_of(outcome: Outcome) -> Row:
-    """The row of an outcome; what is not known is None.
-
-    Nothing in it depends on when or where the work was done.
-    """
+    """The row of an outcome, whenever and wherever it was done; what is not known is None."""
     row: Row = dict.fromkeys(COLUMNS)
     row |= {name: outcome[name] for name in ("name", "vehicle", "error")}
     row["bags"] = " ".join(outcome["bags"])

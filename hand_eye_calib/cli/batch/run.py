@@ -63,13 +63,7 @@ class _Done(NamedTuple):
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
-    """Calibrate from many recordings; returns the exit code.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If a batch file cannot be used; a bag that fails is a row in the result.
-    """
+    """Calibrate from many recordings; returns the exit code. A bag that fails is a row."""
     out: Path | None = arguments.out
     title = " ".join(map(str, arguments.batch))
     with waiting_for(f"reading {title}"):
@@ -108,11 +102,6 @@ def run_together(
 ) -> int:
     """Calibrate from several recordings of one rig, each given by its bags or files, for one
     result; returns the exit code.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If no recording can be used.
     """
     out: Path | None = arguments.out
     entries = [{"bag": list(map(str, group))} for group in groups]
@@ -223,13 +212,7 @@ def _write_summary(
     vehicles: Mapping[str, Calibration],
     changed: Collection[str],
 ) -> None:
-    """Write everything that is said of all together, and the results of vehicles that changed.
-
-    Raises
-    ------
-    InputError
-        If something cannot be written.
-    """
+    """Write everything that is said of all together, and the results of vehicles that changed."""
     from hand_eye_calib.io.results import save_result
 
     with waiting_for("writing the summary"):

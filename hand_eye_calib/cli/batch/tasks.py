@@ -60,13 +60,6 @@ class Task:
     def key(self) -> str:
         """Digest of the task, its options, and names, sizes and times of its files, so that no
         older result is taken for this one's.
-
-        Raises
-        ------
-        OSError
-            If a file of a bag cannot be looked at.
-        InputError
-            If a store cannot be reached.
         """
         text = json.dumps([asdict(self), list(map(_state, self.bags))], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -89,21 +82,8 @@ def read_batch(
 ) -> list[Task]:
     """The tasks of a batch file; or of bags, patterns of bags, and entries as in such a file.
 
-    Parameters
-    ----------
-    given : list of path-like or dict
-        One YAML file, or what can stand in its list.
-    options, sources, vehicle
-        What holds if the file says nothing else.
-    **flags
-        Of every Task.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    ConfigError
-        If it says something that cannot be.
+    ``given`` is one YAML file, or what can stand in its list; options, sources and vehicle hold if
+    the file says nothing else, the flags are those of every Task.
     """
     document: Any = [each if isinstance(each, dict) else str(each) for each in given]
     shown, folder = "recordings", Path()
