@@ -84,6 +84,8 @@ class TestOptionsOfCalibrate:
             child_quaternion="wxyz",
             parent_measures="rates",
             child_measures="rotations",
+            parent_kind="exact",
+            child_kind="exact",
             target_translation=0.5,
             target_rotation=0.25,
             target_axes="z=0.1",
