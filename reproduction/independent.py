@@ -246,7 +246,7 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
         result = hec.calibrate(parent, child, child_measures="positions", time_offset="estimate")
         offset, sigmas = result.T_parent_child[:3, 3], result.sigmas_with_floor[:3]
         offsets.append(offset)
-        precisions.append(1.0 / sigmas**2)
+        precisions.append(1.0 / result.sigmas[:3] ** 2)
         ours = " ".join(f"{value:.4f}" for value in offset)
         sigmas_mm = " ".join(f"{1e3 * sigma:.1f}" for sigma in sigmas)
         z = np.max(np.abs(offset - published) / sigmas)
@@ -255,7 +255,13 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
     weights = np.stack(precisions)
     mean = np.sum(weights * offsets, axis=0) / weights.sum(axis=0)
     chi2 = float(np.sum(weights * (np.stack(offsets) - mean) ** 2)) / 6.0
-    yield Row("NTU VIRAL", "chi-square between flights, per degree", f"{chi2:.2f}", "", "3 flights")
+    yield Row(
+        "NTU VIRAL",
+        "chi-square between flights, per degree, without the floor that they share",
+        f"{chi2:.2f}",
+        "",
+        "3 flights",
+    )
 
 
 def page(rows: list[Row]) -> str:
