@@ -31,4 +31,4 @@ def test_commands_and_options_are_completed():
     )
     assert done.returncode == 0, done.stderr
     offered = [set(line.split()) for line in done.stdout.splitlines()]
-    assert offered == [{"check"}, {"--child-format", "--child-frame"}]
+    assert offered == [{"check"}, {"--child-fields", "--child-format", "--child-frame"}]
