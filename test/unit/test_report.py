@@ -163,7 +163,8 @@ def test_numbers_are_the_calibrations(drive, request):
         values = [*transform["translation"], *transform["rpy_deg"]]
         for value, sigma, decimals in zip(values, sigmas, (3, 3, 3, 2, 2, 2), strict=True):
             assert with_sigma(value, sigma, decimals).replace("+/-", "±") in page.text
-    for dof in calibration.observability:
+    totals = calibration.sigmas_with_floor.tolist()
+    for dof, total in zip(calibration.observability, totals, strict=True):
         if dof.verdict is DofVerdict.UNOBSERVABLE:
             continue
         per_unit = {"mm": 1e3, "cm": 100, "m": 1, "deg": 180 / np.pi}
@@ -174,7 +175,7 @@ def test_numbers_are_the_calibrations(drive, request):
         )
         known = re.fullmatch(rf"{dof.name}: ([\d.]+) (mm|cm|m|deg), (\w+)", label)
         number, unit, verdict = known.groups()
-        assert float(number) == pytest.approx(per_unit[unit] * dof.sigma, rel=0.06)
+        assert float(number) == pytest.approx(per_unit[unit] * total, rel=0.06)
         assert verdict == dof.verdict.value
     assert static_transform_command(calibration) in page.text
     assert f"{calibration.n_inliers} of {calibration.n_pairs} are inliers" in page.text
