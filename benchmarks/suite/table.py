@@ -84,7 +84,7 @@ def _growth(source, rows):
     sizes = sorted({row.size for row in rows})
     cells = {}
     for row in rows:
-        cells.setdefault(row.name, {})[row.size] = _cell(row)
+        cells.setdefault(row.name, {})[row.size] = _readable(row.seconds)
     return Table(
         f"Processor time by number of motion pairs ({REFERENCE}; {SHORT} and {LONG:,} "
         f"{source}, others simulated)",
