@@ -21,7 +21,7 @@ def plain(value: Any) -> Any:
     enum its value without spaces. Infinity and NaN, which JSON does not have, become None.
     """
     if isinstance(value, Enum):
-        return str(value.value).replace(" ", "_")
+        value = value.value.replace(" ", "_") if isinstance(value.value, str) else value.value
     if is_dataclass(value) and not isinstance(value, type):
         value = {each.name: getattr(value, each.name) for each in fields(value)}
     if isinstance(value, Mapping):
@@ -71,7 +71,8 @@ def from_plain(kind: Any, value: Any) -> Any:
     if kind is float:
         return _number(value)
     if issubclass(kind, Enum):
-        return {plain(each): each for each in kind}.get(value) or kind(value)
+        by_plain = {plain(each): each for each in kind}
+        return by_plain[value] if value in by_plain else kind(value)
     if isinstance(value, bool) and kind is not bool:
         raise TypeError(f"a {kind.__name__} is true or false")
     return _of_type(kind, value)
