@@ -70,6 +70,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="none: the poses of two files are stops without an order, paired by their rows. So "
         "are the samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH",
     )
+    _add_images(parser)
+    _add_many(parser)
+    add_config_arguments(parser)
+    add_output_arguments(parser)
+    robot = parser.add_argument_group("what is installed")
+    robot.add_argument(
+        "--installed",
+        metavar="SOURCE",
+        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
+        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad',
+    )
+    robot.add_argument(
+        "--base-frame",
+        metavar="FRAME",
+        help="state the child's pose in this frame too, as the URDF of --installed or the bag's "
+        "/tf_static has it",
+    )
+
+
+def _add_images(parser: argparse.ArgumentParser) -> None:
     images = parser.add_argument_group("images of a target, one for each pose of a hand")
     images.add_argument(
         "--target",
@@ -84,6 +104,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="its intrinsics: YAML of camera_info, of Kalibr or of OpenCV",
     )
+
+
+def _add_many(parser: argparse.ArgumentParser) -> None:
     batch = parser.add_argument_group("many recordings")
     batch.add_argument(
         "--batch",
@@ -116,21 +139,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dask",
         metavar="ADDRESS",
         help="use a Dask cluster instead: address of its scheduler, tcp://...",
-    )
-    add_config_arguments(parser)
-    add_output_arguments(parser)
-    robot = parser.add_argument_group("what is installed")
-    robot.add_argument(
-        "--installed",
-        metavar="SOURCE",
-        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
-        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad',
-    )
-    robot.add_argument(
-        "--base-frame",
-        metavar="FRAME",
-        help="state the child's pose in this frame too, as the URDF of --installed or the bag's "
-        "/tf_static has it",
     )
 
 

@@ -78,25 +78,17 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             checked = check_partial(snapshot)
     findings = gravest_first(answered([*checked.findings, *of_files], config))
-    streams = {
-        name: summarise(one)
-        for name, one in zip(STREAMS, (parent, child), strict=True)
-        if len(one) > 1
-    }
+    both = zip(STREAMS, (parent, child), strict=True)
+    streams = {name: summarise(one) for name, one in both if len(one) > 1}
     said = _verdict(findings)
 
     def finish() -> None:
         if arguments.out:
             corrected = child.shifted(offset_s).scaled(scale)
-            names = [
-                f"{stream}: {source if is_bag else Path(source).name}"
-                for stream, source in sources.items()
-            ]
-            write_page(
-                arguments.out / CHECK,
-                "check_page.render_check",
-                *(parent, corrected, checked, findings, names, said, config.max_gap),
-            )
+            shown = ((name, one if is_bag else Path(one).name) for name, one in sources.items())
+            names = [f"{name}: {one}" for name, one in shown]
+            of_page = (parent, corrected, checked, findings, names, said, config.max_gap)
+            write_page(arguments.out / CHECK, "check_page.render_check", *of_page)
 
     errors = [str(finding) for finding in findings[:1] if finding.makes_unusable]
     return show(

@@ -63,8 +63,7 @@ def deliver(
     arguments : argparse.Namespace
         With ``json``, ``out``, ``verbose``, ``installed`` and ``base_frame``.
     inputs : dict
-        Where the data came from, in plain values: part of the JSON document and of the saved file's
-        provenance.
+        Where the data came from, in plain values; it is saved, too.
     snapshot : Snapshot or None
         The poses and options that gave it. With them, ``--out`` also runs the cross-checks and
         writes the report. None for stops.

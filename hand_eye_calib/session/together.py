@@ -189,7 +189,6 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     found = agreement_of_results([*fit.values()])
     names = [*fit]
     apart = {names[index] for index in found.apart}
-    sentence = found.sentence(names)
     unfit |= dict.fromkeys(apart, "it does not belong to the others")
     used = [each for name, each in fit.items() if name not in apart]
     of_axes = dict(zip(names, zip(found.deviations, found.sigmas, strict=True), strict=True))
@@ -203,7 +202,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
         found,
         Together(
             kind=found.kind.value,
-            sentence=sentence,
+            sentence=found.sentence(names),
             chi2=found.chi2,
             dof=found.dof,
             p_value=found.p_value,

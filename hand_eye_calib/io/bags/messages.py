@@ -2,10 +2,7 @@
 
 All types that are read begin with the same bytes: a ``std_msgs/Header``, for some types the
 sensor's frame, then what is measured. Only those are unpacked, which takes a small part of the time
-of a whole message and needs no type definitions. Poses that differ only in their values are
-unpacked together.
-
-A new type is a row in :data:`MESSAGE_TYPES`.
+of a whole message and needs no type definitions. A new type is a row in :data:`MESSAGE_TYPES`.
 """
 
 import math

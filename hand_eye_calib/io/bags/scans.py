@@ -101,14 +101,20 @@ def unpack_scan(data: Buffer, is_ros1: bool) -> Scan:
     points, times = points[is_used], times[is_used]
     if not len(points):
         return Scan(points, times, header_ns, frame)
+    phases, last_ns = _timed(times, header_ns)
+    return Scan(points, phases, last_ns, frame)
+
+
+def _timed(times: FloatArray, header_ns: int) -> tuple[FloatArray, int]:
+    """When each point was taken, from 0 to 1, and the stamp of the last. Times may be relative to
+    the stamp of the header, or absolute.
+    """
     first, span = times.min(), np.ptp(times)
     unit = next((u for u in _UNITS_S if _SHORTEST_S <= span * u <= _LONGEST_S), None)
     if unit is None:
-        return Scan(points, np.ones(len(points)), header_ns, frame)
-    last_s = times.max() * unit
-    # Times are relative to the stamp of the header, or absolute.
-    last_ns = header_ns + round(last_s * 1e9) if last_s <= _LONGEST_S else round(last_s * 1e9)
-    return Scan(points, (times - first) / span, last_ns, frame)
+        return np.ones(len(times)), header_ns
+    last_s = float(times.max() * unit)
+    return (times - first) / span, round(last_s * 1e9) + header_ns * (last_s <= _LONGEST_S)
 
 
 class ScanOdometry:

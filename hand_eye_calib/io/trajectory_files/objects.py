@@ -35,8 +35,7 @@ def trajectory_from_object(
     stamp_unit: str | None = None,
     repair: bool = False,
 ) -> tuple[Trajectory, list[str]]:
-    """The poses of an object as a Trajectory, and what a person should know as a list of str; see
-    :func:`hand_eye_calib.read_trajectory`.
+    """The poses of an object, and what a person should know; see ``read_trajectory``.
 
     Raises
     ------
