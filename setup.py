@@ -113,7 +113,7 @@ setup(
     ],
     extras_require={
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
-        "camera": ["opencv-python-headless>=4.7"],
+        "camera": ["opencv-python-headless>=4.7,<5"],
         "cluster": ["distributed>=2024.1"],
         "completion": ["argcomplete>=2.0"],
         "qr": ["segno>=1.5"],

@@ -85,7 +85,7 @@ def rigs_of(
 
 
 def tables(rigs: Sequence[Recorded], seed: int) -> str:
-    """Errors and coverage by rig; and what is said of recordings that belong, and that do not."""
+    """Errors and coverage by rig; and what is told of recordings that belong, and that do not."""
     rng = np.random.default_rng((34, seed))
     kinds = dict.fromkeys(each.rig for each in rigs if each.truth)
     rows = [_row(kind, [each for each in rigs if each.rig == kind]) for kind in kinds]

@@ -11,7 +11,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 
 POSES = wandering_poses(60)
-PARENT, CHILD = as_trajectory(POSES), as_trajectory(disturbed(child_of(POSES), 1, 1e-4, 1e-4))
+PARENT, CHILD = as_trajectory(POSES), as_trajectory(disturbed(child_of(POSES), 1, 1e-3, 1e-3))
 
 ODD_TOKENS = ("", "nan", "inf", "-inf", "1e400", "1e154", "-1e300", "0x10", "1_0", "1e-400", "abc",
               "9" * 400, "1e999999999", "-0", "1,5", '"', "'", "\0", "\x1b[2J", "١", "1e9", "NaN",

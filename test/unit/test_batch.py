@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import types
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -439,7 +440,7 @@ def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
             copied.append(target)
 
     copied = []
-    monkeypatch.setattr(remote, "_opened", lambda url: (Hostile(), "bag"))
+    monkeypatch.setattr(remote, "_reached", lambda url: nullcontext((Hostile(), "bag")))
     with remote.local_copies(["s3://bag"]) as (paths, _):
         assert copied == [f"{paths[0]}/outside.mcap"]
 

@@ -16,12 +16,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hand_eye_calib.assessment import metrics
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.report import style
 from hand_eye_calib.solvers import park
 from reproduction import comparison, results, runner
 from reproduction.catalogue import ARTEFACTS, GROUPS
@@ -162,15 +159,6 @@ def test_other_trajectories_agree_where_intervals_overlap():
     assert comparison.compare_summaries(ours, near, same_cases=False)
     assert not comparison.compare_summaries(ours, near, same_cases=True)
     assert not comparison.compare_summaries(ours, far, same_cases=False)
-
-
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
-def test_labels_keep_their_distance_and_order(positions):
-    placed = np.array(style.spread(positions, 0.1))
-    order = np.argsort(positions, kind="stable")
-    assert (np.diff(placed[order]) >= 0.1 - 1e-9).all()
-    if len(positions) > 1 and np.diff(np.sort(positions)).min() >= 0.1:
-        np.testing.assert_allclose(placed, positions)
 
 
 def kept_in(folder, source=SOURCE):

@@ -20,7 +20,7 @@ from hand_eye_calib.io.trajectory_files import read_trajectory_file, write_traje
 
 PARENT = as_trajectory(wandering_poses(30), sensor_frame="lidar")
 CHILD = as_trajectory(
-    disturbed(child_of(wandering_poses(30)), 1, 1e-4, 1e-4), sensor_frame="camera"
+    disturbed(child_of(wandering_poses(30)), 1, 1e-3, 1e-3), sensor_frame="camera"
 )
 
 
