@@ -14,23 +14,24 @@ from source_code import SOURCE, imports_of, room_of
 
 ROOT = SOURCE.parent
 
-# What may not be exceeded. The goals are: 30,000 lines, 19,000 of code, 400 constants, no file
-# above 500 lines, 10 functions above 50, 450 functions in 50 files entered by ``calibrate a b``;
-# 7,000 lines of reproduction, 19,000 of tests, 35,000 words.
+# What may not be exceeded: the sizes of the day on which several recordings, exports, formats of
+# other programs, images and scans came in. The goals, with all of them inside, are: 30,000 lines,
+# 19,000 of code, 400 constants, no file above 500 lines, 10 functions above 50, 450 functions in 50
+# files entered by ``calibrate a b``; 7,000 lines of reproduction, 19,000 of tests, 35,000 words.
 LIMITS = {
-    "lines": 39_100,
-    "lines of code": 24_600,
-    "numeric constants": 745,
+    "lines": 40_700,
+    "lines of code": 26_000,
+    "numeric constants": 790,
     "files above 500 lines": 0,
-    "functions above 50 lines": 19,
-    "rooms": 28,
-    "floors": 15,
-    "arrows between rooms": 179,
-    "functions entered by calibrate": 885,
+    "functions above 50 lines": 20,
+    "rooms": 30,
+    "floors": 17,
+    "arrows between rooms": 187,
+    "functions entered by calibrate": 835,
     "files entered by calibrate": 94,
-    "lines of reproduction": 8_300,
-    "lines of tests": 22_300,
-    "words of documentation": 43_100,
+    "lines of reproduction": 8_600,
+    "lines of tests": 23_750,
+    "words of documentation": 42_900,
 }
 
 _LONG_FILE, _LONG_FUNCTION = 500, 50
