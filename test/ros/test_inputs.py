@@ -197,7 +197,9 @@ class TestRefusedInput:
 
     def test_positions_on_both_inputs(self, start_node, peer):
         node = start_node("-p solve_period:=0.1", *RELIABLE_INPUTS)
-        _, wrong = peer.publishers(NavSatFix)
+        # The one that comes second is refused.
+        peer.wait_matched(peer.publisher(NavSatFix, "parent_odom"))
+        wrong = peer.publisher(NavSatFix, "child_odom")
         node.wait_for_log(
             "/child_odom is not used: positions show a lever arm only beside poses of the other "
             "sensor; the parent measures positions, the child positions"
