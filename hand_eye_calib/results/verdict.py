@@ -291,7 +291,9 @@ def _worse_than_target(result: Result) -> Iterator[_Found]:
         if math.isfinite(dof.sigma) and dof.sigma > target_of(dof.name, result)
     ]
     if rough:
-        told = listing([f"{dof.name} {amount(dof.name, dof.sigma)}" for dof in rough])
+        names = [dof.name for dof in result.observability]
+        total = dict(zip(names, result.sigmas_with_floor.tolist(), strict=True))
+        told = listing([f"{dof.name} {amount(dof.name, total[dof.name])}" for dof in rough])
         targets = {amount(dof.name, target_of(dof.name, result)): None for dof in rough}
         text = f"standard deviations above the target of {listing(list(targets))}: {told}"
         axes = tuple(dof.name for dof in rough)
