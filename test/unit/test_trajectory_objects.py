@@ -167,7 +167,7 @@ class TestShowing:
         )
         figure = hec.plot(dataclasses.replace(result, observability=hidden))
         assert [len(panel.patches) for panel in figure.axes] == [1, 0, 0]
-        assert "Unknown along z: the dashed line." in figure.get_supxlabel()
+        assert "Unknown along z: the dashed line." in figure._supxlabel.get_text()
 
     def test_a_notebook_shows_a_table(self):
         shown = self.result()._repr_html_()
