@@ -349,7 +349,9 @@ def read_bags(
         calibrator = Calibrator(dataclasses.replace(config, **of_streams))
         bag.shown = with_progress
         blocks = bag.blocks(parent, child, config.max_gap, measures)
-        first = list(islice(blocks, 1))
+        # What is read whole, as transforms and scans, is read before the first block.
+        with waiting_for(f"opening {bag}"):
+            first = list(islice(blocks, 1))
         expected = bag.expected(parent, child)
         shown = with_progress(chain(first, blocks), expected, f"reading {bag}", len)
         found = feed(calibrator, shown, sources) + bag.n_left_out
