@@ -53,6 +53,8 @@ _MAX_DISTANCE = 4.0
 # sensors farther apart than this (m): such a prior is in another unit.
 _MAX_LEVER_ARM = 50.0
 
+_ALL_AXES = slice(None)
+
 
 @dataclass(frozen=True)
 class Fused:
@@ -72,14 +74,15 @@ class Fused:
     assessment: Assessment
     contradictions: dict[str, float]
 
-    def status(self, converged: bool) -> SolveStatus:
-        """How a solve ended."""
+    def status(self, converged: bool, within: slice = _ALL_AXES) -> SolveStatus:
+        """How a solve ended, if it can determine the axes ``within``."""
         if not converged:
             return SolveStatus.NOT_CONVERGED
         if self.contradictions:
             return SolveStatus.CONTRADICTED
-        unobservable = self.assessment.named(DofVerdict.UNOBSERVABLE)
-        return SolveStatus.UNOBSERVABLE if unobservable else SolveStatus.OK
+        verdicts = [dof.verdict for dof in self.assessment.observability[within]]
+        is_open = DofVerdict.UNOBSERVABLE in verdicts
+        return SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK
 
     @property
     def warnings(self) -> list[str]:

@@ -33,7 +33,7 @@ from hand_eye_calib.gls.solution import AdaptiveSolution, LeverArmSolution
 from hand_eye_calib.gls.windows import unexplained_share
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals, SolveStatus
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
 from hand_eye_calib.results.records import ClockRate, RateBias
 
 # Two streams of which more than this share of the path, or of the rotation, stays unexplained are
@@ -67,18 +67,10 @@ def _calibration(
     config: CalibratorConfig,
 ) -> Calibration:
     """What both have: a result without frame names, time offset and scale."""
-    verdicts = [dof.verdict for dof in fused.assessment.observability[within_reach]]
-    status = SolveStatus.OK
-    if not solution.converged:
-        status = SolveStatus.NOT_CONVERGED
-    elif fused.contradictions:
-        status = SolveStatus.CONTRADICTED
-    elif DofVerdict.UNOBSERVABLE in verdicts:
-        status = SolveStatus.UNOBSERVABLE
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
-        status=status,
+        status=fused.status(solution.converged, within_reach),
         observability=fused.assessment.observability,
         objective=solution.objective,
         method="adaptive",

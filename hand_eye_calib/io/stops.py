@@ -5,7 +5,6 @@ Read are the samples of MoveIt's calibration (YAML of ``effector_wrt_world``,
 ``T1_0``, ``T2_0`` ... in a FileStorage of OpenCV, and two stacks in an ``.npz``.
 """
 
-import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -83,11 +82,10 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     path = Path(path)
     if path.suffix == ".npz":
         return _of_stacks(path)
-    from hand_eye_calib.io.yaml_files import parse_yaml
+    from hand_eye_calib.io.yaml_files import parse_opencv_yaml
 
     text = read_text(path, _EXPECTED, LARGEST_YAML)
-    # OpenCV's header and tag are not of YAML.
-    document = parse_yaml(re.sub(r"^%YAML:.*|!!opencv-matrix", "", text), str(path))
+    document = parse_opencv_yaml(text, str(path))
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:

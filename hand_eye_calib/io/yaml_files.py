@@ -6,6 +6,7 @@ numbers that are too long, and documents that are too large, too deep, or that e
 by aliases and merge keys.
 """
 
+import re
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,11 @@ def parse_yaml(text: str, name: str) -> Any:
     except Exception as error:
         reason = " ".join(str(error).split())[:_MOST_SHOWN] or type(error).__name__
         raise InputError(f"{name} is not YAML that can be read: {reason}") from None
+
+
+def parse_opencv_yaml(text: str, name: str) -> Any:
+    """The same of a text that may be of OpenCV, whose header and tag are not of YAML."""
+    return parse_yaml(re.sub(r"^%YAML:.*|!!opencv-matrix", "", text), name)
 
 
 def _check_events(text: str) -> None:

@@ -121,7 +121,8 @@ def _of_nmea(text: str, _: str | None) -> Rows:
                 (-1 if side in "SW" else 1) * (int(each[:n]) + float(each[n:]) / 60)
                 for each, n, side in ((lat, 2, north), (lon, 3, east))
             )
-            rows.append((day + now, *degrees, float(cells[9]) + float(cells[11] or 0)))  # type: ignore[arg-type]
+            height = float(cells[9]) + float(cells[11] or 0)
+            rows.append((day + now, *degrees, height))  # type: ignore[arg-type]
     if not rows:
         raise ValueError("NMEA without positions: expected GGA sentences with a fix")
     note = "" if day else "NMEA without a date: stamps are seconds of the day, in UTC"
