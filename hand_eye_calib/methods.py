@@ -3,7 +3,7 @@
 The solvers are in :mod:`hand_eye_calib.solvers.registry` and :mod:`hand_eye_calib.gls`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hand_eye_calib.errors import ConfigError
 
@@ -24,20 +24,12 @@ class MethodRecord:
         Outliers are left out, so that a few jumps of a stream hardly change the answer.
     backends : tuple of str
         Values of the option ``backend`` that it takes.
-    most_poses_of_many, most_poses_of_few : int
-        Largest number of poses for a cross-check of about ten solves, and for one of two: a second
-        or so each. More poses are downsampled to that.
-    parts : int
-        Number of growing parts of the recording in the convergence figure.
     """
 
     name: str
     uses_reference: bool = True
     rejects_outliers: bool = False
     backends: tuple[str, ...] = ("fast",)
-    most_poses_of_many: int = 3_000
-    most_poses_of_few: int = 3_000
-    parts: int = 10
 
     def require_backend(self, backend: str) -> None:
         """Check that the method has a backend.
@@ -54,36 +46,15 @@ class MethodRecord:
             )
 
 
-def _of_stream(name: str) -> MethodRecord:
-    """The record of a method that uses the pose stream as a whole."""
-    return MethodRecord(
-        name=name,
-        uses_reference=False,
-        rejects_outliers=True,
-        most_poses_of_many=600,
-        most_poses_of_few=600,
-        parts=4,
-    )
-
-
-def _of_quadratic_form(name: str, rejects_outliers: bool) -> MethodRecord:
-    """The record of a method whose time hardly depends on the number of poses."""
-    return MethodRecord(
-        name=name,
-        rejects_outliers=rejects_outliers,
-        backends=BACKENDS,
-        most_poses_of_many=20_000,
-        most_poses_of_few=50_000,
-    )
-
+_OF_STREAM = MethodRecord(name="auto", uses_reference=False, rejects_outliers=True)
 
 METHODS = {
     record.name: record
     for record in (
-        _of_stream("auto"),
-        _of_quadratic_form("dnlo", rejects_outliers=True),
-        _of_quadratic_form("dnl", rejects_outliers=False),
+        _OF_STREAM,
+        MethodRecord(name="dnlo", rejects_outliers=True, backends=BACKENDS),
+        MethodRecord(name="dnl", backends=BACKENDS),
         *(MethodRecord(name=name) for name in ("park", "taylor", "zhuang", "ali")),
-        _of_stream("adaptive"),
+        replace(_OF_STREAM, name="adaptive"),
     )
 }

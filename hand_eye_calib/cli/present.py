@@ -17,7 +17,7 @@ from hand_eye_calib.cli.console import (
     typed_options,
     waiting_for,
 )
-from hand_eye_calib.cli.reporting import static_transform_command, with_cross_check, write_report
+from hand_eye_calib.cli.reporting import static_transform_command, write_report
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import json_text
@@ -33,7 +33,6 @@ from hand_eye_calib.text import (
 )
 
 if TYPE_CHECKING:
-    from hand_eye_calib.engine.evidence import Evidence
     from hand_eye_calib.engine.snapshot import Snapshot
 
 _EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
@@ -65,16 +64,12 @@ def deliver(
     inputs : dict
         Where the data came from, in plain values; it is saved, too.
     snapshot : Snapshot or None
-        The poses and options that gave it. With them, ``--out`` also runs the cross-checks and
-        writes the report. None for stops.
+        The poses and options that gave it. With them, ``--out`` also writes the report. None for
+        stops.
     """
     calibration = _with_robot(calibration, arguments)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
-    evidence: Evidence | None = None
-    if arguments.out and snapshot:
-        with waiting_for("cross-checks with other methods and halves of the recording"):
-            calibration, evidence = with_cross_check(calibration, snapshot)
 
     def save() -> Path:
         from hand_eye_calib.io.results import keep_earlier_results, save_result
@@ -83,8 +78,8 @@ def deliver(
         return save_result(calibration, arguments.out, inputs)
 
     def finish() -> None:
-        if evidence is not None and snapshot:
-            write_report(arguments.out, calibration, evidence, snapshot.config, inputs)
+        if arguments.out and snapshot:
+            write_report(arguments.out, calibration, snapshot, inputs)
 
     code = exit_code(calibration)
     reasons = calibration.reasons[:1] if code == _EXIT_FAILED else ()

@@ -2,7 +2,6 @@
 process that writes them for a session of the node.
 """
 
-import dataclasses
 import os
 import pickle
 import shlex
@@ -13,12 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import fail, note, waiting_for
-from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import HandEyeCalibError, InputError
 from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
-    from hand_eye_calib.engine.evidence import Evidence
     from hand_eye_calib.engine.snapshot import Snapshot
     from hand_eye_calib.geometry.trajectory import Trajectory
     from hand_eye_calib.live.processes import SessionResult
@@ -27,23 +24,6 @@ REPORT, CHECK = "report.html", "check.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 # Frame of a child sensor that names none: in a rig it has the name of its input.
 _NAMELESS = "child_sensor"
-
-
-def with_cross_check(
-    calibration: Calibration, snapshot: "Snapshot"
-) -> "tuple[Calibration, Evidence]":
-    """Cross-check a calibration with other methods, other references and the two halves of the
-    recording that gave it; returns it with their scatter, and the evidence for a report.
-    """
-    from hand_eye_calib.engine.evidence import gather
-
-    # The time offset is settled; estimating it again would cost time.
-    config = dataclasses.replace(snapshot.config, time_offset=calibration.time_offset_s)
-    pose_pairs = dataclasses.replace(snapshot, config=config).pose_pairs()
-    streams = dict(zip(("parent", "child"), snapshot.streams, strict=True))
-    evidence = gather(calibration, snapshot.config, pose_pairs, streams)
-    checked = dataclasses.replace(calibration, cross_check=evidence.cross_check)
-    return checked, evidence
 
 
 def static_transform_command(calibration: Calibration) -> str:
@@ -70,19 +50,14 @@ def static_transform_command(calibration: Calibration) -> str:
 # ----------------------------------------------------------------------- pages
 
 
-def rendered(
-    calibration: Calibration,
-    evidence: "Evidence",
-    config: CalibratorConfig,
-    inputs: Mapping[str, Any],
-) -> str:
-    """The report as HTML, from what :func:`with_cross_check` returns, the options that gave the
-    result, and where the data came from in plain values.
+def rendered(calibration: Calibration, snapshot: "Snapshot", inputs: Mapping[str, Any]) -> str:
+    """The report as HTML, of a result, the poses and options that gave it, and where the data came
+    from in plain values.
     """
     from hand_eye_calib.report.report import render
 
     command = static_transform_command(calibration)
-    return render(calibration, config, evidence, inputs=inputs, command=command)
+    return render(calibration, snapshot, inputs=inputs, command=command)
 
 
 def write_report(directory: Path, *of: Any) -> None:
@@ -163,12 +138,9 @@ def write_session() -> None:
             from hand_eye_calib.io.results import save_result
 
             found = review(result.calibration, result.snapshot, may_solve=False)
-            calibration, evidence = with_cross_check(found.calibration, result.snapshot)
             # The file and the report beside it say the same.
-            save_result(calibration, directory, result.inputs)
-            if calibration.verdict is not result.calibration.verdict:
-                note(f"with cross-checks by other methods: {calibration.headline}")
-            write_report(directory, calibration, evidence, result.snapshot.config, result.inputs)
+            save_result(found.calibration, directory, result.inputs)
+            write_report(directory, found.calibration, result.snapshot, result.inputs)
     except HandEyeCalibError as error:
         sys.exit(fail(error, 1))
 

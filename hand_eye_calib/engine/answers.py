@@ -1,18 +1,15 @@
-"""Other answers to the same question, from parts of the recording and from other methods and
-references, and their scatter about a result, compared with what their covariances allow.
+"""Other answers to the same question, from other references and from parts of the recording, and
+their scatter about a result, compared with what their covariances allow.
 
-Other methods and references show what the noise model misses, such as errors that last longer than
-it assumes; both halves of the recording what changes during it. Neither shows an error that is
-constant.
-
-Long recordings are downsampled before they are solved again, so that all answers together take
-seconds.
+Other references show what the noise model misses, such as errors that last longer than it assumes;
+both halves of the recording what changes during it. Neither shows an error that is constant.
 """
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -30,16 +27,9 @@ from hand_eye_calib.results.records import AxisScatter, CrossCheck
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import MEDIAN_NORMAL, median
 
-# Methods that a result is compared with, at these baselines and with at most so many poses; and the
-# method without a reference.
-_COMPARED_METHODS = ("dnlo", "dnl", "park")
-_COMPARED_BASELINES = (1, 5, 10, 20)
-_MAX_POSES_OF_OTHERS = 3_000
-_COMPARED_ESTIMATOR = "adaptive"
-
-# The same for a check within every solve: the method that takes least time, at these baselines.
-_QUICK_METHOD, _QUICK_BASELINES = "dnlo", (1, 3, 8, 20)
-
+# A result is compared with the method that takes least time, at these baselines, from at most so
+# many poses; the halves of a result without a baseline are solved at the last but one.
+_METHOD, _BASELINES, _MOST_POSES = "dnlo", (1, 3, 8, 20), 3_000
 _MIN_POSES = 20
 
 # Fewest other answers that have a scatter.
@@ -56,167 +46,12 @@ _FEWEST_INLIERS = 0.55
 # Smallest joint standard deviation (m, rad) to divide by: noise-free data has none.
 _ROUNDING = 1e-9
 
-Estimator: TypeAlias = Callable[[PosePairs, CalibratorConfig], Calibration]
-
 # What estimates the extrinsic, or a part of it, by what both streams measure together.
-ESTIMATORS: Mapping[str, Estimator] = {
+ESTIMATORS: Mapping[str, Callable[[PosePairs, CalibratorConfig], Calibration]] = {
     "poses": estimate_extrinsic,
     "rotations": estimate_rotation,
     "positions": estimate_lever_arm,
 }
-
-
-@dataclass(frozen=True)
-class Answer:
-    """Another answer to the same question.
-
-    Attributes
-    ----------
-    label : str
-        Method and reference, or part of the recording.
-    until_s : float
-        Seconds from the first pose of the recording to the last one used.
-    calibration : Calibration
-    stride : int
-        One pose in so many was used.
-    """
-
-    label: str
-    until_s: float
-    calibration: Calibration
-    stride: int = 1
-
-
-class OtherAnswers:
-    """Solves the same question again. Answers with too few data are left out.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The result. Its method, time offset and scale are used in every other answer.
-    config : CalibratorConfig
-        The options that gave it.
-    pose_pairs : PosePairs
-        The poses that gave it, on one clock, each stream in its own unit of length.
-    """
-
-    def __init__(
-        self, calibration: Calibration, config: CalibratorConfig, pose_pairs: PosePairs
-    ) -> None:
-        self._calibration, self._poses = calibration, pose_pairs
-        self._config = replace(
-            config,
-            method=calibration.method,
-            time_offset=calibration.time_offset_s,
-            scale="none" if calibration.measured == "rotations" else calibration.scale,
-            backend="fast",
-        )
-        no_prior: dict[str, Any] = {name: "" for name in vars(config) if name.startswith("prior_")}
-        self._without_prior = replace(self._config, **no_prior)
-
-    def growing(self) -> tuple[Answer, ...]:
-        """From the first part of the recording, the first two ... to all of it, with the prior."""
-        method = METHODS[self._config.method]
-        ends = np.linspace(0, len(self._poses), method.parts + 1).astype(int)[1:-1]
-        parts = {str(end): slice(0, end) for end in ends}
-        found = self._of_parts(parts, self._config, method.most_poses_of_many)
-        return (*found, Answer("all", self._seconds(self._poses), self._calibration))
-
-    def halves(self) -> tuple[Answer, ...]:
-        """From each half alone, without priors."""
-        most = METHODS[self._config.method].most_poses_of_few
-        return self._of_parts(self._halves(), self._without_prior, most)
-
-    def other_methods(self) -> tuple[Answer, ...]:
-        """From other methods and references, without priors: of poses."""
-        if self._calibration.measured != "poses":
-            return ()
-        found: list[Answer | None] = [
-            answer
-            for method in _COMPARED_METHODS
-            for answer in self._at_baselines(method, _COMPARED_BASELINES, estimate_extrinsic)
-        ]
-        label = _COMPARED_ESTIMATOR
-        if self._calibration.method != label:
-            config = replace(self._without_prior, method=label, reference="auto")
-            stride = _stride(len(self._poses), METHODS[label].most_poses_of_few)
-            label += f" (1 in {stride})" if stride > 1 else ""
-            found.append(self._answer(label, slice(None, None, stride), config))
-        return tuple(filter(None, found))
-
-    def quick(self) -> tuple[tuple[Answer, ...], tuple[Answer, ...]]:
-        """From other references, and from each half, with the quickest method: without priors."""
-        others = self._at_baselines(_QUICK_METHOD, _QUICK_BASELINES, estimate_beside)
-        own = self._calibration.reference
-        if not METHODS[self._calibration.method].uses_reference or own[0] not in "BC":
-            own = f"B{_QUICK_BASELINES[2]}"
-        config = replace(self._without_prior, method=_QUICK_METHOD, reference=own)
-        return others, self._of_parts(self._halves(), config, _MAX_POSES_OF_OTHERS, estimate_beside)
-
-    def _halves(self) -> dict[str, slice]:
-        half = len(self._poses) // 2
-        return {"first half": slice(0, half), "second half": slice(half, None)}
-
-    def _at_baselines(
-        self, method: str, baselines: Sequence[int], estimate: Estimator
-    ) -> tuple[Answer, ...]:
-        """A method at these baselines, with at most so many poses; without the result itself."""
-        stride = _stride(len(self._poses), _MAX_POSES_OF_OTHERS)
-        own_label = f"{self._calibration.method} {self._calibration.reference}"
-        found = []
-        for n in baselines:
-            label = f"{method} B{n * stride}"
-            if n * stride * 4 < len(self._poses) and label != own_label:
-                config = replace(self._without_prior, method=method, reference=f"B{n}")
-                found.append(self._answer(label, slice(None, None, stride), config, estimate))
-        return tuple(filter(None, found))
-
-    def _of_parts(
-        self,
-        parts: Mapping[str, slice],
-        config: CalibratorConfig,
-        max_poses: int,
-        estimate: Estimator | None = None,
-    ) -> tuple[Answer, ...]:
-        """Answers from parts of the recording, from at most so many poses of each."""
-        own = self._calibration.reference if estimate is None else config.reference
-        found = []
-        for label, part in parts.items():
-            start, end, _ = part.indices(len(self._poses))
-            stride = _stride(end - start, max_poses)
-            uses_reference = METHODS[config.method].uses_reference
-            on = replace(config, reference=_coarser(own, stride) if uses_reference else "auto")
-            found.append(self._answer(label, slice(start, end, stride), on, estimate))
-        return tuple(filter(None, found))
-
-    def _answer(
-        self, label: str, part: slice, config: CalibratorConfig, estimate: Estimator | None = None
-    ) -> Answer | None:
-        """The answer of an estimator: by default of the one that gave the result."""
-        poses = self._poses[part]
-        if len(poses) < _MIN_POSES:
-            return None
-        try:
-            found = (estimate or ESTIMATORS[self._calibration.measured])(poses, config)
-        except HandEyeCalibError:
-            return None
-        return Answer(label, self._seconds(poses), found, part.step or 1)
-
-    def _seconds(self, poses: PosePairs) -> float:
-        """Seconds from the first pose of the recording to the last of these."""
-        return float((poses.stamps_ns[-1] - self._poses.stamps_ns[0]) * 1e-9)
-
-
-def _stride(count: int, max_count: int) -> int:
-    return max(-(-count // max_count), 1)
-
-
-def _coarser(reference: str, stride: int) -> str:
-    """The reference with about the same pairs of every ``stride``-th pose."""
-    kind, step = reference[0], reference[1:]
-    if kind not in "BC" or not step.isdecimal():
-        return reference
-    return f"{kind}{max(round(int(step) / stride), 1 if kind == 'B' else 2)}"
 
 
 def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
@@ -229,18 +64,73 @@ def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePair
     config : CalibratorConfig
         The options that gave it.
     pose_pairs : PosePairs
-        The poses that gave it.
+        The poses that gave it, on one clock, each stream in its own unit of length.
 
     Returns
     -------
     Calibration
     """
     result = solved.calibration()
-    answers = OtherAnswers(result, config, pose_pairs).quick()
-    others, halves = ([answer.calibration for answer in kind] for kind in answers)
+    others, halves = other_answers(result, config, pose_pairs)
     if unseen := _unseen_by_all(result, others):
         result = solved.calibration(unseen)
     return replace(result, cross_check=compare_answers(result, others, halves))
+
+
+def other_answers(
+    calibration: Calibration, config: CalibratorConfig, pose_pairs: PosePairs
+) -> tuple[list[Calibration], list[Calibration]]:
+    """Answers to the same question at other references, and from each half of the recording, with
+    the time offset and the scale of the result, without priors; those with too few data are left
+    out. Parameters as of :func:`cross_checked`.
+    """
+    no_prior: dict[str, Any] = {name: "" for name in vars(config) if name.startswith("prior_")}
+    settled = replace(
+        config,
+        method=_METHOD,
+        time_offset=calibration.time_offset_s,
+        scale=calibration.scale,
+        backend="fast",
+        **no_prior,
+    )
+
+    def answers(parts: Sequence[tuple[str, slice]]) -> list[Calibration]:
+        found = []
+        for reference, part in parts:
+            poses = pose_pairs[part]
+            if len(poses) >= _MIN_POSES:
+                with contextlib.suppress(HandEyeCalibError):
+                    found.append(estimate_beside(poses, replace(settled, reference=reference)))
+        return found
+
+    n_poses, own = len(pose_pairs), calibration.reference
+    stride = _stride(n_poses)
+    others = [
+        (f"B{n}", slice(None, None, stride))
+        for n in _BASELINES
+        if n * stride * 4 < n_poses and (calibration.method, own) != (_METHOD, f"B{n * stride}")
+    ]
+    if not METHODS[calibration.method].uses_reference or own[0] not in "BC":
+        own = f"B{_BASELINES[-2]}"
+    half = n_poses // 2
+    edges = ((0, half), (half, n_poses))
+    strides = [_stride(end - start) for start, end in edges]
+    halves = [
+        (_coarser(own, each), slice(*edge, each)) for edge, each in zip(edges, strides, strict=True)
+    ]
+    return answers(others), answers(halves)
+
+
+def _stride(count: int) -> int:
+    return max(-(-count // _MOST_POSES), 1)
+
+
+def _coarser(reference: str, stride: int) -> str:
+    """The reference with about the same pairs of every ``stride``-th pose."""
+    kind, step = reference[0], reference[1:]
+    if not step.isdecimal():
+        return reference
+    return f"{kind}{max(round(int(step) / stride), 1 if kind == 'B' else 2)}"
 
 
 def _unseen_by_all(calibration: Calibration, others: Sequence[Calibration]) -> list[str]:

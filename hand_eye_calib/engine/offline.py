@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, TypeAlias, cast
 import numpy as np
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.answers import OtherAnswers, compare_answers
+from hand_eye_calib.engine.answers import compare_answers, other_answers
 from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.errors import ConfigError
@@ -234,9 +234,8 @@ def cross_check(
     child: Trajectory,
     config: CalibratorConfig | None = None,
 ) -> CrossCheck:
-    """Cross-check a result with other methods and references and with both halves of its recording.
-
-    This solves some fifteen times.
+    """Cross-check a result with DNLO at other references and with both halves of its recording, as
+    every solve with method or reference auto does by itself.
 
     Parameters
     ----------
@@ -268,9 +267,4 @@ def cross_check(
     config.require_poses("a cross-check")
     settled = replace(config, time_offset=calibration.time_offset_s)
     pose_pairs = whole_snapshot(settled, parent, child).pose_pairs()
-    answers = OtherAnswers(calibration, config, pose_pairs)
-    return compare_answers(
-        calibration,
-        [other.calibration for other in answers.other_methods()],
-        [half.calibration for half in answers.halves()],
-    )
+    return compare_answers(calibration, *other_answers(calibration, config, pose_pairs))

@@ -1,15 +1,15 @@
 """``check.html``: the findings of the stream checks, and a figure of both streams."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Finding
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import view_streams
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.report.captions import TITLES, of_streams
+from hand_eye_calib.report.figures import figure_of_streams
 from hand_eye_calib.report.report import TONES, page
-from hand_eye_calib.report.report_figures import draw_streams
 
 # A smaller time offset (s) is not mentioned.
 _SHOWN_S = 5e-4
@@ -36,14 +36,14 @@ def render_check(
     if checked.correlation.overlap_s:
         offset_s = checked.correlation.offset_s if checked.correlation.is_clear else 0.0
         seen = view_streams(parent, child.shifted(offset_s), max_gap_s)
-        text = of_streams(seen)
+        drawn = figure_of_streams(seen, ("parent", "child"))
         if abs(offset_s) >= _SHOWN_S:
-            text += (
+            more_said = (
                 f" In the figure {offset_s:.3f} s are added to the child's stamps: with that "
                 f"offset both have the same {seen.quantity}."
             )
-        svg = draw_streams(seen, ("parent", "child"))
-        figures = [{"name": "streams", "title": TITLES["streams"], "said": text, "svg": svg}]
+            drawn = replace(drawn, said=drawn.said + more_said)
+        figures = [drawn]
     word, _, said = verdict.partition(": ")
     more = {"inputs": inputs, "findings": findings, "figures": figures}
     return page("check.html", TONES[word], word, said, **more)

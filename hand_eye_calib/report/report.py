@@ -14,13 +14,12 @@ import numpy as np
 
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.streams import summarise
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.evidence import Evidence
-from hand_eye_calib.errors import printable
+from hand_eye_calib.engine.evidence import Evidence, gather
+from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.report.captions import TITLES, captions
-from hand_eye_calib.report.report_figures import draw_all
+from hand_eye_calib.report.figures import figures_of
 from hand_eye_calib.results.calibration import Calibration, Reason, Verdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
@@ -90,10 +89,29 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
     )
 
 
+def write_report(calibration: Calibration, path: Path) -> Path:
+    """Write the report of a result that was calibrated in this process; returns the file.
+
+    Raises
+    ------
+    InputError
+        If the result has no poses, or the file cannot be written.
+    """
+    snapshot = calibration.recording
+    if not isinstance(snapshot, Snapshot):
+        raise InputError("a result that was read from a file has no poses; calibrate again")
+    path = path / "report.html" if path.is_dir() else path
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(render(calibration, snapshot), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
+    return path
+
+
 def render(
     calibration: Calibration,
-    config: CalibratorConfig,
-    evidence: Evidence,
+    snapshot: Snapshot,
     *,
     inputs: Plain | None = None,
     command: str = "",
@@ -103,10 +121,8 @@ def render(
     Parameters
     ----------
     calibration : Calibration
-    config : CalibratorConfig
-        The options that gave it.
-    evidence : Evidence
-        See :func:`~hand_eye_calib.engine.evidence.gather`.
+    snapshot : Snapshot
+        The poses and options that gave it.
     inputs : mapping, optional
         Where the data came from, in plain values.
     command : str
@@ -125,7 +141,7 @@ def render(
     parent, child = printable(calibration.parent_frame), printable(calibration.child_frame)
     verdict, _, said = calibration.headline.partition(": ")
     document, numbers = calibration.to_dict(), calibration.usable_numbers()
-    svgs = draw_all(calibration, evidence)
+    evidence = gather(calibration, snapshot)
     is_poor = calibration.verdict is Verdict.DO_NOT_USE
     unknown = {*calibration.out_of_reach}
     return page(
@@ -151,16 +167,15 @@ def render(
         unknown=listing([value for value in numbers.values() if isinstance(value, str)]),
         target=_targets(calibration),
         reasons=[_reason(reason) for reason in shown(calibration.reasons)],
-        figures=[
-            {"name": name, "title": TITLES[name], "said": text, "svg": svgs.get(name)}
-            for name, text in captions(calibration, evidence).items()
-        ],
+        figures=figures_of(calibration, evidence),
         shown_first=_SHOWN_FIRST,
         findings=calibration.findings,
         summary=_summary(calibration, evidence),
         streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
         provenance=list(_provenance(inputs)),
-        options={name: value for name, value in config.to_options().items() if value != ""},
+        options={
+            name: value for name, value in snapshot.config.to_options().items() if value != ""
+        },
     )
 
 

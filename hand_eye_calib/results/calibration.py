@@ -201,15 +201,14 @@ class Calibration(Result):
         return upstairs("report.plot", "plot")(self)
 
     def report(self, path: str | Path) -> Path:
-        """Cross-check the result with other methods and both halves of its recording, and write the
-        report as one HTML file; a directory gets ``report.html``.
+        """Write the report as one HTML file; a directory gets ``report.html``.
 
         Raises
         ------
         InputError
             If the result was read from a file, which has no poses.
         """
-        return cast(Path, upstairs("report.of_result", "write_report")(self, Path(path)))
+        return cast(Path, upstairs("report.report", "write_report")(self, Path(path)))
 
     def child_as_parent(self, child: Trajectory) -> Trajectory:
         """The trajectory that the parent sensor has according to the child's: with the time offset

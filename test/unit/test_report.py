@@ -20,13 +20,11 @@ import hand_eye_calib as hec
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE
 from hand_eye_calib.cli.present import static_transform_command
-from hand_eye_calib.cli.reporting import with_cross_check, write_report
-from hand_eye_calib.engine import answers, evidence
+from hand_eye_calib.cli.reporting import write_report
+from hand_eye_calib.engine import evidence
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.report import render
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.finding import Finding, Severity
@@ -35,7 +33,7 @@ from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import REALISTIC
 from hand_eye_calib.text import amount, with_sigma
 
-FIGURES = ("views", "trajectories", "residuals", "convergence", "answers", "streams")
+FIGURES = ("views", "trajectories", "residuals", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 
 
@@ -88,22 +86,14 @@ def simulated(planar=False, poses=200, frames=("lidar", "camera"), **options):
 def page_of(snapshot, calibration, **more):
     if calibration.verdict is not Verdict.DO_NOT_USE:
         more.setdefault("command", static_transform_command(calibration))
-    streams = more.pop("streams", None)
-    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs(), streams)
-    text = render(calibration, snapshot.config, found, **more)
+    text = render(calibration, snapshot, **more)
     return text, Page(text)
 
 
 @pytest.fixture(scope="module")
 def hilly():
     snapshot, calibration = simulated()
-    return (
-        snapshot,
-        calibration,
-        *page_of(
-            snapshot, calibration, streams={"parent": snapshot.parent, "child": snapshot.child}
-        ),
-    )
+    return snapshot, calibration, *page_of(snapshot, calibration)
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +200,7 @@ def partial():
         config = offline_config(streams["parent"], streams["child"], options)
         snapshot = whole_snapshot(config, **streams)
         calibration = snapshot.estimate()
-        made[name] = (calibration, *page_of(snapshot, calibration, streams=streams))
+        made[name] = (calibration, *page_of(snapshot, calibration))
     return made
 
 
@@ -288,54 +278,12 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
         offline_config(drive.parent, drive.child, options), drive.parent, drive.child
     )
     calibration = snapshot.estimate()
-    write_report(tmp_path, *with_cross_check(calibration, snapshot), snapshot.config, {})
+    write_report(tmp_path, calibration, snapshot, {})
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
     assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]
     assert "nan" not in re.findall(r"[a-z]+", page.text.lower())
     assert not re.search(r"\binf\b", page.text)
-
-
-def test_evidence_ends_at_the_result_and_halves_are_halves():
-    snapshot, calibration = simulated(method="dnlo")
-    pose_pairs = snapshot.pose_pairs()
-    found = evidence.gather(calibration, snapshot.config, pose_pairs)
-    assert found.convergence[-1].calibration is calibration
-    parts = [one.calibration.n_poses for one in found.convergence]
-    assert parts == sorted(parts)
-    assert parts[-1] == len(pose_pairs)
-    assert sum(half.calibration.n_poses for half in found.halves) == len(pose_pairs)
-    alone = hec.calibrate(
-        Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p)[: len(pose_pairs) // 2],
-        Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c)[: len(pose_pairs) // 2],
-        reference=calibration.reference,
-        parent_frame="a",
-        child_frame="b",
-    )
-    np.testing.assert_allclose(
-        found.halves[0].calibration.T_parent_child, alone.T_parent_child, atol=1e-9
-    )
-    labels = [one.label for one in found.comparison]
-    assert {"dnl B1", "park B10"} <= set(labels)
-    assert any(label.startswith("adaptive") for label in labels)
-    assert f"{calibration.method} {calibration.reference}" not in labels
-
-
-def test_long_recordings_are_downsampled(monkeypatch):
-    snapshot, calibration = simulated(poses=400, reference="B10")
-    for name, many, few in (("dnlo", 50, 100), ("adaptive", 60, 60)):
-        smaller = dict(most_poses_of_many=many, most_poses_of_few=few)
-        monkeypatch.setitem(METHODS, name, dataclasses.replace(METHODS[name], **smaller))
-    monkeypatch.setattr(answers, "_MAX_POSES_OF_OTHERS", 100)
-    found = evidence.gather(calibration, snapshot.config, snapshot.pose_pairs())
-    assert max(one.calibration.n_poses for one in found.convergence[:-1]) <= 50
-    assert max(one.calibration.n_poses for one in (*found.halves, *found.comparison)) <= 100
-    assert [half.calibration.reference for half in found.halves] == [
-        "B5",
-        "B5",
-    ]  # every second pose
-    assert "dnlo B4" in [one.label for one in found.comparison]  # B1 of every fourth
-    assert "one pose in" in page_of(snapshot, calibration)[1].text
 
 
 @pytest.fixture
@@ -385,9 +333,6 @@ def test_without_out_nothing_is_drawn(files, capsys, monkeypatch):
 def test_streams_are_shown_on_one_clock_and_in_one_unit():
     drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=200))
     seen = evidence.view_streams(drive.parent, drive.child, 0.5)
-    assert np.median(np.abs(np.diff(seen.angles, axis=1))) < 1e-3
-    assert np.median(np.abs(np.diff(seen.along_axis, axis=1))) < 5e-3
-    assert np.ptp(seen.along_axis) > 0.1
     (times_p, rates_p), (times_c, rates_c) = seen.rates
     assert np.median(np.abs(np.interp(times_p, times_c, rates_c) - rates_p)) < 0.01 < rates_p.max()
     assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
@@ -445,7 +390,7 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     ids=["vehicle", "camera", "x up"],
 )
 def test_the_path_is_drawn_in_the_plane_of_motion(order, plane):
-    from hand_eye_calib.report.report_figures import _plane_of_motion
+    from hand_eye_calib.report.figures import _plane_of_motion
 
     time = np.linspace(0, 6, 100)
     path = np.stack([30 * np.sin(time), 20 * np.cos(time), 0.5 * np.sin(9 * time)], axis=1)
@@ -494,28 +439,14 @@ AGAINST = r"do not trust|not settled|record longer|more than chance|disagree|can
 
 @pytest.mark.usefixtures("no_figures")
 def test_no_sentence_speaks_against_a_green_verdict():
-    """Over recordings whose other answers and halves scatter as they like."""
     green = 0
     for seed, poses in ((1, 120), (3, 200), (4, 160)):
         drive = simulate_drive(seed, dataclasses.replace(DRIVE, poses=poses), REALISTIC)
         snapshot = whole_snapshot(
             offline_config(drive.parent, drive.child, {}), drive.parent, drive.child
         )
-        calibration, found = with_cross_check(snapshot.estimate(), snapshot)
-        # However far its halves lie apart, and however late it settled: the rules judge.
-        far = dataclasses.replace(found.halves[0], calibration=moved(found.halves[0].calibration))
-        *before, last = found.convergence
-        before[-1] = dataclasses.replace(before[-1], calibration=far.calibration)
-        late = dataclasses.replace(found, convergence=(*before, last))
-        for shown in (found, dataclasses.replace(late, halves=(far, found.halves[1]))):
-            text = Page(render(calibration, snapshot.config, shown)).text.lower()
-            if calibration.verdict is Verdict.USE:
-                green += 1
-                assert not re.findall(AGAINST, text)
+        calibration = snapshot.estimate()
+        if calibration.verdict is Verdict.USE:
+            green += 1
+            assert not re.findall(AGAINST, Page(render(calibration, snapshot)).text.lower())
     assert green >= 2
-
-
-def moved(calibration):
-    """A result that is 30 of its own standard deviations away."""
-    T = calibration.T_parent_child @ se3.exp(30 * np.sqrt(np.diag(calibration.covariance)))
-    return dataclasses.replace(calibration, T_parent_child=T)

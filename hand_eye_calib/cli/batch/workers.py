@@ -19,7 +19,7 @@ from hand_eye_calib.cli.batch.tasks import Task
 from hand_eye_calib.cli.console import silence
 from hand_eye_calib.cli.options import STREAMS
 from hand_eye_calib.cli.reading import read_paths
-from hand_eye_calib.cli.reporting import rendered, with_cross_check
+from hand_eye_calib.cli.reporting import rendered
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io.limits import ReadingMemory
 from hand_eye_calib.io.remote import local_copies, public
@@ -86,9 +86,7 @@ def _calibrated(task: Task, paths: list[str]) -> Outcome:
         recording.with_fingerprints()
     found: Outcome = {"inputs": recording.inputs}
     if task.with_report:
-        calibration, evidence = with_cross_check(calibration, recording.snapshot)
-        config = recording.snapshot.config
-        found["page"] = rendered(calibration, evidence, config, recording.inputs)
+        found["page"] = rendered(calibration, recording.snapshot, recording.inputs)
     if calibration.status.failure:
         found["error"] = calibration.status.failure
     return found | {

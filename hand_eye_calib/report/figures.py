@@ -1,0 +1,274 @@
+"""The figures of the report, and what there is to see in each, in words and numbers.
+
+The verdict judges, by rules of its own; a caption says how large something is.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.engine.evidence import Evidence, StreamView
+from hand_eye_calib.report.plot import draw_views, said_of_views
+from hand_eye_calib.report.style import (
+    BAD,
+    CHILD,
+    INK,
+    PARENT,
+    WIDTH,
+    as_svg,
+    page_style,
+    plain_decades,
+    plain_label,
+)
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.text import amount, angle, counted, length, listing, share
+
+# Points drawn of a line, and of dots that each stand alone.
+_MOST_ON_A_LINE, _MOST_DOTS, _MOST_OUTLIERS = 1500, 600, 300
+
+# A path is flat if it extends less than this share of its second extent along the third.
+_FLAT = 0.5
+
+# From m and rad to the units of the figures.
+_UNITS = {"x": (100.0, "translation (cm)"), "yaw": (180 / np.pi, "rotation (deg)")}
+
+_WHAT_COINCIDES = {
+    "angular rate": "Two sensors on one rigid body have the same angular rate at every moment, "
+    "however they are mounted: the two curves must coincide, up to the bias of a gyroscope.",
+    "speed": "Two points of one rigid body have the same speed while it does not rotate: the two "
+    "curves must have the same course.",
+}
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure of a page: ``name`` of its element, title, caption and SVG (empty for none)."""
+
+    name: str
+    title: str
+    said: str
+    svg: str
+
+
+def figures_of(calibration: Calibration, evidence: Evidence) -> list[Drawn]:
+    """The figures that a result of its kind has."""
+    makers: dict[str, Callable[[Calibration, Evidence], tuple[Figure, str]]] = {
+        "Both sensors in space": _views,
+        "Both trajectories, aligned": _trajectories,
+        "Residuals over time": _residuals,
+    }
+    if calibration.measured == "rotations":
+        makers = {"Residuals over time": _residuals}
+    with page_style():
+        made = {title: make(calibration, evidence) for title, make in makers.items()}
+        drawn = [
+            Drawn(name, title, said, as_svg(figure, name))
+            for title, (figure, said) in made.items()
+            for name in [makers[title].__name__.strip("_")]
+        ]
+    names = (calibration.parent_frame, calibration.child_frame)
+    return [*drawn, figure_of_streams(evidence.streams, names)]
+
+
+def figure_of_streams(seen: StreamView, names: tuple[str, str]) -> Drawn:
+    """Rates of both streams over time before any solve, and when there are poses; ``names`` are of
+    the parent and the child.
+    """
+    is_speed = seen.quantity == "speed"
+    with page_style():
+        factor, unit = _time_axis(max(times[-1] if len(times) else 0.0 for times, _ in seen.rates))
+        figure, (rate, strip) = _figure(
+            2.95, 2, 1, left=0.8, top=0.25, sharex=True, height_ratios=(5, 1)
+        )
+        looks = ((PARENT, 2.6), (CHILD, 1.0))
+        streams = zip(seen.rates, seen.spans_s, names, looks, strict=True)
+        for row, ((times, rates), spans, name, (colour, width)) in enumerate(streams):
+            values = rates if is_speed else np.degrees(rates)
+            rate.plot(times * factor, values, color=colour, lw=width, label=plain_label(name))
+            bars = [(start * factor, (end - start) * factor) for start, end in spans]
+            strip.broken_barh(bars, (0.6 - row, 0.8), color=colour, lw=0)
+        rate.set(ylabel="speed (m/s)" if is_speed else "angular rate (deg/s)", ylim=(0, None))
+        rate.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
+        strip.set(ylim=(-0.6, 1.6), xlabel=f"time ({unit})")
+        strip.set_yticks([1.0, 0.0], ["parent", "child"])
+        strip.tick_params(axis="y", length=0)
+        strip.grid(visible=False)
+        svg = as_svg(figure, "streams")
+    gaps = [counted(len(spans) - 1, "gap") for spans in seen.spans_s]
+    differ = "Here the streams never overlap."
+    if np.isfinite(seen.apart):
+        apart = length(seen.apart) if is_speed else angle(seen.apart)
+        differ = f"Here they differ by less than {apart}/s half of the time."
+    said = (
+        f"{_WHAT_COINCIDES[seen.quantity]} {differ} The bars below the curves show when there is "
+        f"data: {gaps[0]} in the parent stream, {gaps[1]} in the child stream."
+    )
+    return Drawn("streams", "Both streams before any solve", said, svg)
+
+
+def _figure(
+    height: float,
+    rows: int,
+    columns: int,
+    *,
+    left: float,
+    bottom: float = 0.5,
+    gap: float = 0.2,
+    top: float = 0.3,
+    **options: Any,
+) -> tuple[Figure, Sequence[Axes]]:
+    """A figure with its panels; margins are given in inches, because measuring the text takes more
+    time than all else.
+    """
+    figure = Figure(figsize=(WIDTH, height))
+    right, between = 0.12, 0.15
+    width = (WIDTH - left - right - gap * (columns - 1)) / columns
+    tall = (height - top - bottom - between * (rows - 1)) / rows
+    spacing = {
+        "left": left / WIDTH,
+        "right": 1 - right / WIDTH,
+        "bottom": bottom / height,
+        "top": 1 - top / height,
+        "wspace": gap / width,
+        "hspace": between / tall,
+    }
+    panels = figure.subplots(rows, columns, gridspec_kw=spacing, squeeze=False, **options)
+    return figure, panels.ravel()
+
+
+def _legend(figure: Figure, panel: Axes) -> None:
+    handles = panel.get_legend_handles_labels()
+    figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
+
+
+def _views(calibration: Calibration, evidence: Evidence) -> tuple[Figure, str]:
+    figure, panels = _figure(3.1, 1, 3, left=0.7, gap=0.75)
+    draw_views(panels, calibration)
+    return figure, said_of_views(calibration)
+
+
+def _trajectories(calibration: Calibration, evidence: Evidence) -> tuple[Figure, str]:
+    tracks = evidence.tracks
+    shown = _downsample(len(tracks.times_s), _MOST_ON_A_LINE)
+    factor, unit = _time_axis(tracks.times_s[-1])
+    first, second, across = _plane_of_motion(tracks.parent)
+    figure, (plane, side) = _figure(4.1, 1, 2, left=0.7, bottom=0.85, gap=0.7)
+    names = [calibration.parent_frame, calibration.child_frame]
+    is_reversed = calibration.measured == "positions" and not evidence.has_positions_of_parent
+    through = 0 if is_reversed else 1  # whose path is computed through the result
+    labels = [name + ", through the result" * (n == through) for n, name in enumerate(names)]
+    paths = ((tracks.parent, PARENT, 3.2), (tracks.child, CHILD, 1.1))
+    for (points, colour, width), label in zip(paths, labels, strict=True):
+        look: dict[str, Any] = {"color": colour, "lw": width}
+        plane.plot(points[shown, first], points[shown, second], label=plain_label(label), **look)
+        side.plot(tracks.times_s[shown] * factor, points[shown, across], **look)
+    plane.plot(*tracks.parent[0, [first, second]], "o", color=INK, ms=6, label="start")
+    axes = [f"{axis} (m)" for axis in "xyz"]
+    is_level = across == 2
+    plane.set(title="From above" if is_level else "In the plane of motion")
+    plane.set(xlabel=axes[first], ylabel=axes[second], aspect="equal", adjustable="datalim")
+    side.set(title="Height" if is_level else "Across the plane of motion")
+    side.set(xlabel=f"time ({unit})", ylabel=axes[across])
+    low, high = side.get_ylim()
+    if high - low < 0.5:  # rounding is no relief
+        side.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)
+    _legend(figure, plane)
+    apart = np.linalg.norm(tracks.parent - tracks.child, axis=1)
+    path_m = float(np.linalg.norm(np.diff(tracks.parent, axis=0), axis=1).sum())
+    return figure, (
+        f"The path of {names[1 - through]}, {length(path_m)} long, and the same path "
+        f"computed from the poses of {names[through]} and the result. Half of the time "
+        f"they are within {length(float(np.median(apart)))} of each other, and at most "
+        f"{length(apart.max())} apart, {_at(tracks.times_s[int(np.argmax(apart))], evidence)}. "
+        "That includes drift and jumps of the odometry."
+    )
+
+
+def _plane_of_motion(points: FloatArray) -> tuple[int, int, int]:
+    """Axes to draw a path by: two in the plane of motion, and the one across it.
+
+    A camera moves in its x and z; for it, x and y would be a view from the side. A path that fills
+    all three axes is drawn from above.
+    """
+    extents = np.ptp(points, axis=0)
+    across = int(np.argmin(extents))
+    if extents[across] > _FLAT * np.sort(extents)[1]:
+        across = 2
+    first, second = (axis for axis in range(3) if axis != across)
+    return first, second, across
+
+
+def _residuals(calibration: Calibration, evidence: Evidence) -> tuple[Figure, str]:
+    residuals = evidence.residuals
+    # Of translations under "x", of rotations under "yaw": those that streams of this kind have.
+    sizes = {"x": residuals.translation_m, "yaw": residuals.rotation_rad}
+    sizes.pop({"rotations": "x", "positions": "yaw"}.get(calibration.measured, ""), None)
+    factor, unit = _time_axis(evidence.tracks.times_s[-1])
+    height = 1.0 + 1.6 * len(sizes)
+    figure, panels = _figure(height, len(sizes), 1, left=0.7, bottom=0.8, top=0.1, sharex=True)
+    dots, crosses = (np.flatnonzero(residuals.is_outlier == is_out) for is_out in (False, True))
+    dots = dots[_downsample(len(dots), _MOST_DOTS)]
+    axis, largest = next(iter(sizes.items()))
+    crosses = crosses[np.argsort(-largest[crosses])[:_MOST_OUTLIERS]]
+    times = residuals.times_s * factor
+    used: dict[str, Any] = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
+    rejected: dict[str, Any] = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
+    for panel, (name, sized) in zip(panels, sizes.items(), strict=True):
+        to_unit, label = _UNITS[name]
+        values = np.maximum(sized * to_unit, 1e-5)  # a logarithm has no zero
+        panel.plot(times[dots], values[dots], "o", **used)
+        panel.plot(times[crosses], values[crosses], "x", **rejected)
+        panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
+        panel.set_ylabel(label)
+        panel.yaxis.set_label_coords(-0.06, 0.5)
+        if values.max() > 15 * np.median(values):  # the largest would hide the others
+            panel.set_yscale("log")
+            plain_decades(panel.yaxis)
+        else:
+            panel.set_ylim(0, 1.08 * values.max())
+    panels[-1].set_xlabel(f"time ({unit})")
+    _legend(figure, panels[0])
+    return figure, _said_of_residuals(calibration, evidence, sizes)
+
+
+def _said_of_residuals(
+    calibration: Calibration, evidence: Evidence, sizes: Mapping[str, FloatArray]
+) -> str:
+    residuals = evidence.residuals
+    n_out = int(residuals.is_outlier.sum())
+    what = f"motion pairs ({residuals.reference})"
+    if calibration.measured == "positions":
+        what = "distances from one position to the next"
+    halves, largest = (
+        listing([amount(axis, float(of(values))) for axis, values in sizes.items()])
+        for of in (np.median, np.max)
+    )
+    text = f"Half of the {len(residuals.times_s):,} {what} agree with the result to {halves}"
+    if not n_out:
+        return f"{text}, all of them to {largest}. There are no outliers."
+    axis, values = next(iter(sizes.items()))
+    worst = int(np.argmax(np.where(residuals.is_outlier, values, -1)))
+    return (
+        f"{text}; {n_out:,} ({share(n_out / len(residuals.times_s))}) were rejected as outliers, "
+        f"the largest {amount(axis, values[worst])} {_at(residuals.times_s[worst], evidence)}."
+    )
+
+
+def _time_axis(duration_s: float) -> tuple[float, str]:
+    """Factor and name of the unit in which the time of a recording is shown."""
+    return (1.0, "s") if duration_s < 300 else (1 / 60, "min")
+
+
+def _at(seconds: float, evidence: Evidence) -> str:
+    factor, unit = _time_axis(evidence.tracks.times_s[-1])
+    return f"at {seconds * factor:.1f} {unit}"
+
+
+def _downsample(count: int, most: int) -> IntArray:
+    """Indices of at most ``most`` of so many points, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
