@@ -3,7 +3,7 @@
 The verdict judges, by rules of its own; a caption says how large something is.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +47,7 @@ _WHAT_COINCIDES = {
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure of a page: ``name`` of its element, title, caption and SVG (empty for none)."""
+    """A figure of a page: ``name`` of its element, title, caption and SVG (empty: not drawn)."""
 
     name: str
     title: str
@@ -57,48 +57,46 @@ class Drawn:
 
 def figures_of(calibration: Calibration, evidence: Evidence) -> list[Drawn]:
     """The figures that a result of its kind has."""
-    makers: dict[str, Callable[[Calibration, Evidence], tuple[Figure, str]]] = {
-        "Both sensors in space": _views,
-        "Both trajectories, aligned": _trajectories,
-        "Residuals over time": _residuals,
-    }
-    if calibration.measured == "rotations":
-        makers = {"Residuals over time": _residuals}
-    with page_style():
-        made = {title: make(calibration, evidence) for title, make in makers.items()}
-        drawn = [
-            Drawn(name, title, said, as_svg(figure, name))
-            for title, (figure, said) in made.items()
-            for name in [makers[title].__name__.strip("_")]
-        ]
     names = (calibration.parent_frame, calibration.child_frame)
-    return [*drawn, figure_of_streams(evidence.streams, names)]
+    drawn = [_residuals(calibration, evidence), figure_of_streams(evidence.streams, names)]
+    if calibration.measured == "rotations":
+        return drawn
+    return [figure_of_views([calibration]), _trajectories(calibration, evidence), *drawn]
 
 
+@page_style()
+def figure_of_views(calibrations: Sequence[Calibration]) -> Drawn:
+    """Where the child sensors of one or several results are in their parent's frame."""
+    figure, panels = _figure(3.1, 1, 3, left=0.7, gap=0.75)
+    draw_views(panels, *calibrations)
+    svg = as_svg(figure, "views")
+    return Drawn("views", "The sensors in space", said_of_views(*calibrations), svg)
+
+
+@page_style()
 def figure_of_streams(seen: StreamView, names: tuple[str, str]) -> Drawn:
     """Rates of both streams over time before any solve, and when there are poses; ``names`` are of
     the parent and the child.
     """
     is_speed = seen.quantity == "speed"
-    with page_style():
-        factor, unit = _time_axis(max(times[-1] if len(times) else 0.0 for times, _ in seen.rates))
-        figure, (rate, strip) = _figure(
-            2.95, 2, 1, left=0.8, top=0.25, sharex=True, height_ratios=(5, 1)
-        )
-        looks = ((PARENT, 2.6), (CHILD, 1.0))
-        streams = zip(seen.rates, seen.spans_s, names, looks, strict=True)
-        for row, ((times, rates), spans, name, (colour, width)) in enumerate(streams):
-            values = rates if is_speed else np.degrees(rates)
-            rate.plot(times * factor, values, color=colour, lw=width, label=plain_label(name))
-            bars = [(start * factor, (end - start) * factor) for start, end in spans]
-            strip.broken_barh(bars, (0.6 - row, 0.8), color=colour, lw=0)
-        rate.set(ylabel="speed (m/s)" if is_speed else "angular rate (deg/s)", ylim=(0, None))
-        rate.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
-        strip.set(ylim=(-0.6, 1.6), xlabel=f"time ({unit})")
-        strip.set_yticks([1.0, 0.0], ["parent", "child"])
-        strip.tick_params(axis="y", length=0)
-        strip.grid(visible=False)
-        svg = as_svg(figure, "streams")
+    factor, unit = _time_axis(max(times[-1] if len(times) else 0.0 for times, _ in seen.rates))
+    figure, (rate, strip) = _figure(
+        2.95, 2, 1, left=0.8, top=0.25, sharex=True, height_ratios=(5, 1)
+    )
+    looks = ((PARENT, 2.6), (CHILD, 1.0))
+    streams = zip(seen.rates, seen.spans_s, names, looks, strict=True)
+    for row, ((times, rates), spans, name, (colour, width)) in enumerate(streams):
+        values = rates if is_speed else np.degrees(rates)
+        rate.plot(times * factor, values, color=colour, lw=width, label=plain_label(name))
+        bars = [(start * factor, (end - start) * factor) for start, end in spans]
+        strip.broken_barh(bars, (0.6 - row, 0.8), color=colour, lw=0)
+    rate.set(ylabel="speed (m/s)" if is_speed else "angular rate (deg/s)", ylim=(0, None))
+    rate.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
+    strip.set(ylim=(-0.6, 1.6), xlabel=f"time ({unit})")
+    strip.set_yticks([1.0, 0.0], ["parent", "child"])
+    strip.tick_params(axis="y", length=0)
+    strip.grid(visible=False)
+    svg = as_svg(figure, "streams")
     gaps = [counted(len(spans) - 1, "gap") for spans in seen.spans_s]
     differ = "Here the streams never overlap."
     if np.isfinite(seen.apart):
@@ -146,13 +144,8 @@ def _legend(figure: Figure, panel: Axes) -> None:
     figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
 
 
-def _views(calibration: Calibration, evidence: Evidence) -> tuple[Figure, str]:
-    figure, panels = _figure(3.1, 1, 3, left=0.7, gap=0.75)
-    draw_views(panels, calibration)
-    return figure, said_of_views(calibration)
-
-
-def _trajectories(calibration: Calibration, evidence: Evidence) -> tuple[Figure, str]:
+@page_style()
+def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     tracks = evidence.tracks
     shown = _downsample(len(tracks.times_s), _MOST_ON_A_LINE)
     factor, unit = _time_axis(tracks.times_s[-1])
@@ -180,13 +173,15 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> tuple[Figure,
     _legend(figure, plane)
     apart = np.linalg.norm(tracks.parent - tracks.child, axis=1)
     path_m = float(np.linalg.norm(np.diff(tracks.parent, axis=0), axis=1).sum())
-    return figure, (
+    said = (
         f"The path of {names[1 - through]}, {length(path_m)} long, and the same path "
         f"computed from the poses of {names[through]} and the result. Half of the time "
         f"they are within {length(float(np.median(apart)))} of each other, and at most "
         f"{length(apart.max())} apart, {_at(tracks.times_s[int(np.argmax(apart))], evidence)}. "
         "That includes drift and jumps of the odometry."
     )
+    svg = as_svg(figure, "trajectories")
+    return Drawn("trajectories", "Both trajectories, aligned", said, svg)
 
 
 def _plane_of_motion(points: FloatArray) -> tuple[int, int, int]:
@@ -203,7 +198,8 @@ def _plane_of_motion(points: FloatArray) -> tuple[int, int, int]:
     return first, second, across
 
 
-def _residuals(calibration: Calibration, evidence: Evidence) -> tuple[Figure, str]:
+@page_style()
+def _residuals(calibration: Calibration, evidence: Evidence) -> Drawn:
     residuals = evidence.residuals
     # Of translations under "x", of rotations under "yaw": those that streams of this kind have.
     sizes = {"x": residuals.translation_m, "yaw": residuals.rotation_rad}
@@ -233,7 +229,8 @@ def _residuals(calibration: Calibration, evidence: Evidence) -> tuple[Figure, st
             panel.set_ylim(0, 1.08 * values.max())
     panels[-1].set_xlabel(f"time ({unit})")
     _legend(figure, panels[0])
-    return figure, _said_of_residuals(calibration, evidence, sizes)
+    said = _said_of_residuals(calibration, evidence, sizes)
+    return Drawn("residuals", "Residuals over time", said, as_svg(figure, "residuals"))
 
 
 def _said_of_residuals(

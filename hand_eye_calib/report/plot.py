@@ -1,4 +1,4 @@
-"""Both sensors in space from three sides, with the uncertainty of the child's position."""
+"""Sensors in space from three sides, with the uncertainty of their positions."""
 
 import io
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.report.style import (
     BAD,
     CHILD,
@@ -65,63 +66,76 @@ def plot(calibration: Calibration) -> Figure:
     return figure
 
 
-def said_of_views(calibration: Calibration) -> str:
+def said_of_views(*calibrations: Calibration) -> str:
     """What the three views show, in words."""
-    sigmas = calibration.sigmas_with_floor[:3]
-    unknown = [axis for axis, sigma in zip("xyz", sigmas, strict=True) if not np.isfinite(sigma)]
-    larger = _enlarged(calibration)
-    text = "Axes of both sensors: x red, y green, z blue."
-    if len(unknown) < 3:
+    sigmas = np.array([each.sigmas_with_floor[:3] for each in calibrations])
+    known = np.isfinite(sigmas)
+    larger = _enlarged(calibrations)
+    text = "Axes of all sensors: x red, y green, z blue."
+    if known.any():
         text += f" Ellipse: {_SIGMAS:g} standard deviations of the position"
         text += f", drawn {larger:,.0f} times as large." if larger > 1 else "."
-    if unknown:
+    if not known.all():
+        unknown = [axis for axis, each in zip("xyz", known.T, strict=True) if not each.all()]
         text += f" Unknown along {' and '.join(unknown)}: the dashed line."
     return text
 
 
-def draw_views(panels: Sequence[Axes], calibration: Calibration) -> None:
-    """Draw the three views into three panels."""
-    T, extent = calibration.T_parent_child, _extent(calibration)
-    sigmas = calibration.sigmas_with_floor[:3]
-    R = T[:3, :3]
-    covariance = R @ calibration.covariance_with_floor[:3, :3] @ R.T
+def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
+    """Draw three views into three panels: of the parent sensor, and of the child sensors of one or
+    several results in its frame.
+    """
+    axis_m = _AXIS * _extent(calibrations)
     for panel, (across, up, title) in zip(panels, _VIEWS, strict=True):
         seen = [across, up]
-        panel.plot(*T[seen, 3][:, None] * [[0.0, 1.0]], color=MUTED, lw=0.8, ls=":", zorder=1)
-        for pose, name, colour, below in (
-            (np.eye(4), calibration.parent_frame, PARENT, 6),
-            (T, calibration.child_frame, CHILD, -14),
-        ):
-            at = pose[seen, 3]
-            for axis, of_axis in zip(pose[seen, :3].T, (BAD, GREEN, PARENT), strict=True):
-                panel.plot(*np.stack([at, at + _AXIS * extent * axis], axis=1), color=of_axis)
-            panel.plot(*at, "o", color=colour, ms=5)
-            panel.annotate(
-                plain_label(name), (at[0], at[1]), (5, below), textcoords="offset points", color=INK
-            )
-        if np.isfinite(sigmas[seen]).all():
-            values, vectors = np.linalg.eigh(covariance[np.ix_(seen, seen)])
-            wide, high = 2 * _SIGMAS * _enlarged(calibration) * np.sqrt(np.maximum(values, 0.0))
-            turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
-            panel.add_patch(
-                Ellipse((T[across, 3], T[up, 3]), wide, high, angle=turned, color=CHILD, alpha=0.3)
-            )
-        for axis, line in ((across, panel.axhline), (up, panel.axvline)):
-            if not np.isfinite(sigmas[axis]):
-                line(T[up if axis == across else across, 3], color=CHILD, ls="--", lw=1.0)
+        _draw_sensor(panel, np.eye(4)[seen], calibrations[0].parent_frame, PARENT, axis_m, 6)
+        for calibration in calibrations:
+            T = calibration.T_parent_child
+            at = T[seen, 3]
+            panel.plot(*at[:, None] * [[0.0, 1.0]], color=MUTED, lw=0.8, ls=":", zorder=1)
+            _draw_sensor(panel, T[seen], calibration.child_frame, CHILD, axis_m, -14)
+            is_known = np.isfinite(calibration.sigmas[seen])
+            if is_known.all():
+                R = T[seen, :3]
+                covariance = R @ calibration.covariance_with_floor[:3, :3] @ R.T
+                values, vectors = np.linalg.eigh(covariance)
+                wide, high = (
+                    2 * _SIGMAS * _enlarged(calibrations) * np.sqrt(np.maximum(values, 0.0))
+                )
+                turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
+                ellipse = Ellipse((at[0], at[1]), wide, high, angle=turned, color=CHILD, alpha=0.3)
+                panel.add_patch(ellipse)
+            lines = (panel.axhline, panel.axvline)
+            for line, fixed, known in zip(lines, at[::-1], is_known, strict=True):
+                if not known:
+                    line(fixed, color=CHILD, ls="--", lw=1.0)
         panel.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", title=title)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.3)
 
 
-def _extent(calibration: Calibration) -> float:
-    return max(float(np.linalg.norm(calibration.translation)), _LEAST)
+def _draw_sensor(
+    panel: Axes, seen: FloatArray, name: str, colour: str, axis_m: float, below: float
+) -> None:
+    """A sensor's axes at its origin, and its name; ``seen`` are two rows of its transform."""
+    at = seen[:, 3]
+    for axis, of_axis in zip(seen[:, :3].T, (BAD, GREEN, PARENT), strict=True):
+        panel.plot(*np.stack([at, at + axis_m * axis], axis=1), color=of_axis)
+    panel.plot(*at, "o", color=colour, ms=5)
+    panel.annotate(
+        plain_label(name), (at[0], at[1]), (5, below), textcoords="offset points", color=INK
+    )
 
 
-def _enlarged(calibration: Calibration) -> float:
+def _extent(calibrations: Sequence[Calibration]) -> float:
+    distances = [float(np.linalg.norm(each.translation)) for each in calibrations]
+    return max(*distances, _LEAST)
+
+
+def _enlarged(calibrations: Sequence[Calibration]) -> float:
     """How many times as large the ellipses are drawn, to be seen: 1, 2, 5, 10 ..."""
-    sigmas = calibration.sigmas_with_floor[:3]
+    sigmas = np.array([each.sigmas_with_floor[:3] for each in calibrations])
     widest = _SIGMAS * float(np.max(sigmas[np.isfinite(sigmas)], initial=0.0))
-    wanted = _SEEN * _extent(calibration) / max(widest, 1e-9)
+    wanted = _SEEN * _extent(calibrations) / max(widest, 1e-9)
     steps = [step * 10**power for power in range(6) for step in (1, 2, 5)]
     return float(next((step for step in steps if step >= wanted), steps[-1]))
