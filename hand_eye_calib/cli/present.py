@@ -104,7 +104,7 @@ def _with_robot(calibration: Calibration, arguments: argparse.Namespace) -> Cali
     if calibration.status.failure or not (installed or base):
         return calibration
     from hand_eye_calib.io.installed import frames_of_bag, read_installed
-    from hand_eye_calib.io.urdf import RobotDescription
+    from hand_eye_calib.io.urdf import read_urdf
     from hand_eye_calib.session.compare import with_comparison
 
     if installed:
@@ -114,7 +114,7 @@ def _with_robot(calibration: Calibration, arguments: argparse.Namespace) -> Cali
     if not base:
         return calibration
     if installed and Path(installed).suffix == ".urdf":
-        tree = RobotDescription(Path(installed)).frames
+        tree = read_urdf(Path(installed))
     elif getattr(arguments, "is_of_bags", False):
         tree = frames_of_bag(arguments.paths[0])
     else:

@@ -1,9 +1,9 @@
 """Frames and their parents: the one tree behind robot descriptions, ``/tf`` and ``/tf_static``."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
@@ -14,7 +14,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 _MOST_LISTED = 50
 
 
-def checked_pose(position: Sequence[float], quat_xyzw: Sequence[float]) -> FloatArray:
+def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
     """Pose (4, 4) of a transform as it comes from outside.
 
     Raises
@@ -23,7 +23,7 @@ def checked_pose(position: Sequence[float], quat_xyzw: Sequence[float]) -> Float
         If it is not finite, or the quaternion is not of unit length.
     """
     stamps_ns = np.zeros(1, dtype=np.int64)
-    poses = Trajectory.from_quat_xyzw(stamps_ns, np.array([position]), np.array([quat_xyzw])).poses
+    poses = Trajectory.from_quat_xyzw(stamps_ns, position, quat_xyzw).poses
     return np.asarray(poses[0])
 
 

@@ -1,22 +1,37 @@
-"""What is installed now: from a robot description, an earlier result, a bag, or numbers."""
+"""What is installed now: from a robot description, an earlier result, a file of another program, a
+bag, or numbers.
+"""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
-from hand_eye_calib.geometry.frames import FrameTree
-from hand_eye_calib.io.exports import SUFFIXES, open_export
+from hand_eye_calib.geometry.frames import FrameTree, checked_pose
+from hand_eye_calib.io.files import read_text
+from hand_eye_calib.io.limits import LARGEST_YAML
 from hand_eye_calib.io.results import FILE_NAME, load_result
-from hand_eye_calib.io.urdf import RobotDescription
+from hand_eye_calib.io.urdf import read_urdf
+from hand_eye_calib.io.yaml_files import parse_foreign_yaml
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.exports import FORMATS, arranged
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import parse_pose
 
-# Results say what they are, within so many bytes.
-_FORMAT, _SEARCHED = b"hand_eye_calib/extrinsic", 65_536
+# Results say what they are.
+_FORMAT = "hand_eye_calib/extrinsic"
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
+_DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib", ".npy")
+# A matrix whose rotation is further than this from one is none.
+_ROTATION_WITHIN = 1e-2
+_EXPECTED = "a calibration: extrinsic.yaml of this package, or a file of " + ", ".join(FORMATS)
 
 
 def read_installed(text: str, parent_frame: str, child_frame: str) -> Extrinsic:
@@ -56,32 +71,35 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
         If it is neither a file nor six numbers.
     """
     path = Path(text)
-    try:
-        exists = path.exists()
-    except (OSError, ValueError):
-        exists = False
-    if not exists:
-        numbers = _numbers(text)
-        return lambda parent_frame, child_frame: numbers
-    if (path / FILE_NAME).exists() or path.name == FILE_NAME or _is_result(path):
-        return partial(_of_result, load_result(path), path)
-    if path.suffix in SUFFIXES:
-        return open_export(path).of
-    is_description = path.suffix in _DESCRIPTIONS
-    frames = RobotDescription(path).frames if is_description else frames_of_bag(path)
-    return partial(of_frames, frames, origin=str(path))
+    if not os.path.exists(text):
+        T = _of_numbers(text)
+        return lambda parent_frame, child_frame: Extrinsic(T, text)
+    if (path / FILE_NAME).exists():
+        path = path / FILE_NAME
+    if path.suffix in _DESCRIPTIONS:
+        find = read_urdf(path).pose
+    elif path.suffix in _DOCUMENTS:
+        document = _document(path)
+        if isinstance(document, Mapping) and document.get("format") == _FORMAT:
+            return partial(_of_result, load_result(path), path)
+        find = partial(_find, document)
+    else:
+        find = frames_of_bag(path).pose
+    return partial(stated, find, str(path))
 
 
-def of_frames(frames: FrameTree, parent_frame: str, child_frame: str, origin: str) -> Extrinsic:
-    """The installed pose that a tree of frames has.
+def stated(
+    find: Callable[[str, str], FloatArray], origin: str, parent_frame: str, child_frame: str
+) -> Extrinsic:
+    """The installed pose that a source finds by the names of both frames.
 
     Raises
     ------
     InputError
-        If the frames are not there, or move against each other.
+        If it does not; the message begins with the origin.
     """
     try:
-        return Extrinsic(frames.pose(parent_frame, child_frame), origin)
+        return Extrinsic(find(parent_frame, child_frame), origin)
     except InputError as error:
         raise InputError(f"{origin}: {error}") from None
 
@@ -94,35 +112,197 @@ def frames_of_bag(path: str | Path) -> FrameTree:
         return bag.static_frames()
 
 
-def _is_result(path: Path) -> bool:
-    """Whether a file under another name is a result of this package."""
-    try:
-        with path.open("rb") as file:
-            return path.suffix in (".yaml", ".yml") and _FORMAT in file.read(_SEARCHED)
-    except OSError:
-        return False
+def pose_of(*values: Any) -> FloatArray:
+    """Pose (4, 4) of what a file has: a matrix of 12 or 16 numbers; x, y, z, qx, qy, qz, qw; a
+    message; or a translation and a rotation, as matrix, quaternion w, x, y, z, or roll, pitch and
+    yaw in degrees.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    parts = [_numbers(value) for value in values]
+    sizes, flat, T = tuple(map(len, parts)), np.array(sum(parts, [])), np.eye(4)
+    if not np.isfinite(flat).all():
+        raise InputError("a number is not finite")
+    if sizes in ((16,), (12,)):
+        T[:3] = flat[:12].reshape(3, 4)
+    elif sizes == (7,):
+        T = checked_pose(flat[:3], flat[3:])
+    elif sizes == (3, 4):
+        T = checked_pose(flat[:3], np.roll(flat[3:], -1))
+    elif sizes == (3, 9):
+        T[:3, 3], T[:3, :3] = flat[:3], flat[3:].reshape(3, 3)
+    elif sizes == (3, 3):
+        T = _of_angles(np.r_[flat[:3], np.radians(flat[3:])])
+    else:
+        raise InputError(
+            "expected a pose: 12 or 16 numbers of a matrix, 7 of x, y, z, qx, qy, qz, qw, or "
+            "translation and rotation"
+        )
+    rotation = se3.nearest_rotation(T[:3, :3])
+    if np.abs(rotation - T[:3, :3]).max() > _ROTATION_WITHIN:
+        raise InputError("the rotation is not one")
+    return se3.from_rotation_translation(rotation, T[:3, 3])
 
 
-def _numbers(text: str) -> Extrinsic:
+def _numbers(value: Any) -> list[float]:
+    """The numbers of nested lists, of a message, of OpenCV's matrix or of a text, in their order;
+    empty if something else is among them.
+    """
+    if isinstance(value, Mapping):
+        position = value.get("translation", value.get("position"))
+        quaternion = value.get("rotation", value.get("orientation"))
+        if isinstance(position, Mapping) and isinstance(quaternion, Mapping):
+            value = [position.get(axis) for axis in "xyz"]
+            value += [quaternion.get(axis) for axis in "xyzw"]
+        else:
+            value = value.get("data", ())
+    if isinstance(value, str):
+        value = value.split()
     try:
-        values = parse_pose("installed", text)
+        return [float(x) for x in np.array(value, dtype=float).ravel()]
+    except (TypeError, ValueError):
+        return []
+
+
+def _of_angles(values: Any) -> FloatArray:
+    """A pose (4, 4) from x, y, z, roll, pitch, yaw."""
+    rotation = se3.rotation_from_rpy(np.array(values[3:]))
+    return se3.from_rotation_translation(rotation, np.array(values[:3]))
+
+
+def _of_numbers(text: str) -> FloatArray:
+    try:
+        return _of_angles(parse_pose("installed", text))
     except ConfigError as error:
         raise ConfigError(
             "what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or six "
             f"numbers in m and rad: {error}"
         ) from None
-    rotation = se3.rotation_from_rpy(values[3:])
-    return Extrinsic(se3.from_rotation_translation(rotation, values[:3]), text)
 
 
 def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
     found, wanted = (result.parent_frame, result.child_frame), (parent_frame, child_frame)
-    T, covariance = result.T_parent_child, result.covariance
     if found == wanted[::-1]:
-        adjoint = se3.adjoint(T)
-        T, covariance = result.T_child_parent, adjoint @ covariance @ adjoint.T
+        result = result.inverse()
     elif found != wanted:
         raise InputError(
             f"{path}: is about {found[1]} in {found[0]}; expected {child_frame} in {parent_frame}"
         )
-    return Extrinsic(T, str(path), covariance, is_calibration=True)
+    return Extrinsic(result.T_parent_child, str(path), result.covariance, is_calibration=True)
+
+
+# ---- files of other programs
+
+
+def _document(path: Path) -> Any:
+    """What a file has, in plain values."""
+    if path.suffix == ".npy":
+        try:
+            return np.load(path, allow_pickle=False, mmap_mode="r").tolist()
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(f"cannot read {path}: {error}") from None
+    text = read_text(path, _EXPECTED, LARGEST_YAML)
+    if "EKF2_EV_POS_X" in text or "EKF2_GPS_POS_X" in text:
+        raise InputError(
+            f"{path}: parameters of PX4 have a position and no rotation; give six numbers instead, "
+            '"X Y Z ROLL PITCH YAW"'
+        )
+    return parse_foreign_yaml(text, str(path))
+
+
+def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
+    """The pose of the child sensor in the parent sensor's frame, in a document of any format.
+
+    Raises
+    ------
+    InputError
+        If it does not have it.
+    """
+    nodes, frames = [*_nodes(document, ())], FrameTree("the file")
+    for above, node in nodes:
+        for parent, child, value in _named(above, node):
+            T = value if isinstance(value, np.ndarray) else pose_of(value)
+            frames.add(str(parent).lstrip("/"), str(child).lstrip("/"), T)
+    if frames.edges:
+        return frames.pose(parent_frame, child_frame)
+    for layouts in FORMATS.values():
+        fitting = [
+            each for each in layouts if each.keys and any(_at(node, each.keys) for _, node in nodes)
+        ]
+        if fitting:
+            layout, is_inverted, _ = arranged(fitting, parent_frame, child_frame)
+            T = pose_of(*_of_sensors(nodes, layout.keys, parent_frame, child_frame))
+            return se3.inverse(T) if is_inverted else T
+    if len(_numbers(document)) in (12, 16):
+        return pose_of(document)
+    raise InputError(f"expected {_EXPECTED}")
+
+
+# A mapping, and the keys that lead to it.
+_Node = tuple[tuple[str, ...], Mapping[str, Any]]
+
+
+def _nodes(document: Any, above: tuple[str, ...]) -> Iterator[_Node]:
+    """All mappings of a document."""
+    if isinstance(document, Mapping):
+        yield above, document
+        for name, each in document.items():
+            yield from _nodes(each, (*above, str(name)))
+    elif isinstance(document, list):
+        for each in document:
+            yield from _nodes(each, above)
+
+
+def _named(above: tuple[str, ...], node: Mapping[str, Any]) -> Iterator[tuple[Any, Any, Any]]:
+    """Parent, child and pose of a node that names both frames."""
+    header, about = node.get("header"), node.get("parameters")
+    if isinstance(header, Mapping) and "child_frame_id" in node:  # TransformStamped
+        yield header.get("frame_id"), node["child_frame_id"], node.get("transform")
+    elif {"parent", "child", "value"} <= node.keys():
+        yield node["parent"], node["child"], node["value"]
+    elif {*AXES} <= node.keys() and len(above) > 1:
+        values = _numbers([node[name] for name in AXES])
+        if not np.isfinite(values).all() or len(values) != len(AXES):
+            raise InputError("expected six numbers: x, y, z, roll, pitch, yaw")
+        yield above[-2], above[-1], _of_angles(values)
+    elif isinstance(about, Mapping) and "transform" in node:  # easy_handeye2
+        is_fixed = about.get("calibration_type") == "eye_on_base"
+        robot = about.get("robot_base_frame" if is_fixed else "robot_effector_frame")
+        yield robot, about.get("tracking_base_frame"), node["transform"]
+
+
+def _of_sensors(
+    nodes: list[_Node], keys: tuple[str, ...], parent_frame: str, child_frame: str
+) -> list[Any]:
+    """What stands under some keys; of several, that of these sensors."""
+    found = [
+        ({*above, *map(str, node.values())}, values)
+        for above, node in nodes
+        if (values := _at(node, keys))
+    ]
+    if len(found) > 1:
+        names = {parent_frame, child_frame}
+        named = [each for each in found if any(name.strip("/") in names for name in each[0])]
+        if len(named) != 1:
+            raise InputError(
+                f"has {len(found)} extrinsics, and none or several of them are named "
+                f"{child_frame}; leave the one that is meant"
+            )
+        found = named
+    return found[0][1]
+
+
+def _at(node: Mapping[str, Any], keys: tuple[str, ...]) -> list[Any]:
+    """What stands under keys such as ``T`` or ``extrinsics.T``; empty if one is not there."""
+    found = []
+    for key in keys:
+        value: Any = node
+        for part in [key] if key in node else key.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        if value is None:
+            return []
+        found.append(value)
+    return found

@@ -37,10 +37,8 @@ BLOCK_BYTES = 4 * _MIB
 LARGEST_YAML = 1 * _MIB
 #: Levels of nesting.
 DEEPEST_YAML = 32
-#: Values of a YAML file, with aliases and merge keys expanded.
+#: Values of a YAML file.
 MOST_YAML_VALUES = 100_000
-#: Characters of a number; integers must also fit into 64 bits.
-LONGEST_NUMBER = 64
 
 # ---- trajectory files
 

@@ -17,7 +17,9 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.files import read_text
+from hand_eye_calib.io.installed import pose_of
 from hand_eye_calib.io.limits import LARGEST_YAML
+from hand_eye_calib.io.yaml_files import parse_foreign_yaml
 
 # Names of both poses of a sample, the robot's first.
 _NAMES = (
@@ -36,12 +38,6 @@ _FRAMES = {
     "camera": "tracking_base_frame",
     "target": "tracking_marker_frame",
 }
-
-# With this type of easy_handeye2 ``robot`` is the pose of the base in the hand.
-_BESIDE = "eye_on_base"
-
-# A matrix whose rotation is further than this from one is none.
-_ROTATION_WITHIN = 1e-2
 
 _EXPECTED = (
     "samples of an arm: a list of effector_wrt_world and object_wrt_sensor (MoveIt), of robot and "
@@ -80,102 +76,54 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     (40, 4, 4)
     """
     path = Path(path)
-    if path.suffix == ".npz":
-        return _of_stacks(path)
-    from hand_eye_calib.io.yaml_files import parse_opencv_yaml
-
-    text = read_text(path, _EXPECTED, LARGEST_YAML)
-    document = parse_opencv_yaml(text, str(path))
+    document = _stacks(path) if path.suffix == ".npz" else _document(path)
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
         of_file = document.get("parameters") or {}
         frames = {name: of_file[key] for name, key in _FRAMES.items() if of_file.get(key)}
-        document, is_inverse = document["samples"], of_file.get("calibration_type") == _BESIDE
+        # ``robot`` is the pose of the base in the hand then.
+        is_inverse = of_file.get("calibration_type") == "eye_on_base"
+        document = document["samples"]
     elif isinstance(document, Mapping):
-        document = _pairs_of_opencv(document)
+        pairs = ((document.get(f"T1_{k}"), document.get(f"T2_{k}")) for k in range(len(document)))
+        document = [pair for pair in pairs if None not in pair]
     if not isinstance(document, list) or not document:
         raise InputError(f"{path}: expected {_EXPECTED}")
-    pairs = [_pair(sample, f"{path}, sample {number}") for number, sample in enumerate(document, 1)]
-    robot, tracking = (np.stack(column) for column in zip(*pairs, strict=True))
-    robot = se3.inverse(robot) if is_inverse else robot
-    return ArmSamples(robot, tracking, frames)
+    robot: list[FloatArray] = []
+    tracking: list[FloatArray] = []
+    for number, sample in enumerate(document, 1):
+        try:
+            for Ts, value in zip((robot, tracking), _pair(sample), strict=True):
+                Ts.append(pose_of(value))
+        except InputError as error:
+            raise InputError(f"{path}, sample {number}: {error}") from None
+    Ts_base_hand = se3.inverse(robot) if is_inverse else np.stack(robot)
+    return ArmSamples(Ts_base_hand, np.stack(tracking), frames)
 
 
-def _pairs_of_opencv(document: Mapping[str, Any]) -> list[Any]:
-    """The matrices T1_k and T2_k; empty if there are none."""
-    pairs: list[list[Any]] = []
-    while f"T1_{len(pairs)}" in document and f"T2_{len(pairs)}" in document:
-        pairs.append([document[f"{side}_{len(pairs)}"] for side in ("T1", "T2")])
-    return pairs
+def _document(path: Path) -> Any:
+    return parse_foreign_yaml(read_text(path, _EXPECTED, LARGEST_YAML), str(path))
 
 
-def _pair(sample: Any, where: str) -> tuple[FloatArray, FloatArray]:
-    """Both matrices of a sample."""
+def _stacks(path: Path) -> list[Any]:
+    """Pairs of rows of two stacks of poses."""
+    try:
+        with np.load(path, allow_pickle=False) as stacks:
+            arrays = {name: stacks[name] for name in stacks.files}
+        return [*zip(*_pair(arrays), strict=True)]
+    except (OSError, ValueError, TypeError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
+
+
+def _pair(sample: Any) -> Sequence[Any]:
+    """Both poses of a sample."""
     if isinstance(sample, Mapping):
         names = next((names for names in _NAMES if all(name in sample for name in names)), None)
         if names is None:
-            raise InputError(f"{where}: expected {_EXPECTED}; found {', '.join(sample) or 'none'}")
-        sample = [sample[name] for name in names]
+            known = " or ".join(", ".join(pair) for pair in _NAMES)
+            raise InputError(f"expected poses named {known}; found {', '.join(sample) or 'none'}")
+        return [sample[name] for name in names]
     if not isinstance(sample, Sequence) or len(sample) != 2:
-        raise InputError(f"{where}: expected two poses")
-    return _matrix(sample[0], where), _matrix(sample[1], where)
-
-
-def _matrix(value: Any, where: str) -> FloatArray:
-    """A pose from a matrix of OpenCV, a message or numbers."""
-    if isinstance(value, Mapping) and "data" in value:
-        value = value["data"]
-    try:
-        if isinstance(value, Mapping):
-            position = value.get("translation", value.get("position"))
-            quaternion = value.get("rotation", value.get("orientation"))
-            numbers = [position[axis] for axis in "xyz"] + [quaternion[axis] for axis in "xyzw"]
-            return _poses(np.array([numbers], dtype=float), where)[0]
-        array = np.array(value, dtype=float)
-        return _poses(array.reshape(1, 4, 4) if array.size == 16 else array[None], where)[0]
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{where}: expected a pose: 16 numbers of a matrix, 7 of x, y, z, qx, qy, qz, qw, or "
-            "translation and rotation"
-        ) from None
-
-
-def _of_stacks(path: Path) -> ArmSamples:
-    try:
-        with np.load(path, allow_pickle=False) as stacks:
-            arrays = {name: np.asarray(stacks[name]) for name in stacks.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
-    names = next((names for names in _NAMES if all(name in arrays for name in names)), None)
-    if names is None:
-        raise InputError(
-            f"{path}: expected two stacks of poses named "
-            f"{' or '.join(', '.join(pair) for pair in _NAMES[1:])}; found "
-            f"{', '.join(arrays) or 'none'}"
-        )
-    robot, tracking = (_poses(arrays[name], f"{path}, {name}") for name in names)
-    if len(robot) != len(tracking):
-        raise InputError(
-            f"{path}: {len(robot)} and {len(tracking)} poses; expected as many of both"
-        )
-    return ArmSamples(robot, tracking, {})
-
-
-def _poses(array: FloatArray, where: str) -> FloatArray:
-    """Poses (N, 4, 4) from matrices or from rows x, y, z, qx, qy, qz, qw."""
-    if not np.issubdtype(array.dtype, np.number) or not np.all(np.isfinite(array)):
-        raise InputError(f"{where}: a number is not finite")
-    if array.ndim == 2 and array.shape[1] == 7:
-        norms = np.linalg.norm(array[:, 3:], axis=1, keepdims=True)
-        if np.any(np.abs(norms - 1.0) > _ROTATION_WITHIN):
-            raise InputError(f"{where}: a quaternion does not have the norm 1")
-        return np.asarray(se3.from_quat_xyzw(array[:, :3], array[:, 3:] / norms))
-    if array.ndim != 3 or array.shape[1:] != (4, 4):
-        raise InputError(f"{where}: expected poses (N, 4, 4) or (N, 7); found {array.shape}")
-    rotations = se3.nearest_rotation(array[:, :3, :3])
-    if np.any(np.abs(rotations - array[:, :3, :3]) > _ROTATION_WITHIN):
-        raise InputError(f"{where}: a matrix is no rotation")
-    return np.asarray(se3.from_rotation_translation(rotations, array[:, :3, 3]))
+        raise InputError("expected two poses")
+    return sample

@@ -107,10 +107,10 @@ def read_camera(path: str | Path) -> Camera:
     InputError
         If the file cannot be read, or has none.
     """
-    from hand_eye_calib.io.yaml_files import parse_opencv_yaml
+    from hand_eye_calib.io.yaml_files import parse_foreign_yaml
 
     text = read_text(Path(path), _EXPECTED_CAMERA, LARGEST_YAML)
-    document: Any = parse_opencv_yaml(text, str(path))
+    document: Any = parse_foreign_yaml(text, str(path))
     if isinstance(document, Mapping):
         document = document.get("cam0", document)
     try:

@@ -4,7 +4,6 @@ Only plain URDF is understood. A file with xacro macros is refused, as nobody ca
 value comes from.
 """
 
-import math
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,44 +13,34 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.io.files import read_bytes
+from hand_eye_calib.io.limits import LARGEST_TEXT
 
-LARGEST_URDF = 64 << 20
 
-
-class RobotDescription:
-    """A URDF file.
-
-    Parameters
-    ----------
-    path : str or path-like
+def read_urdf(path: str | Path) -> FrameTree:
+    """The frames of a URDF file.
 
     Raises
     ------
     InputError
         If it cannot be read, is no URDF, or has xacro in it; one line that says why.
     """
-
-    def __init__(self, path: str | Path) -> None:
-        try:
-            data = read_bytes(Path(path), LARGEST_URDF)
-        except OSError as error:
-            raise InputError(f"cannot read {path}: {error.strerror}") from None
-        try:
-            self.frames = _frames(data)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+    try:
+        return _frames(read_bytes(Path(path), LARGEST_TEXT))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def _frames(data: bytes) -> FrameTree:
     if b"<!DOCTYPE" in data:
         raise InputError("has a document type; expected a plain URDF file")
+    if b"<xacro:" in data:
+        raise InputError("has xacro macros; give the URDF that xacro makes of it")
     try:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, LookupError, ValueError) as error:
-        if b"<xacro:" not in data:
-            raise InputError(f"not XML: {error}; expected a URDF file") from None
-    if b"<xacro:" in data:
-        raise InputError("has xacro macros; give the URDF that xacro makes of it")
+        raise InputError(f"not XML: {error}; expected a URDF file") from None
     if root.tag != "robot":
         raise InputError(f"expected a URDF file, found <{root.tag}>")
     joints = root.findall("joint")
@@ -62,8 +51,6 @@ def _frames(data: bytes) -> FrameTree:
     for joint, (parent, child), T_parent_child in zip(
         joints, links, se3.from_rotation_translation(rotations, values[:, :3]), strict=True
     ):
-        if child in found.edges:
-            raise InputError(f"link {child!r} has two parents")
         found.add(parent, child, T_parent_child, joint.get("type") == "fixed")
     return found
 
@@ -78,18 +65,17 @@ def _link(joint: ElementTree.Element, name: str) -> str:
 
 def _origin(joint: ElementTree.Element) -> list[float]:
     """x, y, z, roll, pitch and yaw of a joint's origin."""
-    origins, name = joint.findall("origin"), joint.get("name", "")
-    attributes = dict(origins[0].attrib) if origins else {}
-    if len(origins) > 1 or set(attributes) - {"xyz", "rpy"}:
-        raise InputError(f"the origin of joint {name!r} is not one pair of xyz and rpy")
+    origin = joint.find("origin")
+    attributes = {} if origin is None else dict(origin.attrib)
     try:
-        texts = (attributes.get(each, "0 0 0").split() for each in ("xyz", "rpy"))
-        values = [float(text) for three in texts for text in three]
+        values = [
+            float(text) for name in ("xyz", "rpy") for text in attributes.pop(name, "0 0 0").split()
+        ]
     except ValueError:
         values = []
-    if len(values) != 6 or not all(map(math.isfinite, values)):
+    if attributes or len(values) != 6 or not np.isfinite(values).all():
         raise InputError(
-            f"the origin of joint {name!r} is not six numbers: {attributes}; xacro expressions "
-            "must be evaluated first"
+            f"the origin of joint {joint.get('name', '')!r} is not six numbers, xyz and rpy: "
+            f"{dict(origin.attrib) if origin is not None else {}}"
         )
     return values

@@ -16,7 +16,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.text import axes_in_words
 from hand_eye_calib.version import package_version
 
@@ -50,7 +50,7 @@ class Layout(NamedTuple):
         The file, with ``%(name)s`` where numbers and names go.
     clock : int
         ``t_target = t_source + clock * shift``; 0 if the file has no shift.
-    by_axis : str
+    by_axis : tuple of str
         Axes that stand alone, so that one which is not known can be left to measure by hand.
     """
 
@@ -58,8 +58,8 @@ class Layout(NamedTuple):
     source: str
     keys: tuple[str, ...]
     text: str
-    clock: int = 0
-    by_axis: tuple[str, ...] = ()
+    clock: int
+    by_axis: tuple[str, ...]
 
 
 _YAML_ROWS = "%(about)s\ncam0:\n  {key}:\n%(rows)s\n  timeshift_cam_imu: %(shift)s\n"
@@ -74,214 +74,124 @@ _STAMPED = (
     "  translation: {x: %(x)s, y: %(y)s, z: %(z)s}\n"
     "  rotation: {x: %(qx)s, y: %(qy)s, z: %(qz)s, w: %(qw)s}\n"
 )
+_PX4 = (
+    "%(about)s\nparam set EKF2_{kind}_POS_X %(x)s\nparam set EKF2_{kind}_POS_Y %(y_frd)s\n"
+    "param set EKF2_{kind}_POS_Z %(z_frd)s\n"
+)
 _PARENT, _CHILD = ":parent", ":child"
 
 #: The layouts of each format.
-FORMATS: dict[str, tuple[Layout, ...]] = {
-    "autoware": (
-        Layout(
-            _PARENT,
-            _CHILD,
-            (),
-            "%(about)s\n%(target)s:\n  %(source)s:\n    x: %(x)s\n    y: %(y)s\n    z: %(z)s\n"
-            "    roll: %(roll)s\n    pitch: %(pitch)s\n    yaw: %(yaw)s\n",
-            by_axis=(*TRANSLATIONS, *ROTATIONS),
-        ),
-    ),
-    "fast_lio": (
-        Layout(
-            "imu",
-            "lidar",
-            ("extrinsic_T", "extrinsic_R"),
-            "%(about)s\ncommon:\n    time_offset_lidar_to_imu: %(shift)s\nmapping:\n"
-            "    extrinsic_est_en: false\n" + _LIO,
-            1,
-        ),
-    ),
-    "fast_livo2": (
-        Layout(
-            "imu",
-            "lidar",
-            ("extrinsic_T", "extrinsic_R"),
-            "%(about)s\nextrin_calib:\n" + _LIO + "time_offset:\n    imu_time_offset: %(shift)s\n",
-            1,
-        ),
-        Layout(
-            "camera",
-            "lidar",
-            ("Pcl", "Rcl"),
-            "%(about)s\nextrin_calib:\n    Rcl: [ %(R)s ]\n    Pcl: [ %(t)s ]\n"
-            "time_offset:\n    img_time_offset: %(shift)s\n",
-            -1,
-        ),
-    ),
-    "lio_sam": (
-        Layout(
-            "lidar",
-            "imu",
-            ("extrinsicTrans", "extrinsicRot"),
-            "%(about)s\nlio_sam:\n  extrinsicTrans: [ %(t)s ]\n  extrinsicRot: [ %(R)s ]\n"
-            "  extrinsicRPY: [ %(R)s ]  # the orientation of the IMU is that of its axes\n",
-        ),
-    ),
-    "kalibr": (
-        Layout("camera", "imu", ("T_cam_imu",), _YAML_ROWS.format(key="T_cam_imu"), -1),
-        Layout(
-            "camera:child",
-            "camera:parent",
-            ("T_cn_cnm1",),
-            "%(about)s\n# %(source)s is cam0, %(target)s is cam1.\ncam1:\n  T_cn_cnm1:\n%(rows)s\n",
-        ),
-    ),
-    "openvins": (
-        Layout(
-            "imu",
-            "camera",
-            ("T_imu_cam",),
-            "%%YAML:1.0\n\n" + _YAML_ROWS.format(key="T_imu_cam"),
-            1,
-        ),
-    ),
-    "vins": (
-        Layout(
-            "imu",
-            "camera",
-            ("body_T_cam0",),
-            _OPENCV.format(key="body_T_cam0", dt="d") + "td: %(shift)s\n",
-            1,
-        ),
-    ),
-    "orbslam3": (
-        Layout("imu", "camera", ("IMU.T_b_c1",), _OPENCV.format(key="IMU.T_b_c1", dt="f")),
-        Layout("imu", "camera", ("Tbc",), ""),  # read in files of an older version
-        Layout(
-            "camera:parent",
-            "camera:child",
-            ("Stereo.T_c1_c2",),
-            _OPENCV.format(key="Stereo.T_c1_c2", dt="f"),
-        ),
-    ),
-    "apollo": (
-        Layout(
-            _PARENT,
-            _CHILD,
-            (),
-            "%(about)s\nheader:\n  seq: 0\n  stamp: {secs: 0, nsecs: 0}\n  frame_id: %(target)s\n"
-            "child_frame_id: %(source)s\ntransform:\n" + _STAMPED,
-        ),
-    ),
-    "dlio": (
-        Layout(
-            "base",
-            "lidar",
-            ("baselink2lidar.t", "baselink2lidar.R"),
-            _DLIO.format(key="baselink2lidar"),
-        ),
-        Layout(
-            "base", "imu", ("baselink2imu.t", "baselink2imu.R"), _DLIO.format(key="baselink2imu")
-        ),
-    ),
-    "glim": (
-        Layout(
-            "lidar",
-            "imu",
-            ("T_lidar_imu",),
-            '{\n  "sensors": {\n    "comment": %(about)s,\n'
-            '    "T_lidar_imu": [ %(t)s, %(xyzw)s ]\n  }\n}\n',
-        ),
-    ),
-    "msa": (
-        Layout(
-            _PARENT,
-            _CHILD,
-            (),
-            "%(about)s\n%(source)s:\n  parent: %(target)s\n  child: %(source)s\n"
-            "  value: [ %(t)s, %(xyzw)s ]\n",
-        ),
-    ),
-    "px4": (
-        Layout(
-            _PARENT,
-            "gnss:child",
-            (),
-            "%(about)s\nparam set EKF2_GPS_POS_X %(x)s\nparam set EKF2_GPS_POS_Y %(y_frd)s\n"
-            "param set EKF2_GPS_POS_Z %(z_frd)s\n",
-            by_axis=TRANSLATIONS,
-        ),
-        Layout(
-            _PARENT,
-            _CHILD,
-            (),
-            "%(about)s\nparam set EKF2_EV_POS_X %(x)s\nparam set EKF2_EV_POS_Y %(y_frd)s\n"
-            "param set EKF2_EV_POS_Z %(z_frd)s\n%(ev_delay)s\n",
-            by_axis=TRANSLATIONS,
-        ),
-    ),
-    "kitti": (
-        Layout("camera", "lidar", ("T", "R"), _KITTI),
-        Layout("lidar", "imu", ("T", "R"), _KITTI),
-    ),
-    "nuscenes": (
-        Layout(
-            _PARENT,
-            _CHILD,
-            ("translation", "rotation"),
-            '[\n  {\n    "comment": %(about)s,\n    "channel": %(source)s,\n'
-            '    "translation": [ %(t)s ],\n    "rotation": [ %(wxyz)s ]\n  }\n]\n',
-        ),
-    ),
-    "colmap": (
-        Layout(
-            _CHILD,
-            _PARENT,
-            ("cam_from_rig_translation", "cam_from_rig_rotation"),
-            '[\n  {\n    "cameras": [\n      { "image_prefix": %(source)s, "ref_sensor": true },\n'
-            '      {\n        "comment": %(about)s,\n        "image_prefix": %(target)s,\n'
-            '        "cam_from_rig_rotation": [ %(wxyz)s ],\n'
-            '        "cam_from_rig_translation": [ %(t)s ]\n      }\n    ]\n  }\n]\n',
-        ),
-    ),
-    "driveworks": (
-        Layout(
-            _PARENT,
-            _CHILD,
-            ("nominalSensor2Rig_FLU.t", "nominalSensor2Rig_FLU.roll-pitch-yaw"),
-            '{\n  "rig": {\n    "sensors": [\n      {\n        "comment": %(about)s,\n'
-            '        "name": %(source)s,\n        "nominalSensor2Rig_FLU": {\n'
-            '          "roll-pitch-yaw": [ %(rpy_deg)s ],\n          "t": [ %(t)s ]\n'
-            "        }\n      }\n    ]\n  }\n}\n",
-        ),
-    ),
-    "easy_handeye2": (
-        Layout(
-            _PARENT,
-            _CHILD,
-            (),
-            "%(about)s\nparameters:\n  name: hand_eye_calib\n  calibration_type: %(eye)s\n"
-            "  robot_base_frame: %(robot)s\n  robot_effector_frame: %(effector)s\n"
-            "  tracking_base_frame: %(source)s\n  tracking_marker_frame: marker\n"
-            "  freehand_robot_movement: true\ntransform:\n" + _STAMPED,
-        ),
-    ),
-    "opencv": (
-        Layout(_PARENT, _CHILD, ("T_parent_child",), _OPENCV.format(key="T_parent_child", dt="d")),
-    ),
-    "numpy": (Layout(_PARENT, _CHILD, (), "%(about)s\n%(plain_rows)s\n"),),
-}
-# Those whose comments are values of JSON, and the one whose comment is a line.
-_JSON = ("glim", "nuscenes", "colmap", "driveworks")
+FORMATS: dict[str, list[Layout]] = {}
+
+
+def _layout(words: str, text: str, clock: int = 0, by_axis: tuple[str, ...] = ()) -> None:
+    """Add a row to the table; the words are format, target, source and keys."""
+    name, target, source, *keys = words.split()
+    layout = Layout(target, source, tuple(keys), text, clock, by_axis)
+    FORMATS.setdefault(name, []).append(layout)
+
+
+_layout(
+    "autoware :parent :child",
+    "%(about)s\n%(target)s:\n  %(source)s:\n    x: %(x)s\n    y: %(y)s\n    z: %(z)s\n"
+    "    roll: %(roll)s\n    pitch: %(pitch)s\n    yaw: %(yaw)s\n",
+    by_axis=AXES,
+)
+_layout(
+    "fast_lio imu lidar extrinsic_T extrinsic_R",
+    "%(about)s\ncommon:\n    time_offset_lidar_to_imu: %(shift)s\nmapping:\n"
+    "    extrinsic_est_en: false\n" + _LIO,
+    clock=1,
+)
+_layout(
+    "fast_livo2 imu lidar extrinsic_T extrinsic_R",
+    "%(about)s\nextrin_calib:\n" + _LIO + "time_offset:\n    imu_time_offset: %(shift)s\n",
+    clock=1,
+)
+_layout(
+    "fast_livo2 camera lidar Pcl Rcl",
+    "%(about)s\nextrin_calib:\n    Rcl: [ %(R)s ]\n    Pcl: [ %(t)s ]\n"
+    "time_offset:\n    img_time_offset: %(shift)s\n",
+    clock=-1,
+)
+_layout(
+    "lio_sam lidar imu extrinsicTrans extrinsicRot",
+    "%(about)s\nlio_sam:\n  extrinsicTrans: [ %(t)s ]\n  extrinsicRot: [ %(R)s ]\n"
+    "  extrinsicRPY: [ %(R)s ]  # the orientation of the IMU is that of its axes\n",
+)
+_layout("kalibr camera imu T_cam_imu", _YAML_ROWS.format(key="T_cam_imu"), clock=-1)
+_layout(
+    "kalibr camera:child camera:parent T_cn_cnm1",
+    "%(about)s\n# %(source)s is cam0, %(target)s is cam1.\ncam1:\n  T_cn_cnm1:\n%(rows)s\n",
+)
+_layout(
+    "openvins imu camera T_imu_cam", "%%YAML:1.0\n\n" + _YAML_ROWS.format(key="T_imu_cam"), clock=1
+)
+_layout(
+    "vins imu camera body_T_cam0",
+    _OPENCV.format(key="body_T_cam0", dt="d") + "td: %(shift)s\n",
+    clock=1,
+)
+_layout("orbslam3 imu camera IMU.T_b_c1", _OPENCV.format(key="IMU.T_b_c1", dt="f"))
+_layout("orbslam3 imu camera Tbc", "")  # read in files of an older version
+_layout(
+    "orbslam3 camera:parent camera:child Stereo.T_c1_c2",
+    _OPENCV.format(key="Stereo.T_c1_c2", dt="f"),
+)
+_layout(
+    "apollo :parent :child",
+    "%(about)s\nheader:\n  seq: 0\n  stamp: {secs: 0, nsecs: 0}\n  frame_id: %(target)s\n"
+    "child_frame_id: %(source)s\ntransform:\n" + _STAMPED,
+)
+_layout("dlio base lidar baselink2lidar.t baselink2lidar.R", _DLIO.format(key="baselink2lidar"))
+_layout("dlio base imu baselink2imu.t baselink2imu.R", _DLIO.format(key="baselink2imu"))
+_layout(
+    "glim lidar imu T_lidar_imu",
+    '{\n  "sensors": {\n    "comment": %(about)s,\n'
+    '    "T_lidar_imu": [ %(t)s, %(xyzw)s ]\n  }\n}\n',
+)
+_layout(
+    "msa :parent :child",
+    "%(about)s\n%(source)s:\n  parent: %(target)s\n  child: %(source)s\n"
+    "  value: [ %(t)s, %(xyzw)s ]\n",
+)
+_layout("px4 :parent gnss:child", _PX4.format(kind="GPS"), by_axis=TRANSLATIONS)
+_layout("px4 :parent :child", _PX4.format(kind="EV") + "%(ev_delay)s\n", by_axis=TRANSLATIONS)
+_layout("kitti camera lidar T R", _KITTI)
+_layout("kitti lidar imu T R", _KITTI)
+_layout(
+    "nuscenes :parent :child translation rotation",
+    '[\n  {\n    "comment": %(about)s,\n    "channel": %(source)s,\n'
+    '    "translation": [ %(t)s ],\n    "rotation": [ %(wxyz)s ]\n  }\n]\n',
+)
+_layout(
+    "colmap :child :parent cam_from_rig_translation cam_from_rig_rotation",
+    '[\n  {\n    "cameras": [\n      { "image_prefix": %(source)s, "ref_sensor": true },\n'
+    '      {\n        "comment": %(about)s,\n        "image_prefix": %(target)s,\n'
+    '        "cam_from_rig_rotation": [ %(wxyz)s ],\n'
+    '        "cam_from_rig_translation": [ %(t)s ]\n      }\n    ]\n  }\n]\n',
+)
+_layout(
+    "driveworks :parent :child nominalSensor2Rig_FLU.t nominalSensor2Rig_FLU.roll-pitch-yaw",
+    '{\n  "rig": {\n    "sensors": [\n      {\n        "comment": %(about)s,\n'
+    '        "name": %(source)s,\n        "nominalSensor2Rig_FLU": {\n'
+    '          "roll-pitch-yaw": [ %(rpy_deg)s ],\n          "t": [ %(t)s ]\n'
+    "        }\n      }\n    ]\n  }\n}\n",
+)
+_layout(
+    "easy_handeye2 :parent :child",
+    "%(about)s\nparameters:\n  name: hand_eye_calib\n  calibration_type: %(eye)s\n"
+    "  robot_base_frame: %(robot)s\n  robot_effector_frame: %(effector)s\n"
+    "  tracking_base_frame: %(source)s\n  tracking_marker_frame: marker\n"
+    "  freehand_robot_movement: true\ntransform:\n" + _STAMPED,
+)
+_layout("opencv :parent :child T_parent_child", _OPENCV.format(key="T_parent_child", dt="d"))
+_layout("numpy :parent :child", "%(about)s\n%(plain_rows)s\n")
 
 
 class Arrangement(NamedTuple):
-    """Which of both sensors a layout's target is.
-
-    Attributes
-    ----------
-    layout : Layout
-    is_inverted : bool
-        Whether the numbers are ``T_child_parent``.
-    is_certain : bool
-        Whether the frames' names say that.
+    """A layout, whether its numbers are ``T_child_parent``, and whether the names of the frames say
+    so.
     """
 
     layout: Layout
@@ -337,7 +247,8 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
     if not usable:
         raise InputError(f"nothing is written: {headline}")
     frames, T = (result.parent_frame, result.child_frame), result.T_parent_child
-    layout, is_inverted, is_certain = arranged(FORMATS[name], *frames)
+    arrangement = arranged(FORMATS[name], *frames)
+    layout, is_inverted, _ = arrangement
     if layout.target == _PARENT:
         frames, T = (result.mounting[0], result.child_frame), result.mounting[1]
     unknown = [axis for axis in result.unobservable() if axis not in layout.by_axis]
@@ -347,47 +258,38 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
             f"the numbers of format {name} depend on each other; measure it by hand and calibrate "
             "again with --prior"
         )
-    target, source = frames[::-1] if is_inverted else frames
     texts = _numbers(se3.inverse(T) if is_inverted else T, usable if result.unobservable() else {})
-    shift = layout.clock * (-1 if is_inverted else 1) * result.time_offset_s
-    texts |= {"target": json.dumps(target), "source": json.dumps(source), "shift": _number(shift)}
+    target, source = frames[::-1] if is_inverted else frames
+    shift_s = layout.clock * (-1 if is_inverted else 1) * result.time_offset_s
+    texts |= {"target": json.dumps(target), "source": json.dumps(source), "shift": _number(shift_s)}
     is_fixed = "base" in target.lower()  # a camera beside the robot, not on its hand
     texts |= {"eye": "eye_on_base" if is_fixed else "eye_in_hand", "robot": '"base"'}
-    texts |= {"effector": '"hand"', ("robot" if is_fixed else "effector"): json.dumps(target)}
+    texts |= {"effector": '"hand"', ("robot" if is_fixed else "effector"): texts["target"]}
     delay_ms = -1e3 * result.time_offset_s
     texts["ev_delay"] = f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
     if not 0 <= delay_ms <= _LONGEST_DELAY_MS:
         texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
-    offset = (
+    lines = [
+        f"{name}, by hand_eye_calib {package_version()}. {headline}",
+        *_directions(name, target, source, arrangement),
         f"Clocks: t({result.parent_frame}) = t({result.child_frame}) + "
         f"{_number(result.time_offset_s)} s, "
-        + ("estimated." if result.time_offset_sigma_s else "given, not estimated.")
-    )
-    about = _about(name, target, source, frames if is_inverted else None, layout, is_certain)
-    about = [f"{name}, by hand_eye_calib {package_version()}. {headline}", *about, offset]
-    lines = [printable(" ".join(line.split())) for line in about]
+        + ("estimated." if result.time_offset_sigma_s else "given, not estimated."),
+    ]
+    lines = [printable(" ".join(line.split())) for line in lines]
     texts["about"] = "\n".join(f"# {line}" for line in lines)
-    if name in _JSON:
-        texts["about"] = json.dumps(lines)
-    elif name == "kitti":
-        texts["about"] = json.dumps(" ".join(lines))
+    if name == "kitti" or layout.text.startswith(("{", "[")):  # a value, not a comment
+        texts["about"] = json.dumps(" ".join(lines) if name == "kitti" else lines)
     return layout.text % texts
 
 
-def _about(
-    name: str,
-    target: str,
-    source: str,
-    inverted: tuple[str, str] | None,
-    layout: Layout,
-    is_certain: bool,
-) -> list[str]:
-    """What the numbers of a file mean, in lines."""
+def _directions(name: str, target: str, source: str, arrangement: Arrangement) -> list[str]:
+    """What the numbers of a file map, in lines."""
     lines = [f"Maps coordinates of {source} into {target}: the pose of {source} in {target}."]
-    if inverted:
-        lines.append(f"Inverted: the calibration is the pose of {inverted[1]} in {inverted[0]}.")
-    if not is_certain:
-        roles = [each.partition(":")[0] for each in layout[:2]]
+    if arrangement.is_inverted:
+        lines.append(f"Inverted: the calibration is the pose of {target} in {source}.")
+    if not arrangement.is_certain:
+        roles = [each.partition(":")[0] for each in arrangement.layout[:2]]
         pairs = zip(roles, (target, source), strict=True)
         said = [f"{frame} is the {role}" for role, frame in pairs if role]
         lines.append(f"Assumed, as the names of the frames do not say it: {', '.join(said)}.")
@@ -400,16 +302,14 @@ def _about(
 
 def _numbers(T: FloatArray, by_hand: Mapping[str, float | str]) -> dict[str, str]:
     """The texts of a pose (4, 4) that layouts need; axes by themselves may be known by hand."""
-    quat_xyzw = se3.to_quat_xyzw(T).tolist()
     t, R, rpy = T[:3, 3], T[:3, :3], se3.rotation_to_rpy(T[:3, :3])
-    axes: dict[str, float | str] = dict(
-        zip((*TRANSLATIONS, *ROTATIONS), [*t.tolist(), *rpy.tolist()], strict=True)
-    )
-    axes |= {axis: value for axis, value in by_hand.items() if axis in axes}
-    texts = {axis: each if isinstance(each, str) else _number(each) for axis, each in axes.items()}
-    for axis in "yz":
-        value = axes[axis]
-        texts[f"{axis}_frd"] = value if isinstance(value, str) else _number(-value)
+    qx, qy, qz, qw = quat_xyzw = se3.to_quat_xyzw(T)
+    numbers = dict(zip(AXES, [*t, *rpy], strict=True)) | {"y_frd": -t[1], "z_frd": -t[2]}
+    numbers |= {"qx": qx, "qy": qy, "qz": qz, "qw": qw}
+    texts = {axis: _number(value) for axis, value in numbers.items()}
+    for axis, value in by_hand.items():
+        if isinstance(value, str):
+            texts |= dict.fromkeys({axis, f"{axis}_frd"} & {*texts}, value)
     rows = [_listed(row) for row in T]
     return texts | {
         "t": _listed(t),
@@ -420,13 +320,12 @@ def _numbers(T: FloatArray, by_hand: Mapping[str, float | str]) -> dict[str, str
         "plain_rows": "\n".join(_listed(row, " ") for row in T),
         "matrix": ",\n           ".join(rows),
         "xyzw": _listed(quat_xyzw),
-        "wxyz": _listed([quat_xyzw[3], *quat_xyzw[:3]]),
+        "wxyz": _listed(np.roll(quat_xyzw, 1)),
         "rpy_deg": _listed(np.degrees(rpy)),
-        **dict(zip(("qx", "qy", "qz", "qw"), map(_number, quat_xyzw), strict=True)),
     }
 
 
-def _listed(values: Sequence[float] | FloatArray, separator: str = ", ") -> str:
+def _listed(values: FloatArray, separator: str = ", ") -> str:
     return separator.join(map(_number, values))
 
 

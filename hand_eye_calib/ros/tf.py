@@ -20,7 +20,7 @@ from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
-from hand_eye_calib.io.installed import of_frames, open_installed
+from hand_eye_calib.io.installed import open_installed, stated
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import Broadcast
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Verdict
@@ -188,7 +188,7 @@ class Robot:
         self._again_at_s = 0.0
         self.problem = ""
         is_file = self._source not in ("", TF)
-        of_tree = partial(of_frames, frames, origin=STATIC_TOPIC)
+        of_tree = partial(stated, frames.pose, STATIC_TOPIC)
         self._read = open_installed(self._source) if is_file else of_tree
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:

@@ -13,7 +13,6 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import EXPORT_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.exports import open_export
 from hand_eye_calib.io.installed import read_installed
 from hand_eye_calib.io.results import save_result
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
@@ -228,7 +227,7 @@ def test_what_the_names_do_not_say_is_assumed_and_said():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("mapping: {extrinsic_T: [1, 2], extrinsic_R: [1]}", "expected a matrix, or"),
+        ("mapping: {extrinsic_T: [1, 2], extrinsic_R: [1]}", "expected a pose: 12 or 16"),
         ("cam0: {T_cam_imu: [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}", "rotation is not one"),
         ("param set EKF2_EV_POS_X 0.1", "have a position and no rotation"),
         ("some: text", "expected a calibration: extrinsic.yaml"),
@@ -245,7 +244,7 @@ def test_a_file_that_does_not_say_it_is_refused_in_one_line(text, message, tmp_p
     path = tmp_path / "foreign.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as error:
-        open_export(path).of("imu", "lidar")
+        read_installed(str(path), "imu", "lidar")
     assert str(error.value).startswith(str(path))
     assert "\n" not in str(error.value)
 
@@ -256,7 +255,7 @@ def test_of_several_cameras_the_named_one_is_read(tmp_path):
     path.write_text(
         yaml.safe_dump({"cam0": {"T_cam_imu": identity}, "cam1": {"T_cam_imu": moved.tolist()}})
     )
-    found = open_export(path).of("imu", "cam1").T_parent_child
+    found = read_installed(str(path), "imu", "cam1").T_parent_child
     np.testing.assert_allclose(found, se3.inverse(moved))
 
 

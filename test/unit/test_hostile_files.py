@@ -34,35 +34,20 @@ def one_line(error):
 # ---- YAML
 
 
-def merge_bomb(depth=12, width=9):
-    lines = ["a0: &a0 {x: 1}"]
-    for level in range(1, depth):
-        lines.append(f"a{level}: &a{level} {{<<: [{', '.join([f'*a{level - 1}'] * width)}]}}")
-    return "\n".join(lines)
-
-
-def alias_bomb(depth=12, width=9):
-    lines = ["a0: &a0 [x, x]"]
-    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * width)}]" for k in range(1, depth)]
-    return "\n".join(lines)
-
-
 HOSTILE_YAML = {
-    "merge keys": (merge_bomb(), "expand to more than"),
-    "aliases": (alias_bomb(), "expand to more than"),
+    "aliases": ("a: &a [x]\nb: *a", "aliases are not read: write out the value of 'a'"),
     "deep flow": ("[" * 100_000, "nested more than"),
     "deep blocks": ("\n".join(" " * k + "a:" for k in range(500)), "nested more than"),
-    "itself": ("a: &a {b: *a}", "an alias leads to the value it is part of"),
-    "long integer": ("n: " + "9" * 5000, "a number has 5000 characters"),
+    "long integer": ("n: " + "9" * 5000, "is not YAML"),
     "large integer": ("n: 99999999999999999999", "an integer does not fit into 64 bits"),
     "float": ("n: !!float abc", "is not YAML"),
     "empty integer": ("n: !!int ''", "is not YAML"),
-    "empty date": ("n: !!timestamp ''", "has the tag"),
-    "object": ("n: !!python/object/apply:os.system ['true']", "has the tag"),
-    "binary": ("n: !!binary '='", "has the tag"),
-    "set": ("n: !!set {a, b}", "has the tag"),
+    "empty date": ("n: !!timestamp ''", "the tag"),
+    "object": ("n: !!python/object/apply:os.system ['true']", "the tag"),
+    "binary": ("n: !!binary '='", "the tag"),
+    "set": ("n: !!set {a, b}", "the tag"),
     "twice": ("a: 1\nb: 2\na: 3", "the key 'a' appears twice, line 3"),
-    "list as a key": ("? [a, b]\n: 1", "a key is not a single value"),
+    "list as a key": ("? [a, b]\n: 1", "unhashable key"),
     "too many values": ("[" + "1," * 100_001 + "]", "it has more than 100000 values"),
     "two documents": ("a: 1\n---\nb: 2", "is not YAML"),
     "control characters": ("a: \x01", "is not YAML"),

@@ -8,7 +8,7 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.io.installed import read_installed
-from hand_eye_calib.io.urdf import RobotDescription
+from hand_eye_calib.io.urdf import read_urdf
 
 URDF = """<?xml version="1.0" encoding="utf-8"?>
 <!-- origin xyz="9 9 9": a decoy; the mast's <joint> is bent -->
@@ -36,7 +36,7 @@ def urdf(tmp_path):
 
 
 def test_frames_through_the_base(urdf):
-    found = RobotDescription(urdf).frames.pose("lidar", "camera")
+    found = read_urdf(urdf).pose("lidar", "camera")
     np.testing.assert_allclose(found[:3, 3], [-0.5, 0, -1])
     np.testing.assert_allclose(se3.rotation_to_rpy(found[:3, :3]), [0, 0.1, 0], atol=1e-12)
 
@@ -53,7 +53,7 @@ def test_frames_through_the_base(urdf):
         ),
         ('<link name="lidar"/>', "<xacro:lidar/>", ("lidar", "camera"), "has xacro macros"),
         ('xyz="0.5 0 1"', 'xyz="${x} 0 1"', ("lidar", "camera"), "not six numbers"),
-        ('xyz="0.5 0 1"', 'xyz="0.5 0 1" quat_xyzw="0 0 0 1"', ("lidar", "camera"), "one pair"),
+        ('xyz="0.5 0 1"', 'xyz="0.5 0 1" quat_xyzw="0 0 0 1"', ("lidar", "camera"), "xyz and rpy"),
         ('link="optical"', 'link="lidar"', ("lidar", "camera"), "'lidar' has two parents"),
         ("<robot", "<!DOCTYPE robot><robot", ("lidar", "camera"), "document type"),
         ("</robot>", "", ("lidar", "camera"), "not XML"),
@@ -63,7 +63,7 @@ def test_frames_through_the_base(urdf):
 def test_what_is_not_understood_is_refused(urdf, old, new, frames, text):
     urdf.write_text(URDF.replace(old, new))
     with pytest.raises(InputError, match=text):
-        RobotDescription(urdf).frames.pose(*frames)
+        read_urdf(urdf).pose(*frames)
 
 
 def test_a_loop_of_frames_is_refused():
