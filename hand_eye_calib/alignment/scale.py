@@ -149,9 +149,9 @@ def settle_scale(pose_pairs: PosePairs, option: str | float) -> ScaleInUse:
     return ScaleInUse(scale.value, scale, (warning,))
 
 
-def horizontal_factors(path: FloatArray, positions: FloatArray) -> FloatArray | None:
-    """Factors (2,) by which x and y of positions must be multiplied so that their distances become
-    those of a path.
+def horizontal_factors(path: FloatArray, positions: FloatArray) -> tuple[float, float]:
+    """Factors by which x and y of positions must be multiplied so that their distances become those
+    of a path; ones if the path does not show both.
 
     The square of a distance along the direction (c, s) is multiplied by ``M11 c^2 + 2 M12 c s +
     M22 s^2``, whatever the worlds of both are, and however they drift against each other.
@@ -162,11 +162,6 @@ def horizontal_factors(path: FloatArray, positions: FloatArray) -> FloatArray | 
         Of the sensor with poses, m.
     positions : (N, 3) array
         Of another point of the same body, z up.
-
-    Returns
-    -------
-    (2,) array or None
-        None if the path does not show both.
     """
     lags = [lag for lag in (len(path) // part for part in _PARTS) if lag > 0]
     steps = np.concatenate([positions[lag:] - positions[:-lag] for lag in lags])
@@ -174,7 +169,7 @@ def horizontal_factors(path: FloatArray, positions: FloatArray) -> FloatArray | 
     flat2 = (steps[:, :2] ** 2).sum(axis=1)
     used = flat2 > _SHORT**2 * median(flat2)
     if not used.any():
-        return None
+        return 1.0, 1.0
     across, along = (steps[used, :2] / np.sqrt(flat2[used])[:, None]).T
     gains = ((chords[used] ** 2).sum(axis=1) - steps[used, 2] ** 2) / flat2[used]
     columns = np.stack([across**2, 2 * across * along, along**2], axis=1)
@@ -182,9 +177,9 @@ def horizontal_factors(path: FloatArray, positions: FloatArray) -> FloatArray | 
     for _ in range(_ROUNDS):
         normal = (columns * weights[:, None]).T @ columns
         if np.linalg.cond(normal) > 1e6:
-            return None
+            return 1.0, 1.0
         found = np.linalg.solve(normal, (columns * weights[:, None]).T @ gains)
         off = np.abs(gains - columns @ found)
         weights = 1.0 / (1.0 + (off / (median(off) + 1e-12)) ** 2)
-    factors: FloatArray = np.sqrt(np.maximum(found[[0, 2]], 0.0))
-    return factors
+    of_x, of_y = np.sqrt(np.maximum(found[[0, 2]], 0.0)).tolist()
+    return of_x, of_y

@@ -34,9 +34,6 @@ class _Row:
 
 
 _ONE_BODY = "check that both are on one rigid body, {units}, and the clocks (time_offset estimate)"
-_MENDED = "then {unexplained_share_mended:.1%} of the motion stays unexplained instead of "
-_MENDED += "{unexplained_share:.0%}"
-_SHARES = ("unexplained_share", "unexplained_share_mended")
 
 _ROWS = {
     # ------------------------------------------------------------------ of one stream
@@ -154,29 +151,14 @@ _ROWS = {
         "give the poses that each sensor measured by itself",
         evidence=("residual_rad",),
     ),
-    "swapped_coordinates": _Row(
-        "latitude and longitude of the {stream} seem to be swapped: its distances along x (east) "
-        "must be multiplied by {factor_x:.3g} and along y (north) by {factor_y:.3g}, as if the "
-        "true latitude were {latitude:.0f} deg and the true longitude {longitude:.0f} deg, north "
-        "or south, east or west; " + _MENDED,
-        "swap latitude and longitude at their source, or the names of the columns",
-        evidence=("factor_x", "factor_y", *_SHARES),
-    ),
-    "mirrored_positions": _Row(
-        "the {stream}'s positions are mirrored: with x and y swapped "
+    "coordinates": _Row(
+        "the {stream}'s positions fit the other sensor's path only with x (east) multiplied by "
+        "{factor_x:.3g} and y (north) by {factor_y:.3g}{swapped}: then "
         "{unexplained_share_mended:.1%} of the motion stays unexplained instead of "
         "{unexplained_share:.0%}",
-        "convert the stream to right-handed axes (REP 103)",
-        "east and north (or latitude and longitude near the equator) swapped, or z downwards",
-        evidence=_SHARES,
-        code="left_handed",
-    ),
-    "longitude_scale": _Row(
-        "the {stream}'s distances along x (east) must be multiplied by {factor_x:.3g}, those along "
-        "y (north) are right; " + _MENDED,
-        "multiply x by the cosine of the latitude, or give latitude and longitude themselves",
-        "longitudes that became metres without the cosine of the latitude",
-        evidence=("factor_x", "factor_y", *_SHARES),
+        "write metres east, north and up: longitudes times the cosine of the latitude, and neither "
+        "latitude and longitude nor east and north swapped",
+        evidence=("factor_x", "factor_y", "unexplained_share", "unexplained_share_mended"),
     ),
     "rate_unit": _Row(
         "the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are {unit} "

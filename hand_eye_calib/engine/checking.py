@@ -4,25 +4,13 @@ Of streams that have only positions, rotations or angular rates, what they have 
 solve, which is quick: whether they are of one body, in one unit of length, and on one clock.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import (
-    MIN_VARIATION,
-    Correlation,
-    correlate_rates,
-)
+from hand_eye_calib.alignment.angular_rates import MIN_VARIATION, Correlation, correlate_rates
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.checks.check import (
-    CheckResult,
-    check_offset,
-    check_parts,
-    check_streams,
-    unrelated_rates,
-)
+from hand_eye_calib.checks.check import CheckResult, check_offset, check_parts, check_streams
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import Snapshot
@@ -104,56 +92,35 @@ def _correlated(snapshot: Snapshot, known_s: float) -> Correlation:
 def check_partial(snapshot: Snapshot) -> CheckResult:
     """Check the streams of a snapshot of which one at least gives only a part of its poses.
 
-    A time offset in the options is known; otherwise the streams are compared at the offset at which
+    A time offset in the options is known; otherwise the streams are solved at the offset at which
     their angular rates, or the speeds beside positions, agree.
-
-    Parameters
-    ----------
-    snapshot : Snapshot
-        Of whole trajectories.
-
-    Returns
-    -------
-    CheckResult
     """
     config = snapshot.config
     known_s = 0.0 if isinstance(config.time_offset, str) else config.time_offset
-    before = check(replace(snapshot, config=replace(config, time_offset=known_s)))
+    before = check(_at_offset(snapshot, known_s))
     if any(each.makes_unusable for each in before.findings):
         return before
     correlation = _correlated(snapshot, known_s)
-    offset_s = known_s
-    if correlation.is_clear and abs(correlation.offset_s) > _FOUND_BY_SOLVE_S / 2:
-        offset_s += correlation.offset_s
+    is_behind = correlation.is_clear and abs(correlation.offset_s) > _FOUND_BY_SOLVE_S / 2
+    solved = _at_offset(snapshot, known_s + (correlation.offset_s if is_behind else 0.0))
     try:
-        found = _of_solve(snapshot, correlation, known_s, {"time_offset": offset_s})
+        result = solved.estimate()
     except NotEnoughDataError as error:
-        quantity = "speeds" if config.measured == "positions" else "angular rates"
-        is_short = correlation.is_clear or not correlation.overlap_s
-        short = finding("too_short", text=str(error))
-        found = [*before.findings, short if is_short else unrelated_rates(correlation, quantity)]
+        found = [*before.findings, finding("too_short", text=str(error))]
     except InputError as error:
         found = [*before.findings, finding("unsolved", text=str(error), units="the units")]
+    else:
+        found = [*check(solved, result).findings]
+        is_still = correlation.overlap_s > 0 and correlation.variation < MIN_VARIATION
+        if not any(each.makes_unusable for each in found):
+            found += _of_result(result, correlation, known_s)
+        elif is_still and all(each.code == "unrelated" for each in found):
+            found = [finding("no_turning")]
     return CheckResult(gravest_first(found), correlation)
 
 
-def _of_solve(
-    snapshot: Snapshot, correlation: Correlation, known_s: float, options: Mapping[str, Any]
-) -> list[Finding]:
-    """Findings of a solve with other options; with lengths in another unit, of one in metres."""
-    solved = replace(snapshot, config=replace(snapshot.config, **options))
-    result = solved.estimate()
-    found = [*check(solved, result).findings]
-    if in_units := [each for each in found if each.code == "units" and "scale" not in options]:
-        more = {**options, **in_units[0].options}
-        return [*in_units, *_of_solve(snapshot, correlation, known_s, more)]
-    if any(each.makes_unusable for each in found):
-        is_still = correlation.overlap_s > 0 and correlation.variation < MIN_VARIATION
-        is_in_unit = all(each.code != "rate_unit" for each in found)
-        if is_still and is_in_unit and result.measured == "rotations":
-            return [finding("no_turning")]
-        return found
-    return [*found, *_of_result(result, correlation, known_s)]
+def _at_offset(snapshot: Snapshot, offset_s: float) -> Snapshot:
+    return replace(snapshot, config=replace(snapshot.config, time_offset=offset_s))
 
 
 def _of_result(result: Calibration, correlation: Correlation, known_s: float) -> list[Finding]:

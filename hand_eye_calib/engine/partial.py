@@ -6,7 +6,6 @@ bias of a gyroscope. The adaptive estimator sees trajectories that never leave t
 it finds for the rotation does not depend on the rest. Of both: the time offset.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +18,7 @@ from hand_eye_calib.assessment.prior import Fused, fuse
 from hand_eye_calib.checks.check import in_other_units, unit_of
 from hand_eye_calib.checks.findings import Finding, finding
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.estimation import residuals_of
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator as adaptive_estimator
@@ -40,9 +40,9 @@ from hand_eye_calib.results.records import ClockRate, RateBias
 # not of one body. Of one body it is 0.05 of the path at most, of two 0.5 and more.
 _UNRELATED_PATH, _EXPLAINED_PATH, _UNRELATED_ROTATION = 0.3, 0.05, 0.5
 
-# Factors of x and y differ from 1 by more than this if latitude and longitude are wrong, and leave
-# at most this share of what was unexplained.
-_FACTOR_OFF, _MENDED = 0.03, 0.3
+# Factors of x and y that differ by more than this are of wrong coordinates if they leave at most
+# this share of what was unexplained.
+_FACTORS_APART, _MENDED = 0.03, 0.3
 
 # Poses between the ends of the motions that tell how much of the rotation is explained; the
 # quantile of their angles above which they count.
@@ -218,50 +218,28 @@ def _coordinates(
     """What is wrong with east and north, if that explains the path: of which the given share is
     unexplained as it is.
     """
-
-    def solved(mended: FloatArray) -> tuple[float, FloatArray]:
-        """Unexplained share of the path of positions, and the lever arm."""
+    found = horizontal_factors(poses[:, :3, 3], positions)
+    hypotheses = [(1.0, 1.0, True)]
+    if abs(found[0] - found[1]) > _FACTORS_APART * found[1]:
+        hypotheses = [(*found, False), (*found, True), *hypotheses]
+    for east, north, is_swapped in hypotheses:
+        mended = (positions * [east, north, 1.0])[:, [1, 0, 2] if is_swapped else [0, 1, 2]]
         try:
             solution = _lever_arm(stamps_ns, poses, mended, with_scale=False)
         except InputError:
-            return 1.0, np.zeros(3)
-        return unexplained_share(
-            poses, mended, solution.lever_arm, solution.scale
-        ), solution.lever_arm
-
-    def told(key: str, factors: Sequence[float], left: float) -> Finding:
-        cosines = min(1.0 / factors[0], 1.0), min(factors[1], 1.0)
-        longitude, latitude = np.degrees(np.arccos(cosines))
-        return finding(
-            key,
-            stream,
-            factor_x=float(factors[0]),
-            factor_y=float(factors[1]),
-            latitude=latitude,
-            longitude=longitude,
-            unexplained_share=share,
-            unexplained_share_mended=left,
-        )
-
-    lever_arm_m, found = np.zeros(3), None
-    for _ in range(2):  # the second time with the lever arm
-        factors = horizontal_factors(poses[:, :3, :3] @ lever_arm_m + poses[:, :3, 3], positions)
-        if factors is None:
-            break
-        east, north = factors
-        off = np.abs(factors - 1.0) > _FACTOR_OFF
-        if east > 1.0 - _FACTOR_OFF and north < 1.0 + _FACTOR_OFF and off.any():
-            key, order = "swapped_coordinates", [1, 0, 2]
-        elif east < 1.0 and off.tolist() == [True, False]:
-            key, order = "longitude_scale", [0, 1, 2]
-        else:
-            break
-        left, lever_arm_m = solved((positions * [east, north, 1.0])[:, order])
-        found = told(key, (east, north), left) if left < _MENDED * share else None
-    if found:
-        return found
-    left, _ = solved(positions[:, [1, 0, 2]])
-    return told("mirrored_positions", (1.0, 1.0), left) if left < _MENDED * share else None
+            continue
+        left = unexplained_share(poses, mended, solution.lever_arm, solution.scale)
+        if left < _MENDED * share:
+            return finding(
+                "coordinates",
+                stream,
+                factor_x=east,
+                factor_y=north,
+                swapped=" and then swapped" if is_swapped else "",
+                unexplained_share=share,
+                unexplained_share_mended=left,
+            )
+    return None
 
 
 def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
@@ -297,14 +275,8 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         findings = _rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
     fused = fuse(solution.T_parent_child, assess_rotation(Ts_pw_p, solution), config.prior())
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
-    translation, rotation = pairs.residuals(solution.T_parent_child)
-    residuals = Residuals(
-        translation=translation,
-        rotation=rotation,
-        weights=(~solution.jumps).astype(float),
-        start_ns=pose_pairs.stamps_ns[pairs.i],
-        end_ns=pose_pairs.stamps_ns[pairs.j],
-    )
+    weights, stamps_ns = (~solution.jumps).astype(float), pose_pairs.stamps_ns
+    residuals = residuals_of(pairs, solution.T_parent_child, weights, stamps_ns)
     return replace(
         _calibration(solution, fused, _ROTATION, residuals, pose_pairs, config),
         measured="rotations",

@@ -13,8 +13,9 @@ from hand_eye_calib.alignment.angular_rates import (
 )
 from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.answers import ESTIMATORS, cross_checked
+from hand_eye_calib.engine.answers import cross_checked
 from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
+from hand_eye_calib.engine.partial import estimate_lever_arm, estimate_rotation
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry.misread import put_right
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -186,7 +187,8 @@ class Snapshot:
         for name in ("method", "reference", "backend"):
             if getattr(self.config, name) not in _OF_PARTS_ALONE[name]:
                 self.config.require_poses(f"{name} {getattr(self.config, name)}")
-        estimate = ESTIMATORS[self.config.measured]
+        of_positions = self.config.measured == "positions"
+        estimate = estimate_lever_arm if of_positions else estimate_rotation
         result = estimate(self._pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)
         if not abs(found_s - given_s) < _BELIEVABLE_S:
