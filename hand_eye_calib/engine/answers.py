@@ -7,7 +7,7 @@ both halves of the recording what changes during it. Neither shows an error that
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +16,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimation import Solved, estimate_beside, estimate_extrinsic
-from hand_eye_calib.engine.partial import estimate_lever_arm, estimate_rotation
+from hand_eye_calib.engine.estimation import Solved, estimate_beside
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -46,29 +45,11 @@ _FEWEST_INLIERS = 0.55
 # Smallest joint standard deviation (m, rad) to divide by: noise-free data has none.
 _ROUNDING = 1e-9
 
-# What estimates the extrinsic, or a part of it, by what both streams measure together.
-ESTIMATORS: Mapping[str, Callable[[PosePairs, CalibratorConfig], Calibration]] = {
-    "poses": estimate_extrinsic,
-    "rotations": estimate_rotation,
-    "positions": estimate_lever_arm,
-}
-
 
 def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
     """The result of a solve, compared with what DNLO gives at a few references and from each half:
-    part of every solve. An axis that none of the references reveals is unobservable.
-
-    Parameters
-    ----------
-    solved : Solved
-    config : CalibratorConfig
-        The options that gave it.
-    pose_pairs : PosePairs
-        The poses that gave it, on one clock, each stream in its own unit of length.
-
-    Returns
-    -------
-    Calibration
+    part of every solve. An axis that none of the references reveals is unobservable. Options and
+    poses are those that gave it: on one clock, each stream in its own unit of length.
     """
     result = solved.calibration()
     others, halves = other_answers(result, config, pose_pairs)
@@ -161,8 +142,8 @@ def compare_answers(
     calibration : Calibration
         The result.
     others : sequence of Calibration
-        From other methods and references. Only those count that reject outliers, and not half of
-        the motion pairs: the others disagree for a reason that says nothing about the result.
+        At other references. Only those count that do not reject half of the motion pairs: the
+        others disagree for a reason that says nothing about the result.
     halves : sequence of Calibration
         From the first and the second half of the recording, or fewer.
 
@@ -170,28 +151,31 @@ def compare_answers(
     -------
     CrossCheck
     """
-    robust = [other for other in others if _is_sound(other)]
-    of_methods, excess_of_methods = _scatter(calibration, robust)
+    sigmas, floor = calibration.sigmas, calibration.sigmas_of_floor
+    sound = [other for other in others if _is_sound(other)]
+    pairs = [_apart(calibration, other) for other in sound]
+    apart, joint = np.reshape(pairs, (-1, 2, 6)).swapaxes(0, 1)
+    own = np.maximum(sigmas, _ROUNDING)
+    as_certain = np.reshape([other.sigmas for other in sound], (-1, 6)) < _AS_CERTAIN * own
+    of_as_certain = _robust_sigma(np.where(as_certain, apart, np.nan), _MIN_AS_CERTAIN)
     of_halves = excess_of_halves = np.full(6, np.nan)
     if len(halves) == 2:
-        apart, allowed = _apart(halves[0], halves[1])
+        between, allowed = _apart(*halves)
         # The whole is the mean of both halves: its standard deviation is half of that of their
-        # difference.
-        of_halves = apart / 2
-        # The halves do not state the floor and, of another method, errors that last.
-        beside = calibration.sigmas_of_floor
-        if halves[0].method != calibration.method:
-            beside = calibration.sigmas_with_floor
+        # difference. They do not state the floor and, of another method, errors that last.
+        of_halves = between / 2
+        is_same = halves[0].method == calibration.method
+        beside = floor if is_same else calibration.sigmas_with_floor
         excess_of_halves = of_halves / np.hypot(allowed / 2, beside)
     columns = {
-        "sigma": calibration.sigmas,
-        "of_methods": of_methods,
+        "sigma": sigmas,
+        "of_methods": _robust_sigma(apart, _MIN_OTHERS),
         "of_halves": of_halves,
-        "excess_of_methods": excess_of_methods,
+        "excess_of_methods": _robust_sigma(apart / np.hypot(joint, floor), _MIN_OTHERS),
         "excess_of_halves": excess_of_halves,
-        "excess_over_own": _over_own(calibration, robust),
+        "excess_over_own": of_as_certain / np.hypot(own, floor),
     }
-    known = np.isfinite(calibration.sigmas)
+    known = np.isfinite(sigmas)
     return {
         axis: AxisScatter(
             **{name: plain(values[k]) if known[k] else None for name, values in columns.items()}
@@ -200,54 +184,24 @@ def compare_answers(
     }
 
 
-def _scatter(
-    calibration: Calibration, others: Sequence[Calibration]
-) -> tuple[FloatArray, FloatArray]:
-    """Robust standard deviation (6,) of other answers about a result, and the same in joint
-    standard deviations.
-    """
-    if not others:
-        return np.full(6, np.nan), np.full(6, np.nan)
-    floor = calibration.sigmas_of_floor
-    distances = [_apart(calibration, other, floor) for other in others]
-    apart = np.array([distance for distance, _ in distances])
-    allowed = np.array([joint for _, joint in distances])
-    apart[:, np.isfinite(apart).sum(axis=0) < _MIN_OTHERS] = np.nan
-    return _median(apart) / MEDIAN_NORMAL, _median(apart / allowed) / MEDIAN_NORMAL
-
-
 def _is_sound(other: Calibration) -> bool:
-    share = other.n_inliers / max(other.n_pairs, 1)
-    return METHODS[other.method].rejects_outliers and share > _FEWEST_INLIERS
+    return other.n_inliers > _FEWEST_INLIERS * max(other.n_pairs, 1)
 
 
-def _over_own(calibration: Calibration, others: Sequence[Calibration]) -> FloatArray:
-    """Median distance (6,) of other answers in the result's own standard deviations, over that of a
-    normal variable.
-    """
-    if not others:
-        return np.full(6, np.nan)
-    own = np.maximum(calibration.sigmas, _ROUNDING)
-    as_certain = np.array([other.sigmas for other in others]) < _AS_CERTAIN * own
-    own = np.hypot(own, calibration.sigmas_of_floor)
-    apart = np.array([_apart(calibration, other)[0] for other in others])
-    apart[~as_certain] = np.nan
-    apart[:, np.isfinite(apart).sum(axis=0) < _MIN_AS_CERTAIN] = np.nan
-    return _median(apart) / own / MEDIAN_NORMAL
-
-
-def _median(values: FloatArray) -> FloatArray:
-    """Median (6,) of the finite values in each column; NaN if there is none."""
-    return np.array([median(column[np.isfinite(column)]) for column in values.T])
-
-
-def _apart(
-    first: Calibration, second: Calibration, floor: FloatArray | float = 0.0
-) -> tuple[FloatArray, FloatArray]:
+def _apart(first: Calibration, second: Calibration) -> tuple[FloatArray, FloatArray]:
     """Distance (6,) of two answers and their joint standard deviation; NaN if either does not know
     the axis.
     """
     distance = np.abs(deviation(first.T_parent_child, second.T_parent_child))
-    joint = np.hypot(np.hypot(first.sigmas, second.sigmas), floor)
+    joint = np.hypot(first.sigmas, second.sigmas)
     known = np.isfinite(joint)
     return np.where(known, distance, np.nan), np.where(known, np.maximum(joint, _ROUNDING), np.nan)
+
+
+def _robust_sigma(distances: FloatArray, fewest: int) -> FloatArray:
+    """Standard deviation (6,) by the median of distances (N, 6) from zero; NaN for axes on which
+    fewer are finite.
+    """
+    columns = [column[np.isfinite(column)] for column in distances.T]
+    medians = [median(column) if len(column) >= fewest else np.nan for column in columns]
+    return np.array(medians) / MEDIAN_NORMAL
