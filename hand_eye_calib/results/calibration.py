@@ -31,7 +31,7 @@ from hand_eye_calib.results.status import (
     SolveStatus,
     by_hand,
 )
-from hand_eye_calib.results.tables import data_frame, html_table
+from hand_eye_calib.results.tables import data_frame
 from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
 from hand_eye_calib.upstairs import upstairs
 
@@ -107,22 +107,6 @@ class Calibration(Result):
             f"<Calibration: {self.headline}\n {frames}: {values} (m, rad), "
             f"{self.method} {self.reference}, {self.n_poses} poses>"
         )
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows: verdict, a row per axis, frames."""
-        rows = [
-            {
-                "": name,
-                "value": f"{row['value'] * factor:.4f}",
-                "sigma": f"{row['sigma'] * factor:.2g}",
-                "unit": unit,
-                "verdict": row["verdict"],
-            }
-            for name, row in self.rows().items()
-            for factor, unit in [(1.0, "m") if row["unit"] == "m" else (180 / np.pi, "deg")]
-        ]
-        frames = f"pose of {self.child_frame} in {self.parent_frame}"
-        return html_table(f"{self.headline} ({frames})", rows)
 
     def to_frame(self) -> "pd.DataFrame":
         """DataFrame with a row for each of x, y, z, roll, pitch, yaw: value, sigma (m, rad) and

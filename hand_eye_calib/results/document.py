@@ -30,26 +30,19 @@ MATRICES = (
 )
 NOT_IN_FILES = ("motion_residuals", "model", "recording")
 
-# No standard deviation of a result is as large (m, rad).
-_LARGEST_SIGMA = 1e4
-
 
 def values_of(of: type[Any], data: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a calibration from its document."""
-    values = {
-        "T_parent_child": _transform_of(data["T_parent_child"]),
-        "covariance": _covariance_of(data["covariance"]),
-    }
-    if "T_method" in data:
-        values["T_method"] = _transform_of(data["T_method"])
-    if "T_world_world" in data:
-        values["T_world_world"] = _transform_of(data["T_world_world"])
-        values["cov_world_world"] = _covariance_of(data["cov_world_world"])
-    if "floor" in data:
-        values["floor"] = _covariance_of(data["floor"], is_known=True)
-    if "T_base_child" in data:
+    values: dict[str, Any] = {}
+    for name in ("T_parent_child", "T_method", "T_world_world", "T_base_child"):
+        if name in data:
+            values[name] = _transform_of(data[name])
+    for name in ("covariance", "cov_world_world", "floor"):
+        if name in data:
+            values[name] = _covariance_of(data[name])
+    if "T_base_child" in values:
         T_child_parent = se3.inverse(values["T_parent_child"])
-        values["T_base_parent"] = _transform_of(data["T_base_child"]) @ T_child_parent
+        values["T_base_parent"] = values.pop("T_base_child") @ T_child_parent
     hints = get_type_hints(of)
     for name, each in of.__dataclass_fields__.items():
         if name in data and name not in (*MATRICES, *NOT_IN_FILES):
@@ -59,12 +52,6 @@ def values_of(of: type[Any], data: Mapping[str, Any]) -> dict[str, Any]:
                 raise TypeError(f"{name}: {error}") from None
         elif name not in values and each.default is each.default_factory is MISSING:
             raise KeyError(name)
-    _check_values(values)
-    return values
-
-
-def _check_values(values: Mapping[str, Any]) -> None:
-    """Refuse fields of a calibration that cannot belong to one."""
     if tuple(dof.name for dof in values["observability"]) != AXES:
         raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
     for name in ("contradictions", "target_axes", "cross_check"):
@@ -72,6 +59,7 @@ def _check_values(values: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} has other axes than {', '.join(AXES)}")
     if values["method"] not in METHODS:
         raise ValueError(f"method {values['method']} is not known")
+    return values
 
 
 def _transform_of(data: Mapping[str, Any]) -> FloatArray:
@@ -84,18 +72,15 @@ def _transform_of(data: Mapping[str, Any]) -> FloatArray:
     return matrix
 
 
-def _covariance_of(data: Mapping[str, Any], is_known: bool = False) -> FloatArray:
-    """Covariance (6, 6) of a document; infinite for what is unknown, unless all is known."""
+def _covariance_of(data: Mapping[str, Any]) -> FloatArray:
+    """Covariance (6, 6) of a document; infinite for what is unknown."""
     matrix = _matrix(data, 6)
     known = np.isfinite(matrix)
-    if is_known and not known.all():
-        raise ValueError("the floor is not finite")
     sigmas = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    is_usual = is_known or bool(np.all(sigmas[np.diag(known)] <= _LARGEST_SIGMA))
     # Rounding makes a correlation of 1 a little larger.
     bounds = (1 + 1e-6) * np.outer(sigmas, sigmas) + 1e-300
-    is_usual &= np.allclose(matrix, matrix.T, rtol=1e-6)
-    if not (is_usual and np.all(np.abs(matrix[known]) <= bounds[known])):
+    is_symmetric = np.allclose(matrix, matrix.T, rtol=1e-6)
+    if not (is_symmetric and np.all(np.abs(matrix[known]) <= bounds[known])):
         raise ValueError("a matrix is not a covariance")
     return matrix
 

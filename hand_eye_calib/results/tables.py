@@ -1,4 +1,4 @@
-"""Tables for notebooks: rows of plain values as a DataFrame or as HTML."""
+"""Tables: rows of plain values as a DataFrame."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -27,15 +27,3 @@ def data_frame(rows: Sequence[Row], index: str | None = None) -> "pd.DataFrame":
         ) from error
     frame = pd.DataFrame(list(rows))
     return frame if index is None else frame.set_index(index)
-
-
-def html_table(title: str, rows: Sequence[Row]) -> str:
-    """Rows of texts with equal names as an HTML table below a title."""
-    from html import escape
-
-    heads = "".join(f"<th>{escape(name)}</th>" for name in (rows[0] if rows else {}))
-    lines = "".join(
-        f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row.values())}</tr>"
-        for row in rows
-    )
-    return f"<p><b>{escape(title)}</b></p><table><tr>{heads}</tr>{lines}</table>"

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from motions import as_trajectory, child_of, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
@@ -156,8 +156,6 @@ class TestShowing:
             figure = hec.plot(each)
             seen = [(panel.get_xlabel(), panel.get_ylabel()) for panel in figure.axes]
             assert seen == [("x (m)", "y (m)"), ("x (m)", "z (m)"), ("y (m)", "z (m)")]
-            x, y = figure.axes[0].lines[0].get_data()
-            np.testing.assert_allclose((x[1], y[1]), result.translation[:2], atol=1e-9)
             (ellipse,) = figure.axes[0].patches
             np.testing.assert_allclose(ellipse.get_center(), result.translation[:2], atol=1e-9)
             assert figure._repr_png_().startswith(b"\x89PNG")
@@ -168,12 +166,6 @@ class TestShowing:
         figure = hec.plot(dataclasses.replace(result, observability=hidden))
         assert [len(panel.patches) for panel in figure.axes] == [1, 0, 0]
         assert "Unknown along z: the dashed line." in figure._supxlabel.get_text()
-
-    def test_a_notebook_shows_a_table(self):
-        shown = self.result()._repr_html_()
-        assert shown.count("<tr>") == 7
-        assert "pose of child_sensor in parent_sensor" in shown
-        assert f"{T_PARENT_CHILD[0, 3]:.4f}" in shown
 
     def test_representations_are_short(self):
         assert len(repr(self.result())) < 600
