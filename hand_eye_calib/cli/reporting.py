@@ -154,7 +154,7 @@ def _session_rig(directory: Path, result: "SessionResult") -> list[Calibration]:
     HandEyeCalibError
         If they cannot be solved together, or nothing can be written.
     """
-    from hand_eye_calib.io.rig_files import save_rig
+    from hand_eye_calib.io.results import save_rig
     from hand_eye_calib.rig.calibrate import solve_rig
 
     rig = solve_rig(*_rig_of(result))

@@ -55,7 +55,7 @@ def _calibrate(
     trajectories: Mapping[str, "Trajectory"], arguments: argparse.Namespace, inputs: dict[str, Any]
 ) -> int:
     """Calibrate a rig, print it and save it if ``--out`` asks for that; returns the exit code."""
-    from hand_eye_calib.io.rig_files import save_rig
+    from hand_eye_calib.io.results import save_rig
     from hand_eye_calib.rig.calibrate import solve_rig
 
     for name in ("installed", "base_frame"):

@@ -13,18 +13,16 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
-from hand_eye_calib.io.limits import MOST_BAG_FILES
 
 AsGiven = Callable[[Any], Any]
 
-_MARK = "://"
 # Files of a bag, as their names end.
 _SUFFIXES = (".yaml", ".mcap", ".db3", ".bag", ".zstd")
 
 
 def is_url(path: object) -> bool:
     """Whether a bag is named by a URL rather than a path."""
-    return _MARK in str(path)
+    return "://" in str(path)
 
 
 def public(url: str) -> str:
@@ -34,36 +32,23 @@ def public(url: str) -> str:
     """
     if not is_url(url):
         return url
-    protocol, _, rest = url.partition("?")[0].partition(_MARK)
+    protocol, mark, rest = url.partition("?")[0].partition("://")
     host, slash, path = rest.partition("/")
-    return f"{protocol}{_MARK}{host.rpartition('@')[2]}{slash}{path}"
+    return f"{protocol}{mark}{host.rpartition('@')[2]}{slash}{path}"
 
 
 def expanded(pattern: str) -> list[str]:
-    """URLs that a pattern with ``*`` stands for, sorted.
-
-    Raises
-    ------
-    InputError
-        If the store cannot be reached.
-    MissingDependencyError
-        If fsspec, or what it needs for the store, is not installed.
-    """
+    """URLs that a pattern with ``*`` stands for, sorted. Raises as :func:`local_copies`."""
     with _reached(pattern) as (system, path):
         return sorted(system.unstrip_protocol(found) for found in system.glob(path.rstrip("/")))
 
 
 def states(url: str) -> list[str]:
     """What the store says of each file of a bag, such as size, date and digest, from which one sees
-    whether it has changed.
-
-    Raises
-    ------
-    InputError
-        If the store cannot be reached, or there is no bag.
+    whether it has changed. Raises as :func:`local_copies`.
     """
     with _reached(url) as (system, path):
-        return [str(sorted(system.info(name).items())) for name in _files(system, path)]
+        return [str(sorted(about.items())) for about in _files(system, path)]
 
 
 @contextmanager
@@ -81,70 +66,60 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
     ------
     InputError
         If a store cannot be reached, there is no bag, or it would fill more than half of the disk.
+    MissingDependencyError
+        If fsspec, or what it needs for the store, is not installed.
     """
-    if not any(map(is_url, paths)):
-        yield list(paths), lambda value: value
-        return
     with tempfile.TemporaryDirectory(prefix="hand_eye_calib_") as folder:
         names: dict[str, str] = {}
         local = []
         for number, path in enumerate(paths):
             if is_url(path):
-                local.append(_copied(str(path), Path(folder, str(number))))
-                names[str(local[-1])] = public(str(path)).rstrip("/")
-            else:
-                local.append(path)
+                path, url = _copied(str(path), Path(folder, str(number))), path
+                names[str(path)] = public(str(url)).rstrip("/")
+            local.append(path)
 
-        def renamed(value: Any) -> Any:
+        def as_given(value: Any) -> Any:
+            if not names:
+                return value
             text = json.dumps(value)
             for copy, url in names.items():
                 text = text.replace(json.dumps(copy)[1:-1], json.dumps(url)[1:-1])
             return json.loads(text)
 
         try:
-            yield local, renamed
+            yield local, as_given
         except HandEyeCalibError as error:
-            error.args = tuple(renamed(list(error.args)))
+            error.args = tuple(as_given(list(error.args)))
             raise
 
 
 def _copied(url: str, folder: Path) -> Path:
     """Copy the files of a bag into a new folder; returns where it is."""
     folder.mkdir()
-    # Half of the free space is left to the copies of other processes.
-    largest = shutil.disk_usage(folder).free // 2
     with _reached(url) as (system, path):
-        from fsspec.callbacks import Callback
-
-        class Room(Callback):
-            """Ends a copy that is too large, whatever size the store gave for it."""
-
-            def relative_update(self, inc: int = 1) -> None:
-                super().relative_update(inc)
-                if self.value > largest:
-                    raise InputError(
-                        f"it is larger than {largest / 1e9:.3g} GB, half of the free space of "
-                        f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
-                    )
-
-        files, room = _files(system, path), Room()
-        for file in files:
+        files = _files(system, path)
+        # Half of the free space is left to the copies of other processes.
+        largest = shutil.disk_usage(folder).free // 2
+        if sum(about.get("size") or 0 for about in files) > largest:
+            raise InputError(
+                f"it is larger than {largest / 1e9:.3g} GB, half of the free space of "
+                f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
+            )
+        for about in files:
             # The name's last part only: a store does not choose where things go.
-            system.get_file(file, str(folder / _name(file)), callback=room)
-        return folder / _name(path) if files == [path] else folder
+            system.get_file(about["name"], str(folder / _name(about["name"])))
+        is_file = [about["name"] for about in files] == [path]
+        return folder / _name(path) if is_file else folder
 
 
-def _files(system: Any, path: str) -> list[str]:
-    """Paths of the files of a bag."""
-    if PurePosixPath(_name(path)).suffix in _SUFFIXES:
-        return [path]
-    names = [each["name"] for each in system.ls(path, detail=True) if each.get("type") == "file"]
-    files = sorted(name for name in names if PurePosixPath(_name(name)).suffix in _SUFFIXES)
+def _files(system: Any, path: str) -> list[dict[str, Any]]:
+    """What the store says of each file of a bag."""
+    if _name(path).endswith(_SUFFIXES):
+        return [system.info(path) | {"name": path}]
+    files = [about for about in system.ls(path, detail=True) if about["name"].endswith(_SUFFIXES)]
     if not files:
         raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
-    if len(files) > MOST_BAG_FILES:
-        raise InputError(f"more than {MOST_BAG_FILES} files; read them in parts")
-    return files
+    return sorted(files, key=lambda about: str(about["name"]))
 
 
 def _name(path: str) -> str:
@@ -159,19 +134,17 @@ def _reached(url: str) -> Iterator[tuple[Any, str]]:
     """
     try:
         from fsspec.core import url_to_fs
-    except ModuleNotFoundError:
-        raise MissingDependencyError(
-            f"{public(url)} needs the package fsspec, which is not installed: "
-            "pip install 'hand_eye_calib[fleet]'"
-        ) from None
-    try:
+
         yield url_to_fs(url)
     except ImportError as error:
-        raise MissingDependencyError(f"cannot read {public(url)}: {error}") from None
+        raise MissingDependencyError(
+            f"{public(url)} needs a package that is not installed: {error}; "
+            "pip install 'hand_eye_calib[fleet]', and that of the store"
+        ) from None
     except HandEyeCalibError as error:
         raise InputError(f"cannot read {public(url)}: {error}") from None
     except Exception as error:
-        reason = " ".join([f"{type(error).__name__}:", *str(error).split()]).rstrip(".:")
+        reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".:")
         raise InputError(
             f"cannot read {public(url)}: {reason}; check the address and the permission to read it"
         ) from error

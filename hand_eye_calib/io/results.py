@@ -1,5 +1,5 @@
-"""Calibrations in files: ``extrinsic.yaml`` with everything, and the transform alone as xacro and
-as launch file.
+"""Calibrations and rigs in files: ``extrinsic.yaml`` or ``rig.yaml`` with everything, and the
+transforms alone as xacro and as launch file.
 """
 
 import hashlib
@@ -24,6 +24,7 @@ FILE_NAME = "extrinsic.yaml"
 RIG_NAME = "rig.yaml"
 XACRO_NAME = "extrinsic.urdf.xacro"
 LAUNCH_NAME = "static_transform.launch.py"
+_NAMES = (XACRO_NAME, LAUNCH_NAME, FILE_NAME)
 
 
 def save_result(
@@ -59,23 +60,77 @@ def save_result(
     >>> hec.save(result, "saved")
     PosixPath('saved/extrinsic.yaml')
     """
+    is_usable = calibration.verdict is not Verdict.DO_NOT_USE
     document = calibration.to_dict() | {"provenance": provenance(inputs or {})}
-    texts = {FILE_NAME: yaml_text(document)}
-    if calibration.verdict is not Verdict.DO_NOT_USE:
-        ready = {XACRO_NAME: _xacro_text(calibration), LAUNCH_NAME: launch_text([calibration])}
-        texts = ready | texts
-    directory = Path(directory)
+    texts = {
+        XACRO_NAME: _xacro_text(calibration) if is_usable else None,
+        LAUNCH_NAME: _launch_text([calibration]) if is_usable else None,
+        FILE_NAME: yaml_text(document),
+    }
+    return _written(Path(directory), texts)
+
+
+def save_rig(
+    document: Mapping[str, Any],
+    calibrations: Sequence[Calibration],
+    directory: str | Path,
+    inputs: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write ``rig.yaml``, ``static_transform.launch.py`` with all transforms that may be used, and
+    a directory for each sensor with the files of :func:`save_result`.
+
+    Parameters
+    ----------
+    document : mapping
+        The rig in plain values.
+    calibrations : sequence of Calibration
+        All in the frame of one sensor.
+    directory : str or path-like
+        Made if it is missing.
+    inputs : mapping, optional
+        Where the data came from, in plain values.
+
+    Returns
+    -------
+    pathlib.Path
+        ``rig.yaml``.
+
+    Raises
+    ------
+    InputError
+        If they cannot be written.
+    """
+    folders: set[str] = set()
+    for calibration in calibrations:
+        # A frame's name, with what a folder's should not have replaced.
+        name = re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".") or "sensor"
+        while name in folders:
+            name += "_2"
+        folders.add(name)
+        save_result(calibration, Path(directory, name), inputs)
+    usable = [each for each in calibrations if each.verdict is not Verdict.DO_NOT_USE]
+    whole = {**document, "provenance": provenance(inputs or {})}
+    texts = {LAUNCH_NAME: _launch_text(usable) if usable else None, RIG_NAME: yaml_text(whole)}
+    return _written(Path(directory), texts)
+
+
+def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
+    """Write the texts into a directory by their names, all or none, and remove what has none;
+    returns the last file.
+    """
+    kept = {directory / name: text for name, text in texts.items() if text is not None}
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        write_atomically({directory / name: text for name, text in texts.items()})
-        for name in {XACRO_NAME, LAUNCH_NAME} - set(texts):
-            (directory / name).unlink(missing_ok=True)
+        write_atomically(kept)
+        for name in texts:
+            if directory / name not in kept:
+                (directory / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or directory}: {error.strerror}; choose another "
             "directory"
         ) from None
-    return directory / FILE_NAME
+    return [*kept][-1]
 
 
 def provenance(inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -83,7 +138,8 @@ def provenance(inputs: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "package": "hand_eye_calib",
         "package_version": package_version(),
-        "versions": _versions(),
+        "versions": {"python": platform.python_version()}
+        | {name: metadata.version(name) for name in ("numpy", "scipy")},
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "parameters": inputs.get("options", {}),
         "inputs": {name: value for name, value in inputs.items() if name != "options"},
@@ -99,18 +155,14 @@ def keep_earlier_results(directory: str | Path) -> None:
     InputError
         If they cannot be copied.
     """
-    directory = Path(directory)
-    previous = directory / "previous"
-    for name in (XACRO_NAME, LAUNCH_NAME, FILE_NAME):
-        try:
-            if (directory / name).exists():
-                content = read_bytes(directory / name, LARGEST_TEXT)
-                previous.mkdir(exist_ok=True)
-                write_atomically({previous / name: content})
-        except OSError as error:
-            raise InputError(
-                f"cannot keep {directory / name} in {previous}: {error.strerror}"
-            ) from None
+    previous = Path(directory, "previous")
+    found = [path for name in _NAMES if (path := Path(directory, name)).exists()]
+    try:
+        if found:
+            previous.mkdir(exist_ok=True)
+        write_atomically({previous / path.name: read_bytes(path, LARGEST_TEXT) for path in found})
+    except OSError as error:
+        raise InputError(f"cannot keep {error.filename} in {previous}: {error.strerror}") from None
 
 
 def fingerprint(path: str | Path) -> dict[str, Any]:
@@ -154,20 +206,15 @@ def load_result(path: str | Path) -> Calibration:
     """
     path = Path(path)
     if path.is_dir():
-        _refuse_rig(path)
+        if (path / RIG_NAME).exists() and not (path / FILE_NAME).exists():
+            sensors = sorted(str(each.parent) for each in path.glob(f"*/{FILE_NAME}"))
+            raise InputError(f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}")
         path = path / FILE_NAME
     document = read_yaml(path)
     try:
         return Calibration.from_dict(document)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def _refuse_rig(directory: Path) -> None:
-    """Raise InputError for the directory of a rig, which has a result for each of its sensors."""
-    if (directory / RIG_NAME).exists() and not (directory / FILE_NAME).exists():
-        sensors = sorted(str(path.parent) for path in directory.glob(f"*/{FILE_NAME}"))
-        raise InputError(f"{directory} is of a rig; name one of its sensors: {', '.join(sensors)}")
 
 
 def _xacro_text(calibration: Calibration) -> str:
@@ -195,7 +242,7 @@ def _xacro_text(calibration: Calibration) -> str:
 """
 
 
-def launch_text(calibrations: Sequence[Calibration]) -> str:
+def _launch_text(calibrations: Sequence[Calibration]) -> str:
     """A launch file that publishes extrinsics as static transforms."""
     comment = "\n".join(f"# {line}" for each in calibrations for line in _remarks(each))
     headlines = [_remarks(each)[0] for each in calibrations]
@@ -257,9 +304,3 @@ def _remarks(calibration: Calibration) -> list[str]:
 def _xacro_attribute(text: str) -> str:
     """Quoted for XML, and kept from being evaluated by xacro."""
     return quoteattr(printable(text).replace("$", "$$"))
-
-
-def _versions() -> dict[str, str]:
-    return {"python": platform.python_version()} | {
-        name: metadata.version(name) for name in ("numpy", "scipy")
-    }

@@ -2,8 +2,6 @@
 answered with what is there.
 """
 
-import re
-
 import numpy as np
 import pytest
 from bag_making import (
@@ -400,39 +398,6 @@ def test_the_files_of_a_directory_are_read_whatever_its_metadata_says(new_bag):
 
 
 # ---- poses that cannot be right
-
-
-def moved(matrix):
-    return matrix + np.pad([[0.0, 0.0, 0.0, 40.0]], ((1, 2), (0, 0)))
-
-
-def turned(matrix):
-    return matrix @ se3.exp(np.array([0, 0, 0, 1.5, 0, 0]))
-
-
-@pytest.mark.parametrize(("change", "by", "unit"), [(moved, 40, "m"), (turned, 1.5, "rad")])
-@pytest.mark.parametrize("index", [0, 1, 60, 119])
-def test_a_pose_that_jumps_away_and_back_is_warned_about(new_bag, change, by, unit, index):
-    poses = wandering_poses(120, step_rad=0.02)
-    poses[index] = change(poses[index])
-    path = new_bag(streams=STREAMS | {"/b": (as_trajectory(poses), ODOMETRY)})
-    with PoseBag(path) as bag:
-        poses_of(bag)
-        (warning,) = bag.warnings
-        assert bag.warnings == [warning]  # asking twice changes nothing
-    assert f"/b: 1 of 120 poses jump away and back (first message {index + 1}, stamp " in warning
-    found, found_unit = re.search(r"by ([\d.]+) (\w+)", warning).groups()
-    assert (float(found), found_unit) == (pytest.approx(by, rel=0.1), unit)
-
-
-def test_lasting_jumps_and_quick_motion_are_nothing_unusual(new_bag):
-    jumped = CHILD.poses.copy()
-    jumped[50:, 0, 3] += 5.0
-    quick = as_trajectory(wandering_poses(120, step_m=3.0))
-    jumped = Trajectory(CHILD.stamps_ns, jumped)
-    with PoseBag(new_bag(streams={"/a": (quick, POSE_STAMPED), "/b": (jumped, ODOMETRY)})) as bag:
-        poses_of(bag)
-        assert bag.warnings == []
 
 
 def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):

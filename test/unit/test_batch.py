@@ -436,7 +436,7 @@ def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
         def ls(self, path, detail):
             return [{"name": "bag/../../../../outside.mcap", "type": "file"}]
 
-        def get_file(self, name, target, callback):
+        def get_file(self, name, target):
             copied.append(target)
 
     copied = []
@@ -448,10 +448,8 @@ def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
 def test_without_fsspec_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     _, (found,) = outcomes_of(tmp_path / "fleet.yaml", ["s3://fleet/run.mcap"])
-    assert found["error"] == (
-        "s3://fleet/run.mcap needs the package fsspec, which is not installed: "
-        "pip install 'hand_eye_calib[fleet]'"
-    )
+    assert found["error"].startswith("s3://fleet/run.mcap needs a package that is not installed")
+    assert "pip install 'hand_eye_calib[fleet]'" in found["error"]
 
 
 @pytest.mark.parametrize(
