@@ -17,7 +17,7 @@ from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -32,10 +32,6 @@ from hand_eye_calib.io.trajectory_files.writing import tum_line, tum_lines
 _FORMAT, _VERSION = "hand_eye_calib/journal", 2
 _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
-_NS_PER_S = 1_000_000_000
-_LARGEST_STAMP_NS = int(np.iinfo(np.int64).max)
-# What comments note of a stream.
-_KINDS = {_BATCH: int, "options": dict, "given": list, "topic": str, "frame": str, "origin": list}
 
 #: What is known of each stream: plain values, such as topic, frame, origin and options.
 About = Mapping[str, Mapping[str, Any]]
@@ -178,10 +174,9 @@ def read_journal(directory: str | Path) -> Journal:
     InputError
         If there is no journal, or it cannot be read.
     """
-    directory = Path(directory)
     if not has_session(directory):
         raise InputError(f"no session journal in {directory}")
-    paths = {stream: directory / f"{stream}.tum" for stream in _STREAMS}
+    paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
     found = {stream: _read_file(path) for stream, path in paths.items() if os.path.lexists(path)}
     order = np.argsort(np.concatenate([each.arrived for each in found.values()]), kind="stable")
     counts = [len(each.arrived) for each in found.values()]
@@ -189,83 +184,62 @@ def read_journal(directory: str | Path) -> Journal:
         about={stream: each.about for stream, each in found.items()},
         streams=np.repeat([*found], counts)[order],
         stamps_ns=np.concatenate([each.stamps_ns for each in found.values()])[order],
-        poses=np.concatenate([each.poses for each in found.values()])[order],
+        poses=np.concatenate([np.reshape(each.poses, (-1, 7)) for each in found.values()])[order],
         whole_bytes={stream: each.whole_bytes for stream, each in found.items()},
         lost_bytes=sum(each.lost_bytes for each in found.values()),
     )
 
 
-class _File(NamedTuple):
+class _File:
     """One stream: about, poses, and of each the time of its arrival in poses of the parent."""
 
-    about: dict[str, Any]
-    stamps_ns: IntArray
-    poses: FloatArray
-    arrived: FloatArray
-    whole_bytes: int
-    lost_bytes: int
+    def __init__(self) -> None:
+        self.about: dict[str, Any] = {}
+        # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
+        self.stamps_ns, self.poses, self.arrived = array("q"), array("d"), array("d")
+        self.whole_bytes = self.lost_bytes = 0
+
+    def add(self, line: bytes) -> None:
+        """Read a line. Raises ValueError, TypeError, OverflowError or RecursionError."""
+        if line.startswith(b"# {"):
+            self.about |= json.loads(line[2:])
+        elif not line.startswith(b"#"):
+            stamp, *values = line.split()
+            seconds, _, decimals = stamp.partition(b".")
+            if len(values) != 7 or len(decimals) != 9:
+                raise ValueError("no pose")
+            pose = [float(value) for value in values]
+            # The parent's poses count from 0; others came between two of them.
+            arrived = self.about.get(_BATCH, len(self.stamps_ns) + 0.5) - 0.5
+            self.stamps_ns.append(int(seconds + decimals))
+            self.poses.extend(pose)
+            self.arrived.append(arrived)
 
 
 def _read_file(path: Path) -> _File:
-    about: dict[str, Any] = {}
-    # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
-    stamps_ns, poses, arrived = array("q"), array("d"), array("d")
-    whole_bytes = 0
+    found = _File()
     try:
         with open(open_regular(path), "rb") as file:
-            size = os.fstat(file.fileno()).st_size
             while (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
                 try:
-                    if line.startswith(b"#"):
-                        about |= _noted(line)
-                    else:
-                        stamp_ns, pose = _pose(line)
-                        stamps_ns.append(stamp_ns)
-                        poses.extend(pose)
-                        # The parent's poses count from 0; others came between two of them.
-                        arrived.append(about.get(_BATCH, len(stamps_ns) - 0.5) - 0.5)
-                except (ValueError, RecursionError):
+                    found.add(line)
+                except (ValueError, TypeError, OverflowError, RecursionError):
                     break
-                whole_bytes += len(line)
+                found.whole_bytes += len(line)
+            found.lost_bytes = os.fstat(file.fileno()).st_size - found.whole_bytes
     except OSError as error:
         raise InputError(f"cannot read the session journal {path}: {error.strerror}") from None
-    if about.get("format") != _FORMAT:
+    if found.about.get("format") != _FORMAT:
         raise InputError(
             f"the session journal {path} is damaged from its first byte; move it away to start anew"
         )
-    if about.get("version") != _VERSION:
+    if found.about.get("version") != _VERSION:
         raise InputError(
-            f"the session journal {path} is of format version {about.get('version')}, this program "
-            f"reads {_VERSION}: use the version that wrote it, or move it away to start anew"
+            f"the session journal {path} is of format version {found.about.get('version')}, this "
+            f"program reads {_VERSION}: use the version that wrote it, or move it away to start "
+            "anew"
         )
-    rows = np.array(poses).reshape(-1, 7)
-    lost_bytes = size - whole_bytes
-    return _File(about, np.array(stamps_ns), rows, np.array(arrived), whole_bytes, lost_bytes)
-
-
-def _noted(line: bytes) -> dict[str, Any]:
-    """What a comment notes of the stream; nothing if it is somebody's own. Raises ValueError."""
-    if not line.startswith(b"# {"):
-        return {}
-    noted: dict[str, Any] = json.loads(line[2:])
-    if not all(isinstance(noted.get(name, kind()), kind) for name, kind in _KINDS.items()):
-        raise ValueError("a value of another kind")
-    if "origin" in noted and [*map(type, noted["origin"])] != [float] * 3:
-        raise ValueError("origin is no latitude, longitude and height")
-    return noted
-
-
-def _pose(line: bytes) -> tuple[int, list[float]]:
-    """Stamp (ns) and pose of a line. Raises ValueError."""
-    stamp, *values = line.split()
-    seconds, _, decimals = stamp.partition(b".")
-    if len(values) != 7 or len(decimals) != 9:
-        raise ValueError("no pose")
-    sign = -1 if seconds.startswith(b"-") else 1
-    stamp_ns = int(seconds) * _NS_PER_S + sign * int(decimals)
-    if abs(stamp_ns) > _LARGEST_STAMP_NS:
-        raise ValueError("a stamp that is too large")
-    return stamp_ns, [float(value) for value in values]
+    return found
 
 
 def has_session(directory: str | Path) -> bool:

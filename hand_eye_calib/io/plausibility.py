@@ -1,8 +1,8 @@
 """Checks of the poses and stamps of a bag while it is read.
 
-Most bags have no checksums, so a flipped bit reads as a valid value. In a frame's name, a quaternion
-or a length the reader finds it, in a stamp or the size of a position it is found here; a pose that
-is wrong by less is an outlier like any other.
+Most bags have no checksums, so a flipped bit reads as a valid value. In a frame's name, a
+quaternion or a length the reader finds it, in a stamp or the size of a position it is found here; a
+pose that is wrong by less is an outlier like any other.
 """
 
 import numpy as np

@@ -148,7 +148,7 @@ def test_a_line_that_cannot_be_read_ends_its_stream_before_it(tmp_path):
     *lines, _ = path.read_bytes().split(b"\n")
     wrong = (b"\0" * 80, b"1.5 0 0 0 0 0 0 1", b"x.000000001 0 0 0 0 0 0 1", b"9" * 70_000,
              b"99999999999.000000000 0 0 0 0 0 0 1", b"# {" + b"[" * 9000,
-             b'# {"parent_poses": "7"}', b'# {"frame": 7}', b"1.000000001 0 0 0 0 0 0")  # fmt: skip
+             b'# {"parent_poses": "7"}', b"1.000000001 0 0 0 0 0 0")  # fmt: skip
     for line in wrong:
         path.write_bytes(b"\n".join([*lines[:-2], line, *lines[-2:], b""]))
         journal = read_journal(tmp_path)
