@@ -14,12 +14,8 @@ _MIB = 1 << 20
 
 #: Bytes of memory that reading a bag may take, in a command
 LARGEST_GROWTH = 512 * _MIB
-#: Channels or connections in one file.
-MOST_TOPICS = 10_000
-#: Storage files of one bag.
+#: Storage files of one bag in a store.
 MOST_BAG_FILES = 1_000
-#: Bytes of messages of a damaged file, or one without index, that wait to be put in order
-LARGEST_DISORDER = 16 * _MIB
 #: Bytes that a compressed file may unpack to: this much ...
 SMALLEST_UNPACKED = 64 * _MIB
 #: ... plus this many times its own size.

@@ -80,7 +80,7 @@ ROS_LIBRARIES = (
 )
 CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "rosbags": "io/bags/",
-    "mcap": "io/bags/recovery.py",
+    "mcap": "io/bags/mcap_files.py",
     "backports": "io/bags/storage.py",
     "fsspec": "io/remote.py",
     "pyulog": "io/trajectory_files/foreign.py",

@@ -13,7 +13,7 @@ from rosbags.typesys import get_types_from_msg
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags import PoseBag, read_bag_trajectory
+from hand_eye_calib.io.bags import PoseBag, trajectory_of
 
 TIMES = np.arange(0, 30, 0.05)
 TRUTH = as_trajectory(smooth_poses(TIMES), rate_hz=20.0)
@@ -95,6 +95,11 @@ def bag(tmp_path_factory):
     return path
 
 
+def read_bag_trajectory(path, source):
+    with PoseBag(path) as bag:
+        return trajectory_of(bag, source)[0]
+
+
 def from_start(poses):
     return se3.inverse(poses[:1]) @ poses
 
@@ -118,7 +123,7 @@ def from_start(poses):
     ],
 )  # fmt: skip
 def test_the_poses_are_those_of_the_truth(bag, source, within):
-    found, _ = read_bag_trajectory(bag, source)
+    found = read_bag_trajectory(bag, source)
     assert found.measures == "poses"
     np.testing.assert_allclose(found.stamps_ns, TRUTH.stamps_ns, atol=1000, rtol=0)
     np.testing.assert_allclose(from_start(found.poses), from_start(TRUTH.poses), atol=within)
@@ -142,7 +147,7 @@ def test_messages_of_json(tmp_path):
             }
             writer.add_message(channel, stamp_ns, json.dumps(message).encode(), stamp_ns)
         writer.finish()
-    found, _ = read_bag_trajectory(path, "/pose")
+    found = read_bag_trajectory(path, "/pose")
     np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-12)
     assert (found.stamps_ns == TRUTH.stamps_ns).all()
 

@@ -6,7 +6,7 @@ Only the messages of the chosen topics are read, and of these only stamp, frames
 from hand_eye_calib.io.bags.poses import PoseBlock
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.topics import TopicInfo
-from hand_eye_calib.io.bags.trajectories import read_bag_trajectory, trajectory_of
+from hand_eye_calib.io.bags.trajectories import trajectory_of
 from hand_eye_calib.io.bags.writer import STORAGES, write_bag
 
 __all__ = [
@@ -14,7 +14,6 @@ __all__ = [
     "PoseBag",
     "PoseBlock",
     "TopicInfo",
-    "read_bag_trajectory",
     "trajectory_of",
     "write_bag",
 ]

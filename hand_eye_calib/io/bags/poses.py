@@ -31,6 +31,13 @@ class PoseColumns(NamedTuple):
     sensor_frames: Sequence[str | None]
     poses: FloatArray
 
+    @classmethod
+    def of_frames(
+        cls, stamps_ns: IntArray, poses: FloatArray, world: str = "", sensor: str | None = None
+    ) -> "PoseColumns":
+        """All in the same frames."""
+        return cls(stamps_ns, [world] * len(stamps_ns), [sensor] * len(stamps_ns), poses)
+
 
 @dataclass(frozen=True)
 class PoseBlock:

@@ -1,12 +1,12 @@
 """Reading the poses of two streams from bags."""
 
 import heapq
-from collections import defaultdict
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
-from itertools import chain, compress, pairwise
+from contextlib import ExitStack
+from itertools import chain, pairwise
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags import scans
 from hand_eye_calib.io.bags.fields import FIELDS, decoder, rows_of_messages, split_fields
+from hand_eye_calib.io.bags.mcap_files import Message, MessageKind
 from hand_eye_calib.io.bags.messages import (
     MALFORMED,
     MESSAGE_TYPES,
@@ -32,11 +34,12 @@ from hand_eye_calib.io.bags.messages import (
     unpack_transforms,
 )
 from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns
-from hand_eye_calib.io.bags.recovery import Message
-from hand_eye_calib.io.bags.storage import BLOCK_SIZE, BagFiles, message_blocks
-from hand_eye_calib.io.bags.topics import Part, Source, joined, joined_parts, unreadable
+from hand_eye_calib.io.bags.storage import BLOCK_SIZE, message_blocks, open_bags
+from hand_eye_calib.io.bags.topics import Source, Topics, joined_parts
 from hand_eye_calib.io.plausibility import PoseWatch
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
+
+T = TypeVar("T")
 
 
 class PoseBag:
@@ -68,23 +71,16 @@ class PoseBag:
         self.shown: Callable[[Iterable[Message], int, str], Iterable[Message]] = (
             lambda messages, count, doing: messages
         )
-        self._files = BagFiles()
         self._watches: dict[str, PoseWatch] = {}
         self._readers: dict[str, MessageReader] = {}
-        self._gaps: list[str] = []
+        self._notes: list[str] = []
         self._parts: dict[tuple[str, int], list[PoseBlock]] = {}
-        try:
-            for number, path in enumerate(self.paths):
-                self._files.open(path, number)
-        except BaseException:
-            self.close()
-            raise
-        found = defaultdict[str, list[tuple[str, int]]](list)
-        for name, about in chain(*(each.topics.items() for each in self._files.storages)):
-            found[name].append(about)
-        self.topics = joined(found, str(self))
-        self.topics.frames = self._first_transforms
-        spans = [(each.start_ns, each.end_ns) for each in self._files.storages]
+        with ExitStack() as opened:
+            self._storages = open_bags(self.paths, opened)
+            self._opened = opened.pop_all()
+        found = chain(*(storage.topics for storage in self._storages))
+        self.topics = Topics.of_connections(found, str(self), self._first_transforms)
+        spans = [(each.start_ns, each.end_ns) for each in self._storages]
         known = [(first, last) for first, last in spans if first is not None and last is not None]
         self.start_ns = min((first for first, _ in known), default=None)
         self.end_ns = max((last for _, last in known), default=None)
@@ -97,7 +93,7 @@ class PoseBag:
 
     def close(self) -> None:
         """Close the files."""
-        self._files.close()
+        self._opened.close()
 
     def __str__(self) -> str:
         return ", ".join(map(str, self.paths))
@@ -105,9 +101,7 @@ class PoseBag:
     @property
     def warnings(self) -> list[str]:
         """What could not be read, and poses that cannot be right; complete after reading."""
-        losses = [
-            f"{storage.path}: {loss}" for storage in self._files.storages for loss in storage.losses
-        ]
+        losses = [f"{each.path}: {loss}" for each in self._storages for loss in each.losses]
         watched = [text for name, watch in self._watches.items() for text in watch.warnings(name)]
         without = [
             f"{name}: {reader.n_left_out} messages without a fix, or without what they were read "
@@ -115,7 +109,7 @@ class PoseBag:
             for name, reader in self._readers.items()
             if reader.n_left_out
         ]
-        return [*self._files.notes, *self._gaps, *losses, *watched, *without]
+        return [*self._notes, *losses, *watched, *without]
 
     @property
     def n_left_out(self) -> int:
@@ -132,14 +126,16 @@ class PoseBag:
 
     def files(self) -> list[Path]:
         """Paths of all files that are read."""
-        return [storage.path for storage in self._files.storages]
+        return [storage.path for storage in self._storages]
 
     # ---- topics
 
     def _first_transforms(self) -> list[str]:
         """Pairs of frames in the first messages of transforms."""
-        names = [topic.name for topic in self.topics.values() if topic.type in TF_TYPES]
-        return sorted({pair for name in names for pair in self.frames_on(name)})
+        return sorted({pair for name in self._of_transforms() for pair in self.frames_on(name)})
+
+    def _of_transforms(self) -> list[str]:
+        return [topic.name for topic in self.topics.values() if topic.type in TF_TYPES]
 
     def frames_on(self, topic: str) -> list[str]:
         """Pairs of frames in the first messages of a topic: ``world:sensor`` of poses, as far as
@@ -150,15 +146,11 @@ class PoseBag:
         InputError
             If a message cannot be read.
         """
-        found = set[str]()
         if self.topics.type_of(topic) not in {*SENSOR_TYPES, *TF_TYPES}:
             return []
-        for number, (kind, _, data) in enumerate(next(self._blocks([topic]), []), start=1):
-            try:
-                found |= frames_in(data, kind.type, kind.encoding == "ros1")
-            except MALFORMED as error:
-                raise unreadable(kind, number, error) from error
-        return sorted(found)
+        block = next(self._blocks([topic]), [])
+        found = _decoded(block, lambda kind, data: frames_in(data, kind.type, _is_ros1(kind)))
+        return sorted(set[str]().union(*(frames for _, _, frames in found)))
 
     def expected(self, *sources: Source | None) -> int | None:
         """Number of poses that the sources will give, as far as the bag says; None for paths and
@@ -213,55 +205,53 @@ class PoseBag:
         InputError
             If the bag is damaged, or the transforms do not lead from one frame to the other.
         """
-        sources = {"parent": parent, "child": child}
+        sources = {"parent": parent} | ({"child": child} if child else {})
         self._watches = {str(source): PoseWatch() for source in sources.values()}
         self._readers, self._parts = {}, {}
         direct: dict[str, str] = {}
-        paths, transforms, scans = {}, {}, {}
+        others, transforms = dict[str, str](), dict[str, TfSource]()
         for stream, source in sources.items():
-            type_ = self.topics.type_of(source)
             if isinstance(source, TfSource):
                 transforms[stream] = source
-            elif source is not None and type_ in MESSAGE_TYPES:
+            elif (type_ := self.topics.type_of(source)) in MESSAGE_TYPES:
                 direct[source] = stream
                 measured = self.measured(source, (measures or {}).get(stream, "auto"))
                 self._readers[source] = MessageReader(type_, measured)
-            elif source and (type_ in (PATH_TYPE, *FIELDS) or {*"?+"} & {*source}):
-                paths[stream] = source
-            elif source is not None and type_ == POINTS_TYPE:
-                scans[stream] = source
+            else:
+                others[stream] = source
         blocks = self._direct_blocks(direct) if direct else iter(())
-        if paths or transforms or scans:
-            of_others = self._transformed_poses(transforms, max_gap_s) if transforms else []
-            of_others += [self._other_poses(*each) for each in paths.items()]
-            of_others += [self._scan_poses(*each) for each in scans.items()]
-            whole = PoseBlock.concatenate([*blocks, *of_others])
-            whole = whole[np.argsort(whole.bag_ns, kind="stable")]
-            blocks = (whole[k : k + BLOCK_SIZE] for k in range(0, len(whole), BLOCK_SIZE))
+        if others or transforms:
+            whole = [*blocks, *(self._other_poses(*each) for each in others.items())]
+            whole += self._transformed_poses(transforms, max_gap_s) if transforms else []
+            poses = _in_bag_order(PoseBlock.concatenate(whole))
+            blocks = (poses[k : k + BLOCK_SIZE] for k in range(0, len(poses), BLOCK_SIZE))
         yield from filter(len, blocks)
 
     def _direct_blocks(self, streams: dict[str, str]) -> Iterator[PoseBlock]:
         """Poses of topics that carry one in each message."""
-        for parts in self._unpackable(streams):
-            blocks, kept_rows = [], []
-            for part in parts:
-                name, reader = part.kind.topic, self._readers[part.kind.topic]
+        counts = dict.fromkeys(streams, 0)
+        for block in self._blocks(streams):
+            found = []
+            for kind in {id(each): each for each, _, _ in block}.values():
+                name, reader = kind.topic, self._readers[kind.topic]
+                messages = [data for each, _, data in block if each is kind]
+                bag_ns = np.array([each_ns for each, each_ns, _ in block if each is kind])
+                numbers = counts[name] + 1 + np.arange(len(messages))
+                counts[name] += len(messages)
                 try:
-                    columns, keep = reader.columns(part.messages, part.kind.encoding == "ros1")
+                    columns, keep = reader.columns(messages, _is_ros1(kind))
                 except MalformedMessage as error:
-                    number = int(part.numbers[error.index])
-                    raise unreadable(part.kind, number, error) from error
+                    raise _unreadable(kind, numbers[error.index], error) from error
                 except InputError as error:
-                    number = part.numbers[getattr(error, "index", 0)]
+                    number = numbers[getattr(error, "index", 0)]
                     raise InputError(f"{name}, message {number}: {error}") from None
-                first = int(part.numbers[0])
-                keep &= self._watches[name].believable(first, columns.stamps_ns, part.bag_ns)
-                block = PoseBlock.of_columns(streams[name], part.numbers, columns, part.bag_ns)
-                blocks.append(self._watched(name, block[keep]))
+                first = int(numbers[0])
+                keep &= self._watches[name].believable(first, columns.stamps_ns, bag_ns)
+                poses = PoseBlock.of_columns(streams[name], numbers, columns, bag_ns)
+                found.append(self._watched(name, poses[keep]))
                 if len(self.paths) > 1:
-                    self._parts.setdefault((name, part.kind.bag), []).append(blocks[-1])
-                kept_rows.append(part.rows[keep])
-            yield PoseBlock.concatenate(blocks)[np.argsort(np.concatenate(kept_rows))]
+                    self._parts.setdefault((name, kind.bag), []).append(found[-1])
+            yield _in_bag_order(PoseBlock.concatenate(found))
 
     def parts(self, topic: str) -> list[tuple[Path, Trajectory]]:
         """The poses of a topic in each of several bags, after they were read."""
@@ -277,42 +267,39 @@ class PoseBag:
             raise InputError(f"{name}, {error}") from None
         return block
 
-    def _whole(self, name: str, stream: str, columns: PoseColumns, bag_ns: IntArray) -> PoseBlock:
+    def _whole(self, source: Source, stream: str, columns: PoseColumns, bag_ns: Any) -> PoseBlock:
         """All poses of a source that is no topic of poses, in the order of bag time."""
-        numbers = 1 + np.arange(len(bag_ns))
-        block = self._watched(name, PoseBlock.of_columns(stream, numbers, columns, bag_ns))
-        return block[np.argsort(bag_ns, kind="stable")]
+        numbers, bag_ns = 1 + np.arange(len(bag_ns)), np.array(bag_ns, dtype=np.int64)
+        poses = PoseBlock.of_columns(stream, numbers, columns, bag_ns)
+        return _in_bag_order(self._watched(str(source), poses))
 
     def _other_poses(self, stream: str, source: str) -> PoseBlock:
-        """Poses of a path, of two topics that are joined, or of fields of messages."""
+        """Poses of a path, of scans, of two topics that are joined, or of fields of messages."""
         type_, (topic, fields) = self.topics.type_of(source), split_fields(source)
         if type_ == PATH_TYPE:
             return self._path_poses(stream, source)
-        parts = joined_parts(topic)
-        if topic not in self.topics and len(parts) == 2:
-            return self._joined_poses(stream, source, *parts)
-        fields = fields or FIELDS[type_]
+        if type_ == POINTS_TYPE:
+            return self._scan_poses(stream, source)
+        if topic not in self.topics:
+            return self._joined_poses(stream, source, *joined_parts(topic))
         decode: dict[str, Callable[[bytes], Any]] = {}
         bag_ns: list[int] = []
 
+        def decoded(kind: MessageKind, data: bytes) -> Any:
+            if kind.type not in decode:
+                found = (each.definition(topic) for each in self._storages)
+                decode[kind.type] = decoder(*kind[1:3], next(filter(None, found), None))
+            return decode[kind.type](data)
+
         def messages() -> Iterator[Any]:
-            for number, (kind, message_ns, data) in enumerate(self._messages([topic]), start=1):
-                if kind.type not in decode:
-                    found = (each.definition(topic) for each in self._files.storages)
-                    definition = next(filter(None, found), None)
-                    decode[kind.type] = decoder(kind.type, kind.encoding, definition)
-                try:
-                    message = decode[kind.type](data)
-                except Exception as error:  # the library's, of many kinds
-                    raise unreadable(kind, number, error) from error
+            # The library's errors are of many kinds.
+            for _, message_ns, message in _decoded(self._messages([topic]), decoded, Exception):
                 bag_ns.append(message_ns)
                 yield message
 
-        stamps_ns, poses, notes = rows_of_messages(topic, fields, messages())
-        self._gaps += notes
-        count = len(stamps_ns)
-        columns = PoseColumns(stamps_ns, [""] * count, [None] * count, poses)
-        return self._whole(source, stream, columns, np.array(bag_ns))
+        stamps_ns, poses, notes = rows_of_messages(topic, fields or FIELDS[type_], messages())
+        self._notes += notes
+        return self._whole(source, stream, PoseColumns.of_frames(stamps_ns, poses), bag_ns)
 
     def _joined_poses(self, stream: str, source: str, fix: str, imu: str) -> PoseBlock:
         """Positions of one topic with the orientations of another, interpolated."""
@@ -331,9 +318,9 @@ class PoseBag:
         positions, quats = positions[inside], positions.poses[inside, 3:]
         if len(turning) > 1 and len(positions):
             quats = se3.to_quat_xyzw(turning.at(positions.stamps_ns))
-        frames = [orientations.sensor_frames[0]] * len(positions)
         poses = np.c_[positions.poses[:, :3], quats]
-        columns = PoseColumns(positions.stamps_ns, [""] * len(frames), frames, poses)
+        frame = orientations.sensor_frames[0]
+        columns = PoseColumns.of_frames(positions.stamps_ns, poses, "", frame)
         return self._whole(source, stream, columns, positions.bag_ns)
 
     def _path_poses(self, stream: str, topic: str) -> PoseBlock:
@@ -342,11 +329,10 @@ class PoseBag:
         """
         stamps_ns, bag_ns = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
         poses, world_frame = np.empty((0, 7)), ""
-        for number, (kind, message_ns, data) in enumerate(self._messages([topic]), start=1):
-            try:
-                world_frame, new_stamps_ns, new_poses = unpack_path(data, kind.encoding == "ros1")
-            except MALFORMED as error:
-                raise unreadable(kind, number, error) from error
+        messages = self._messages([topic])
+        unpacked = _decoded(messages, lambda kind, data: unpack_path(data, _is_ros1(kind)))
+        for _, message_ns, (frame, new_stamps_ns, new_poses) in unpacked:
+            world_frame = frame
             if not len(new_stamps_ns):
                 continue
             order = np.argsort(new_stamps_ns, kind="stable")
@@ -356,29 +342,31 @@ class PoseBag:
             stamps_ns = np.concatenate([stamps_ns[older], new_stamps_ns])
             bag_ns = np.concatenate([bag_ns[older], new_bag_ns])
             poses = np.concatenate([poses[older], new_poses[order]])
-        count = len(stamps_ns)
-        if count > 1 and not stamps_ns.any():
+        if len(stamps_ns) > 1 and not stamps_ns.any():
             raise InputError(
                 f"the poses of path {topic} have no stamps: all are zero; use the odometry that "
                 "the path was made from"
             )
-        columns = PoseColumns(stamps_ns, [world_frame] * count, [None] * count, poses)
+        columns = PoseColumns.of_frames(stamps_ns, poses, world_frame)
         return self._whole(topic, stream, columns, bag_ns)
 
     def _scan_poses(self, stream: str, topic: str) -> PoseBlock:
         """Odometry from the points of a lidar, which is kept beside the bag for the next time."""
-        from hand_eye_calib.io.bags import scans
-
         place = scans.kept_file(self.paths[0], topic)
         found = scans.read_kept(place, self.files())
         if found is None:
-            doing, count = f"odometry of {topic}", self.topics[topic].count
-            found = scans.odometry(self.shown(self._messages([topic]), count, doing))
+            count, doing = self.topics[topic].count, f"odometry of {topic}"
+            messages = self.shown(self._messages([topic]), count, doing)
+            unpacked = _decoded(
+                messages, lambda kind, data: scans.unpack_scan(data, _is_ros1(kind))
+            )
+            found = scans.odometry(topic, ((scan, bag_ns) for _, bag_ns, scan in unpacked))
             scans.keep(place, self.files(), found)
         about = f"{topic}: odometry from {len(found.poses)} scans"
         lost = f", {found.n_failed} of which could not be registered" if found.n_failed else ""
-        self._files.notes.append(f"{about}{lost}; it is kept in {place}")
-        return self._whole(topic, stream, found.columns(), found.bag_ns)
+        self._notes.append(f"{about}{lost}; it is kept in {place}")
+        columns = PoseColumns.of_frames(found.stamps_ns, found.poses, "scans", found.frame)
+        return self._whole(topic, stream, columns, found.bag_ns)
 
     def _transformed_poses(self, sources: dict[str, TfSource], max_gap_s: float) -> list[PoseBlock]:
         """A PoseBlock for each stream whose poses come from the transform tree."""
@@ -389,20 +377,15 @@ class PoseBag:
         found = []
         for stream, source in sources.items():
             trajectory, log_ns, n_left_out = tree.trajectory(source, max_gap_s)
-            count = len(trajectory)
             if n_left_out:
-                self._gaps.append(
-                    f"{source}: {n_left_out} of {n_left_out + count} poses were left out, because "
-                    f"another transform of the chain was not known within {max_gap_s:g} s"
+                self._notes.append(
+                    f"{source}: {n_left_out} of {n_left_out + len(trajectory)} poses were left "
+                    "out, because another transform of the chain was not known within "
+                    f"{max_gap_s:g} s"
                 )
-            quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
-            columns = PoseColumns(
-                trajectory.stamps_ns,
-                [source.world_frame] * count,
-                [source.sensor_frame] * count,
-                np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1),
-            )
-            found.append(self._whole(str(source), stream, columns, log_ns))
+            poses = np.c_[trajectory.poses[:, :3, 3], se3.to_quat_xyzw(trajectory.poses)]
+            columns = PoseColumns.of_frames(trajectory.stamps_ns, poses, *source)
+            found.append(self._whole(source, stream, columns, log_ns))
         return found
 
     def static_frames(self) -> FrameTree:
@@ -430,14 +413,12 @@ class PoseBag:
         self, frames: Container[str] | None = None
     ) -> Iterator[tuple[PoseFields, bool, int]]:
         """Transforms, whether each is static, and its bag time; of some frames, or of all."""
-        names = [topic.name for topic in self.topics.values() if topic.type in TF_TYPES]
-        for number, (kind, bag_ns, data) in enumerate(self._messages(names), start=1):
-            try:
-                for transform in unpack_transforms(data, kind.encoding == "ros1"):
-                    if frames is None or transform.sensor_frame in frames:
-                        yield transform, kind.topic.endswith("tf_static"), bag_ns
-            except MALFORMED as error:
-                raise unreadable(kind, number, error) from error
+        messages = self._messages(self._of_transforms())
+        unpacked = _decoded(messages, lambda kind, data: unpack_transforms(data, _is_ros1(kind)))
+        for kind, bag_ns, transforms in unpacked:
+            for transform in transforms:
+                if frames is None or transform.sensor_frame in frames:
+                    yield transform, kind.topic.endswith("tf_static"), bag_ns
 
     # ---- messages
 
@@ -447,28 +428,43 @@ class PoseBag:
 
     def _blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Messages of some topics in the order of bag time, many at once."""
-        storages = [each for each in self._files.storages if each.start_ns is not None]
+        storages = [each for each in self._storages if each.start_ns is not None]
         if all((one.end_ns or 0) < (two.start_ns or 0) for one, two in pairwise(storages)):
-            for storage in storages:
-                yield from storage.blocks(topics)
-        else:
-            streams = (chain.from_iterable(storage.blocks(topics)) for storage in storages)
-            yield from message_blocks(heapq.merge(*streams, key=itemgetter(1)), self._gaps.append)
+            return chain.from_iterable(storage.blocks(topics) for storage in storages)
+        streams = (chain.from_iterable(storage.blocks(topics)) for storage in storages)
+        return message_blocks(heapq.merge(*streams, key=itemgetter(1)))
 
-    def _unpackable(self, topics: Collection[str]) -> Iterator[list[Part]]:
-        """Messages of some topics, many at once, those of each kind together."""
-        counts = dict.fromkeys(topics, 0)
-        for block in self._blocks(topics):
-            kinds, times_ns, contents = zip(*block, strict=True)
-            bag_ns, parts = np.array(times_ns), []
-            for kind in {id(each): each for each in kinds}.values():
-                is_of_kind = [each is kind for each in kinds]
-                rows = np.flatnonzero(is_of_kind)
-                numbers = counts[kind.topic] + 1 + np.arange(len(rows))
-                counts[kind.topic] += len(rows)
-                messages = [*compress(contents, is_of_kind)]
-                parts.append(Part(kind, rows, numbers, messages, bag_ns[rows]))
-            yield parts
+
+def _decoded(
+    messages: Iterable[Message],
+    decode: Callable[[MessageKind, bytes], T],
+    errors: type[Exception] | tuple[type[Exception], ...] = MALFORMED,
+) -> Iterator[tuple[MessageKind, int, T]]:
+    """Kind, bag time and content of messages; one that cannot be unpacked is named."""
+    for number, (kind, bag_ns, data) in enumerate(messages, start=1):
+        try:
+            found = decode(kind, data)
+        except InputError:
+            raise
+        except errors as error:
+            raise _unreadable(kind, number, error) from error
+        yield kind, bag_ns, found
+
+
+def _unreadable(kind: MessageKind, number: int, error: Exception) -> InputError:
+    """The error of a message that cannot be unpacked."""
+    return InputError(
+        f"{kind.topic}, message {number}: not a readable {kind.type} ({error}); "
+        "the bag is damaged, record it again"
+    )
+
+
+def _is_ros1(kind: MessageKind) -> bool:
+    return kind.encoding == "ros1"
+
+
+def _in_bag_order(poses: PoseBlock) -> PoseBlock:
+    return poses[np.argsort(poses.bag_ns, kind="stable")]
 
 
 def _first_seen(

@@ -16,10 +16,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import InputError, MissingDependencyError, printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import MALFORMED, Buffer, Cursor
-from hand_eye_calib.io.bags.poses import PoseColumns
-from hand_eye_calib.io.bags.recovery import Message
-from hand_eye_calib.io.bags.topics import unreadable
+from hand_eye_calib.io.bags.messages import Buffer, Cursor
 
 # numpy's name of each datatype of a PointField.
 _DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -202,37 +199,27 @@ class Odometry(NamedTuple):
     frame: str
     n_failed: int
 
-    def columns(self) -> PoseColumns:
-        """As the poses of messages."""
-        count = len(self.stamps_ns)
-        return PoseColumns(self.stamps_ns, ["scans"] * count, [self.frame] * count, self.poses)
 
-
-def odometry(messages: Iterable[Message]) -> Odometry:
-    """Register all scans of a topic.
+def odometry(topic: str, scans: Iterable[tuple[Scan, int]]) -> Odometry:
+    """Register all scans of a topic, each with its bag time (ns).
 
     Raises
     ------
     InputError
-        If a message is damaged, or most scans cannot be registered.
+        If most scans cannot be registered.
     MissingDependencyError
         If small_gicp is not installed.
     """
-    lidar = ScanOdometry()
+    lidar, frame = ScanOdometry(), ""
     found: list[tuple[FloatArray, int, int]] = []
-    kind, frame = None, ""
-    for number, (kind, bag_ns, data) in enumerate(messages, start=1):
-        try:
-            scan = unpack_scan(data, kind.encoding == "ros1")
-        except MALFORMED as error:
-            raise unreadable(kind, number, error) from error
+    for scan, bag_ns in scans:
         frame = scan.frame
         if len(scan.points) > _NEIGHBOURS:
             found.append((lidar.add(scan), scan.stamp_ns, bag_ns))
-    if kind is None or 2 * lidar.n_failed >= len(found):
+    if 2 * lidar.n_failed >= len(found):
         raise InputError(
-            f"{kind.topic if kind else 'the points'}: {lidar.n_failed} of {len(found)} scans could "
-            "not be registered; use the odometry of a lidar SLAM"
+            f"{topic}: {lidar.n_failed} of {len(found)} scans could not be registered; use the "
+            "odometry of a lidar SLAM"
         )
     poses, stamps_ns, times_ns = (np.array(column) for column in zip(*found, strict=True))
     rows = np.concatenate([poses[:, :3, 3], se3.to_quat_xyzw(poses)], axis=1)

@@ -1,10 +1,10 @@
 """Topics of bags: what is on them, and which of them are meant."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.bags.fields import split_fields
 from hand_eye_calib.io.bags.messages import (
@@ -14,15 +14,13 @@ from hand_eye_calib.io.bags.messages import (
     TF_TYPES,
     measured_as,
 )
-from hand_eye_calib.io.bags.recovery import MessageKind
 from hand_eye_calib.io.transforms import TfSource
 
 # A topic with fewer poses is not one of the two sensors: goals and initial poses are published
 # once.
 _FEWEST_POSES = 3
 # Words of a topic's name that say which stream it is, the likeliest parent first.
-_PARENT_WORDS = ("parent", "base", "lidar")
-_CHILD_WORD = "child"
+_WORDS = ("parent", "base", "lidar", "", "child")
 # Transforms that a message lists.
 _MOST_FRAMES = 20
 
@@ -30,15 +28,8 @@ Source = str | TfSource
 
 
 class TopicInfo(NamedTuple):
-    """A topic of a bag.
-
-    Attributes
-    ----------
-    name : str
-    type : str
-        Message type, empty if publishers disagree.
-    count : int
-        Number of messages.
+    """A topic of a bag: its name, its message type (empty if publishers disagree), and how many
+    messages it has.
     """
 
     name: str
@@ -56,6 +47,22 @@ class Topics(dict[str, TopicInfo]):
 
     bag = ""
     frames: Callable[[], list[str]] = list
+
+    @classmethod
+    def of_connections(
+        cls, found: Iterable[tuple[str, str, int]], bag: str, frames: Callable[[], list[str]]
+    ) -> "Topics":
+        """From topic, message type and number of messages of each connection."""
+        types, counts = defaultdict[str, set[str]](set), defaultdict[str, int](int)
+        for name, type_, count in found:
+            types[name].add(type_)
+            counts[name] += count
+        topics = cls(
+            (name, TopicInfo(name, "" if len(types[name]) > 1 else [*types[name]][0], counts[name]))
+            for name in sorted(types)
+        )
+        topics.bag, topics.frames = bag, frames
+        return topics
 
     def __str__(self) -> str:
         if not self:
@@ -86,19 +93,16 @@ class Topics(dict[str, TopicInfo]):
         if len(parts) > 1:
             for part, wanted in zip(parts, ("positions", "rotations"), strict=True):
                 measured_as(self[part].type, wanted, part)
-        if len(parts) > 1 or fields:
-            return
-        found = self[source].type
-        if found not in SENSOR_TYPES:
-            is_tf = found in TF_TYPES
+        elif not fields and self[source].type not in SENSOR_TYPES:
+            is_tf = self[source].type in TF_TYPES
             hint = (
                 "name two of its frames with --parent-tf and --child-tf"
                 if is_tf
                 else "read others by their fields, TOPIC?t=header.stamp,x=..."
             )
             raise InputError(
-                f"topic {source} of {self.bag} is of type {found or 'several types'}; accepted are "
-                f"{', '.join(SENSOR_TYPES)}; {hint}. {self}"
+                f"topic {source} of {self.bag} is of type {self[source].type or 'several types'}; "
+                f"accepted are {', '.join(SENSOR_TYPES)}; {hint}. {self}"
             )
 
     def select(
@@ -121,25 +125,22 @@ class Topics(dict[str, TopicInfo]):
             self.check(source)
         if len(named) == 2 and named[0] == named[1]:
             raise InputError(f"parent and child topic are both {parent}; name two topics. {self}")
-        free = [name for name in self if name not in named]
-        poses = [name for name in free if self[name].type in POSE_TYPES]
-        moving = [name for name in poses if self[name].count >= _FEWEST_POSES]
-        paths = [name for name in free if self[name].type == PATH_TYPE]
+        free = [topic for name, topic in self.items() if name not in named]
+        poses = [topic for topic in free if topic.type in POSE_TYPES]
+        moving = [topic for topic in poses if topic.count >= _FEWEST_POSES]
+        paths = [topic for topic in free if topic.type == PATH_TYPE]
         wanted = 2 - len(named)
-        choices = [names for names in (poses, moving, moving + paths) if len(names) == wanted]
+        choices = [topics for topics in (poses, moving, moving + paths) if len(topics) == wanted]
         if wanted and not choices:
+            found = self.frames()
+            more = f" and {len(found) - _MOST_FRAMES} more" if len(found) > _MOST_FRAMES else ""
             raise InputError(
                 "name the topics of poses with --parent-topic and --child-topic, or frames with "
-                f"--parent-tf and --child-tf. {self}{self._transforms()}"
+                f"--parent-tf and --child-tf. {self}"
+                + (f". Transforms are {', '.join(found[:_MOST_FRAMES])}{more}" if found else "")
             )
-        chosen = sorted(choices[0], key=_parent_first)[::-1] if wanted else []
-        return parent or chosen.pop(), child or chosen.pop()
-
-    def _transforms(self) -> str:
-        """The frames of the first transforms, for a message."""
-        found = self.frames()
-        more = f" and {len(found) - _MOST_FRAMES} more" if len(found) > _MOST_FRAMES else ""
-        return f". Transforms are {', '.join(found[:_MOST_FRAMES])}{more}" if found else ""
+        chosen = sorted((topic.name for topic in choices[0]), key=_parent_first) if wanted else []
+        return parent or chosen.pop(0), child or chosen.pop(0)
 
 
 def joined_parts(source: str) -> tuple[str, ...]:
@@ -148,41 +149,8 @@ def joined_parts(source: str) -> tuple[str, ...]:
     return parts if len(parts) == 2 and all(parts) else (source,)
 
 
-def joined(parts: Mapping[str, list[tuple[str, int]]], bag: str) -> Topics:
-    """Topics from what each file says of them: message type, and number of messages."""
-    topics = Topics()
-    topics.bag = bag
-    for name in sorted(parts):
-        types = {each for each, _ in parts[name]}
-        count = sum(each for _, each in parts[name])
-        topics[name] = TopicInfo(name, types.pop() if len(types) == 1 else "", count)
-    return topics
-
-
-class Part(NamedTuple):
-    """The N messages of one kind in a block: rows of the block (N,), numbers within the topic (N,),
-    bytes, and bag times (N,).
-    """
-
-    kind: MessageKind
-    rows: IntArray
-    numbers: IntArray
-    messages: list[bytes]
-    bag_ns: IntArray
-
-
-def unreadable(kind: MessageKind, number: int, error: Exception) -> InputError:
-    """The error of a message that cannot be unpacked."""
-    return InputError(
-        f"{kind.topic}, message {number}: not a readable {kind.type} ({error}); "
-        "the bag is damaged, record it again"
-    )
-
-
 def _parent_first(topic: str) -> tuple[int, str]:
     """Sorts the likelier parent first: by name, then alphabetically."""
-    words = re.split(r"[/_]+", topic.lower())
-    if _CHILD_WORD in words:
-        return len(_PARENT_WORDS) + 1, topic
-    ranks = [rank for rank, word in enumerate(_PARENT_WORDS) if word in words]
-    return min(ranks, default=len(_PARENT_WORDS)), topic
+    words = {*re.split(r"[/_]+", topic.lower()), ""}
+    word = "child" if "child" in words else next(each for each in _WORDS if each in words)
+    return _WORDS.index(word), topic

@@ -1,7 +1,6 @@
 """Whole trajectories out of bags."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -10,20 +9,17 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.poses import PoseBlock
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.topics import Source
-from hand_eye_calib.io.transforms import TfSource
 
 
-def read_bag_trajectory(
-    path: str | Path, topic: str | None = None, tf: str | None = None, measures: str = "auto"
+def trajectory_of(
+    bag: PoseBag, source: Source, measures: str = "auto"
 ) -> tuple[Trajectory, list[str]]:
-    """Read one trajectory of a bag.
+    """The trajectory of one source of an open bag.
 
     Parameters
     ----------
-    path : str or path-like
-    topic : str, optional
-    tf : str, optional
-        ``world:sensor``, instead of a topic.
+    bag : PoseBag
+    source : str or TfSource
     measures : str
         What to read of the poses, see :meth:`PoseBag.measured`.
 
@@ -38,17 +34,6 @@ def read_bag_trajectory(
     ------
     InputError
         If the bag or a pose cannot be read.
-    """
-    with PoseBag(path) as bag:
-        trajectory, notes = trajectory_of(bag, TfSource.parse(tf) if tf else topic or "", measures)
-        return trajectory, [*bag.warnings, *notes]
-
-
-def trajectory_of(
-    bag: PoseBag, source: Source, measures: str = "auto"
-) -> tuple[Trajectory, list[str]]:
-    """The trajectory of one source of an open bag, as :func:`read_bag_trajectory` gives it, and
-    what a person should know of it.
     """
     bag.topics.check(source)
     kind = bag.measured(source, measures)

@@ -15,6 +15,7 @@ from hand_eye_calib.io.trajectory_files.formats import AUTO, FileOptions
 from hand_eye_calib.io.trajectory_files.objects import PoseObject, trajectory_from_object
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, rates_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import Table, read_table
+from hand_eye_calib.io.transforms import TfSource
 
 _Path = str | Path
 _USUAL = FileOptions.format
@@ -110,9 +111,12 @@ def read_trajectory(
             raise ConfigError(
                 "topic and tf are for bags: give one of them and none of the options of text files"
             )
-        from hand_eye_calib.io.bags import read_bag_trajectory
+        from hand_eye_calib.io.bags import PoseBag, trajectory_of
 
-        trajectory, notes = read_bag_trajectory(source, topic, tf, measures)
+        with PoseBag(source) as bag:
+            of = TfSource.parse(tf) if tf else topic or ""
+            trajectory, notes = trajectory_of(bag, of, measures)
+            notes = [*bag.warnings, *notes]
     elif isinstance(source, _Path):
         if not isinstance(times, _Path | None):
             raise ConfigError("stamps in memory are for poses in memory; of a kitti file name one")
