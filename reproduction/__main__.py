@@ -1,8 +1,163 @@
-"""``python -m reproduction ID``: the command line of this folder."""
+"""``python -m reproduction ID``: a figure or table of the paper, with a comparison with the
+published results.
+"""
 
+import argparse
+import os
 import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
-from reproduction.command import main
+from hand_eye_calib.cli.console import note
+from hand_eye_calib.cli.main import exit_code_of
+from hand_eye_calib.errors import ConfigError
+from reproduction import certificate, conclusions, faults, figures, findings, published, tables
+from reproduction.published import KITTI, METHODS, SIMULATED
+from reproduction.results import SIMULATION_METHODS, Results
+from reproduction.rows import TITLES, Cell, cells, solve_cell, table_of
+from reproduction.runner import in_parallel
+from reproduction.sources import PublishedSource, SimulatedSource, Source
+from reproduction.writing import put_into_page, study_parser
+
+EXPERIMENTS = {
+    "fig3": "errors of DNLO for every reference: noise, outliers, drift, mixture",
+    "fig4": "components of the relative motions",
+    "fig5": "the best variant of every method",
+    "table1": "KITTI 2011_09_30_drive_0027, lidar and camera",
+    "table2": "KITTI 2011_10_03_drive_0027, two cameras",
+    "s-figures": "S1-S5: as fig3, for the other methods",
+    "s-tables": "S1-S12: every method and reference on both drives",
+    "certificate": "study: which answers are proved to be global minima",
+    "faults": "study: faults on purpose, what is found and what the verdict is",
+    "all": "all figures and tables of the paper, its conclusions and our findings",
+}
+
+_EPILOG = (
+    "\n".join(f"{name:<13}{about}" for name, about in EXPERIMENTS.items())
+    + """
+
+Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV. Beside each,
+*_comparison.csv and *_comparison.md compare it with the published results, cell by cell.
+Published data: clone github.com/tau-alma/trajectory_calibration_experiments and name its
+folder with --data-folder."""
+)
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A figure, a table or a text, with its comparison; its files begin with its name."""
+
+    name: str
+    # What must be solved for it.
+    cells: list[Cell]
+    # Given the name and :class:`Results`, writes the files and returns their paths.
+    write: Callable[[str, Results], list[Path]]
+
+
+_EVERYTHING = cells(SIMULATED, SIMULATION_METHODS) + cells(KITTI, METHODS)
+_FIGURES = [
+    Artefact(name, cells(SIMULATED, methods), figures.write_error_figure)
+    for name, methods in figures.FIGURE_METHODS.items()
+]
+_VARIANTS = [
+    Artefact(name, cells([dataset], [method]), tables.write_variant_table)
+    for name, (dataset, method) in tables.VARIANT_TABLES.items()
+]
+_PAPER = [
+    Artefact("fig4", [], figures.write_components),
+    *_FIGURES,
+    *(
+        Artefact(name, cells([dataset], METHODS), tables.write_summary_table)
+        for name, dataset in tables.SUMMARY_TABLES.items()
+    ),
+    *_VARIANTS,
+    Artefact("conclusions", _EVERYTHING, conclusions.write),
+    Artefact("findings", _EVERYTHING, findings.write),
+]
+GROUPS = {each.name: [each] for each in _PAPER} | {
+    "s-figures": [each for each in _FIGURES if each.name.startswith("figS")],
+    "s-tables": _VARIANTS,
+    "certificate": [Artefact("certificate", [], certificate.write)],
+    "all": _PAPER,
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run an experiment; returns the exit code."""
+    parser = study_parser("reproduction", f"{__doc__}\n{_EPILOG}", "of certificate and faults")
+    add = parser.add_argument
+    add("id", metavar="ID", choices=tuple(EXPERIMENTS), help=", ".join(EXPERIMENTS))
+    add("--data", choices=("published", "simulated"), default="published",
+        help="published trajectories, or drives of our simulator. Default: published")  # fmt: skip
+    add("--seed", type=int, default=0, help="with --data simulated. Default: 0")
+    add("--runs", type=int, default=published.N_RUNS, help="simulated drives. Default: 38")
+    add("--out", metavar="DIR", type=Path, default=Path("reproduced"),
+        help="directory for the files. Default: reproduced")  # fmt: skip
+    add("--jobs", type=int, default=os.cpu_count() or 1, help="processes. Default: all cores")
+    add("--clean", action="store_true", help="with faults: only the recordings without a fault")
+    return exit_code_of(lambda: run(parser.parse_args(argv)))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the experiment; returns the exit code."""
+    if arguments.jobs < 1 or arguments.runs < 2:
+        raise ConfigError("--jobs must be at least 1, --runs at least 2")
+    if arguments.id == "faults":
+        text = faults.run(arguments)
+    else:
+        results, files = made(arguments.id, _source(arguments), arguments.out, arguments.jobs)
+        text = said(results, files)
+        if arguments.page is not None:
+            page = (arguments.out / f"{arguments.id}.md").read_text(encoding="utf-8")
+            put_into_page(arguments.page, arguments.id, page)
+    print(text)
+    return 0
+
+
+def _source(arguments: argparse.Namespace) -> Source:
+    if arguments.data == "simulated":
+        return SimulatedSource(arguments.seed, arguments.runs)
+    if arguments.data_folder is None:
+        raise ConfigError(
+            "--data published needs the published data: clone "
+            "github.com/tau-alma/trajectory_calibration_experiments and name its "
+            "folder with --data-folder or $HAND_EYE_CALIB_DATA, or use --data simulated"
+        )
+    return PublishedSource(published.find_folder(arguments.data_folder))
+
+
+def made(
+    identifier: str, source: Source, out: Path, jobs: int
+) -> tuple[Results, dict[str, list[Path]]]:
+    """Solve and write an experiment; gives what was solved, and the paths of the files by artefact.
+    What needs other data than the source has is left out. Raises ConfigError if that is all of it.
+    """
+    wanted = GROUPS[identifier]
+    artefacts = [
+        one for one in wanted if all(cell.dataset in source.datasets for cell in one.cells)
+    ]
+    if not artefacts:
+        raise ConfigError(f"{identifier} is about the KITTI drives: use --data published")
+    if len(artefacts) < len(wanted):
+        note("what is about the KITTI drives is left out: it needs the published data")
+    out.mkdir(parents=True, exist_ok=True)
+    todo = dict.fromkeys(cell for artefact in artefacts for cell in artefact.cells)
+    solved = in_parallel(solve_cell, [(source, cell) for cell in todo], jobs)
+    results = Results(source, table_of([row for rows in solved for row in rows]), out, jobs)
+    return results, {each.name: each.write(each.name, results) for each in artefacts}
+
+
+def said(results: Results, files: dict[str, list[Path]]) -> str:
+    """The text of a single artefact, how many rows agree, and where the files are."""
+    lines = []
+    for name, paths in files.items() if len(files) == 1 else ():
+        lines += [path.read_text(encoding="utf-8") for path in paths if path.name == f"{name}.md"]
+    for method, rows in results.rows.groupby("method") if results.source.is_published else ():
+        lines.append(f"{TITLES[method]:<20}{rows['agrees'].sum():>6} of {len(rows):>5} rows agree")
+    count = sum(map(len, files.values()))
+    return "\n".join([*lines, f"{count} files written to {results.out}: {', '.join(files)}"])
+
 
 if __name__ == "__main__":
     sys.exit(main())

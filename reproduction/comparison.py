@@ -1,17 +1,12 @@
-"""Comparison with the published results: every row, every plotted point, differences and why."""
+"""Comparison with the published results: how many rows agree, and why others do not."""
 
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from reproduction.results import Summary
-from reproduction.rows import METRICS, PUBLISHED, TITLES, UNITS, agree
+from reproduction.rows import METRICS, PUBLISHED, TITLES, UNITS
 from reproduction.writing import markdown_table, percent, write_csv
-
-# Half the width of the 95 % interval of a median, in interquartile ranges over the root of the
-# number of runs (McGill, Tukey, Larsen 1978).
-_NOTCH = 1.57
 
 _MOST_LISTED = 30
 
@@ -28,28 +23,15 @@ def write_rows(path: Path, rows: pd.DataFrame) -> Path:
 
 def describe_rows(rows: pd.DataFrame) -> str:
     """Markdown: how many rows agree, by method, and the reasons why others do not."""
-    lines = []
-    for method, some in rows.groupby("method"):
-        absolute = agree(some[["e_at", "e_aR"]].to_numpy(), some[list(PUBLISHED[2:])].to_numpy())
-        why = some["why"][~some["agrees"]].value_counts()
-        lines.append(
-            {
-                "method": TITLES[method],
-                "rows that agree": percent(some["agrees"].sum(), len(some)),
-                "values of e_at and e_aR that agree": percent(absolute.sum(), absolute.size),
-                "why the others differ": "; ".join(f"{k}: {n}" for k, n in why.items()) or "-",
-            }
-        )
-    others = rows[~rows["agrees"] & ~rows["method"].isin(["ali", "dnlo"])]
-    return (
-        "A row agrees where each of its four errors is within 0.1 % or 1e-6 (m, deg) of "
-        f"the published one.\n\n{markdown_table(lines)}{_list_differing(others)}"
+    table = markdown_table(
+        {
+            "method": TITLES[method],
+            "rows that agree": percent(some["agrees"].sum(), len(some)),
+            "why the others differ": reasons(some) or "-",
+        }
+        for method, some in rows.groupby("method")
     )
-
-
-def _list_differing(rows: pd.DataFrame) -> str:
-    if rows.empty:
-        return ""
+    others = rows[~rows["agrees"] & ~rows["method"].isin(["ali", "dnlo"])]
     listed = [
         {
             "case": row.case,
@@ -57,16 +39,17 @@ def _list_differing(rows: pd.DataFrame) -> str:
             "reference": row.reference,
             "ours: e_at m, e_aR deg": f"{row.e_at:.4g}, {row.e_aR:.4g}",
             "published": f"{row.published_e_at:.4g}, {row.published_e_aR:.4g}",
-            "objective: ours, at the published X": "-"
-            if np.isnan(row.published_objective)
-            else f"{row.objective:.4g}, {row.published_objective:.4g}",
+            "objective: ours, at the published X": (
+                f"{row.objective:.4g}, {row.published_objective:.4g}"
+            ),
             "why": row.why,
         }
-        for row in rows[:_MOST_LISTED].itertuples()
+        for row in others[:_MOST_LISTED].itertuples()
     ]
-    n_more = len(rows) - _MOST_LISTED
-    more = f"\n\n{n_more} more are in the CSV file." if n_more > 0 else ""
-    return "\n\n" + markdown_table(listed) + more
+    return (
+        "A row agrees where each of its four errors is within 0.1 % or 1e-6 (m, deg) of "
+        f"the published one.\n\n{table}" + (f"\n\n{markdown_table(listed)}" if listed else "")
+    )
 
 
 def describe_dnlo(rows: pd.DataFrame) -> str:
@@ -91,24 +74,6 @@ def describe_dnlo(rows: pd.DataFrame) -> str:
             "error."
         )
     return text
-
-
-def compare_summaries(ours: Summary, theirs: Summary, same_cases: bool) -> bool:
-    """Whether a plotted point agrees with the published one. Of the same trajectories: the numbers
-    must be equal. Of others: the 95 % intervals must overlap.
-    """
-    if same_cases:
-        pairs = ((getattr(one, x) for one in (ours, theirs)) for x in ("centre", "low", "high"))
-        return all(agree(*pair) for pair in pairs)
-    (low, high), (their_low, their_high) = _interval(ours), _interval(theirs)
-    return bool(agree(ours.centre, theirs.centre)) or (low <= their_high and their_low <= high)
-
-
-def _interval(summary: Summary) -> tuple[float, float]:
-    if summary.is_median:
-        half = _NOTCH * (summary.high - summary.low) / np.sqrt(summary.n)
-        return summary.centre - half, summary.centre + half
-    return summary.low, summary.high
 
 
 def reasons(rows: pd.DataFrame) -> str:

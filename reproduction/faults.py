@@ -5,8 +5,9 @@ names it, what the verdict is, and how wrong the answer is, in its own standard 
 that was interrupted goes on from ``faults.jsonl``. ``--clean`` solves the clean recordings alone.
 """
 
+import argparse
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from itertools import chain
@@ -27,8 +28,8 @@ from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction import clean_recordings
 from reproduction.fault_cases import GROUPS, Fault
-from reproduction.recordings import Rig, real_rigs
-from reproduction.runner import Store, solve
+from reproduction.recordings import real_rigs
+from reproduction.runner import kept
 from reproduction.writing import counted, markdown_table, put_into_page
 
 METHODS: tuple[MethodName, ...] = ("dnlo", "auto")
@@ -88,23 +89,17 @@ class Outcome:
     rules: list[str] = field(default_factory=list)
 
 
-def run(
-    todo: Sequence[Case],
-    folder: Path | None,
-    out: Path,
-    page: Path | None,
-    jobs: int,
-    advance: Callable[[str], object] = lambda name: None,
-) -> str:
-    """Solve cases, and write the text about them and those solved before into the page; returns the
-    text.
+def run(arguments: argparse.Namespace) -> str:
+    """Solve the cases, and write the text about them and those solved before into the page; returns
+    the text.
     """
-    store = Store(out / "faults.jsonl", {"study": "faults"})
-    solve(_plain_outcome, {case.key: (case, folder) for case in todo}, jobs, store, advance)
-    text = report([Outcome(**found) for found in store.found.values()], folder)
-    (out / "faults.md").write_text(text, encoding="utf-8")
-    if page is not None:
-        put_into_page(page, "faults", text)
+    folder, out = arguments.data_folder, arguments.out
+    todo = clean_cases(folder) if arguments.clean else cases(folder)
+    tasks = {case.key: (case, folder) for case in todo}
+    found = kept(out / "faults.jsonl", _plain_outcome, tasks, arguments.jobs)
+    text = report([Outcome(**each) for each in found.values()], folder)
+    if arguments.page is not None:
+        put_into_page(arguments.page, "faults", text)
     return text
 
 
@@ -153,7 +148,9 @@ def outcome(case: Case, folder: Path | None) -> Outcome:
     try:
         result = calibrate(parent, child, method=case.method, max_pairs=_MAX_PAIRS, **options)
     except HandEyeCalibError:
-        return Outcome(key=case.key, verdict=_NO_ANSWER, findings=_codes(parent, child))
+        return Outcome(
+            key=case.key, verdict=_NO_ANSWER, findings=_named(check_streams(parent, child).findings)
+        )
     return _judged(case.key, result, T_parent_child)
 
 
@@ -163,10 +160,6 @@ def _of_clean(case: Case, folder: Path | None) -> Outcome:
     options = clean.options if clean.is_real else {"max_pairs": _MAX_PAIRS}
     result = calibrate(clean.parent, clean.child, method=case.method, **options)
     return _judged(case.key, result, clean.T_parent_child)
-
-
-def _codes(parent: Trajectory, child: Trajectory) -> list[str]:
-    return _named(check_streams(parent, child).findings)
 
 
 def _named(findings: Iterable[Any]) -> list[str]:
@@ -204,7 +197,7 @@ def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
     if name.startswith("hilly"):
         drive = simulate_drive(int(name.rsplit("_", 1)[1]), HILLY_DRIVE, _NOISE)
         return drive.parent, drive.child, drive.T_parent_child, {}
-    rig = next(rig for rig in _rigs(folder) if rig.name == name)
+    rig = next(rig for rig in real_rigs(folder or Path())[0] if rig.name == name)
     (recording,) = rig.recordings.values()
     found = check_streams(recording.parent, recording.child)
     parent, child = recording.parent, recording.child
@@ -214,11 +207,6 @@ def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
     child = child.scaled(fit.scale if fit else 1.0)
     result = calibrate(parent, child, method=method, max_pairs=_MAX_PAIRS)
     return parent, child, result.T_parent_child, {}
-
-
-@cache
-def _rigs(folder: Path | None) -> tuple[Rig, ...]:
-    return tuple(real_rigs(folder)[0]) if folder else ()
 
 
 # ------------------------------------------------------------------ the page
@@ -231,16 +219,21 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
         by_fault.setdefault(found.key.split()[0], []).append(found)
     clean, sound = by_fault.pop(_CLEAN, []), by_fault.pop(_SOUND, [])
     faulty = list(chain.from_iterable(by_fault.values()))
+    unsafe = [found for found in faulty if found.verdict == "USE" and found.z > _LIMIT_Z]
     parts = []
     if faulty:
         parts += [
             f"{len(faulty)} calibrations with `{'` or `'.join(METHODS)}`: of simulated hilly "
             "drives of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), "
             "whose answer without the fault counts as the truth. z is the largest error of an axis "
-            "in its stated standard deviations; z and the error are the largest of all. Verdicts "
-            "and the three most frequent findings are counted: `no` is DO NOT USE, `care` USE WITH "
-            "CARE.",
-            _unsafe_text(faulty),
+            "in its stated standard deviations, of all. Verdicts and the three most frequent "
+            "findings are counted: `no` is DO NOT USE, `care` USE WITH CARE.",
+            f"{len(unsafe)} of them are more than {_LIMIT_Z:g} standard deviations off and called "
+            f"USE{':' if unsafe else '.'}\n"
+            + "\n".join(
+                f"- {one.key}: z {one.z:.1f}, {1e3 * one.metres:.0f} mm, {one.degrees:.2f} deg"
+                for one in unsafe
+            ),
             f"Without a fault, these recordings end in {counted(f.verdict for f in sound)}; z is "
             f"at most {max((f.z for f in sound), default=0.0):.1f}.",
         ]
@@ -253,18 +246,6 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     return "\n\n".join(parts)
 
 
-def _unsafe_text(faulty: Sequence[Outcome]) -> str:
-    unsafe = [found for found in faulty if found.verdict == "USE" and found.z > _LIMIT_Z]
-    listed = "".join(
-        f"\n- {found.key}: z {found.z:.1f}, {1e3 * found.metres:.0f} mm, {found.degrees:.2f} deg"
-        for found in unsafe
-    )
-    return (
-        f"Of {len(faulty)} calibrations with a fault, {len(unsafe)} are more than {_LIMIT_Z:g} "
-        f"standard deviations off and called USE{':' if unsafe else '.'}{listed}"
-    )
-
-
 def _row(fault: Fault, found: Sequence[Outcome]) -> dict[str, str]:
     named = (
         code.removeprefix("note:")
@@ -273,71 +254,43 @@ def _row(fault: Fault, found: Sequence[Outcome]) -> dict[str, str]:
         if not code.endswith(("gaps", "one_axis"))
     )
     answered = [one for one in found if math.isfinite(one.z)]
-    severities = ", ".join(f"{severity:g}" for severity in fault.severities)
     return {
         "": fault.code,
-        "fault": f"{fault.what}: {severities} {fault.unit}".strip(),
+        "fault": fault.what,
         "findings": counted(named, most=3) or "none",
         "verdicts": counted(_SHORT.get(one.verdict, one.verdict) for one in found),
-        "error": _largest(answered),
         "largest z": f"{max(one.z for one in answered):.1f}" if answered else "",
     }
 
 
-def _largest(found: Sequence[Outcome]) -> str:
-    if not found:
-        return ""
-    metres, degrees = (max(getattr(one, name) for one in found) for name in ("metres", "degrees"))
-    return f"{1e3 * metres:.0f} mm, {degrees:.2g} deg"
-
-
 def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     """How clean recordings end, and what was found in them that is not there."""
-    rows: dict[str, list[tuple[Outcome, set[str]]]] = {}
-    wrong: dict[str, set[str]] = {}
+    kinds: dict[str, list[Outcome]] = {}
+    wrong: dict[str, list[str]] = {}
     for found in outcomes:
-        name = _recording_of(found)
-        codes = {code for code in found.findings if not code.startswith("note:")}
-        codes -= clean_recordings.known_in(name, folder)
-        rows.setdefault(clean_recordings.kind_of(name), []).append((found, codes))
-        wrong.setdefault(name, set()).update(codes)
-    n_wrong = sum(map(bool, wrong.values()))
-    unexplained = [found for found in outcomes if set(found.rules) - _PHYSICAL]
-    rows = {kind: of for kind, of in rows.items() if any(_is_worth_telling(*one) for one in of)}
-    table = markdown_table(_clean_row(kind, of_kind) for kind, of_kind in rows.items())
+        name = found.key.split(" ", 2)[2].rpartition(" ")[0]
+        known = clean_recordings.known_in(name, folder)
+        codes = [c for c in found.findings if not c.startswith("note:") and c not in known]
+        kinds.setdefault(clean_recordings.kind_of(name), []).append(found)
+        wrong.setdefault(clean_recordings.kind_of(name), []).extend(codes[:1])
+    n_wrong = sum(map(len, wrong.values()))
+    n_own = sum(not set(found.rules) - _PHYSICAL for found in outcomes)
+    rows = [
+        {
+            "clean recordings": kind,
+            "solved": len(found),
+            "wrong findings": counted(wrong[kind]) or "none",
+            "verdict": counted(_SHORT.get(one.verdict, one.verdict) for one in found),
+            "reasons": counted(rule for one in found for rule in dict.fromkeys(one.rules)),
+            "largest z": f"{max((one.z for one in found if one.z == one.z), default=0.0):.1f}",
+        }
+        for kind, found in kinds.items()
+        if wrong[kind] or any(set(one.rules) - _PHYSICAL or one.z > _LIMIT_Z for one in found)
+    ]
     return (
-        f"Wrong findings in {n_wrong} of {len(wrong)} clean recordings ({n_wrong / len(wrong):.1%})"
-        f", solved with the default method. {len(outcomes) - len(unexplained)} of "
-        f"{len(outcomes)} results are called USE or have reasons that the recording itself has: an "
-        "axis that the motion does not show, or less well than the target, the common-mode floor, "
-        f"outliers, a finding that is right.{_contradicted_text(unexplained)} "
-        f"Listed are those, and what is more than {_LIMIT_Z:g} standard deviations off.\n\n{table}"
+        f"Wrong findings in {n_wrong} of {len(outcomes)} clean recordings, solved with the default "
+        f"method. {n_own} of {len(outcomes)} results are called USE or have reasons that the "
+        "recording itself has: an axis that the motion does not show, or less well than the "
+        "target, the common-mode floor, outliers, a finding that is right. Listed are the others, "
+        f"and what is more than {_LIMIT_Z:g} standard deviations off.\n\n{markdown_table(rows)}"
     )
-
-
-def _is_worth_telling(found: Outcome, wrong: set[str]) -> bool:
-    return bool(wrong) or bool(set(found.rules) - _PHYSICAL) or found.z > _LIMIT_Z
-
-
-def _contradicted_text(outcomes: Sequence[Outcome]) -> str:
-    """Of clean recordings in which answers contradict each other."""
-    if not outcomes:
-        return ""
-    kinds = counted(clean_recordings.kind_of(_recording_of(found)) for found in outcomes)
-    return f" In the others answers contradict each other (`halves`, `methods`, `model`): {kinds}."
-
-
-def _recording_of(found: Outcome) -> str:
-    return found.key.split(" ", 2)[2].rpartition(" ")[0]
-
-
-def _clean_row(kind: str, found: Sequence[tuple[Outcome, set[str]]]) -> dict[str, object]:
-    largest = [one.z for one, _ in found if math.isfinite(one.z)]
-    return {
-        "clean recordings": kind,
-        "solved": len(found),
-        "wrong findings": counted(c for _, codes in found for c in sorted(codes)) or "none",
-        "verdict": counted(_SHORT.get(one.verdict, one.verdict) for one, _ in found),
-        "reasons": counted(rule for one, _ in found for rule in dict.fromkeys(one.rules)),
-        "largest z": f"{max(largest):.1f}" if largest else "",
-    }

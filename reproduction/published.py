@@ -15,6 +15,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.metrics import Errors
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
@@ -41,12 +42,38 @@ _LEVEL_COLUMNS: dict[str, str | None] = {
 SIMULATED = tuple(_LEVELS)
 KITTI = ("kitti_short", "kitti_long")
 LEVELS = {dataset: tuple(folders.values()) for dataset, folders in _LEVELS.items()}
-_RESULTS_FOLDERS = ("published", "calib")
 KEYFRAMES = "KeyFrameTrajectory_TUM_Format.txt"
 KITTI_DRIVES = ("2011_09_30_drive_0027", "2011_10_03_drive_0027")
 
 # The answers of a closed-form method agree to the eight digits that are printed.
 _SAME_ANSWER = 1e-6
+
+
+# The published ground truth of both KITTI drives is the calibration of the cameras as they are; the
+# trajectories come from images that KITTI had rectified, which turns all cameras into a common
+# orientation. The truth of these, from the calibration files that come with the drives:
+# calib_cam_to_cam.txt of 2011_10_03: P_rect_02, projection matrix of the left colour camera. Its
+# last column is -K times the camera's place in the frame of camera 0, the left grey one.
+_P_RECT_02 = np.array(
+    [
+        [718.856, 0.0, 607.1928, 45.38225],
+        [0.0, 718.856, 185.2157, -0.1130887],
+        [0.0, 0.0, 1.0, 0.003779761],
+    ]
+)
+
+# calib_velo_to_cam.txt and R_rect_00 of calib_cam_to_cam.txt of 2011_09_30, put together: rectified
+# camera 0 in the lidar's frame.
+_T_LIDAR_CAMERA = se3.from_quat_xyzw(
+    (0.3335, -0.0048, -0.0756), (-0.499146, 0.504085, -0.496817, 0.499924)
+)
+
+RECTIFIED = {
+    "kitti_short": _T_LIDAR_CAMERA,
+    "kitti_long": se3.from_rotation_translation(
+        np.eye(3), -np.linalg.solve(_P_RECT_02[:, :3], _P_RECT_02[:, 3])
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -104,25 +131,26 @@ Run = tuple[str, Trajectory, Trajectory, FloatArray]
 PublishedResults = dict[float | None, dict[tuple[str, str], list[PublishedResult]]]
 
 
-def check_folder(folder: str | Path) -> Path:
-    """The folder as a path. Raises InputError if it is not the folder of the published data."""
-    folder = Path(folder)
-    missing = [name for name in ("kitti_tests", "simulation_tests") if not (folder / name).is_dir()]
-    if not any((folder / name).is_dir() for name in _RESULTS_FOLDERS):
-        missing.append(" or ".join(_RESULTS_FOLDERS))
+def find_folder(folder: str | Path) -> str:
+    """The folder of the published data: itself, or the folder valimaki2023 in it. Raises InputError
+    if it is none.
+    """
+    inside = Path(folder) / "valimaki2023"
+    found = inside if inside.is_dir() else Path(folder)
+    names = ["kitti_tests", "simulation_tests", results_folder(found).name]
+    missing = [name for name in names if not (found / name).is_dir()]
     if missing:
         raise InputError(
-            f"{folder}: expected the published data, a clone of "
-            "github.com/tau-alma/trajectory_calibration_experiments, with "
-            "kitti_tests, simulation_tests and calib (the results, also as published) in "
-            f"it; found no {', no '.join(missing)}"
+            f"{found}: expected the published data, a clone of "
+            f"github.com/tau-alma/trajectory_calibration_experiments; it has no {missing[0]}"
         )
-    return folder
+    return str(found.resolve())
 
 
 def results_folder(folder: Path) -> Path:
-    """Where in the checked folder the CSV files of results are."""
-    return next(folder / name for name in _RESULTS_FOLDERS if (folder / name).is_dir())
+    """Where in the folder the CSV files of results are."""
+    inside = folder / "published"
+    return inside if inside.is_dir() else folder / "calib"
 
 
 def load_kitti_short(folder: str | Path) -> Case:
@@ -130,7 +158,7 @@ def load_kitti_short(folder: str | Path) -> Case:
     which precedes the lidar's first. Raises InputError if a file is missing or cannot be used.
     """
     return _kitti_case(
-        check_folder(folder),
+        Path(folder),
         "kitti_short",
         KITTI_DRIVES[0],
         ("LIDAR_HDL64E/traj_HDL_aft_opt.csv", f"cam01/{KEYFRAMES}"),
@@ -145,7 +173,7 @@ def load_kitti_long(folder: str | Path) -> Case:
     InputError if a file is missing or cannot be used.
     """
     return _kitti_case(
-        check_folder(folder),
+        Path(folder),
         "kitti_long",
         KITTI_DRIVES[1],
         (f"cam01/{KEYFRAMES}", f"cam23/{KEYFRAMES}"),
@@ -185,7 +213,7 @@ def load_simulated(
     trajectories at each of six levels of noise, outliers and drift, or only at ``levels``; and in
     the mixture, which has none. Raises InputError if a file is missing or cannot be used.
     """
-    folder = check_folder(folder)
+    folder = Path(folder)
     cases = []
     for dataset in datasets:
         results = _read_results(
@@ -259,18 +287,11 @@ def _read_results(path: Path, level_column: str | None) -> PublishedResults:
     order.
     """
     results: PublishedResults = {}
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                level = float(row[level_column]) if level_column else None
-                key = row["algorithm"].lower(), "A" if row["method"] == "A1" else row["method"]
-                results.setdefault(level, {}).setdefault(key, []).append(_result(row))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            f"{path} is not a file of published results ({error!r}); get the data again"
-        ) from None
+    with open(path, newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            level = float(row[level_column]) if level_column else None
+            key = row["algorithm"].lower(), "A" if row["method"] == "A1" else row["method"]
+            results.setdefault(level, {}).setdefault(key, []).append(_result(row))
     return results
 
 

@@ -20,8 +20,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import read_trajectory, read_trajectory_file
-from reproduction.kitti_truth import RECTIFIED
-from reproduction.published import KEYFRAMES, KITTI_DRIVES
+from reproduction.published import KEYFRAMES, KITTI_DRIVES, RECTIFIED
 
 # Parts of a drive, by how many there are.
 PARTS = {2: "halves", 3: "thirds"}

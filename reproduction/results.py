@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,12 +14,11 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 from hand_eye_calib.arrays import FloatArray
-from reproduction.published import LEVELS, METHODS, REFERENCES, SIMULATED, Case
-from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED, in_m_and_deg, published_name
-from reproduction.sources import PublishedSource, Source
+from reproduction.published import METHODS, REFERENCES
+from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED
+from reproduction.sources import Source
 
 SIMULATION_METHODS = (*METHODS, ALI_AS_PUBLISHED)
-_KEYS = ["dataset", "level", "method", "reference"]
 
 
 @dataclass(frozen=True)
@@ -35,8 +33,6 @@ class Summary:
     whiskers: tuple[float, float]
     # Number of runs.
     n: int
-    # Median and quartiles, not mean and interval.
-    is_median: bool
 
 
 def mean_summary(values: ArrayLike) -> Summary:
@@ -45,7 +41,7 @@ def mean_summary(values: ArrayLike) -> Summary:
     mean, n = values.mean(), len(values)
     half = stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
     whiskers = float(values.min()), float(values.max())
-    return Summary(float(mean), float(mean - half), float(mean + half), whiskers, n, False)
+    return Summary(float(mean), float(mean - half), float(mean + half), whiskers, n)
 
 
 def quartile_summary(values: ArrayLike) -> Summary:
@@ -54,16 +50,17 @@ def quartile_summary(values: ArrayLike) -> Summary:
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
     inside = values[(values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))]
     whiskers = float(inside[0]), float(inside[-1])
-    return Summary(float(median), float(low), float(high), whiskers, len(values), True)
+    return Summary(float(median), float(low), float(high), whiskers, len(values))
 
 
 class Table:
     """Errors of many rows by data set, level, method and reference; m and deg."""
 
     def __init__(self, rows: pd.DataFrame) -> None:
+        keys = ["dataset", "level", "method", "reference"]
         self._errors = {
             (dataset, None if np.isnan(level) else level, method, reference): errors
-            for (dataset, level, method, reference), group in rows.groupby(_KEYS, dropna=False)
+            for (dataset, level, method, reference), group in rows.groupby(keys, dropna=False)
             if np.isfinite(errors := group[list(METRICS)].to_numpy()).all()
         }
 
@@ -107,22 +104,10 @@ class Results:
     """Solved rows (:func:`~reproduction.rows.table_of`) and the output directory."""
 
     source: Source
-    # Source of the published results to compare with.
-    theirs_source: PublishedSource | None
     rows: pd.DataFrame
     out: Path
     # Number of processes of the studies, which are not solved cell by cell.
     jobs: int = 1
-
-    @property
-    def same_cases(self) -> bool:
-        """Whether ours and the published results are of the same trajectories."""
-        return self.source == self.theirs_source
-
-    @property
-    def n_runs(self) -> int:
-        """Number of runs per level of the simulated data sets."""
-        return self.source.runs
 
     @cached_property
     def ours(self) -> Table:
@@ -130,34 +115,11 @@ class Results:
         return Table(self.rows)
 
     @cached_property
-    def theirs(self) -> Table | None:
-        """The published errors; None without published data."""
-        if self.same_cases:
-            named = dict(zip(PUBLISHED, METRICS, strict=True))
-            return Table(self.rows.drop(columns=list(METRICS)).rename(columns=named))
-        if self.theirs_source is None:
-            return None
-        cases = (
-            case
-            for dataset in SIMULATED
-            for level in LEVELS[dataset]
-            for case in self.theirs_source.cases(dataset, level)
-        )
-        return Table(_published_of(cases))
+    def theirs(self) -> Table:
+        """The published errors of the same trajectories."""
+        named = dict(zip(PUBLISHED, METRICS, strict=True))
+        return Table(self.rows.drop(columns=list(METRICS)).rename(columns=named))
 
     def of(self, dataset: str, method: str) -> pd.DataFrame:
         """Rows of a method on a data set."""
         return self.rows[(self.rows["dataset"] == dataset) & (self.rows["method"] == method)]
-
-
-def _published_of(cases: Iterable[Case]) -> pd.DataFrame:
-    """The published errors of cases, whatever was solved."""
-    rows = [
-        (case.dataset, case.level, method, reference)
-        + in_m_and_deg(case.results[published_name(method), reference].errors)
-        for case in cases
-        for method in SIMULATION_METHODS
-        for reference in REFERENCES
-    ]
-    table = pd.DataFrame(rows, columns=[*_KEYS, *METRICS])
-    return table.astype({"level": float})

@@ -2,7 +2,6 @@
 the rectified ground truth.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,7 @@ import pandas as pd
 
 from hand_eye_calib.assessment.metrics import absolute_errors
 from reproduction import comparison
-from reproduction.kitti_truth import RECTIFIED
-from reproduction.published import METHODS, REFERENCES
+from reproduction.published import METHODS, RECTIFIED, REFERENCES
 from reproduction.results import Results
 from reproduction.rows import METRICS, TITLES
 from reproduction.writing import markdown_table, percent, write_csv, write_text
@@ -122,22 +120,25 @@ def _print(value: float, bold: float | None = None) -> str:
 def _compare_with_print(
     name: str, rows: pd.DataFrame, best: pd.DataFrame, results: Results
 ) -> list[Path]:
-    """Cell by cell: ours (of our best variant, and of the paper's), the published file's, and as
-    printed.
-    """
+    """Cell by cell: ours of our best variant, and as printed."""
     dataset = SUMMARY_TABLES[name]
     compared = pd.DataFrame(
-        line
+        {
+            "method": TITLES[method],
+            "our_best_variant": reference,
+            "papers_variant": variant,
+            "column": column,
+            "ours": ours,
+            "printed": number,
+            "agrees": same,
+            "why": "" if same else why,
+        }
         for method, reference in best.index
-        for line in _printed_cells(rows.loc[method], method, reference, PRINTED[dataset][method])
-    )
-    agreeing, there = (
-        percent(compared[which].sum(), len(compared))
-        for which in ("agrees", "agrees_with_the_papers_variant")
-    )
-    differing = (
-        {column: f"{x:.4f}" if isinstance(x, float) else x for column, x in line.items()}
-        for line in compared[~compared["agrees"]].to_dict("records")
+        for variant, *numbers in [PRINTED[dataset][method]]
+        for why in ["; ".join(dict.fromkeys(rows.loc[method].loc[[variant, "B1"], "why"]))]
+        for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True)
+        for ours in [float(best.loc[(method, reference), column])]
+        for same in [np.isnan(ours) if number is None else abs(ours - number) <= _SAME_PRINT]
     )
     solved = results.rows[results.rows["dataset"] == dataset]
     return [
@@ -145,46 +146,14 @@ def _compare_with_print(
         write_text(
             results.out / f"{name}_comparison.md",
             f"# {name}: comparison with the paper",
-            f"Cells that agree with the printed table to its three decimals: {agreeing}; with the "
-            f"paper's variant of each method: {there}.",
-            markdown_table(differing),
+            "Cells that agree with the printed table to its three decimals: "
+            f"{percent(compared['agrees'].sum(), len(compared))}.",
+            markdown_table(compared[~compared["agrees"]].round(4).to_dict("records")),
             "## Every variant, against the published results in full precision",
             comparison.describe_rows(solved),
             comparison.describe_dnlo(solved),
         ),
     ]
-
-
-def _printed_cells(
-    rows: pd.DataFrame, method: str, best: str, printed: tuple[Any, ...]
-) -> Iterator[dict[str, Any]]:
-    """A line for each printed number of a method."""
-    variant, *numbers = printed
-    involved = dict.fromkeys((variant, "B1"))
-    why = "; ".join(
-        f"{name}: {rows.loc[name, 'why']}" for name in involved if rows.loc[name, "why"]
-    )
-    for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True):
-        ours, there = (float(rows.loc[name, column]) for name in (best, variant))
-        same, same_there = (_reads_as(value, number) for value in (ours, there))
-        yield {
-            "method": TITLES[method],
-            "our_best_variant": best,
-            "papers_variant": variant,
-            "column": column,
-            "ours": ours,
-            "ours_with_the_papers_variant": there,
-            "printed": number,
-            "agrees": same,
-            "agrees_with_the_papers_variant": same_there,
-            "why": "" if same else f"best variant is {best} here" if same_there else why,
-        }
-
-
-def _reads_as(value: float, printed: float | None) -> bool:
-    if printed is None:
-        return bool(np.isnan(value))
-    return abs(value - printed) <= _SAME_PRINT
 
 
 def write_variant_table(name: str, results: Results) -> list[Path]:

@@ -1,4 +1,4 @@
-"""CSV and Markdown: files, tables, pages. A table is a list of rows that map column to value."""
+"""CSV and Markdown: files, tables, pages; and the arguments of a study."""
 
 import argparse
 import os
@@ -23,69 +23,48 @@ def write_csv(path: Path, rows: Iterable[TableRow] | pd.DataFrame) -> Path:
 
 def write_text(path: Path, *blocks: str) -> Path:
     """Write blocks of text, an empty line between them; returns the path."""
-    path.write_text("\n\n".join(block for block in blocks if block) + "\n", encoding="utf-8")
+    path.write_text("\n\n".join(filter(None, blocks)) + "\n", encoding="utf-8")
     return path
 
 
-def markdown_table(rows: Iterable[TableRow], titles: str = "") -> str:
-    """A Markdown table; ``titles`` (``a | b | c``) in place of the names of the columns."""
+def markdown_table(rows: Iterable[TableRow]) -> str:
+    """A Markdown table; the keys of the first row are the titles."""
     rows = list(rows)
     if not rows:
         return "Nothing."
-    header = titles.split(" | ") if titles else list(rows[0])
-    lines: list[Iterable[object]] = [header, ["---"] * len(header), *(r.values() for r in rows)]
+    lines: list[Iterable[object]] = [rows[0], ["---"] * len(rows[0]), *(r.values() for r in rows)]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
 def put_into_page(page: Path, name: str, text: str) -> None:
-    """Replace the tables of an earlier run in a Markdown page.
-
-    Parameters
-    ----------
-    page : pathlib.Path
-        Has the lines ``<!-- NAME: begin -->`` and ``<!-- NAME: end -->``, between which the text is
-        put.
-    name : str
-    text : str
-        Markdown; a heading at its beginning is left out, because the page has its own.
-
-    Raises
-    ------
-    InputError
-        If the page cannot be read or has no such lines.
+    """Put Markdown, without a heading at its beginning, between the lines ``<!-- NAME: begin -->``
+    and ``<!-- NAME: end -->`` of a page. Raises InputError if it has no such lines.
     """
     begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->"
-    try:
-        before, found, rest = page.read_text(encoding="utf-8").partition(begin)
-        _, closed, after = rest.partition(end)
-        if not (found and closed):
-            raise InputError(
-                f"{page} has no lines {begin.strip()} and {end} to put the tables into"
-            )
-        body = re.sub(r"\A# .*\n+", "", text).strip()
-        page.write_text(f"{before}{begin}\n{body}\n\n{end}{after}", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot use {page}: {error.strerror}") from None
-
-
-def data_folder(given: Path | None) -> Path | None:
-    """The folder of recordings that was given, else that of the environment, else None."""
-    folder = given or os.environ.get("HAND_EYE_CALIB_DATA")
-    return Path(folder) if folder else None
+    before, found, rest = page.read_text(encoding="utf-8").partition(begin)
+    _, closed, after = rest.partition(end)
+    if not (found and closed):
+        raise InputError(f"{page} has no lines {begin.strip()} and {end} to put the tables into")
+    body = re.sub(r"\A# .*\n+", "", text).strip()
+    page.write_text(f"{before}{begin}\n{body}\n\n{end}{after}", encoding="utf-8")
 
 
 def study_parser(
     name: str, about: str | None, page: str = "put the tables into this page"
 ) -> argparse.ArgumentParser:
-    """Parser of a study that has a command of its own: recordings, and a page for its tables."""
+    """Parser of a study: recordings, and a page for its tables."""
     parser = argparse.ArgumentParser(
-        prog=f"python -m {name}", description=about, allow_abbrev=False
+        prog=f"python -m {name}",
+        description=about,
+        allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    given = os.environ.get("HAND_EYE_CALIB_DATA")
     parser.add_argument(
         "--data-folder",
         metavar="DIR",
         type=Path,
-        default=data_folder(None),
+        default=Path(given) if given else None,
         help="folder of the real recordings (valimaki2023, euroc_vio, ...); without it, simulated "
         "ones only. Default: $HAND_EYE_CALIB_DATA",
     )
@@ -99,11 +78,6 @@ def show(page: Path | None, tables: Mapping[str, str]) -> None:
         print(text, flush=True)
         if page:
             put_into_page(page, name, text)
-
-
-def bullets(items: Iterable[str]) -> str:
-    """A Markdown list."""
-    return "\n".join(f"- {item}" for item in items)
 
 
 def percent(part: int, whole: int) -> str:

@@ -49,7 +49,7 @@ def measure(plan: Plan, jobs: int) -> list[Row]:
     """Rows of every class, level, rig and cycle for every method, then the pooled ones."""
     tasks = [task for method in plan.methods for task in _tasks(plan, method)]
     chosen = [tuple(rest) for table, *rest in tasks if table in plan.tables]
-    rows = in_parallel(_measured, chosen, jobs)
+    rows: list[Row] = [*in_parallel(_measured, chosen, jobs)]
     together = [
         pooled(table, name, method, rows)
         for method in plan.methods

@@ -6,22 +6,20 @@ are drawn anew for each. A shift is put into the child's poses.
 
 import copy
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.monitor import MountMonitor
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 from reproduction.coverage.classes import CLASSES, simulate
-from reproduction.recordings import Rig
+from reproduction.writing import markdown_table, triple
 
 PIECE_S = 600.0
-# Each of these for as many hours as the others. Not the flat floor, which hides the height, and not
-# the recordings with a jump every five seconds.
+# Not the flat floor, which hides the height, and not the recordings with a jump every five seconds.
 WATCHED = tuple(name for name in CLASSES if name not in ("flat_agv", "hand_mixture_30s"))
 
 SHIFTED = {
@@ -41,12 +39,13 @@ _MOUNT_SEED = 11
 
 @dataclass(frozen=True)
 class Watched:
-    """What the monitor said in so many hours without any shift."""
+    """What the monitor said in so many hours without any shift: alarms, and which shift (6,) ten
+    minutes would show.
+    """
 
     name: str
     hours: float
     alarms: int
-    long_run: float
     visible: FloatArray
 
 
@@ -62,7 +61,7 @@ class Delay:
     announced: float
 
 
-def pieces(name: str, seed: int, X: FloatArray, duration_s: float) -> Iterator[PosePairs]:
+def _pieces(name: str, seed: int, X: FloatArray, duration_s: float) -> Iterator[PosePairs]:
     """Synchronised poses of a class that follow each other, with this extrinsic."""
     rate_hz = min(CLASSES[name].rate_hz, _RATE_HZ)
     kind = dataclasses.replace(CLASSES[name], duration_s=min(duration_s, PIECE_S), rate_hz=rate_hz)
@@ -70,28 +69,18 @@ def pieces(name: str, seed: int, X: FloatArray, duration_s: float) -> Iterator[P
         made = simulate(kind, (_MOUNT_SEED, seed, number, sorted(CLASSES).index(name)), X)
         pairs = synchronise(made.parent, made.child, 0.5)
         # Half a minute between the pieces: nothing runs across.
-        yield shifted_in_time(pairs, round(number * (kind.duration_s + 30.0)) * _SECOND_NS)
+        later_ns = round(number * (kind.duration_s + 30.0)) * _SECOND_NS
+        yield PosePairs(pairs.stamps_ns + later_ns, pairs.Ts_pw_p, pairs.Ts_cw_c)
 
 
-def shifted_in_time(pairs: PosePairs, by_ns: int) -> PosePairs:
-    """The same motion at another time."""
-    return PosePairs(pairs.stamps_ns + by_ns, pairs.Ts_pw_p, pairs.Ts_cw_c)
-
-
-def mount(name: str, seed: int) -> FloatArray:
-    """An extrinsic of a class."""
+def _mount(name: str, seed: int) -> FloatArray:
     kind = dataclasses.replace(CLASSES[name], duration_s=10.0)
     return simulate(kind, (_MOUNT_SEED, seed)).T_parent_child
 
 
-def feed(monitor: MountMonitor, pairs: PosePairs, chunk_s: float = 1.0) -> None:
+def _fed(monitor: MountMonitor, pairs: PosePairs) -> Iterator[None]:
     """Give poses to the monitor as they come in, a second at a time."""
-    for _ in _fed(monitor, pairs, chunk_s):
-        pass
-
-
-def _fed(monitor: MountMonitor, pairs: PosePairs, chunk_s: float = 1.0) -> Iterator[None]:
-    edges = np.flatnonzero(np.diff(pairs.stamps_ns // round(chunk_s * _SECOND_NS), prepend=-1))
+    edges = np.flatnonzero(np.diff(pairs.stamps_ns // _SECOND_NS, prepend=-1))
     for first, last in zip(edges, [*edges[1:], len(pairs)], strict=True):
         monitor.add(pairs[first:last])
         yield
@@ -99,58 +88,92 @@ def _fed(monitor: MountMonitor, pairs: PosePairs, chunk_s: float = 1.0) -> Itera
 
 def false_alarms(name: str, hours: float) -> Watched:
     """Watch a mount that does not move."""
-    X = mount(name, 0)
+    X = _mount(name, 0)
     monitor = MountMonitor(X, np.zeros((6, 6)))
-    for pairs in pieces(name, 0, X, 3600.0 * hours):
-        feed(monitor, pairs)
-    return Watched(name, hours, monitor.alarms, monitor.long_run, monitor.visible(600.0))
+    for pairs in _pieces(name, 0, X, 3600.0 * hours):
+        for _ in _fed(monitor, pairs):
+            pass
+    return Watched(name, hours, monitor.alarms, monitor.visible(600.0))
 
 
-def real_loop(rig: Rig, name: str, hours: float) -> Watched:
-    """Play a recording in a loop against the answer of its own whole, with its covariance."""
-    recording = rig.recordings[name]
-    result = calibrate(recording.parent, recording.child, method="auto", **rig.options)
-    child = recording.child.scaled(result.scale).shifted(result.time_offset_s)
-    pairs = synchronise(recording.parent, child, 0.5)
-    duration_ns = int(pairs.stamps_ns[-1] - pairs.stamps_ns[0]) + 30 * _SECOND_NS
-    monitor = MountMonitor(result.T_parent_child, result.covariance)
-    for number in range(max(round(hours * 3600e9 / duration_ns), 1)):
-        feed(monitor, shifted_in_time(pairs, number * duration_ns))
-    visible = monitor.visible(600.0)
-    return Watched(f"{rig.name} {name}", hours, monitor.alarms, monitor.long_run, visible)
+def alarm_table(found: Sequence[Watched]) -> str:
+    """A row for every motion."""
+    groups: dict[str, list[Watched]] = {}
+    for each in found:
+        groups.setdefault(each.name.partition("_")[0], []).append(each)
+    rows = []
+    for name, group in groups.items():
+        visible = np.max([each.visible for each in group], axis=0)
+        rows.append(
+            {
+                "recordings": f"{name} ({len(group)})",
+                "hours": f"{sum(each.hours for each in group):g}",
+                "alarms": sum(each.alarms for each in group),
+                "x, y, z (cm)": triple(visible[:3], 100.0, ".2g"),
+                "about x, y, z (deg)": triple(np.degrees(visible[3:]), form=".2g"),
+            }
+        )
+    hours, alarms = sum(each.hours for each in found), sum(each.alarms for each in found)
+    return (
+        f"{alarms} alarms in {hours:g} h of motion without a shift. The last columns: which shift "
+        f"ten minutes of any of them would show nine times out of ten.\n\n{markdown_table(rows)}"
+    )
 
 
 def delays(kind: str, seed: int) -> list[Delay]:
     """How long each shift takes to be seen, along or about a direction drawn for each."""
     names = SHIFTED[kind]
     name = names[seed % len(names)]
-    X = mount(name, seed)
+    X = _mount(name, seed)
     before = MountMonitor(X, np.zeros((6, 6)))
-    parts = list(pieces(name, 100 + seed, X, _BEFORE_S + _AFTER_S))
+    parts = list(_pieces(name, 100 + seed, X, _BEFORE_S + _AFTER_S))
     n_before = round(_BEFORE_S / PIECE_S)
     for pairs in parts[:n_before]:
-        feed(before, pairs)
+        for _ in _fed(before, pairs):
+            pass
     rng = np.random.default_rng(seed)
-    return [_delay(kind, size, copy.deepcopy(before), parts[n_before:], X, rng) for size in SHIFTS]
+    found = []
+    for size, shift in SHIFTS.items():
+        axis = int(rng.integers(3)) + (3 if size.endswith("deg") else 0)
+        xi = np.kron(np.eye(2), X[:3, :3].T) @ (np.eye(6)[axis] * shift)
+        announced = float(before.visible(600.0)[axis] / shift)
+        seconds = _seconds_until_seen(copy.deepcopy(before), parts[n_before:], xi)
+        found.append(Delay(kind, size, seconds, announced))
+    return found
 
 
-def _delay(
-    kind: str,
-    size: str,
-    monitor: MountMonitor,
-    parts: list[PosePairs],
-    X: FloatArray,
-    rng: np.random.Generator,
-) -> Delay:
-    axis = int(rng.integers(3)) + (3 if size.endswith("deg") else 0)
-    in_parent = np.eye(6)[axis] * SHIFTS[size]
-    xi = np.kron(np.eye(2), X[:3, :3].T) @ in_parent
-    announced = float(monitor.visible(600.0)[axis] / SHIFTS[size])
-    before = monitor.seconds
-    alarms = monitor.alarms
+def _seconds_until_seen(monitor: MountMonitor, parts: list[PosePairs], xi: FloatArray) -> float:
+    before, alarms = monitor.seconds, monitor.alarms
     for pairs in parts:
         moved = PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, pairs.Ts_cw_c @ se3.exp(xi))
         for _ in _fed(monitor, moved):
             if monitor.alarms > alarms:
-                return Delay(kind, size, float(monitor.seconds - before), announced)
-    return Delay(kind, size, np.inf, announced)
+                return float(monitor.seconds - before)
+    return float("inf")
+
+
+def delay_table(found: Sequence[Delay]) -> str:
+    """A row for every motion and shift."""
+    rows = []
+    for kind, size in dict.fromkeys((each.kind, each.size) for each in found):
+        some = [each for each in found if (each.kind, each.size) == (kind, size)]
+        said, others = (
+            np.array([each.seconds for each in some if (each.announced <= 1.0) == is_said])
+            for is_said in (True, False)
+        )
+        told = ["-", "-"]
+        if len(said):
+            quantiles = np.quantile(said, [0.5, 0.9], method="higher")
+            told = [f"{value:.0f}" if np.isfinite(value) else "> 1800" for value in quantiles]
+        rows.append(
+            {
+                "motion": kind,
+                "shift": size,
+                "said to be seen": f"{len(said)} of {len(some)}",
+                "of these seen": int(np.isfinite(said).sum()) if len(said) else "-",
+                "median (s)": told[0],
+                "90 % (s)": told[1],
+                "others seen": f"{int(np.isfinite(others).sum())} of {len(others)}",
+            }
+        )
+    return markdown_table(rows)

@@ -175,13 +175,15 @@ def _worst(error: FloatArray, truth_sigmas: FloatArray, factor: float) -> float:
     return float((excess / (factor * TARGET)).max())
 
 
-def table(stops: Sequence[Stop], with_kinds: bool) -> str:
-    """A row for all recordings with each target; with the default targets one per kind, too."""
+def table(stops: Sequence[Stop], which: str) -> str:
+    """A row for all recordings with each target; of simulated ones, with the default targets, one
+    for each kind, too.
+    """
     rows = []
     for factor in FACTORS:
         of_factor = [stop for stop in stops if stop.factor == factor]
-        kinds = dict.fromkeys(stop.kind for stop in of_factor if factor == 1.0 and with_kinds)
-        for kind in kinds:
+        kinds = {stop.kind for stop in of_factor if factor == 1.0 and which == "simulated"}
+        for kind in (kind for kind in KINDS if kind in kinds):
             rows.append(_row(kind, factor, [s for s in of_factor if s.kind == kind]))
         rows.append(_row("**all**", factor, of_factor))
     return markdown_table(rows)

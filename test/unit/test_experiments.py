@@ -1,16 +1,8 @@
-"""Experiments: statistics, comparison, what is stored and resumed, the command. On drives of our
-own simulator.
+"""Experiments: statistics, comparison, what is kept, the command. On drives of our own
+simulator.
 """
 
 import dataclasses
-import json
-import multiprocessing
-import os
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,16 +13,13 @@ from hand_eye_calib.assessment import metrics
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.solvers import park
 from reproduction import comparison, results, runner
-from reproduction.catalogue import ARTEFACTS, GROUPS
-from reproduction.command import STUDIES, main
-from reproduction.kitti_truth import RECTIFIED
-from reproduction.published import LEVELS, REFERENCES, check_folder
+from reproduction.__main__ import EXPERIMENTS, GROUPS, main
+from reproduction.published import LEVELS, RECTIFIED, REFERENCES, find_folder
 from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED, Cell, solve_cell, table_of
 from reproduction.sources import SimulatedSource
 from reproduction.tables import PRINTED
 from reproduction.writing import put_into_page
 
-ROOT = Path(__file__).resolve().parents[2]
 SOURCE = SimulatedSource(seed=3, runs=2)
 CELLS = [
     Cell("noise", 0.004, "park"),
@@ -60,7 +49,7 @@ def rows():
 def test_mean_has_students_confidence_interval():
     summary = results.mean_summary([1.0, 2.0, 3.0, 4.0])
     # t(0.975, 3) = 3.18245 and s = 1.290994
-    assert (summary.centre, summary.n, summary.is_median) == (2.5, 4, False)
+    assert (summary.centre, summary.n) == (2.5, 4)
     np.testing.assert_allclose(
         [summary.low, summary.high], [2.5 - 2.05426, 2.5 + 2.05426], atol=1e-5
     )
@@ -152,72 +141,21 @@ def test_comparison_counts_lists_and_explains(tmp_path):
     )
 
 
-def test_other_trajectories_agree_where_intervals_overlap():
-    ours, near, far = (
-        results.mean_summary(np.array([1.0, 2.0, 3.0]) + shift) for shift in (0.0, 1.0, 9.0)
-    )
-    assert comparison.compare_summaries(ours, near, same_cases=False)
-    assert not comparison.compare_summaries(ours, near, same_cases=True)
-    assert not comparison.compare_summaries(ours, far, same_cases=False)
+def tasks_of(cells):
+    return {cell.name: (SOURCE, cell) for cell in cells}
 
 
-def kept_in(folder, source=SOURCE):
-    return runner.Store(folder / "solved.jsonl", source.configuration())
-
-
-def solved(folder, jobs, on_done=lambda name: None):
-    tasks = {cell.name: (SOURCE, cell) for cell in CELLS}
-    found = runner.solve(solve_cell, tasks, jobs, kept_in(folder), on_done)
-    assert list(found) == list(tasks)
-    return [row for rows in found.values() for row in rows]
-
-
-def test_the_number_of_processes_does_not_matter(tmp_path, rows):
-    for jobs in (1, 2):
-        assert solved(tmp_path / str(jobs), jobs) == rows
-
-
-def test_an_interrupted_run_goes_on_where_it_ended(tmp_path, rows):
-    def interrupt(name):
-        raise KeyboardInterrupt
-
-    others = set(multiprocessing.active_children())
-    with pytest.raises(KeyboardInterrupt):
-        solved(tmp_path, 1, interrupt)
-    assert not set(multiprocessing.active_children()) - others
-    (kept,) = kept_in(tmp_path).found
-    # That the kept cell is not solved again shows in a mark that no solver makes.
-    path = tmp_path / "solved.jsonl"
-    path.write_text(path.read_text().replace("run_01", "kept"))
-    marks = {row["method"] for row in solved(tmp_path, 2) if row["run"] == "kept"}
-    assert len(marks) == 1
-    assert kept.endswith(marks.pop())
-    assert len(kept_in(tmp_path).found) == len(CELLS)
-
-
-def test_a_changed_configuration_starts_anew(tmp_path):
-    kept_in(tmp_path).keep("a cell", [1.5])
-    assert kept_in(tmp_path).found == {"a cell": [1.5]}
-    assert kept_in(tmp_path, dataclasses.replace(SOURCE, seed=4)).found == {}
-
-
-def test_a_line_that_was_cut_off_is_solved_again(tmp_path):
-    store = kept_in(tmp_path)
-    for name in ("whole", "cut"):
-        store.keep(name, [1.5])
-    path = tmp_path / "solved.jsonl"
-    path.write_text(path.read_text()[:-5])
-    again = kept_in(tmp_path)
-    assert again.found == {"whole": [1.5]}
-    again.keep("next", [2.5])
-    assert kept_in(tmp_path).found == {"whole": [1.5], "next": [2.5]}
-
-
-def test_a_file_that_is_not_ours_is_left_alone(tmp_path):
-    (tmp_path / "solved.jsonl").write_text("years of work")
-    with pytest.raises(InputError, match="move it"):
-        kept_in(tmp_path)
-    assert (tmp_path / "solved.jsonl").read_text() == "years of work"
+def test_what_is_kept_is_not_solved_again_and_processes_do_not_matter(tmp_path, rows):
+    path = tmp_path / "new" / "solved.jsonl"
+    found = runner.kept(path, solve_cell, tasks_of(CELLS[:2]), 2)
+    assert [row for name in tasks_of(CELLS[:2]) for row in found[name]] == rows[: -len(rows) // 3]
+    # What was kept shows in a mark that no solver makes; a line that was cut off is solved again.
+    first, second = path.read_text().splitlines()[1:]
+    path.write_text(f"\n{first.replace('run_01', 'kept')}\n{second[:-5]}")
+    found = runner.kept(path, solve_cell, tasks_of(CELLS), 1)
+    marked = {name for name, some in found.items() if any(row["run"] == "kept" for row in some)}
+    assert marked == {CELLS[0].name}
+    assert len(found) == len(CELLS)
 
 
 def test_simulated_cases_have_the_noise_of_their_level():
@@ -240,7 +178,8 @@ def test_everything_in_the_article_is_there():
     names = {f"figS{number}" for number in range(1, 6)}
     names |= {f"tableS{number}" for number in range(1, 13)}
     names |= {"fig3", "fig4", "fig5", "table1", "table2"}
-    assert names <= {each.name for each in GROUPS["all"]} == set(ARTEFACTS) - set(STUDIES)
+    assert names <= {each.name for each in GROUPS["all"]}
+    assert set(EXPERIMENTS) - {"faults"} <= set(GROUPS)
 
 
 def test_rectified_truth_of_the_long_drive_is_beside_the_camera_and_parallel():
@@ -257,35 +196,15 @@ def test_printed_gains_are_those_of_variants_other_than_b1():
         }
 
 
-def test_command_draws_and_says_what_it_has_no_numbers_for(tmp_path, capsys):
-    arguments = [
-        "fig3",
-        "--data",
-        "simulated",
-        "--runs",
-        "3",
-        "--seed",
-        "1",
-        "--jobs",
-        "1",
-        "--json",
-    ]
-    assert main([*arguments, "--out", str(tmp_path)]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert (document["experiment"], document["data"], document["runs"]) == ("fig3", "simulated", 3)
-    assert document["rows"] == 19 * 3 * 6
-    assert {Path(path).name for path in document["files"]["fig3"]} == {
-        "fig3.png",
-        "fig3.svg",
-        "fig3.csv",
-        "fig3_comparison.md",
-    }
+def test_command_draws_a_figure(tmp_path, capsys):
+    simulated = ["--data", "simulated", "--runs", "3", "--seed", "1", "--jobs", "1"]
+    assert main(["fig3", *simulated, "--out", str(tmp_path)]) == 0
+    assert "3 files written" in capsys.readouterr().out
     assert (tmp_path / "fig3.png").read_bytes().startswith(b"\x89PNG")
     text = " ".join(ElementTree.parse(tmp_path / "fig3.svg").getroot().itertext())
     assert all(reference in text for reference in REFERENCES)
     lines = (tmp_path / "fig3.csv").read_text().splitlines()
     assert len(lines) == 1 + 19 * len(REFERENCES) * len(METRICS)
-    assert "--data-folder" in (tmp_path / "fig3_comparison.md").read_text()
 
 
 def test_components_of_the_motions_need_no_solver(tmp_path, capsys):
@@ -301,7 +220,7 @@ def test_components_of_the_motions_need_no_solver(tmp_path, capsys):
     assert medians["roll", "B5"] < medians["yaw", "B5"]
 
 
-def test_a_text_is_put_between_the_marks_of_its_study(tmp_path, capsys):
+def test_a_text_is_put_between_the_marks_of_its_study(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# Ours\n\n<!-- study: begin -->\nold\n<!-- study: end -->\n\nThe rest.\n")
     put_into_page(page, "study", "# Title\n\n| table |\n")
@@ -310,10 +229,6 @@ def test_a_text_is_put_between_the_marks_of_its_study(tmp_path, capsys):
     )
     with pytest.raises(InputError, match="has no lines <!-- other: begin --> and <!-- other: end"):
         put_into_page(page, "other", "| table |")
-    with pytest.raises(InputError, match=r"absent\.md: No such file"):
-        put_into_page(tmp_path / "absent.md", "study", "| table |")
-    assert main(["fig4", "--data", "simulated", "--page", str(page)]) == 2
-    assert "--page is for adaptive, certificate, faults; got fig4" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -323,50 +238,20 @@ def test_a_text_is_put_between_the_marks_of_its_study(tmp_path, capsys):
         (["fig3"], 2, "--data-folder"),
         (["fig3", "--data-folder", "{tmp}"], 1, "trajectory_calibration_experiments"),
         (["fig3", "--data", "simulated", "--runs", "1"], 2, "--runs"),
-        (["fig3", "--data", "simulated", "--jobs", "0"], 2, "--jobs"),
-        (["fig4", "--data", "simulated", "--runs", "2", "--out", "{tmp}/file/out"], 1, "--out"),
     ],
 )
 def test_misuse_is_told_in_one_line(tmp_path, capsys, arguments, code, said):
-    (tmp_path / "file").write_text("in the way")
-    assert (
-        main(["--out", str(tmp_path / "out"), *(text.format(tmp=tmp_path) for text in arguments)])
-        == code
-    )
+    arguments = ["--out", str(tmp_path / "out"), *(each.format(tmp=tmp_path) for each in arguments)]
+    assert main(arguments) == code
     captured = capsys.readouterr()
     assert (captured.out, captured.err.count("\n")) == ("", 1)
     assert said in captured.err
 
 
-def test_options_of_simulated_drives_are_refused_for_the_published_ones(tmp_path, capsys):
-    for folder in ("kitti_tests", "simulation_tests", "calib"):
-        (tmp_path / folder).mkdir()
-    assert check_folder(tmp_path) == tmp_path
-    assert main(["fig3", "--data-folder", str(tmp_path), "--runs", "5"]) == 2
-    assert "--data simulated" in capsys.readouterr().err
-    (tmp_path / "calib").rmdir()
-    with pytest.raises(InputError, match="published or calib"):
-        check_folder(tmp_path)
-
-
-def test_ctrl_c_ends_the_command_at_once_and_keeps_what_is_solved(tmp_path):
-    arguments = ["fig3", "--data", "simulated", "--runs", "20", "--jobs", "2", "--out"]
-    # As from a terminal: all processes get the signal.
-    running = subprocess.Popen(
-        [sys.executable, "-m", "reproduction", *arguments, str(tmp_path)],
-        cwd=ROOT,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    path = tmp_path / "solved.jsonl"
-    with running as process:
-        while not path.exists() or len(path.read_text().splitlines()) < 2:
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)
-        errors = process.communicate()[1]
-    assert (process.returncode, errors) == (130, "")
-    _, *kept = path.read_text().splitlines()
-    assert 0 < len(kept) < 19
-    assert all(json.loads(line)["name"].endswith("dnlo") for line in kept)
+def test_the_folder_of_the_published_data_is_looked_for(tmp_path):
+    for name in ("kitti_tests", "simulation_tests"):
+        (tmp_path / "valimaki2023" / name).mkdir(parents=True)
+    with pytest.raises(InputError, match="it has no calib"):
+        find_folder(tmp_path)
+    (tmp_path / "valimaki2023" / "calib").mkdir()
+    assert find_folder(tmp_path) == str((tmp_path / "valimaki2023").resolve())

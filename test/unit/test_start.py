@@ -11,7 +11,6 @@ import pytest
 from hand_eye_calib.cli.main import COMMANDS, main
 from hand_eye_calib.io.trajectory_files import write_trajectory
 from hand_eye_calib.simulation.drive import simulate_drive
-from reproduction.command import EXPERIMENTS
 
 # Each takes from a tenth of a second to a second to load.
 HEAVY = {"casadi", "matplotlib", "numpy", "rclpy", "rich", "rosbags", "scipy", "yaml"}
@@ -73,15 +72,6 @@ def test_commands_use_one_thread_unless_told_otherwise(monkeypatch):
     assert threads() == "3"
     monkeypatch.delenv("OMP_NUM_THREADS")
     assert threads() == "1"
-
-
-def test_the_help_names_every_experiment():
-    from reproduction import catalogue
-
-    # The study of faults has recordings of its own, and none of the cells of the others.
-    parts = {each.name for name in ("s-figures", "s-tables") for each in catalogue.GROUPS[name]}
-    single = set(catalogue.ARTEFACTS) - parts - {"conclusions", "findings"}
-    assert set(EXPERIMENTS) - {"faults"} == single | set(catalogue.GROUPS)
 
 
 def test_the_node_loads_no_scipy():
