@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from reproduction.coverage.measures import KINDS, POOLED, Row
+from reproduction.published import LEVELS, SIMULATED, path_to
 from reproduction.writing import markdown_table
 
 _COLUMNS = {
@@ -39,7 +40,7 @@ _ABOUT = {
         "The same measures where every recording has another mixture of noise, rate and lever arm: "
         "a check that the estimator is not tuned to the classes above."
     ),
-    "levels": "Medians over the 38 trajectories of each level of noise, outliers and drift.",
+    "levels": "Medians over the 38 trajectories of the strongest noise, outliers and drift.",
     "known answer": (
         "Errors over the axes that the truth and the motion both know. The last column adds the "
         "uncertainty of the truth itself to the stated one."
@@ -52,7 +53,9 @@ _ABOUT = {
     ),
     "refused": "A vehicle on a flat road, an arm that turns about one axis: no answer may be `ok`.",
 }
-_PERCENT = ("covers", "covers_floor", "covers_truth", "answered", "refused")
+_PERCENT = ("covers", "covers_floor", "covers_truth", "refused")
+# Of the levels of noise, outliers and drift the strongest are shown.
+_LEVELS_SHOWN = {" ".join(path_to(dataset, LEVELS[dataset][-1])) for dataset in SIMULATED}
 
 
 class Goal(NamedTuple):
@@ -115,15 +118,13 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: int) -> str:
         if chosen:
             shown = (_shown(row, columns, methods[0]) for row in chosen)
             blocks += [f"## {_TITLES[table]}", _ABOUT[table], markdown_table(shown)]
-    about = (
-        f"{seeds} recordings of each class, as `reproduction/coverage/` makes them. The rows of "
-        "every class are in `reproduction/coverage/baseline.json`."
-    )
+    about = f"{seeds} recordings of each class; `--rows FILE` writes the rows of every class."
     return "\n\n".join(filter(None, [*blocks, about])) + "\n"
 
 
 def _is_shown(row: Row, first: str) -> bool:
-    return row.method == first and row.table in ("known answer", "mixed", "levels")
+    is_shown = row.table in ("known answer", "mixed") or row.name in _LEVELS_SHOWN
+    return row.method == first and is_shown
 
 
 def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:
@@ -143,7 +144,7 @@ def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:
 
 def _shown(row: Row, columns: Sequence[str], first: str) -> dict[str, str]:
     name = row.name if row.method == first else f"{row.name}, {row.method}"
-    return {"": name, **{KINDS[kind].title: cell(row, kind) for kind in columns}}
+    return {"": name, **{KINDS[kind][0]: cell(row, kind) for kind in columns}}
 
 
 def cell(row: Row, kind: str) -> str:

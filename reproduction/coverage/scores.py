@@ -1,8 +1,6 @@
 """Answers of the calibration, held against what is known."""
 
-import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,30 +31,15 @@ METHODS = {
 }
 
 
-@dataclass(frozen=True)
-class Answer:
-    """A calibration, None if it failed, and the processor time (s) that it took."""
-
-    calibration: Calibration | None
-    seconds: float
-
-    @property
-    def is_ok(self) -> bool:
-        """Whether there is one, and its status is OK."""
-        return self.calibration is not None and self.calibration.status is SolveStatus.OK
-
-
-def answer(parent: Trajectory, child: Trajectory, options: Mapping[str, Any]) -> Answer:
-    """Calibrate, and take the time."""
-    start = time.process_time()
+def answer(parent: Trajectory, child: Trajectory, options: Mapping[str, Any]) -> Calibration | None:
+    """A calibration, None if it fails."""
     try:
-        calibration = calibrate(parent, child, **options)
+        return calibrate(parent, child, **options)
     except HandEyeCalibError:
-        calibration = None
-    return Answer(calibration, time.process_time() - start)
+        return None
 
 
-def _of_rig(rig: Rig, name: str, method: str) -> Answer:
+def _of_rig(rig: Rig, name: str, method: str) -> Calibration | None:
     recording = rig.recordings[name]
     return answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
 
@@ -65,19 +48,13 @@ def _name_of(rig: Rig, name: str) -> str:
     return f"{rig.name} {name}".removesuffix(" whole")
 
 
-def _by_case(
-    table: str, name: str, method: str, found: Mapping[str, tuple[Answer, Mapping[str, float]]]
-) -> Row:
-    """A row from the answer and the measures of each case."""
+def _row(table: str, name: str, method: str, found: Mapping[str, Mapping[str, float]]) -> Row:
+    """A row from the measures of each case."""
     cases: dict[str, dict[str, float]] = {}
-    for case, (_, measures) in found.items():
+    for case, measures in found.items():
         for kind, value in measures.items():
             cases.setdefault(kind, {})[case] = value
-    return Row(table, name, method, cases, _seconds(one for one, _ in found.values()))
-
-
-def _seconds(answers: Iterable[Answer]) -> float:
-    return float(np.median([one.seconds for one in answers]))
+    return Row(table, name, method, cases)
 
 
 def class_row(name: str, method: str, seeds: int) -> Row:
@@ -87,33 +64,27 @@ def class_row(name: str, method: str, seeds: int) -> Row:
     for seed in range(seeds):
         recording = (mixed if is_mixed else classes).make(name, seed)
         one = answer(recording.parent, recording.child, METHODS[method])
-        found[f"{seed}"] = one, _class_case(name, recording, one)
-    return _by_case("mixed" if is_mixed else "simulated", name, method, found)
+        found[f"{seed}"] = _class_case(name, recording, one)
+    return _row("mixed" if is_mixed else "simulated", name, method, found)
 
 
-def _class_case(name: str, recording: classes.Simulated, found: Answer) -> dict[str, float]:
-    calibration = found.calibration
+def _class_case(
+    name: str, recording: classes.Simulated, found: Calibration | None
+) -> dict[str, float]:
     if name in classes.REFUSED:
-        return {"refused": float(calibration is None or bool(calibration.unobservable()))}
-    if calibration is None:
-        return {"answered": 0.0}
-    xi = se3.log(se3.inverse(calibration.T_parent_child) @ recording.T_parent_child)
+        return {"refused": float(found is None or bool(found.unobservable()))}
+    if found is None:
+        return {}
+    xi = se3.log(se3.inverse(found.T_parent_child) @ recording.T_parent_child)
     bound = recording.bound()
     case = {
-        "answered": float(found.is_ok),
         "bound": _squared(xi, bound),
         "bound_t": _squared(xi[:3], bound[:3, :3]),
         "bound_r": _squared(xi[3:], bound[3:, 3:]),
-        **_sizes(xi),
     }
-    if np.isfinite(calibration.covariance).all():
-        case["nees"] = _squared(xi, calibration.covariance)
-    return case | _covers(xi, calibration)
-
-
-def _sizes(xi: FloatArray) -> dict[str, float]:
-    metres, radians = (float(np.linalg.norm(part)) for part in (xi[:3], xi[3:]))
-    return {"mm": 1e3 * metres, "deg": float(np.degrees(radians))}
+    if np.isfinite(found.covariance).all():
+        case["nees"] = _squared(xi, found.covariance)
+    return case | _covers(xi, found)
 
 
 def _covers(xi: FloatArray, found: Calibration) -> dict[str, float]:
@@ -129,17 +100,12 @@ def level_row(folder: Path, dataset: str, level: float | None, method: str) -> R
     found = {}
     for case in load_simulated(folder, [dataset], None if level is None else [level]):
         one = answer(case.parent, case.child, METHODS[method])
-        found[case.name] = one, _level_case(case.T_parent_child, one)
-    return _by_case("levels", " ".join(path_to(dataset, level)), method, found)
-
-
-def _level_case(truth: FloatArray, found: Answer) -> dict[str, float]:
-    if found.calibration is None:
-        return {"answered": 0.0}
-    xi = se3.log(se3.inverse(found.calibration.T_parent_child) @ truth)
-    e_at, e_aR = absolute_errors(found.calibration.T_parent_child, truth)
-    sizes = {"mm": 1e3 * e_at, "deg": float(np.degrees(e_aR))}
-    return {"answered": float(found.is_ok), **sizes, **_covers(xi, found.calibration)}
+        if one is not None:
+            xi = se3.log(se3.inverse(one.T_parent_child) @ case.T_parent_child)
+            e_at, e_aR = absolute_errors(one.T_parent_child, case.T_parent_child)
+            sizes = {"mm": 1e3 * e_at, "deg": float(np.degrees(e_aR))}
+            found[case.name] = sizes | _covers(xi, one)
+    return _row("levels", " ".join(path_to(dataset, level)), method, found)
 
 
 def _squared(xi: FloatArray, covariance: FloatArray) -> float:
@@ -149,10 +115,9 @@ def _squared(xi: FloatArray, covariance: FloatArray) -> float:
 def truth_row(rig: Rig, name: str, method: str) -> Row:
     """Error of a real recording against the known answer, over the axes that both know."""
     found = _of_rig(rig, name, method)
-    cases = {"answered": {"": 0.0}}
-    if found.calibration is not None and rig.truth is not None:
-        cases = truth_cases(found.calibration, rig.truth)
-    return Row("known answer", _name_of(rig, name), method, cases, found.seconds)
+    assert rig.truth is not None
+    cases = {} if found is None else truth_cases(found, rig.truth)
+    return Row("known answer", _name_of(rig, name), method, cases)
 
 
 def truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]]:
@@ -169,10 +134,7 @@ def truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]]
     apart = np.where(known, np.abs(error), 0.0)
     of_truth = np.where(known, truth.sigmas, 0.0)
     cases = {
-        "answered": {"": 1.0},
         "mm": {"": 1e3 * float(np.linalg.norm(apart[:3]))},
-        "mm_truth": {"": 1e3 * float(np.linalg.norm(of_truth[:3]))},
-        "deg_truth": {"": float(np.degrees(np.linalg.norm(of_truth[3:])))},
         "z": {"": float(np.max(apart / sigmas))},
         "covers": _by_axis(apart < _REACH * sigmas, known),
         "covers_floor": _by_axis(apart < _REACH * with_floor, known),
@@ -200,54 +162,43 @@ def _by_axis(values: BoolArray, known: BoolArray) -> dict[str, float]:
 def refused_row(rig: Rig, name: str, method: str) -> Row:
     """Whether a recording that leaves something open is refused: no answer, or not an OK one."""
     found = _of_rig(rig, name, method)
-    cases = {"refused": {"": float(not found.is_ok)}}
-    return Row("refused", _name_of(rig, name), method, cases, found.seconds)
+    is_refused = found is None or found.status is not SolveStatus.OK
+    return Row("refused", _name_of(rig, name), method, {"refused": {"": float(is_refused)}})
 
 
 def scatter_row(rig: Rig, method: str) -> Row:
     """Scatter between the recordings of a rig over their stated sigmas."""
     found = [_of_rig(rig, name, method) for name in rig.recordings]
-    cases = _scatter_cases([one.calibration for one in found])
-    return Row("rig", rig.name, method, {"scatter": cases} if cases else {}, _seconds(found))
+    return Row("rig", rig.name, method, {"scatter": _scatter_cases(found)})
 
 
 def parts_row(rig: Rig, name: str, method: str) -> Row:
     """Scatter between halves and between thirds of a recording over their stated sigmas."""
     whole = _of_rig(rig, name, method)
     cases: dict[str, float] = {}
-    for count, label in PARTS.items() if whole.calibration is not None else ():
-        assert whole.calibration is not None
-        parts = rig.recordings[name].parts(count, whole.calibration.time_offset_s)
+    for count, label in PARTS.items() if whole is not None else ():
+        assert whole is not None
+        parts = rig.recordings[name].parts(count, whole.time_offset_s)
         options = {**rig.options, **METHODS[method]}
-        answers = [answer(part.parent, part.child, options).calibration for part in parts]
+        answers = [answer(part.parent, part.child, options) for part in parts]
         cases |= {f"{label} {key}": value for key, value in _scatter_cases(answers).items()}
-    measures = {"scatter": cases} if cases else {}
-    return Row("parts", _name_of(rig, name), method, measures, whole.seconds)
+    return Row("parts", _name_of(rig, name), method, {"scatter": cases})
 
 
-def spread_and_sigma(
-    calibrations: Sequence[Calibration],
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Variance (6,) of several answers, mean stated variance (6,), and whether all of them observe
-    the axis (6,).
+def _scatter_cases(answers: Sequence[Calibration | None]) -> dict[str, float]:
+    """Squared scatter over mean stated variance of each axis that all answers observe, once per
+    degree of freedom.
     """
-    sigmas = np.array([answer.sigmas for answer in calibrations])
-    are_known = [[dof.verdict in _KNOWN for dof in answer.observability] for answer in calibrations]
-    known: BoolArray = np.logical_and.reduce(are_known)
-    first = calibrations[0].T_parent_child
-    deviations = np.array([deviation(answer.T_parent_child, first) for answer in calibrations])
-    stated = np.where(known, (np.where(known, sigmas, 0.0) ** 2).mean(axis=0), np.inf)
-    return deviations.var(axis=0, ddof=1), stated, known
-
-
-def _scatter_cases(answers: list[Calibration | None]) -> dict[str, float]:
-    """Squared scatter over stated variance of each axis, once per degree of freedom."""
     good = [one for one in answers if one is not None]
     if len(good) < len(answers) or len(good) < 2:
         return {}
-    spread, stated, known = spread_and_sigma(good)
+    known = np.logical_and.reduce([_knows(one) for one in good])
+    sigmas = np.array([one.sigmas for one in good])
+    off = np.array([deviation(one.T_parent_child, good[0].T_parent_child) for one in good])
+    stated = (np.where(known, sigmas, 1.0) ** 2).mean(axis=0)
+    ratios = off.var(axis=0, ddof=1) / stated
     return {
-        f"{axis}/{freedom}": float(spread[k] / stated[k])
+        f"{axis}/{freedom}": float(ratios[k])
         for k, axis in enumerate(AXES)
         if known[k]
         for freedom in range(len(good) - 1)
@@ -257,13 +208,16 @@ def _scatter_cases(answers: list[Calibration | None]) -> dict[str, float]:
 def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
     """How far three pairwise answers miss closing, and that over their stated covariances."""
     found = [_of_rig(rigs[name], "whole", method) for name in CYCLE]
-    good = [one.calibration for one in found if one.calibration is not None]
-    cases = {"answered": 0.0}
-    if len(good) == len(found):
-        xi, covariance = misclosure(good)
-        cases = {"answered": 1.0, **_sizes(xi), "chi2": _squared(xi, covariance)}
-    by_kind = {kind: {"": value} for kind, value in cases.items()}
-    return Row("cycle", "tango", method, by_kind, _seconds(found))
+    good = [one for one in found if one is not None]
+    if len(good) < len(found):
+        return Row("cycle", "tango", method, {})
+    xi, covariance = misclosure(good)
+    metres, radians = (float(np.linalg.norm(part)) for part in (xi[:3], xi[3:]))
+    sizes = {"mm": 1e3 * metres, "deg": float(np.degrees(radians))}
+    cases = {
+        kind: {"": value} for kind, value in (sizes | {"chi2": _squared(xi, covariance)}).items()
+    }
+    return Row("cycle", "tango", method, cases)
 
 
 def misclosure(answers: list[Calibration]) -> tuple[FloatArray, FloatArray]:

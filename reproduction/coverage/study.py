@@ -1,12 +1,10 @@
-"""All rows of the study, on several processes, and where they are kept."""
+"""All rows of the study, on several processes."""
 
-import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.errors import InputError
 from reproduction.coverage.classes import CLASSES
 from reproduction.coverage.measures import POOLED, Row, pooled
 from reproduction.coverage.mixed import MIXED
@@ -23,13 +21,7 @@ from reproduction.published import LEVELS, SIMULATED
 from reproduction.recordings import CYCLE, Rig
 from reproduction.runner import in_parallel
 
-HERE = Path(__file__).parent
-BASELINE = HERE / "baseline.json"
-
 TABLES = ("simulated", "mixed", "levels", "known answer", "rig", "parts", "cycle", "refused")
-
-# Digits that are kept of a case: more than noise, less than rounding.
-_DIGITS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +47,7 @@ def measure(plan: Plan, jobs: int) -> list[Row]:
         for method in plan.methods
         for table, name in POOLED.items()
     ]
-    return [row for row in rows + together if row.cases]
+    return [row for row in rows + together if any(row.cases.values())]
 
 
 def _tasks(plan: Plan, method: str) -> list[tuple[Any, ...]]:
@@ -89,35 +81,3 @@ def _tasks(plan: Plan, method: str) -> list[tuple[Any, ...]]:
 
 def _measured(function: Callable[..., Row], *arguments: Any) -> Row:
     return function(*arguments)
-
-
-def save(rows: Iterable[Row], path: Path) -> None:
-    """Keep the rows, one per line."""
-    lines = [json.dumps(_document(row), allow_nan=False, separators=(",", ":")) for row in rows]
-    path.write_text('{"rows": [\n' + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
-
-
-def _document(row: Row) -> dict[str, object]:
-    cases = {
-        kind: {key: float(f"{value:.{_DIGITS}g}") for key, value in found.items()}
-        for kind, found in row.cases.items()
-    }
-    return {
-        "table": row.table,
-        "name": row.name,
-        "method": row.method,
-        "seconds": round(row.seconds, 4),
-        "cases": cases,
-    }
-
-
-def load(path: Path) -> dict[str, Row]:
-    """Kept rows by their keys. Raises InputError if the file cannot be read."""
-    try:
-        documents = json.loads(path.read_text(encoding="utf-8"))["rows"]
-        rows = [Row(**document) for document in documents]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"cannot read the rows in {path}: {error}; store new ones with --update-baseline"
-        ) from None
-    return {row.key: row for row in rows}
