@@ -16,10 +16,6 @@ _LOCKED_SIGMAS = 5.0
 _LOCKED_COSINE = 1e-4
 
 
-def _exact() -> FloatArray:
-    return np.zeros((6, 6))
-
-
 @dataclass(frozen=True)
 class Extrinsic:
     """Pose of the child sensor in the parent sensor's frame, as stated by a source.
@@ -37,7 +33,7 @@ class Extrinsic:
 
     T_parent_child: FloatArray
     origin: str
-    covariance: FloatArray = field(default_factory=_exact)
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     is_calibration: bool = False
 
     @property
@@ -68,12 +64,26 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
         Infinite if an angle is unknown; near gimbal lock roll and yaw are.
     """
     rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
+    covariance = np.asarray(covariance, dtype=float)[3:, 3:]
+    if not np.isfinite(covariance).all():
+        return np.full(3, np.inf)
     roll, pitch, _ = se3.rotation_to_rpy(rotation)
-    if is_near_gimbal_lock(rotation, covariance):
-        # The derivative of the pitch alone is finite.
-        pitch_row = np.array([[0.0, np.cos(roll), -np.sin(roll)]])
-        return np.array([np.inf, _sigmas(pitch_row, covariance)[0], np.inf])
-    return _sigmas(_rpy_jacobian(roll, pitch), covariance)
+    sine, cosine, tangent = np.sin(roll), np.cos(roll), np.tan(pitch)
+    # Derivative of roll, pitch and yaw with respect to phi in R exp(phi).
+    jacobian = np.array(
+        [
+            [1.0, sine * tangent, cosine * tangent],
+            [0.0, cosine, -sine],
+            [0.0, sine / np.cos(pitch), cosine / np.cos(pitch)],
+        ]
+    )
+    sigmas = np.sqrt(np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0.0))
+    sigmas[sigmas > _UNKNOWN_ANGLE] = np.inf
+    of_rotation = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
+    largest = np.max(of_rotation[of_rotation <= _UNKNOWN_ANGLE], initial=0.0)
+    if np.hypot(rotation[0, 0], rotation[1, 0]) < max(_LOCKED_SIGMAS * largest, _LOCKED_COSINE):
+        sigmas[[0, 2]] = np.inf
+    return sigmas
 
 
 def sigmas_translation(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -102,37 +112,3 @@ def inverse_covariance(T_target_source: FloatArray, covariance: FloatArray) -> F
         return np.full((6, 6), np.inf)
     adjoint = se3.adjoint(np.asarray(T_target_source, dtype=float))
     return adjoint @ covariance @ adjoint.T
-
-
-def is_near_gimbal_lock(rotation: FloatArray, covariance: FloatArray) -> bool:
-    """Whether the pitch of a rotation (3, 3) is so close to +/- 90 deg, measured by the uncertainty
-    of the rotation, that roll and yaw mean nothing.
-    """
-    cosine = float(np.hypot(rotation[0, 0], rotation[1, 0]))
-    covariance = np.asarray(covariance, dtype=float)[3:, 3:]
-    if not np.isfinite(covariance).all():
-        return cosine < _LOCKED_COSINE
-    sigmas = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
-    largest = float(np.max(sigmas[sigmas <= _UNKNOWN_ANGLE], initial=0.0))
-    return cosine < max(_LOCKED_SIGMAS * largest, _LOCKED_COSINE)
-
-
-def _sigmas(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    covariance = np.asarray(covariance, dtype=float)[3:, 3:]
-    if not np.isfinite(covariance).all():
-        return np.full(len(jacobian), np.inf)
-    variances = np.diag(jacobian @ covariance @ jacobian.T)
-    sigmas = np.sqrt(np.maximum(variances, 0.0))
-    return np.where(sigmas > _UNKNOWN_ANGLE, np.inf, sigmas)
-
-
-def _rpy_jacobian(roll: float, pitch: float) -> FloatArray:
-    """Derivative (3, 3) of roll, pitch and yaw with respect to phi in ``R exp(phi)``."""
-    sine, cosine, tangent = np.sin(roll), np.cos(roll), np.tan(pitch)
-    return np.array(
-        [
-            [1.0, sine * tangent, cosine * tangent],
-            [0.0, cosine, -sine],
-            [0.0, sine / np.cos(pitch), cosine / np.cos(pitch)],
-        ]
-    )

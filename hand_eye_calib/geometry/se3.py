@@ -305,11 +305,8 @@ def rotation_angle(rotation: ArrayLike) -> FloatArray:
     digits.
     """
     rotation = np.asarray(rotation, dtype=float)
-    twice_sine = np.sqrt(
-        (rotation[..., 2, 1] - rotation[..., 1, 2]) ** 2
-        + (rotation[..., 0, 2] - rotation[..., 2, 0]) ** 2
-        + (rotation[..., 1, 0] - rotation[..., 0, 1]) ** 2
-    )
+    x, y, z = np.moveaxis(vee(rotation), -1, 0)
+    twice_sine = np.sqrt(x**2 + y**2 + z**2)
     twice_cosine = np.trace(rotation, axis1=-2, axis2=-1) - 1.0
     return np.arctan2(twice_sine, twice_cosine)
 

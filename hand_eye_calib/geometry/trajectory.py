@@ -1,7 +1,7 @@
 """Trajectories: stamped poses of one sensor in a fixed frame of its own."""
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -63,22 +63,16 @@ class RateIntegrator:
     """Integrates the angular rates of one sensor as they come in, in parts of any length."""
 
     def __init__(self) -> None:
-        self._last_ns: int | None = None
-        self._last_rate = np.zeros(3)
+        self._last: tuple[ArrayLike, FloatArray] | None = None
         self._rotation = np.eye(3)
 
     def quats_xyzw(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
         """Orientations (M, 4), scalar last, at the stamps (M,) of the next rates (M, 3), rad/s."""
-        first_ns = stamps_ns[0] if self._last_ns is None else self._last_ns
-        before = rates[0] if self._last_ns is None else self._last_rate
-        rotations = integrated(
-            np.concatenate([[first_ns], stamps_ns]), np.concatenate([[before], rates])
-        )
-        rotations = self._rotation @ rotations[1:]
-        self._last_ns, self._last_rate = int(stamps_ns[-1]), np.array(rates[-1], dtype=float)
-        # Rounding adds up over hours.
-        left, _, right = np.linalg.svd(rotations[-1])
-        self._rotation = left @ right
+        last_ns, last_rate = self._last or (stamps_ns[:1], rates[:1])
+        steps = integrated(np.r_[last_ns, stamps_ns], np.concatenate([last_rate, rates]))
+        rotations = self._rotation @ steps[1:]
+        self._last = [int(stamps_ns[-1])], np.array(rates[-1:], dtype=float)
+        self._rotation = se3.nearest_rotation(rotations[-1])  # rounding adds up over hours
         return se3.to_quat_xyzw(rotations)
 
 
@@ -165,12 +159,7 @@ class Trajectory:
         """
         translations = np.asarray(translations, dtype=float).reshape(-1, 3)
         quats_xyzw = np.asarray(quats_xyzw, dtype=float).reshape(-1, 4)
-        finite = np.isfinite(translations).all(axis=1) & np.isfinite(quats_xyzw).all(axis=1)
-        if not finite.all():
-            raise InputError(
-                f"pose {int(np.argmin(finite))} has a value that is not finite; "
-                "remove it or repair its source"
-            )
+        _check_finite("pose", np.concatenate([translations, quats_xyzw], axis=1))
         norms = np.linalg.norm(quats_xyzw, axis=1)
         wrong = np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE
         if wrong.any():
@@ -194,10 +183,7 @@ class Trajectory:
         """Build from positions (N, 3), m, of a sensor that has no orientation: the antenna of a
         GNSS receiver, the prism of a total station.
         """
-        positions = np.asarray(positions, dtype=float).reshape(-1, 3)
-        poses = se3.from_rotation_translation(
-            np.broadcast_to(np.eye(3), (len(positions), 3, 3)), positions
-        )
+        poses = se3.from_rotation_translation(np.eye(3), np.reshape(positions, (-1, 3)))
         return cls(stamps_ns, poses, sensor_frame, world_frame, "positions")
 
     @classmethod
@@ -211,27 +197,16 @@ class Trajectory:
             If a rate is not finite or the stamps do not increase.
         """
         rates = np.asarray(rates, dtype=float).reshape(-1, 3)
-        finite = np.isfinite(rates).all(axis=1)
-        if not finite.all():
-            raise InputError(
-                f"rate {int(np.argmin(finite))} has a value that is not finite; remove it or "
-                "repair its source"
-            )
+        _check_finite("rate", rates)
         rotations = integrated(np.asarray(stamps_ns), rates)
         poses = se3.from_rotation_translation(rotations, np.zeros_like(rates))
         return cls(stamps_ns, poses, sensor_frame, "", "rates")
 
     def __repr__(self) -> str:
-        frames = [
-            f", {name}={frame!r}"
-            for name, frame in (
-                ("sensor_frame", self.sensor_frame),
-                ("world_frame", self.world_frame),
-            )
-            if frame
-        ]
-        of = f"{len(self)} {self.measures} over {self.duration_s:.3f} s"
-        return f"Trajectory({of}{''.join(frames)})"
+        text = f"{len(self)} {self.measures} over {self.duration_s:.3f} s"
+        for name in ("sensor_frame", "world_frame"):
+            text += f", {name}={getattr(self, name)!r}" if getattr(self, name) else ""
+        return f"Trajectory({text})"
 
     @property
     def has_positions(self) -> bool:
@@ -253,13 +228,8 @@ class Trajectory:
                 "index a Trajectory with a slice, mask or index array; "
                 "single poses are trajectory.poses[i]"
             )
-        return type(self)(
-            self.stamps_ns[index],
-            self.poses[index],
-            self.sensor_frame,
-            self.world_frame,
-            self.measures,
-        )
+        stamps_ns, poses = self.stamps_ns[index], self.poses[index]
+        return replace(self, stamps_ns=stamps_ns, poses=poses)
 
     @property
     def duration_s(self) -> float:
@@ -346,14 +316,19 @@ def far_position(x: float, y: float, z: float) -> str:
     return f"position ({x:.4g}, {y:.4g}, {z:.4g}) is more than {FARTHEST_M:g} m from the origin"
 
 
-def _check_poses(poses: FloatArray) -> None:
-    """Raise InputError at the first pose (N, 4, 4) that is no rigid transform."""
-    finite = np.isfinite(poses).all(axis=(1, 2))
+def _check_finite(what: str, rows: FloatArray) -> None:
+    """Raise InputError at the first row (N, K) with a value that is not finite."""
+    finite = np.isfinite(rows).all(axis=1)
     if not finite.all():
         raise InputError(
-            f"pose {int(np.argmin(finite))} has a value that is not finite; "
+            f"{what} {int(np.argmin(finite))} has a value that is not finite; "
             "remove it or repair its source"
         )
+
+
+def _check_poses(poses: FloatArray) -> None:
+    """Raise InputError at the first pose (N, 4, 4) that is no rigid transform."""
+    _check_finite("pose", poses.reshape(-1, 16))
     is_far = (np.abs(poses[:, :3, 3]) > FARTHEST_M).any(axis=1)
     if is_far.any():
         index = int(np.argmax(is_far))
@@ -400,7 +375,16 @@ def corners(
         xi in ``T_world_sensor exp(xi)``.
     """
     spans_s = np.diff(stamps_ns) * 1e-9
-    changes = _changes(spans_s, poses, _near(start, len(spans_s)))
+    # Intervals that tell what happens in the wanted ones; the twists of others count as zero.
+    is_near = np.zeros(len(spans_s), dtype=bool)
+    for step in range(-_NEARBY - 1, _NEARBY + 2):
+        is_near[np.clip(start + step, 0, len(spans_s) - 1)] = True
+    near = np.flatnonzero(is_near)
+    twists = np.zeros((len(spans_s), 6))
+    twists[near] = se3.log(se3.inverse(poses[near]) @ poses[near + 1]) / spans_s[near, None]
+    # Change of the twist per second at each pose; zero at the ends.
+    changes = np.zeros((len(poses), 6))
+    changes[1:-1] = np.diff(twists, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))[:, None]
     shares = _shares_of_motion(changes)[start]
     at_start, at_end = changes[start], changes[start + 1]
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
@@ -408,44 +392,22 @@ def corners(
     return -missing[:, None] * shares * bend
 
 
-def _near(start: IntArray, n_intervals: int) -> IntArray:
-    """Intervals that tell what happens in the wanted ones."""
-    is_near = np.zeros(n_intervals, dtype=bool)
-    for step in range(-_NEARBY - 1, _NEARBY + 2):
-        is_near[np.clip(start + step, 0, n_intervals - 1)] = True
-    return np.flatnonzero(is_near)
-
-
-def _changes(spans_s: FloatArray, poses: FloatArray, intervals: IntArray) -> FloatArray:
-    """Change of the twist per second (N, 6) at each pose; zero at the ends and far from these
-    intervals.
-    """
-    twists = np.zeros((len(spans_s), 6))
-    steps = se3.log(se3.inverse(poses[intervals]) @ poses[intervals + 1])
-    twists[intervals] = steps / spans_s[intervals, None]
-    changes = np.zeros((len(poses), 6))
-    changes[1:-1] = np.diff(twists, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))[:, None]
-    return changes
-
-
 def _shares_of_motion(changes: FloatArray) -> FloatArray:
     """Share (N - 1, 6) of motion in the changes at both ends of each interval, translation and
     rotation each on its own, as the weight that makes their mean most precise.
     """
-    shares = np.empty((len(changes) - 1, 6))
+    shares, window = np.empty((len(changes) - 1, 6)), 2 * _NEARBY + 1
     for part in (slice(0, 3), slice(3, 6)):
         of_part = changes[:, part]
         power = (of_part**2).sum(axis=1)
-        products = _sums_nearby((of_part[1:] * of_part[:-1]).sum(axis=1))
-        powers = _sums_nearby(0.5 * (power[1:] + power[:-1]))
+        products, powers = (
+            np.lib.stride_tricks.sliding_window_view(np.pad(values, _NEARBY), window).sum(axis=1)
+            for values in (
+                (of_part[1:] * of_part[:-1]).sum(axis=1),
+                0.5 * (power[1:] + power[:-1]),
+            )
+        )
         alike = products / np.maximum(powers, 1e-300)
         motion = np.clip((alike - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
         shares[:, part] = (motion / (motion + (1.0 - motion) * _LEFT_IN_THE_MEAN))[:, None]
     return shares
-
-
-def _sums_nearby(values: FloatArray) -> FloatArray:
-    """Sum of each value and its neighbours on either side."""
-    padded = np.pad(values, _NEARBY)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEARBY + 1)
-    return np.asarray(windows.sum(axis=1))
