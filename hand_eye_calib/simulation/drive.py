@@ -1,4 +1,10 @@
-"""A ground vehicle with two sensors drives over hills (Välimäki et al. 2023, section 4.1)."""
+"""A ground vehicle with two sensors drives over hills, and the errors of odometry and SLAM in their
+trajectories (Välimäki et al. 2023, section 4.1).
+
+If the article's text and its published trajectories differ, this follows the trajectories: the
+value called sigma^2 is a standard deviation, jumps last until the end, drift affects the child
+sensor only.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.simulation.noise import add_noise
 from hand_eye_calib.simulation.options import (
     HILLY_DRIVE,
     PUBLISHED_DRIVE,
@@ -24,6 +29,9 @@ _START = np.array([0.0, 0.5])
 
 # Time from their start to the first pose (s), and time for which their first yaw rate is held.
 _LEAD_S, _FIRST_HOLD_S = 0.1, 0.4
+
+# Variance of a jump per axis, m^2.
+JUMP_VARIANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -115,8 +123,16 @@ def simulate_drive(
     Ts_pw_p, Ts_pw_p_at_child = _vehicle_poses(
         config, motion_rng, _LEAD_S + parent_times_s, _LEAD_S + child_times_s
     )
-    T_parent_child = _random_extrinsic(extrinsic_rng, config.max_offset)
-    T_pw_cw = _random_world(extrinsic_rng)
+    offset_m = config.max_offset
+    T_parent_child = se3.from_rotation_translation(
+        Rotation.from_quat(extrinsic_rng.standard_normal(4)).as_matrix(),
+        extrinsic_rng.uniform(-offset_m, offset_m, 3),
+    )
+    # Euler angles (rad) and translation (m) are differences of two uniform numbers from 0 to 1.
+    angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(size=(2, 3))
+    T_pw_cw = se3.from_rotation_translation(
+        Rotation.from_euler("ZYX", angles).as_matrix(), translation
+    )
     Ts_pw_p, Ts_cw_c = add_noise(
         Ts_pw_p, se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child, noise, noise_rng
     )
@@ -129,21 +145,6 @@ def simulate_drive(
         )
     )
     return SimulatedDrive(parent, child, T_parent_child, T_pw_cw)
-
-
-def _random_extrinsic(rng: np.random.Generator, max_offset: float) -> FloatArray:
-    rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-    return se3.from_rotation_translation(rotation, rng.uniform(-max_offset, max_offset, 3))
-
-
-def _random_world(rng: np.random.Generator) -> FloatArray:
-    """Transform whose Euler angles (rad) and translation (m) are differences of two uniform numbers
-    between 0 and 1.
-    """
-    angles, translation = rng.uniform(size=(2, 3)) - rng.uniform(size=(2, 3))
-    return se3.from_rotation_translation(
-        Rotation.from_euler("ZYX", angles).as_matrix(), translation
-    )
 
 
 def _vehicle_poses(
@@ -193,39 +194,23 @@ def _poses_on_terrain(
     config: DriveConfig, positions: FloatArray, headings: FloatArray
 ) -> FloatArray:
     """Poses (N, 4, 4) of the vehicle on the ground at positions (N, 2) with headings (N,)."""
+    x, y = positions.T
     z, slope_x, slope_y = surface(
-        positions[:, 0],
-        positions[:, 1],
-        config.terrain_height,
-        config.terrain_scale,
-        config.terrain_limit,
+        x, y, config.terrain_height, config.terrain_scale, config.terrain_limit
     )
     normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    attitude = _published_attitude if config.attitude == "published" else _vehicle_attitude
-    return se3.from_rotation_translation(
-        attitude(headings, normals), np.column_stack([positions, z])
-    )
-
-
-def _vehicle_attitude(headings: FloatArray, normals: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) with z along the normal and x in the vertical plane of the heading."""
-    left = np.cross(
-        normals, np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1)
-    )
-    left /= np.linalg.norm(left, axis=-1, keepdims=True)
-    return np.stack([np.cross(left, normals), left, normals], axis=-1)
-
-
-def _published_attitude(headings: FloatArray, normals: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) of the published trajectories, from a fit to their noise-free poses (to
-    0.01 rad, heading exactly).
-
-    Yaw is the heading, pitch and roll are the arc sines of x and y of the normal in the world, and
-    the matrix is transposed.
-    """
-    angles = np.stack([headings, np.arcsin(normals[:, 0]), np.arcsin(normals[:, 1])], axis=-1)
-    return np.swapaxes(Rotation.from_euler("ZYX", angles).as_matrix(), -1, -2)
+    if config.attitude == "published":
+        # From a fit to the noise-free poses (to 0.01 rad, heading exactly): yaw is the heading,
+        # pitch and roll are the arc sines of x and y of the normal, the matrix is transposed.
+        angles = np.stack([headings, *np.arcsin(normals[:, :2].T)], axis=-1)
+        rotations = np.swapaxes(Rotation.from_euler("ZYX", angles).as_matrix(), -1, -2)
+    else:  # z along the normal, x in the vertical plane of the heading
+        ahead = np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1)
+        left = np.cross(normals, ahead)
+        left /= np.linalg.norm(left, axis=-1, keepdims=True)
+        rotations = np.stack([np.cross(left, normals), left, normals], axis=-1)
+    return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
 
 
 def peaks(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -255,32 +240,15 @@ def peaks_gradient(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray
 def surface(
     x: FloatArray, y: FloatArray, height: float, scale: float, limit: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Height and slopes of the ground.
+    """Height (N,) of the ground, m, and its slopes (N,) along x and y, at places (N,), m.
 
-    Parameters
-    ----------
-    x, y : (N,) arrays
-        m.
-    height : float
-        m per unit of ``peaks``.
-    scale : float
-        m per unit of the arguments of ``peaks``.
-    limit : float
-        Arguments of ``peaks`` beyond +/- limit are mirrored back, so that a long drive stays on the
-        hills.
-
-    Returns
-    -------
-    z, slope_x, slope_y : (N,) arrays
-        Height in m and its derivatives along x and y.
+    ``height`` and ``scale`` are metres per unit of :func:`peaks` and of its arguments; arguments
+    beyond +/- ``limit`` are mirrored back, so that a long drive stays on the hills.
     """
     (u, sign_u), (v, sign_v) = _mirrored(x / scale, limit), _mirrored(y / scale, limit)
     along_u, along_v = peaks_gradient(u, v)
-    return (
-        height * peaks(u, v),
-        height / scale * sign_u * along_u,
-        height / scale * sign_v * along_v,
-    )
+    slope = height / scale
+    return height * peaks(u, v), slope * sign_u * along_u, slope * sign_v * along_v
 
 
 def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
@@ -288,3 +256,65 @@ def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]
     phase = np.mod(values + limit, 4.0 * limit)
     falling = phase > 2.0 * limit
     return np.where(falling, 3.0 * limit - phase, phase - limit), np.where(falling, -1.0, 1.0)
+
+
+# ---- noise
+
+
+def add_noise(
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, noise: NoiseConfig, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """The trajectories (N, 4, 4) and (M, 4, 4) of both sensors with Gaussian noise, then drift
+    (child only), then jumps. Each kind of noise draws from a stream of its own: a change of one
+    does not change the others.
+    """
+    gaussian, drift, jumps = rng.spawn(3)
+    Ts_pw_p, Ts_cw_c = (
+        add_gaussian(poses, noise.gaussian, gaussian, noise.rotation_per_metre)
+        for poses in (Ts_pw_p, Ts_cw_c)
+    )
+    Ts_cw_c = add_drift(Ts_cw_c, noise.drift, drift)
+    Ts_pw_p, Ts_cw_c = (add_jumps(poses, noise.outliers, jumps) for poses in (Ts_pw_p, Ts_cw_c))
+    return Ts_pw_p, Ts_cw_c
+
+
+def add_gaussian(
+    Ts_world_sensor: FloatArray,
+    level: float,
+    rng: np.random.Generator,
+    rotation_per_metre: float = NoiseConfig.rotation_per_metre,
+) -> FloatArray:
+    """Poses (N, 4, 4) with an independent error each, in the frame of the sensor: ``level`` is the
+    standard deviation of each translation component, m, and ``level * rotation_per_metre`` that of
+    ZYX Euler angles, rad.
+    """
+    angles = level * rotation_per_metre * rng.standard_normal((len(Ts_world_sensor), 3))
+    translation = level * rng.standard_normal((len(Ts_world_sensor), 3))
+    return Ts_world_sensor @ se3.from_rotation_translation(
+        Rotation.from_euler("ZYX", angles).as_matrix(), translation
+    )
+
+
+def add_drift(Ts_world_sensor: FloatArray, rate: float, rng: np.random.Generator) -> FloatArray:
+    """Poses (N, 4, 4) with ``rate`` (m per m) times the length of each step added to it, along one
+    axis of the sensor drawn once.
+    """
+    axis = rng.integers(3)
+    lengths = np.linalg.norm(np.diff(Ts_world_sensor[:, :3, 3], axis=0), axis=1)
+    steps = rate * lengths[:, None] * Ts_world_sensor[:-1, :3, axis]
+    drifted = Ts_world_sensor.copy()
+    drifted[1:, :3, 3] += np.cumsum(steps, axis=0)
+    return drifted
+
+
+def add_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:
+    """Poses (N, 4, 4) whose rest is shifted along the axes of the world at ``round(share * N)`` of
+    them, drawn with replacement.
+    """
+    count = len(Ts_world_sensor)
+    indices = rng.integers(count, size=round(share * count))
+    shifts = np.zeros((count, 3))
+    np.add.at(shifts, indices, np.sqrt(JUMP_VARIANCE) * rng.standard_normal((len(indices), 3)))
+    jumped = Ts_world_sensor.copy()
+    jumped[:, :3, 3] += np.cumsum(shifts, axis=0)
+    return jumped

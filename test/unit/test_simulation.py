@@ -18,7 +18,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.trajectory_files import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.results.calibration import Verdict
-from hand_eye_calib.simulation import noise
+from hand_eye_calib.simulation import drive as noise
 from hand_eye_calib.simulation.drive import simulate_drive, surface
 from hand_eye_calib.simulation.options import (
     HILLY_DRIVE,

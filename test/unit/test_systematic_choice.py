@@ -13,8 +13,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.systematic import Model, spread_about
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.noise import add_noise
+from hand_eye_calib.simulation.drive import add_noise, simulate_drive
 from hand_eye_calib.simulation.options import MIXTURE, DriveConfig
 
 
