@@ -23,8 +23,8 @@ from hand_eye_calib.text import amount
 # Takes whether a solve was good, and a line about it.
 OnSolved = Callable[[bool, str], None]
 
-# The line about the result is logged so often (s), a sentence that says what to do now so often.
-_RESULT_EVERY_S, _SENTENCE_EVERY_S = 60.0, 30.0
+# The line about the result, and the sentence that says what to do now, are logged so often (s).
+_SAID_EVERY_S = 60.0
 
 # What the motion does not determine is worth a warning after so many seconds of it.
 _ENOUGH_MOTION_S = 30.0
@@ -77,7 +77,6 @@ class SolveCycle:
         self._rest_until_s = 0.0
         self._asked: list[OnSolved] = []
         self._asked_in_flight: list[OnSolved] = []
-        self._submitted: Snapshot | None = None
         self._process = SolvingProcess(wake)
         self.restart()
 
@@ -90,8 +89,6 @@ class SolveCycle:
         self.failure: Failure | None = None
         self._certain: dict[str, Any] = {}
         self._told: tuple[str, ...] = ()
-        self._said: tuple[object, ...] = ()
-        self._sentence_at_s = -np.inf
         self.checks.restart()
         self.goal.restart()
 
@@ -125,8 +122,6 @@ class SolveCycle:
 
     def take_answers(self) -> None:
         """Take what the solving process has sent."""
-        for note in self._process.notes():
-            self._log.warning(note)
         for answer in self._process.answers():
             good, text = self.conclude(answer)
             self.is_solving = False
@@ -179,8 +174,7 @@ class SolveCycle:
 
     def _take_check(self, checked: Checked) -> None:
         if checked.failure is not None:
-            text = f"the streams cannot be checked: {checked.failure.what}"
-            self._log.warning(text)
+            self._log.warning(f"the streams cannot be checked: {checked.failure.what}")
             return
         if checked.options:
             self._certain, self._told = self._certain | checked.options, checked.told
@@ -195,7 +189,6 @@ class SolveCycle:
         reached the goal is kept.
         """
         assert self.seen is not None
-        assert self._submitted is not None
         was_done = self.goal.progress.done
         progress = self.goal.add(newest, self.seen, self.checks.faults())
         result = self.goal.best or newest
@@ -205,11 +198,13 @@ class SolveCycle:
             result = replace(result, warnings=(*result.warnings, _why_kept(result, newest)))
         self.result, self.solved_at_s = self._with_findings(result), time.monotonic()
         self._publish(self.result)
-        self._tell()
-        every_s = _RESULT_EVERY_S if progress.done == was_done else 0.0
+        if not progress.is_faulty and progress.sentence:
+            write = self._log.warning if progress.will_not_get_there else self._log.info
+            write(progress.sentence, _SAID_EVERY_S, key=f"now {progress.done}")
+        every_s = _SAID_EVERY_S if progress.done == was_done else 0.0
         return self.result.status is SolveStatus.OK, self._answer_with(self.result, every_s)
 
-    def _answer_with(self, calibration: Calibration, every_s: float = _RESULT_EVERY_S) -> str:
+    def _answer_with(self, calibration: Calibration, every_s: float = _SAID_EVERY_S) -> str:
         """A line about a calibration with its reasons and warnings. What is new of that is logged:
         the reasons once the motion has had its chance, as the progress says what to do before.
         """
@@ -228,18 +223,6 @@ class SolveCycle:
             self._log.warning(warning)
         return "; ".join((text, *said, *calibration.warnings))
 
-    def _tell(self) -> None:
-        """Log what to do now, unless only its figures differ from what was said last."""
-        progress, now_s = self.goal.progress, time.monotonic()
-        said = progress.limiting_axis, progress.done, progress.will_not_get_there
-        if said == self._said or progress.is_faulty or not progress.sentence:
-            return
-        is_turn = said[1:] != self._said[1:]
-        if is_turn or now_s - self._sentence_at_s >= _SENTENCE_EVERY_S:
-            self._said, self._sentence_at_s = said, now_s
-            write = self._log.warning if progress.will_not_get_there else self._log.info
-            write(progress.sentence)
-
     def _with_findings(self, calibration: Calibration) -> Calibration:
         if calibration.measured != "poses":
             return calibration  # which has its own
@@ -248,14 +231,13 @@ class SolveCycle:
     def _report_failure(self, failure: Failure) -> str:
         if failure.kind is FailureKind.NOT_ENOUGH_DATA:
             self._log.info(f"cannot solve yet: {failure.what}", ONCE_S)
-            return failure.what
-        if failure.kind is FailureKind.UNUSABLE:
+        elif failure.kind is FailureKind.UNUSABLE:
             self._log.warning(f"cannot solve: {failure.what}")
-            return failure.what
-        details = f"\n{failure.details}" if failure.details else ""
-        text = f"the solve failed unexpectedly: {failure.what}"
-        self._log.error(f"{text}{details}")
-        return f"{text}; see the log"
+        else:
+            text = f"the solve failed unexpectedly: {failure.what}"
+            self._log.error("\n".join(filter(None, (text, failure.details))))
+            return f"{text}; see the log"
+        return failure.what
 
 
 def _why_kept(kept: Calibration, newest: Calibration) -> str:

@@ -16,41 +16,15 @@ from hand_eye_calib.live.stamp_guard import Judgement, StampGuard
 from hand_eye_calib.live.state import InputState, Level
 
 # An input without a message for so long is silent, and a bad message is reported for so long (s).
-STALE_AFTER_S = 2.0
-BAD_INPUT_FOR_S = 10.0
+STALE_AFTER_S, BAD_INPUT_FOR_S = 2.0, 10.0
 
 # Share of lost messages from which on somebody should look.
 _MUCH_LOST = 0.01
 # A message may be overtaken by so many others of its publisher; farther back, the publisher was
 # started again.
 _MOST_OVERTAKEN = 1000
-# Reports (one a second) over which rates and shares are taken, and most delays looked at in one.
-_REPORTS, _MOST_DELAYS = 10, 5000
-
-
-class Delivery:
-    """Counts the messages of one topic, and by the numbers that their publisher gives them the lost
-    ones; nothing is known of these with several publishers, or a middleware without numbers.
-    """
-
-    def __init__(self) -> None:
-        self.received = self.lost = 0
-        self.has_one_publisher, self.is_known = True, False
-        self._next: int | None = None
-
-    def note(self, sequence_number: int | None) -> None:
-        """Count a message by the number of its publication, None if it has none."""
-        self.received += 1
-        self.is_known = sequence_number is not None and self.has_one_publisher
-        if sequence_number is None or not self.has_one_publisher:
-            self._next = None
-            return
-        missing = 0 if self._next is None else sequence_number - self._next
-        if -_MOST_OVERTAKEN <= missing < 0 < self.lost:
-            self.lost -= 1  # it was counted when a later one overtook it
-            return
-        self.lost += max(missing, 0)
-        self._next = sequence_number + 1
+# Reports (one a second) over which rates and shares are taken, and newest delays.
+_REPORTS, _DELAYS = 10, 200
 
 
 class PoseInput:
@@ -75,8 +49,6 @@ class PoseInput:
         Whether poses are taken; ``ignored`` counts those that came while it was not.
     problem : str
         Why the topic is not used; empty if it is.
-    refused : Counter
-        Messages that could not be used, by reason.
     """
 
     def __init__(
@@ -89,26 +61,20 @@ class PoseInput:
         on_jump_back: Callable[["PoseInput"], None],
     ) -> None:
         self.name, self.topic = name, topic
-        self.is_enabled = True
-        self.problem = ""
-        self.ignored, self.refused = 0, Counter[str]()
-        self.delivery = Delivery()
-        self._guard = StampGuard()
+        self.is_enabled, self.problem, self.ignored = True, "", 0
+        self._guard, self._refused = StampGuard(), Counter[str]()
         self._session, self._log, self._clock_ns = session, log, clock_ns
         self._on_jump_back = on_jump_back
         self._sensor_frame = ""
-        self._max_gap_ns, self._wanted, self._is_watching = 0.0, "auto", False
-        self._arrived = 0
+        self._wanted, self._is_watching = "auto", False
+        self._arrived = self._lost = 0
+        self._next_number: int | None = None
         self._arrived_s: float | None = None
         self._bad, self._bad_at_s = "", -np.inf
-        self._delay_s: float | None = None
-        self._delays_ns: deque[int] = deque(maxlen=_MOST_DELAYS)
-        self._counts = deque([(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
-        self._begin_gaps()
-
-    def _begin_gaps(self) -> None:
+        self._delays_ns: deque[int] = deque(maxlen=_DELAYS)
+        self._counts = deque([(time.monotonic(), 0, 0)], maxlen=_REPORTS + 1)
         self._last_stamp_ns: int | None = None
-        self._longest_gap_ns = self._long_gaps = 0
+        self._longest_gap_ns = 0
 
     @property
     def has_poses(self) -> bool:
@@ -117,14 +83,13 @@ class PoseInput:
 
     def configure(self, config: CalibratorConfig, is_watching: bool) -> None:
         """Follow the options; ``is_watching`` if the mount is watched."""
-        self._max_gap_ns = config.max_gap * 1e9
         self._wanted = getattr(config, f"{self.name}_measures", "auto")
         self._is_watching = is_watching
 
     def restart(self, because_of: "PoseInput | None") -> None:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._sensor_frame = ""
-        self._begin_gaps()
+        self._last_stamp_ns, self._longest_gap_ns = None, 0
         if because_of is None:
             self._guard.restart()
         elif because_of is not self:
@@ -149,17 +114,39 @@ class PoseInput:
 
     # -------------------------------------------------------------- messages
 
+    def count(self, sequence_number: int | None) -> None:
+        """Count the lost messages before one with this number of its publisher; None if nothing is
+        known of them: there are several publishers, or the middleware gives no numbers.
+        """
+        expected, self._next_number = self._next_number, sequence_number
+        if sequence_number is None:
+            return
+        missing = 0 if expected is None else sequence_number - expected
+        if -_MOST_OVERTAKEN <= missing < 0:  # counted when a later one overtook it
+            self._lost, self._next_number = max(self._lost - 1, 0), expected
+        else:
+            self._lost += max(missing, 0)
+            self._next_number = sequence_number + 1
+
     def accept(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
         """Take a message; it is read when its stamp is believed."""
         if not self.is_enabled:
             self.ignored += 1
             return
-        steady_s = time.monotonic()
-        self._note(stamp_ns, steady_s)
+        self._arrived, self._arrived_s = self._arrived + 1, time.monotonic()
+        if clock_ns := self._clock_ns():
+            self._delays_ns.append(clock_ns - stamp_ns)
+        if self._last_stamp_ns is not None:
+            self._longest_gap_ns = max(self._longest_gap_ns, stamp_ns - self._last_stamp_ns)
+        self._last_stamp_ns = stamp_ns
         last_ns = self._guard.last_ns
-        judgement = self._guard.check(stamp_ns, read, steady_s)
+        judgement = self._guard.check(stamp_ns, read, self._arrived_s)
         if judgement.jumped_back:
-            self._say_jump_back(judgement.taken[0][0], last_ns)
+            jump_s = ((last_ns or 0) - judgement.taken[0][0]) * 1e-9
+            self._log.warning(
+                f"{self.topic} jumped back by {jump_s:.3f} s (a bag that loops? a clock that was "
+                "reset?): new session, earlier poses forgotten"
+            )
             self._on_jump_back(self)
         self._use(judgement, is_first=last_ns is None)
 
@@ -170,21 +157,10 @@ class PoseInput:
 
     def refuse(self, which: str, reason: str, text: str) -> None:
         """Count a message that cannot be used, and say why."""
-        self.refused[reason] += 1
+        self._refused[reason] += 1
         self._bad, self._bad_at_s = text, time.monotonic()
         self._log.warning(f"{self.topic}: a message is refused: {text}")
         self._log.debug(f"{self.topic}: message {which} refused: {text}")
-
-    def _note(self, stamp_ns: int, steady_s: float) -> None:
-        self._arrived += 1
-        self._arrived_s = steady_s
-        if clock_ns := self._clock_ns():
-            self._delays_ns.append(clock_ns - stamp_ns)
-        if self._last_stamp_ns is not None:
-            gap_ns = stamp_ns - self._last_stamp_ns
-            self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
-            self._long_gaps += gap_ns > self._max_gap_ns
-        self._last_stamp_ns = stamp_ns
 
     def _use(self, judgement: Judgement, is_first: bool) -> None:
         for stamp_ns in judgement.dropped:
@@ -206,13 +182,6 @@ class PoseInput:
             first_s = judgement.taken[0][0] * 1e-9
             self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
 
-    def _say_jump_back(self, stamp_ns: int, last_ns: int | None) -> None:
-        jump_s = ((last_ns or 0) - stamp_ns) * 1e-9
-        self._log.warning(
-            f"{self.topic} jumped back by {jump_s:.3f} s (a bag that loops? a clock that was "
-            "reset?): new session, earlier poses forgotten"
-        )
-
     # ----------------------------------------------------------------- state
 
     def is_silent(self, steady_s: float) -> bool:
@@ -223,17 +192,11 @@ class PoseInput:
         """What has come in; to be called once a second. ``may_rest`` if silence is nothing to look
         at: there is a result, and the other input is silent too.
         """
-        delivery, taken = self.delivery, self._session.statistics(self.name)
-        newest = steady_s, self._arrived, delivery.received, delivery.lost
-        self._counts.append(newest)
-        seconds, arrived, received, lost = np.subtract(newest, self._counts[0]).tolist()
+        self._counts.append((steady_s, self._arrived, self._lost))
+        seconds, arrived, lost = np.subtract(self._counts[-1], self._counts[0]).tolist()
         rate_hz = arrived / seconds if seconds > 0 else 0.0
-        lost_share = lost / max(received + lost, 1)
-        delays_s = np.array(self._delays_ns) * 1e-9
-        self._delays_ns.clear()
-        if delays_s.size:
-            self._delay_s = float(np.median(delays_s))
-        level, text = self._judge(steady_s, rate_hz, lost_share, may_rest)
+        level, text = self._judge(steady_s, rate_hz, lost / max(arrived + lost, 1), may_rest)
+        taken = self._session.statistics(self.name)
         refused = {"repeated stamp": taken.refused_duplicate, "too late": taken.refused_late}
         outdated = {"of the session before": self._guard.outdated} if self._guard.outdated else {}
         return InputState(
@@ -243,16 +206,10 @@ class PoseInput:
             rate_hz=rate_hz,
             messages=self._arrived,
             poses_taken=taken.received,
-            refused=refused | outdated | dict(sorted(self.refused.items())),
-            dropped_unpaired=taken.dropped_unpaired,
-            ignored_while_disabled=self.ignored,
-            lost=delivery.lost if delivery.is_known else None,
-            lost_share=lost_share if delivery.is_known else None,
+            refused=refused | outdated | dict(sorted(self._refused.items())),
+            lost=None if self._next_number is None else self._lost,
             longest_gap_s=self._longest_gap_ns * 1e-9,
-            gaps_above_max_gap=self._long_gaps,
-            silent_s=None if self._arrived_s is None else steady_s - self._arrived_s,
-            delay_s=self._delay_s,
-            delay_99_s=float(np.percentile(delays_s, 99)) if delays_s.size else None,
+            delay_s=float(np.median(self._delays_ns)) * 1e-9 if self._delays_ns else None,
         )
 
     def _judge(

@@ -16,7 +16,7 @@ class NodeLog:
     """Writes to a ROS logger; rclpy's own throttle cannot tell two topics apart.
 
     Each method takes the text, and how often it may be written: texts that differ in their numbers
-    only are the same.
+    only are the same, and so are all with the same ``key``.
 
     Parameters
     ----------
@@ -38,27 +38,26 @@ class NodeLog:
         self._logger.debug(_escaped(text))
 
     def info(self, text: str, every_s: float = 0.0, key: str = "") -> None:
-        """Write what a person may want to know; texts with a ``key`` are all the same."""
+        """Write what a person may want to know."""
         if self._is_due(f"info {key or text}", every_s):
             self._logger.info(_escaped(text))
 
-    def warning(self, text: str, every_s: float = ONCE_S) -> None:
+    def warning(self, text: str, every_s: float = ONCE_S, key: str = "") -> None:
         """Write what a person should look at."""
-        if self._is_due(f"warning {text}", every_s):
+        if self._is_due(f"warning {key or text}", every_s):
             self._logger.warning(_escaped(text))
 
-    def error(self, text: str, every_s: float = ONCE_S) -> None:
-        """Write what went wrong."""
-        if self._is_due(f"error {text}", every_s):
+    def error(self, text: str) -> None:
+        """Write what went wrong, once."""
+        if self._is_due(f"error {text}", ONCE_S):
             self._logger.error(_escaped(text))
 
     def _is_due(self, text: str, every_s: float) -> bool:
         key, now_s = _NUMBERS.sub("", text), time.monotonic()
-        if now_s - self._written_at_s.get(key, -float("inf")) < every_s:
-            return False
-        if len(self._written_at_s) < 10_000:
+        is_due = now_s - self._written_at_s.get(key, -float("inf")) >= every_s
+        if is_due and len(self._written_at_s) < 10_000:
             self._written_at_s[key] = now_s
-        return True
+        return is_due
 
 
 def _escaped(text: str) -> str:

@@ -1,4 +1,4 @@
-"""The mount monitor: has the child sensor moved against the installed extrinsic?
+"""``monitor: true``: has the child sensor moved against the installed extrinsic?
 
 For days on end, in constant memory. Every second of motion adds its information about a shift from
 the installed extrinsic (:mod:`hand_eye_calib.assessment.mount_change`). The likelihood ratio of a
@@ -8,13 +8,13 @@ over all of them; the largest tells. It is measured by what the scores really sc
 What was there before a shift, the installed extrinsic is off by: by its own uncertainty, and by the
 common-mode error of both odometries (:mod:`hand_eye_calib.assessment.floor`). That is learned from
 all motion before. A scale that drifts, as that of visual odometry, looks like a lever arm in
-curves: in each second the scale is a parameter, as free as it is seen to drift. Standing still adds
-nothing. docs/session.md has what the monitor can see.
+curves: in each second the scale is a parameter. Standing still adds nothing. docs/session.md has
+what the monitor can see.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import datetime
 
 import numpy as np
 
@@ -27,10 +27,18 @@ from hand_eye_calib.assessment.moved import (
     shift_covariance,
     squared_shift,
 )
+from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.session import LiveSession
+from hand_eye_calib.live.state import AxisValues, Level, MountState
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.plain import plain
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
+from hand_eye_calib.text import amount, axes_in_words, listing
 
 # Log likelihood ratio from which on the mount has moved.
 THRESHOLD = 10.0
@@ -61,6 +69,10 @@ _NOISE_MEMORY_S, _OLD_MEMORY_S = 900.0, 20_000.0
 # differs from hour to hour (one standard deviation, as a share).
 _CAUTION, _WANDER = 2.0, 0.25
 
+# Standard deviation of the child's scale in a second. A scale that drifts by 0.5 % is wrong for a
+# minute; as errors that are new in each second, that is sqrt(60) times as much.
+_SCALE_SIGMA = 0.04
+
 # Windows (seconds of motion) whose scores show the long-run variance; fewer of them say nothing.
 # What is assumed of it beforehand counts as much as so many windows. It is taken anew every so many
 # seconds. A shift spoils some windows: none counts for more than so many times the typical one.
@@ -68,12 +80,18 @@ _WINDOWS, _FEWEST_WINDOWS = (10, 30, 90, 240), 4
 _ASSUMED, _ASSUMED_WINDOWS = 10.0, 4.0
 _LONG_RUN_EVERY = 10
 _MOST_OF_TYPICAL = 20.0
-# The drift of the scale is followed over stretches of so many seconds of motion. What is assumed of
-# it beforehand (standard deviation over a stretch) counts as much as so many stretches.
-_STRETCH_S, _ASSUMED_SCALE, _ASSUMED_STRETCHES = 60, 0.003, 2.0
-_LEAST_VARIANCE = 1e-12
 # Share of the information of the shifts that are looked for, without which a shift may be anything.
 _RIDGE = 1e-3
+
+# Of the session that is watched, poses are paired soon, and few are kept.
+LIMITS = BufferLimits(
+    capacity=4_000, pairing_starts=32, batch=64, batch_every=16, late_ns=500_000_000
+)
+
+# A shift is told from this many standard deviations on. An axis is watched if ten minutes of motion
+# would show a change of so many targets; changes of m or rad beyond these are as good as nothing.
+_CLEARLY, _TARGETS, _LONG_S = 3.0, 5.0, 600.0
+_UNKNOWN = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,68 +107,18 @@ class Alarm:
     sigmas: FloatArray
     log_ratio: float
 
-
-class _Seconds:
-    """Information H (n, 6, 6) and S (n, 6) of the newest seconds of motion, the newest first; at
-    most MEMORY_S of them.
-    """
-
-    def __init__(self) -> None:
-        self.stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
-        self.H, self.S = np.zeros((0, 6, 6)), np.zeros((0, 6))
-
-    def __len__(self) -> int:
-        return len(self.S)
-
-    def add(self, stamp_ns: int, H: FloatArray, S: FloatArray) -> None:
-        """Add a second."""
-        self.stamps_ns = np.append(np.int64(stamp_ns), self.stamps_ns)
-        self.H, self.S = np.concatenate([H[None], self.H]), np.concatenate([S[None], self.S])
-        self.keep(MEMORY_S)
-
-    def keep(self, newest: int) -> None:
-        """Forget all but so many of the newest seconds."""
-        self.stamps_ns = self.stamps_ns[:newest]
-        self.H, self.S = self.H[:newest], self.S[:newest]
-
-    def newest(self, lags: IntArray) -> tuple[FloatArray, FloatArray]:
-        """H (l, 6, 6) and S (l, 6) of so many of the newest seconds."""
-        return np.cumsum(self.H, axis=0)[lags - 1], np.cumsum(self.S, axis=0)[lags - 1]
-
-    def answer(self) -> FloatArray:
-        """Shift (6,) that all of them together show."""
-        return most_likely(self.H.sum(axis=0), self.S.sum(axis=0), _RIDGE)
-
-
-class _Scale:
-    """The error of the child's scale (its logarithm), as white noise that adds up to the same over
-    a stretch: a scale that drifts for many seconds is unknown in each of them.
-    """
-
-    def __init__(self) -> None:
-        self._variance = _STRETCH_S * _ASSUMED_SCALE**2
-        self._stretches = self._seconds = 0
-        self._information = self._score = 0.0
-
-    def take_out(
-        self, H: FloatArray, S: FloatArray, long_run: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """H (6, 6) and S (6,) of a shift whatever the scale, from those (7, 7) of both."""
-        share = H[:6, 6] / (H[6, 6] + long_run / max(self._variance, _LEAST_VARIANCE))
-        return H[:6, :6] - np.outer(share, H[6, :6]), S[:6] - share * S[6]
-
-    def add(self, information: float, score: float, long_run: float) -> None:
-        """Follow the error with the information and the score of the scale in a second."""
-        self._seconds += 1
-        self._information += information
-        self._score += score
-        if self._seconds == _STRETCH_S:
-            squared = (self._score / self._information) ** 2 - long_run / self._information
-            most = _NOISE_MEMORY_S / _STRETCH_S
-            share = 1.0 / (min(self._stretches, most) + _ASSUMED_STRETCHES)
-            self._variance += share * (_STRETCH_S * squared - self._variance)
-            self._stretches += 1
-            self._seconds, self._information, self._score = 0, 0.0, 0.0
+    def __str__(self) -> str:
+        """Which axes have moved, by how much, since when (local time)."""
+        ratios = np.abs(self.shift) / self.sigmas
+        told = [
+            f"{axes_in_words([axis])} by {amount(axis, shift)} +/- {amount(axis, sigma)}"
+            for axis, shift, sigma, ratio in zip(
+                AXES, self.shift.tolist(), self.sigmas.tolist(), ratios, strict=True
+            )
+            if ratio >= min(_CLEARLY, ratios.max())
+        ]
+        since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(" ", timespec="seconds")
+        return f"the mount has moved: {listing(told)}, since about {since}"
 
 
 class MountMonitor:
@@ -166,9 +134,7 @@ class MountMonitor:
     Attributes
     ----------
     alarm : Alarm or None
-        The shift that is there now.
-    alarms : int
-        How many there were; one that is over and comes again counts twice.
+        The shift that has been seen.
     seconds : int
         Seconds of motion seen so far.
     """
@@ -177,20 +143,18 @@ class MountMonitor:
         self._installed = np.asarray(T_parent_child, dtype=float)
         self._covariance = _CAUTION * np.asarray(covariance, dtype=float)
         self._wander = np.zeros((6, 6))
-        self._old = np.zeros((6, 6)), np.zeros(6)
-        self._before_alarm = np.zeros(6)
         self._to_parent = np.kron(np.eye(2), self._installed[:3, :3])
         self._noise: FloatArray | None = None
         self._learning: list[tuple[int, MotionPairs]] = []
         self._tail = PosePairs.empty()
-        self._memory = _Seconds()
-        self._scale = _Scale()
+        # Of the newest seconds of motion, the newest first, and the sums of those before them.
+        self._stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self._H, self._S = np.zeros((0, 6, 6)), np.zeros((0, 6))
+        self._old = np.zeros((6, 6)), np.zeros(6)
         self._centre = np.zeros(6)
         self._last_s = -1
-        self._since_alarm = 0
         self._motions_per_s = 0.0
         self.alarm: Alarm | None = None
-        self.alarms = 0
         self.seconds = 0
         self.long_run = _ASSUMED
 
@@ -207,7 +171,7 @@ class MountMonitor:
         Alarm or None
             A new one, if it was raised by these poses.
         """
-        raised = None
+        before, raised = self.alarm, None
         for stamp_ns, motions in self._by_second(pose_pairs):
             if not _is_motion(motions, self._noise):
                 continue
@@ -217,7 +181,8 @@ class MountMonitor:
             else:
                 self._take(stamp_ns, motions)
             if self._noise is not None:
-                raised = self._judge() or raised
+                self._judge()
+            raised = raised or (None if before else self.alarm)
         return raised
 
     def restart(self) -> None:
@@ -277,89 +242,64 @@ class MountMonitor:
             self._take(second_ns, each)
 
     def _take(self, stamp_ns: int, motions: MotionPairs) -> None:
-        """Add the information of a second, and follow the noise."""
+        """Add the information of a second whatever the scale in it, and follow the noise."""
         assert self._noise is not None
         residuals, jacobians = residuals_and_jacobians(motions, self._installed)
-        jacobians = np.concatenate([jacobians, _by_scale(motions)], axis=2)
-        if self.seconds % _LONG_RUN_EVERY == 0 and len(self._memory) >= LEARNING_S:
-            self._centre = self._memory.answer()
+        by_scale = np.zeros((len(motions), 6, 1))  # of its logarithm
+        by_scale[:, :3, 0] = -se3.inverse(motions.Ts_childi_childj)[:, :3, 3]
+        jacobians = np.concatenate([jacobians, by_scale], axis=2)
+        if self.seconds % _LONG_RUN_EVERY == 0 and len(self._S) >= LEARNING_S:
+            self._centre = most_likely(self._H.sum(axis=0), self._S.sum(axis=0), _RIDGE)
         shift = np.append(self._centre, 0.0)
-        both_H, both_S, scatter = _information(residuals, jacobians, self._noise, shift)
-        score = float(both_S[6] - both_H[6] @ shift)
-        self._scale.add(float(both_H[6, 6]), score, self.long_run)
-        H, S = self._scale.take_out(both_H, both_S, self.long_run)
-        if len(self._memory) == MEMORY_S and self.alarm is None:
+        H, S, scatter = _information(residuals, jacobians, self._noise, shift)
+        share = H[:6, 6] / (H[6, 6] + self.long_run / _SCALE_SIGMA**2)
+        H, S = H[:6, :6] - np.outer(share, H[6, :6]), S[:6] - share * S[6]
+        if len(self._S) == MEMORY_S and self.alarm is None:
             kept = 1.0 - 1.0 / _OLD_MEMORY_S
-            H_old, S_old = self._old
-            self._old = kept * H_old + self._memory.H[-1], kept * S_old + self._memory.S[-1]
-        self._memory.add(stamp_ns, H, S)
+            self._old = kept * self._old[0] + self._H[-1], kept * self._old[1] + self._S[-1]
+        self._stamps_ns = np.append(np.int64(stamp_ns), self._stamps_ns)[:MEMORY_S]
+        self._H = np.concatenate([H[None], self._H])[:MEMORY_S]
+        self._S = np.concatenate([S[None], self._S])[:MEMORY_S]
         share = 1.0 / _NOISE_MEMORY_S
         self._noise = (1.0 - share) * self._noise + share * scatter
-        self._motions_per_s += (len(motions) - self._motions_per_s) / min(len(self._memory), 100)
+        self._motions_per_s += (len(motions) - self._motions_per_s) / min(len(self._S), 100)
 
     # ------------------------------------------------------------- the judgement
 
-    def _judge(self) -> Alarm | None:
-        """Raise, follow or end an alarm; returns one that is new."""
+    def _judge(self) -> None:
+        """Raise an alarm, or follow one that has become clearer."""
         if self.seconds % _LONG_RUN_EVERY == 0 or self.seconds <= LEARNING_S:
-            self.long_run = _long_run_variance(self._memory, self.long_run)
-        if len(self._memory) < _LAGS[0]:
-            return None
-        self._since_alarm += 1
-        if self.alarm is not None and (put_back_s := self._put_back_s()):
-            self.alarm = None
-            self._memory.keep(put_back_s)
-            return None
-        lags, H, S, before = self._sums()
+            self.long_run = _long_run_variance(self._H, self._S, self.long_run)
+        if len(self._S) < _LAGS[0]:
+            return
+        lags, H, S = self._sums()
         ratios = log_ratio(H, S, 1.0, _KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
         if ratios[best] < (self.alarm.log_ratio if self.alarm else THRESHOLD):
-            return None
+            return
         covariance = np.linalg.inv(H[best] + np.linalg.inv(shift_covariance(1.0, 1.0)))
-        stamps_ns = self._memory.stamps_ns
-        is_new = self.alarm is None
+        since_ns, raised_ns = int(self._stamps_ns[lags[best] - 1]), int(self._stamps_ns[0])
         self.alarm = Alarm(
-            since_ns=self.alarm.since_ns if self.alarm else int(stamps_ns[lags[best] - 1]),
-            raised_ns=self.alarm.raised_ns if self.alarm else int(stamps_ns[0]),
+            since_ns=self.alarm.since_ns if self.alarm else since_ns,
+            raised_ns=self.alarm.raised_ns if self.alarm else raised_ns,
             shift=self._to_parent @ covariance @ S[best],
             sigmas=self._sigmas(covariance),
             log_ratio=float(ratios[best]),
         )
-        self._before_alarm = before[best]
-        self.alarms += is_new
-        if is_new:
-            self._since_alarm = 0
-        return self.alarm if is_new else None
 
-    def _sums(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-        """Lags, H and S over each with the long-run variance and the uncertainty of what was before
-        counted in, and what was before, (l, 6); the last lag is all there is.
+    def _sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Lags (l,), H and S over each, with the long-run variance and the uncertainty of what was
+        before counted in; the last lag is all there is.
         """
-        lags = _LAGS[: np.searchsorted(_LAGS, len(self._memory), side="right")]
-        newest_H, newest_S = self._memory.newest(lags)
-        all_H = self._old[0] + self._memory.H.sum(axis=0)
-        all_S = self._old[1] + self._memory.S.sum(axis=0)
-        H = np.concatenate([newest_H, all_H[None]]) / self.long_run
-        S = np.concatenate([newest_S, all_S[None]]) / self.long_run
-        known = np.linalg.inv(self._covariance) + H[-1] - H
-        uncertain = np.linalg.inv(known)
+        lags = _LAGS[: np.searchsorted(_LAGS, len(self._S), side="right")]
+        H, S = np.cumsum(self._H, axis=0), np.cumsum(self._S, axis=0)
+        H = np.concatenate([H[lags - 1], [self._old[0] + H[-1]]]) / self.long_run
+        S = np.concatenate([S[lags - 1], [self._old[1] + S[-1]]]) / self.long_run
+        uncertain = np.linalg.inv(np.linalg.inv(self._covariance) + H[-1] - H)
         before = (uncertain @ (S[-1] - S)[..., None])[..., 0]
         off = S - (H @ before[..., None])[..., 0]
         reduced = np.linalg.inv(np.eye(6) + H @ (uncertain + self._wander))
-        lags = np.append(lags, len(self._memory))
-        return lags, reduced @ H, (reduced @ off[..., None])[..., 0], before
-
-    def _put_back_s(self) -> int:
-        """The shortest lag since the alarm over which no shift is far more likely than the alarm's;
-        0 if there is none.
-        """
-        assert self.alarm is not None
-        lags = _LAGS[: np.searchsorted(_LAGS, min(self._since_alarm, len(self._memory)))]
-        H, S = (part / self.long_run for part in self._memory.newest(lags))
-        shift = self._to_parent.T @ self.alarm.shift
-        off = S - (H @ self._before_alarm)
-        for_shift = off @ shift - 0.5 * np.einsum("i,lij,j->l", shift, H, shift)
-        return next(iter(lags[for_shift < -THRESHOLD].tolist()), 0)
+        return np.append(lags, len(self._S)), reduced @ H, (reduced @ off[..., None])[..., 0]
 
     def _sigmas(self, covariance: FloatArray) -> FloatArray:
         in_parent = self._to_parent @ covariance @ self._to_parent.T
@@ -371,10 +311,10 @@ class MountMonitor:
         """
         if self.is_learning:
             return np.full(6, np.inf)
-        H = self._memory.H.sum(axis=0)
+        H = self._H.sum(axis=0)
         known = (self._old[0] + H) / self.long_run
         before = np.linalg.inv(np.linalg.inv(self._covariance) + known) + self._wander
-        H /= len(self._memory)
+        H /= len(self._S)
         # Of that, what the rotation noise of a motion seems to tell of a translation: rotations
         # that never took place reveal nothing.
         assert self._noise is not None
@@ -414,13 +354,6 @@ def _is_motion(motions: MotionPairs, noise: FloatArray | None) -> bool:
     return rotation > least or distance > _LEAST_MOTION
 
 
-def _by_scale(motions: MotionPairs) -> FloatArray:
-    """Negative derivatives (K, 6, 1) of the residuals by the logarithm of the child's scale."""
-    column = np.zeros((len(motions), 6, 1))
-    column[:, :3, 0] = -se3.inverse(motions.Ts_childi_childj)[:, :3, 3]
-    return column
-
-
 def _information(
     residuals: FloatArray,
     jacobians: FloatArray,
@@ -440,20 +373,110 @@ def _information(
     return H, S, (weights[:, None] * centred).T @ centred / len(centred)
 
 
-def _long_run_variance(memory: _Seconds, known: float) -> float:
-    """Long-run variance of the scores in units of the information: the largest over windows of
-    several lengths, each about the answer of all; what is known while there are too few.
+def _long_run_variance(H: FloatArray, S: FloatArray, known: float) -> float:
+    """Long-run variance of the scores in units of the information, from those of seconds: the
+    largest over windows of several lengths, each about the answer of all; what is known while there
+    are too few.
     """
-    answer = memory.answer()
+    answer = most_likely(H.sum(axis=0), S.sum(axis=0), _RIDGE)
     found = []
     for length in _WINDOWS:
-        n_windows = len(memory) // length
+        n_windows = len(S) // length
         if n_windows < _FEWEST_WINDOWS:
             break
         newest = n_windows * length
-        H = memory.H[:newest].reshape(n_windows, length, 6, 6).sum(axis=1)
-        S = memory.S[:newest].reshape(n_windows, length, 6).sum(axis=1) - H @ answer
-        squared = squared_shift(H, S, _RIDGE)
+        of_windows = H[:newest].reshape(n_windows, length, 6, 6).sum(axis=1)
+        scores = S[:newest].reshape(n_windows, length, 6).sum(axis=1) - of_windows @ answer
+        squared = squared_shift(of_windows, scores, _RIDGE)
         seen = np.minimum(squared, _MOST_OF_TYPICAL * np.median(squared)).sum() / 6
         found.append((seen + _ASSUMED_WINDOWS * _ASSUMED) / (n_windows + _ASSUMED_WINDOWS))
     return max(found, default=known)
+
+
+class MountWatch:
+    """Feeds the monitor with the pose pairs of the session, once a second.
+
+    Parameters
+    ----------
+    session : LiveSession
+    installed : callable
+        Gives the installed pose of the child's frame in the parent's; None while it is not known.
+    why_unknown : callable
+        Gives the reason for that.
+    log : NodeLog
+    """
+
+    def __init__(
+        self,
+        session: LiveSession,
+        installed: Callable[[str, str], Extrinsic | None],
+        why_unknown: Callable[[], str],
+        log: NodeLog,
+    ) -> None:
+        self._session, self._log = session, log
+        self._installed, self._why_unknown = installed, why_unknown
+        self._monitor: MountMonitor | None = None
+        self._last_ns = -1
+
+    def restart(self) -> None:
+        """The stamps have jumped back: nothing runs across; what was learned stays."""
+        self._last_ns = -1
+        if self._monitor is not None:
+            self._monitor.restart()
+
+    def look(self) -> None:
+        """Judge what has come in; to be called about once a second."""
+        calibrator = self._session.calibrator
+        pairs = calibrator.take_pairs()
+        pairs = pairs[pairs.stamps_ns > self._last_ns]
+        if self._monitor is None and len(pairs):  # before the first, the frames are not known
+            snapshot = calibrator.snapshot()
+            installed = self._installed(snapshot.parent_frame, snapshot.child_frame)
+            if installed is not None:
+                self._monitor = MountMonitor(installed.T_parent_child, installed.covariance)
+        if self._monitor is not None and len(pairs):
+            self._last_ns = int(pairs.stamps_ns[-1])
+            if alarm := self._monitor.add(pairs):
+                self._log.error(str(alarm))
+
+    def state(self) -> MountState:
+        """Whether the mount has moved, and what can be seen of it on this robot."""
+        monitor = self._monitor
+        if monitor is None:
+            return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")
+        visible, alarm = monitor.visible(_LONG_S), monitor.alarm
+        if alarm is not None:
+            text = str(alarm)
+        elif monitor.is_learning:
+            text = f"learning the noise: {monitor.seconds} of {LEARNING_S} s of motion"
+        else:
+            targets = np.array(self._session.calibrator.config.targets)
+            text = _quiet(visible, visible <= _TARGETS * targets)
+        told = np.where(visible < _UNKNOWN, visible, np.nan)
+        return MountState(
+            level=Level.ERROR if alarm else Level.OK,
+            text=text,
+            is_learning=monitor.is_learning,
+            seconds_of_motion=monitor.seconds,
+            shift=_by_axis(alarm.shift) if alarm else {},
+            shift_sigma=_by_axis(alarm.sigmas) if alarm else {},
+            visible_10min=_by_axis(told),
+            since_ns=alarm.since_ns if alarm else None,
+            newest_ns=self._last_ns,
+        )
+
+
+def _by_axis(values: FloatArray) -> AxisValues:
+    return dict(zip(AXES, plain(values), strict=True))
+
+
+def _quiet(visible: FloatArray, is_watched: np.ndarray) -> str:
+    told = []
+    for part in (range(3), range(3, 6)):
+        if known := [index for index in part if is_watched[index]]:
+            worst = amount(AXES[known[0]], float(visible[known].max()))
+            told.append(f"{worst} in {axes_in_words([AXES[index] for index in known])}")
+    shown = f": ten minutes of motion would show {listing(told)}" if told else ""
+    unwatched = [axis for axis, watched in zip(AXES, is_watched, strict=True) if not watched]
+    hidden = f"; {axes_in_words(unwatched)} cannot be watched here" if unwatched else ""
+    return f"the mount has not moved{shown}{hidden}"

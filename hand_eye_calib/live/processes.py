@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -22,13 +22,11 @@ from typing import IO, Any
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.live.solving import Answer, Failure, FailureKind, Job
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.text import listing
 
 # Not `-m`: its classes would belong to the module __main__, which the node does not have.
 _SOLVE = "from hand_eye_calib.live.solving import main; main()"
 _REPORT = "from hand_eye_calib.cli.reporting import write_session; write_session()"
-
-# A job is sent so many times before it is given up.
-_ATTEMPTS = 2
 
 # A job hangs that has taken this long (s), and so many times the longest before it: solves grow
 # with their data, but not by that from one to the next, and a slow computer needs seconds for each.
@@ -57,14 +55,13 @@ def _start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.P
 class SolvingProcess:
     """Answers jobs in another process, in the order they were submitted.
 
-    The process is started at once and again when it has died; the job in hand is sent again then.
-    One that hangs is killed and started again; the job in hand has failed then. It ends with this
-    one, however this one ends.
+    The process is started at once and again when it has died, or was killed because it hung; the
+    job in hand has failed then. It ends with this one, however this one ends.
 
     Parameters
     ----------
     on_answer : callable
-        Called in another thread when an answer or a note is ready; one call may stand for two.
+        Called in another thread when an answer is ready; one call may stand for two.
     command : str
         Python code that the process runs.
     """
@@ -73,10 +70,9 @@ class SolvingProcess:
         self._on_answer, self._command = on_answer, command
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
-        self._notes: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self._stopping = threading.Event()
+        self._is_stopping = False
         self._hangs_after_s = HANGS_AFTER_S
-        self._process = _start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._process = self._started()
         # A daemon: a disk or a pipe that hangs must not keep the node alive.
         self._thread = threading.Thread(target=self._run, name="solving", daemon=True)
         self._thread.start()
@@ -90,77 +86,62 @@ class SolvingProcess:
         """Queue a job."""
         self._jobs.put(job)
 
-    def answers(self) -> Iterator[Answer]:
-        """Each answer that nobody has taken, in order."""
-        while not self._answers.empty():
-            yield self._answers.get()
-
-    def notes(self) -> Iterator[str]:
-        """Lines for the log: the process died and was started again."""
-        while not self._notes.empty():
-            yield self._notes.get()
+    def answers(self) -> list[Answer]:
+        """The answers that nobody has taken, in order."""
+        return [self._answers.get() for _ in range(self._answers.qsize())]
 
     def stop(self, timeout_s: float) -> None:
         """Wait for the job in hand, then end the process whatever it does."""
-        self._stopping.set()
+        self._is_stopping = True
         self._jobs.put(None)
         self._thread.join(timeout_s)
         self._process.kill()
         self._thread.join(_LAST_BREATH_S)  # its pipe has ended
         _end(self._process)
 
+    def _started(self) -> "subprocess.Popen[bytes]":
+        return _start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
-            found = self._answer(job)
-            if found is not None:
-                self._answers.put(found)
-                if not self._stopping.is_set():
-                    self._on_answer()
-
-    def _answer(self, job: Job) -> Answer | None:
-        """The job's answer, a failure if the process dies again and again; None at the end."""
-        cause = ""
-        for _ in range(_ATTEMPTS):
             began_s = time.monotonic()
             killer = threading.Timer(self._hangs_after_s, self._process.kill)
             killer.daemon = True
             killer.start()
+            to, back = self._process.stdin, self._process.stdout
+            assert to is not None
+            assert back is not None
             try:
-                to, back = self._process.stdin, self._process.stdout
-                assert to is not None
-                assert back is not None
                 pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
                 to.flush()
                 found: Answer = pickle.load(back)
                 longest_s = _HANGS_TIMES * (time.monotonic() - began_s)
                 self._hangs_after_s = max(self._hangs_after_s, longest_s)
-                return found
             except _NOT_AN_ANSWER:
-                if self._stopping.is_set():
-                    return None
+                if self._is_stopping:
+                    return
+                what = self._restart(time.monotonic() - began_s >= self._hangs_after_s)
+                failure = Failure(FailureKind.UNEXPECTED, what)
+                found = Answer(job.session, 0.0, failure=failure)
             finally:
                 killer.cancel()
-            hangs = time.monotonic() - began_s >= self._hangs_after_s
-            cause = self._restart(hangs)
-            if hangs:
-                self._hangs_after_s *= 2.0  # it may have been a long solve
-                break
-        failure = Failure(FailureKind.UNEXPECTED, f"the solving process {cause}")
-        return Answer(job.session, 0.0, failure=failure)
+            self._answers.put(found)
+            if not self._is_stopping:
+                self._on_answer()
 
     def _restart(self, hangs: bool) -> str:
         """Start the process again; returns how it ended."""
         code = _end(self._process)
-        self._process = _start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        if self._stopping.is_set():
-            self._process.kill()
         cause = f"ended with code {code}"
         if hangs:
             cause = f"had no answer after {self._hangs_after_s:.3g} s and was killed"
+            self._hangs_after_s *= 2.0  # it may have been a long solve
         elif code < 0:
             cause = f"was ended by {signal.Signals(-code).name}"
-        self._notes.put(f"the solving process {cause}; it was started again")
-        return cause
+        self._process = self._started()
+        if self._is_stopping:
+            self._process.kill()
+        return f"the solving process {cause}; it was started again"
 
 
 def _end(process: "subprocess.Popen[bytes]") -> int:
@@ -188,11 +169,6 @@ class SessionResult:
     with_report: bool = True
     others: Mapping[str, Snapshot] = field(default_factory=dict)
 
-    @property
-    def files(self) -> str:
-        """What is written, in words."""
-        return " and ".join(["report.html"] * self.with_report + ["rig/"] * bool(self.others))
-
 
 class ReportProcess:
     """Writes reports in a process that outlives the node, one at a time: the newest counts."""
@@ -209,17 +185,18 @@ class ReportProcess:
         pipe has to be waited for at the end of the node.
         """
         self.stop()
+        files = ["report.html"] * result.with_report + ["rig/"] * bool(result.others)
         try:
-            answer = tempfile.TemporaryFile() if result.others else None  # noqa: SIM115
+            answer = tempfile.TemporaryFile()  # noqa: SIM115
             with tempfile.TemporaryFile() as file:
                 pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
                 file.seek(0)
-                out = answer or subprocess.DEVNULL
-                self._process = _start(_REPORT, str(directory.resolve()), stdin=file, stdout=out)
+                where = str(directory.resolve())
+                self._process = _start(_REPORT, where, stdin=file, stdout=answer)
         except OSError as error:  # a full temporary directory, or no process can be started
-            return f"{result.files} cannot be written: {error.strerror}"
-        self._answer = answer
-        return f"{result.files} follow" + "s" * (" and " not in result.files)
+            return f"{listing(files)} cannot be written: {error.strerror}"
+        self._answer = answer if result.others else None
+        return f"{listing(files)} follow{'s' * (len(files) == 1)}"
 
     def stop(self) -> None:
         """End the process: what it writes is out of date."""
@@ -227,6 +204,10 @@ class ReportProcess:
             self._process.kill()
             self._process.wait()
         self._process = self._answer = None
+
+    def forget(self) -> None:
+        """A new session has begun: results of the one before are of no use."""
+        self._answer = None
 
     def take_others(self) -> list[Calibration]:
         """Results of further child sensors in their order, once, when they are there."""
@@ -237,7 +218,3 @@ class ReportProcess:
             answer.seek(0)
             found: list[Calibration] = pickle.load(answer) if self._process.returncode == 0 else []
             return found
-
-    def forget(self) -> None:
-        """A new session has begun: results of the one before are of no use."""
-        self._answer = None

@@ -55,58 +55,42 @@ def extrinsic_state(
     steady_s, clock_ns
         Steady time, and the node's clock, 0 if it does not run yet.
     """
-    seen, result = cycle.seen, cycle.result
-    age_s = cycle.age_s(steady_s)
-    level, text = _judged(cycle, accepts_poses, tf_static, age_s, waited_for_s)
-    rotation = np.degrees(seen.rotation).tolist() if seen else []
+    seen, result, failure = cycle.seen, cycle.result, cycle.failure
+    age_s, said = cycle.age_s(steady_s), failure.what if failure else ""
+    broadcast, why = tf_static
+    # The gravest that applies is first.
+    if failure is not None and failure.kind is FailureKind.UNEXPECTED:
+        level, text = Level.ERROR, f"the solve failed unexpectedly, see the log: {said}"
+    elif not accepts_poses:
+        level, text = Level.WARN, "not accepting poses: call ~/set_enabled to go on"
+    elif result is None:
+        faults = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in cycle.checks.faults()[:1]]
+        level, text = Level.WARN, "; ".join(filter(None, (*faults, said))) or "no result yet"
+    elif broadcast is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
+        level, text = Level.WARN, f"publish_tf is refused: {why}"
+    elif waited_for_s is not None and age_s > max(_STALE_S, _STALE_PERIODS * waited_for_s):
+        text = ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
+        level = Level.WARN
+    else:
+        level = Level.OK if result.verdict is Verdict.USE else Level.WARN
+        text = result.headline
     return ExtrinsicState(
         level=level,
         text=text,
-        accepts_poses=accepts_poses,
         is_solving=cycle.is_solving,
         solves=cycle.solves,
         last_solve_s=cycle.seconds,
-        last_failure=cycle.failure.what if cycle.failure else "",
         n_poses=seen.n_poses if seen else 0,
         path_m=seen.distance if seen else 0.0,
         motion_s=seen.motion_s if seen else 0.0,
         has_vehicle_axes=bool(seen and seen.has_vehicle_axes),
-        rotation_deg=dict(zip("xyz", rotation, strict=False)),
-        tf_static=tf_static[0],
-        tf_static_reason=tf_static[1],
+        rotation_deg=dict(zip("xyz", plain(np.degrees(seen.rotation)), strict=True))
+        if seen
+        else {},
+        tf_static=broadcast,
+        tf_static_reason=why,
         result=_result_state(result, age_s, clock_ns) if result else None,
     )
-
-
-def _judged(
-    cycle: SolveCycle,
-    accepts_poses: bool,
-    tf_static: tuple[Broadcast, str],
-    age_s: float,
-    waited_for_s: float | None,
-) -> tuple[Level, str]:
-    """Level and message: the gravest that applies."""
-    result, failure = cycle.result, cycle.failure
-    said = failure.what if failure else ""
-    is_stale = waited_for_s is not None and age_s > max(_STALE_S, _STALE_PERIODS * waited_for_s)
-    level = Level.WARN
-    if failure is not None and failure.kind is FailureKind.UNEXPECTED:
-        level, text = Level.ERROR, f"the solve failed unexpectedly, see the log: {said}"
-    elif not accepts_poses:
-        text = "not accepting poses: call ~/set_enabled to go on"
-    elif result is None:
-        faults = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in cycle.checks.faults()[:1]]
-        text = "; ".join(filter(None, (*faults, said))) or "no result yet"
-    elif result.verdict is Verdict.DO_NOT_USE:
-        text = result.headline
-    elif tf_static[0] in (Broadcast.REFUSED, Broadcast.ON) and tf_static[1]:
-        text = f"publish_tf is refused: {tf_static[1]}"
-    elif is_stale:
-        text = ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
-    else:
-        level = Level.OK if result.verdict is Verdict.USE else Level.WARN
-        text = result.headline
-    return level, text
 
 
 def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultState:
@@ -168,18 +152,17 @@ def input_states(
     """
     may_rest = has_result and all(each.is_silent(steady_s) for each in inputs[:2])
     states = {each.name: each.state(steady_s, may_rest) for each in inputs}
-    delays_s = [states[name].delay_s for name in ("parent", "child")]
-    if delays_s[0] is None or delays_s[1] is None:
+    parent_s, child_s = states["parent"].delay_s, states["child"].delay_s
+    if parent_s is None or child_s is None:
         return states
-    seen_s, told = delays_s[1] - delays_s[0], ""
-    if not isinstance(time_offset, str) and abs(seen_s - time_offset) > _SUSPICIOUS_OFFSET_S:
-        told = (
-            f"; the stamps of the two inputs are {seen_s:.3f} s apart but time_offset is "
-            f"{time_offset:.3f}: if their clocks differ, set time_offset"
-        )
+    seen_s = child_s - parent_s
+    is_other = isinstance(time_offset, float) and abs(seen_s - time_offset) > _SUSPICIOUS_OFFSET_S
     for name in ("parent", "child"):
-        state = replace(states[name], clock_offset_s=seen_s)
-        if told and state.level is Level.OK:
-            state = replace(state, level=Level.WARN, text=state.text + told)
-        states[name] = state
+        states[name] = replace(states[name], clock_offset_s=seen_s)
+        if is_other and states[name].level is Level.OK:
+            text = (
+                f"{states[name].text}; the stamps of the two inputs are {seen_s:.3f} s apart but "
+                f"time_offset is {time_offset:.3f}: if their clocks differ, set time_offset"
+            )
+            states[name] = replace(states[name], level=Level.WARN, text=text)
     return states

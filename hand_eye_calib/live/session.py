@@ -12,7 +12,7 @@ from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.journal import Journal, has_session, read_journal
-from hand_eye_calib.live.journal import DirectoryLock, SessionJournal, give, poses_so_far, takers
+from hand_eye_calib.live.journal import SessionJournal, give, takers
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import JournalState, Level
 
@@ -45,7 +45,6 @@ class LiveSession:
         self._measures: dict[str, Any] = {}
         self._origins: dict[str, LocalOrigin] = {}
         self._journal: SessionJournal | None = None
-        self._lock: DirectoryLock | None = None
 
     @property
     def calibrator(self) -> Calibrator:
@@ -141,29 +140,25 @@ class LiveSession:
 
     # -------------------------------------------------------------- journal
 
-    def check_journal(self, options: NodeConfig) -> None:
-        """Raise ConfigError if the journal cannot be where these options want it."""
-        if options.journal == "resume" and not options.output_directory:
+    def start_journal(self, options: NodeConfig, is_first: bool = False) -> None:
+        """Write a journal from now on, if the options want one; at the start of the node, when the
+        session on disk may go on, and when it goes over to calibrating.
+
+        Raises
+        ------
+        ConfigError
+            If there is no directory to resume from, or another node writes there.
+        """
+        self.stop_journal()
+        is_resuming = is_first and options.journal == "resume"
+        if is_resuming and not options.output_directory:
             raise ConfigError(
                 "journal resume needs output_directory: that is where the session to resume is"
             )
-        directory = journal_directory(options)
-        if directory and (self._lock is None or directory.parent != self._lock.directory):
-            DirectoryLock(directory.parent).release()
-
-    def follow_journal(self, options: NodeConfig, resuming: bool = False) -> None:
-        """Write the journal where the options want it; with ``resuming``, go on with the session
-        that is there. Raises ConfigError if another node writes there.
-        """
-        directory = journal_directory(options)
-        if directory == (self._journal.directory if self._journal else None):
-            return
-        self.stop_journal()
-        if directory is not None:
-            self._lock = DirectoryLock(directory.parent)
-            resumed = self._resume(directory) if resuming else None
-            so_far = lambda: poses_so_far(self.engines)  # noqa: E731
-            self._journal = SessionJournal(directory, self._about, so_far, resumed)
+        if options.output_directory and options.journal != "off" and not options.monitor:
+            directory = output_path(options.output_directory) / "journal"
+            resumed = self._resume(directory) if is_resuming else None
+            self._journal = SessionJournal(directory, self._about, resumed)
 
     def flush_journal(self) -> None:
         """Hand what came in to the disk; to be called often."""
@@ -176,9 +171,7 @@ class LiveSession:
         if self._journal is not None:
             self._journal.stop(_GRACE_S)
             self._log_notes(self._journal)
-        if self._lock is not None:
-            self._lock.release()
-        self._journal = self._lock = None
+            self._journal = None
 
     def journal_state(self, options: NodeConfig) -> JournalState:
         """Whether a crash would lose the session."""
@@ -190,7 +183,7 @@ class LiveSession:
             text = "off"
         elif journal is None:
             level = Level.WARN
-            text = "off: output_directory is not set, a crash would lose the session"
+            text = "off: the node began without output_directory, a crash would lose the session"
         directory = str(journal.directory.resolve()) if journal else ""
         return JournalState(level=level, text=text, directory=directory)
 
@@ -241,13 +234,6 @@ def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorCon
     of_child -= {"child_measures"}
     defaults = {name: getattr(CalibratorConfig, name) for name in of_child}
     return replace(config, child_measures=measures, given=config.given - of_child, **defaults)
-
-
-def journal_directory(options: NodeConfig) -> Path | None:
-    """Where the options want the journal; None for nowhere."""
-    if not options.output_directory or options.journal == "off" or options.monitor:
-        return None
-    return output_path(options.output_directory) / "journal"
 
 
 def output_path(directory: str) -> Path:

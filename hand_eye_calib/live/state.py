@@ -80,11 +80,9 @@ class ExtrinsicState(Part):
         The parent sensor moves along its x and turns about its z, as on a vehicle (REP 103).
     """
 
-    accepts_poses: bool
     is_solving: bool
     solves: int
     last_solve_s: float
-    last_failure: str
     n_poses: int
     path_m: float
     motion_s: float = 0.0
@@ -111,7 +109,7 @@ class ProgressState(Part):
 class InputState(Part):
     """What an input has delivered. ``lost`` messages were published and never arrived, None if the
     middleware does not tell; ``delay_s`` is the node's clock minus the stamps, the median, and
-    ``clock_offset_s`` what the other input's delay is more than this one's.
+    ``clock_offset_s`` what the child's delay is more than the parent's.
     """
 
     topic: str
@@ -119,15 +117,9 @@ class InputState(Part):
     messages: int
     poses_taken: int
     refused: Mapping[str, int]
-    dropped_unpaired: int
-    ignored_while_disabled: int
     lost: int | None
-    lost_share: float | None
     longest_gap_s: float
-    gaps_above_max_gap: int
-    silent_s: float | None
     delay_s: float | None
-    delay_99_s: float | None
     clock_offset_s: float | None = None
 
 
@@ -149,17 +141,14 @@ class JournalState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class MountState(Part):
-    """A mount that is watched: the alarm's shift since a stamp, and the shift that so much motion
-    would show, None if none would.
+    """A mount that is watched: the alarm's shift since a stamp, and the shift that ten minutes of
+    motion would show, None if none would.
     """
 
     is_learning: bool = False
     seconds_of_motion: int = 0
-    alarms: int = 0
-    long_run: float = 1.0
     shift: AxisValues = field(default_factory=dict)
     shift_sigma: AxisValues = field(default_factory=dict)
-    visible_1min: AxisValues = field(default_factory=dict)
     visible_10min: AxisValues = field(default_factory=dict)
     since_ns: int | None = None
     newest_ns: int | None = None

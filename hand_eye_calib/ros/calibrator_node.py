@@ -5,7 +5,6 @@ nothing here needs a lock.
 """
 
 import time
-from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from hand_eye_calib.live.cycle import SolveCycle
 from hand_eye_calib.live.input import PoseInput
 from hand_eye_calib.live.journal import FLUSH_PERIOD_S
 from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.live.mount import LIMITS, MountWatch
+from hand_eye_calib.live.monitor import LIMITS, MountWatch
 from hand_eye_calib.live.reporting import extrinsic_state, input_states, progress_state
 from hand_eye_calib.live.saving import Saver
 from hand_eye_calib.live.session import LiveSession, check_below, output_path
@@ -45,10 +44,6 @@ _DISCOVERY_PERIOD_S = 0.2
 _STATE_PERIOD_S = 1.0
 # Inputs that have not delivered anything yet are named in the log so often.
 _SILENT_EVERY_S = 30.0
-
-# Answers to many calls are sent a few at a time: a client keeps ten that it has not taken yet, and
-# loses the others.
-_ANSWERS_AT_ONCE, _ANSWER_PERIOD_S = 4, 0.02
 
 # Requests that come while the node is busy wait here.
 _SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -93,13 +88,12 @@ class CalibratorNode(Node):
         self._session.take_others(self._others)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *self._others)]
         self._session.topics = {each.name: each.topic for each in self._inputs[:2]}
-        self._session.follow_journal(options, resuming=options.journal == "resume")
+        self._session.start_journal(options, is_first=True)
         for each in self._inputs:
             each.resume()
         self._results, self._states = ResultTopics(self), StateTopics(self)
         self._tf.switch(options.publish_tf)
         self._mount = self._watch_mount() if options.monitor else None
-        self._due_answers: deque[tuple[Future, tuple[bool, str]]] = deque()
         self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
         self._cycle = SolveCycle(
             self._session,
@@ -157,12 +151,14 @@ class CalibratorNode(Node):
         return MountWatch(self._session, robot.installed, lambda: robot.problem, self._log)
 
     def _make_input(self, name: str) -> TopicInput | TfInput:
-        options, parts = self._options.node, (self._session, self._log, self._begin_session)
+        options = self._options.node
+        clock_ns = lambda: self.get_clock().now().nanoseconds  # noqa: E731
+        parts = self._session, self._log, clock_ns, self._begin_session
         made: TopicInput | TfInput
         if frames := getattr(options, f"{name}_tf", ""):
-            made = TfInput(self, name, TfSource.parse(frames), *parts)
+            made = TfInput(self, name, TfSource.parse(frames), parts)
         else:
-            made = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), *parts)
+            made = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), parts)
         made.configure(self._options.calibrator, options.monitor)
         made.is_enabled = options.enabled
         return made
@@ -184,13 +180,12 @@ class CalibratorNode(Node):
     def _start_timers(self) -> None:
         # Steady time: these go on while a bag, and with it simulated time, is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._solve_timer, _, _, self._answer_timer, _ = (
+        self._solve_timer, *_ = (
             self.create_timer(period_s, callback, clock=steady)
             for period_s, callback in (
                 (self._options.node.solve_period, self._on_solve_timer),
                 (_DISCOVERY_PERIOD_S, self._discover),
                 (_STATE_PERIOD_S, self._publish_state),
-                (_ANSWER_PERIOD_S, self._answer_some),
                 (FLUSH_PERIOD_S, self._session.flush_journal),
             )
         )
@@ -209,13 +204,6 @@ class CalibratorNode(Node):
             self._log.info(text, _SILENT_EVERY_S)
         self._cycle.start_if_due()
 
-    def _answer_some(self) -> None:
-        for _ in range(min(_ANSWERS_AT_ONCE, len(self._due_answers))):
-            future, answer = self._due_answers.popleft()
-            future.set_result(answer)
-        if not self._due_answers:
-            self._answer_timer.cancel()
-
     def _publish_result(self, calibration: Calibration) -> None:
         self._results.publish(calibration)
         progress = self._cycle.goal.progress
@@ -225,12 +213,8 @@ class CalibratorNode(Node):
 
     def _publish_state(self, has_ended: bool = False) -> None:
         # New results of the further child sensors, in their order.
-        others = self._saver.take_others()
-        for name, calibration in zip(self._others, others, strict=False):
+        for name, calibration in zip(self._others, self._saver.take_others(), strict=False):
             self._results.publish_other(name, calibration)
-        mounted = [self._robot.in_base(each) for each in others]
-        if mounted:
-            self._tf.add_others([each for each in mounted if not self._robot.lacks_base(each)])
         self._tf.look()
         if self._mount is not None:
             self._mount.look()
@@ -268,6 +252,8 @@ class CalibratorNode(Node):
     def _begin_session(self, because_of: PoseInput | None = None) -> None:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._session.reset()
+        if self._mount is not None and because_of is None:
+            self._mount = self._watch_mount()
         for part in (self._log, self._cycle, self._saver, self._tf, self._mount):
             if part is not None:
                 part.restart()
@@ -281,12 +267,7 @@ class CalibratorNode(Node):
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         solved = Future()
-
-        def on_solved(good: bool, text: str) -> None:
-            self._due_answers.append((solved, (good, text)))
-            self._answer_timer.reset()
-
-        self._cycle.ask(on_solved)
+        self._cycle.ask(lambda good, text: solved.set_result((good, text)))
         response.success, response.message = await solved
         return response
 
@@ -329,7 +310,6 @@ class CalibratorNode(Node):
                 message_type(name)
         if self._output_base is not None and options.output_directory:
             check_below(self._output_base, options.output_directory)
-        self._session.check_journal(options)
 
     def _follow_parameters(self) -> None:
         options, config = self._options.node, self._options.calibrator
@@ -342,7 +322,7 @@ class CalibratorNode(Node):
             self._session.watch_only(None)
             self._mount = self._watch_mount() if options.monitor else None
             self._begin_session()
-        self._session.follow_journal(options)
+            self._session.start_journal(options)
         self._tf.switch(options.publish_tf)
         period_ns = round(options.solve_period * 1e9)
         if period_ns != self._solve_timer.timer_period_ns:

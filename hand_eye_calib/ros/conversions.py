@@ -71,24 +71,18 @@ def from_transform(message: TransformStamped) -> PoseFields:
     )
 
 
-def to_transform(calibration: Calibration) -> TransformStamped:
+def to_transform(
+    calibration: Calibration, mounted_on: str = "", T: FloatArray | None = None
+) -> TransformStamped:
     """The extrinsic as geometry_msgs/TransformStamped: header.frame_id is the parent sensor,
-    child_frame_id the child sensor.
+    child_frame_id the child sensor; or the child sensor's pose T (4, 4) in another frame that it
+    is mounted on.
     """
+    T = calibration.T_parent_child if T is None else T
     message = TransformStamped()
     message.header.stamp = to_time(calibration.stamp_ns)
-    message.header.frame_id = calibration.parent_frame
+    message.header.frame_id = mounted_on or calibration.parent_frame
     message.child_frame_id = calibration.child_frame
-    message.transform.translation = _xyz(Vector3, calibration.T_parent_child)
-    message.transform.rotation = _quaternion(calibration.T_parent_child)
-    return message
-
-
-def to_mounting(calibration: Calibration) -> TransformStamped:
-    """The child sensor's pose in the frame that it is mounted on, for the transform tree."""
-    mounted_on, T = calibration.mounting
-    message = to_transform(calibration)
-    message.header.frame_id = mounted_on
     message.transform.translation = _xyz(Vector3, T)
     message.transform.rotation = _quaternion(T)
     return message

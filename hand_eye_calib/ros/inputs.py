@@ -1,6 +1,6 @@
 """The subscriptions of the node's inputs: from a topic, or from transforms, to poses."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -9,6 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from hand_eye_calib.config import CalibratorConfig, other_names
 from hand_eye_calib.errors import ConfigError, InputError
@@ -20,19 +21,16 @@ from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.tf_stream import TfStream
 from hand_eye_calib.ros.conversions import LISTENING, MESSAGES, from_transform
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
+from hand_eye_calib.text import counted
 
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
 # Messages taken in one callback beyond the first; services and timers have their turn then.
 _MOST_AT_ONCE = 50
 
-_BAD_QOS = (
-    ParameterException,
-    InvalidQosOverridesError,
-    RuntimeError,
-    AssertionError,
-    ValueError,
-)
+_BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
+
+Parts = tuple[LiveSession, NodeLog, Callable[[], int], Callable[[PoseInput], None]]
 
 
 def _quick() -> QoSProfile:
@@ -56,25 +54,16 @@ class TopicInput(PoseInput):
         "parent", "child", or one of :func:`~hand_eye_calib.config.other_names`.
     wanted_type : str
         Message type, or "auto" for that of the publishers.
-    session, log, on_jump_back
+    parts : (session, log, clock_ns, on_jump_back)
         As of :class:`~hand_eye_calib.live.input.PoseInput`.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        name: str,
-        wanted_type: str,
-        session: LiveSession,
-        log: NodeLog,
-        on_jump_back: Any,
-    ) -> None:
+    def __init__(self, node: Node, name: str, wanted_type: str, parts: Parts) -> None:
         self._relative_topic = f"{name}_odom"
-        topic = node.resolve_topic_name(self._relative_topic)
-        super().__init__(name, topic, session, log, _clock_of(node), on_jump_back)
+        super().__init__(name, node.resolve_topic_name(self._relative_topic), *parts)
         self._node, self._wanted_type = node, wanted_type
         self._subscription: Subscription | None = None
-        self._type_name = ""
+        self._type_name, self._publishers = "", 0
 
     def discover(self) -> None:
         """Subscribe as soon as the type is known, and again if the publisher changes it; to be
@@ -86,8 +75,11 @@ class TopicInput(PoseInput):
             If a type that is wanted cannot be used. A type that is found is refused in the log.
         """
         is_wanted = self._wanted_type != "auto"
-        type_name = self._wanted_type if is_wanted else self._choose_type()
-        self.problem = ""
+        # Of the topic as resolved: rclpy's count does not follow remaps itself.
+        publishers = self._node.get_publishers_info_by_topic(self._relative_topic)
+        offered = {each.topic_type for each in publishers}
+        type_name = self._wanted_type if is_wanted else self._choose_type(offered)
+        self.problem, self._publishers = self._why_deaf(publishers), len(publishers)
         if type_name is not None and type_name != self._type_name:
             try:
                 self._subscribe(type_name)
@@ -96,26 +88,26 @@ class TopicInput(PoseInput):
                     raise
                 self.problem = str(error)
                 self._log.error(f"{self.topic} is not used: {error}")
-        publishers = self._node.count_publishers(self.topic)  # which does not follow remaps itself
-        self.delivery.has_one_publisher = publishers == 1
 
     def describe_silence(self) -> str:
         """Why nothing has come yet, as far as the graph tells."""
-        publishers = self._node.count_publishers(self.topic)
-        count = f"{publishers or 'no'} publisher{'s' * (publishers != 1)}"
-        return f"no pose yet on {self.topic} ({count})"
+        return f"no pose yet on {self.topic} ({counted(self._publishers, 'publisher')})"
 
-    def _choose_type(self) -> str | None:
+    def _why_deaf(self, publishers: Sequence[TopicEndpointInfo]) -> str:
+        """Why the middleware brings nothing of these publishers; empty if it does."""
+        offered = {each.qos_profile.reliability for each in publishers}
+        own = self._subscription.qos_profile.reliability if self._subscription else None
+        if own is not ReliabilityPolicy.RELIABLE or offered != {ReliabilityPolicy.BEST_EFFORT}:
+            return ""
+        return "it is published best effort, and qos_overrides ask for reliable: leave them out"
+
+    def _choose_type(self, offered: set[str]) -> str | None:
         """The type of the publishers; None if there is none that can be used."""
-        infos = self._node.get_publishers_info_by_topic(self._relative_topic)
-        offered = sorted({info.topic_type for info in infos})
-        if self._type_name in offered:
-            return self._type_name
-        usable = [name for name in MESSAGES if name in offered]
+        usable = [name for name in (self._type_name, *MESSAGES) if name in offered]
         if offered and not usable:
             self._log.warning(
-                f"{self.topic} has type {', '.join(offered)}; expected {', '.join(MESSAGES)}: "
-                f"remap {self._relative_topic} to a topic with poses"
+                f"{self.topic} has type {', '.join(sorted(offered))}; expected "
+                f"{', '.join(MESSAGES)}: remap {self._relative_topic} to a topic with poses"
             )
         return usable[0] if usable else None
 
@@ -156,7 +148,8 @@ class TopicInput(PoseInput):
 
     def receive(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
         """Take a message: the callback of the subscription."""
-        self.delivery.note(info["publication_sequence_number"])
+        # With several publishers, or none any more, the numbers of lost messages are not known.
+        self.count(info["publication_sequence_number"] if self._publishers == 1 else None)
         try:
             stamp_ns = unpack_stamp_ns(data)
         except MALFORMED as error:
@@ -174,20 +167,12 @@ class TfInput(PoseInput):
     node : rclpy.node.Node
     name : {"parent", "child"}
     source : TfSource
-    session, log, on_jump_back
+    parts : (session, log, clock_ns, on_jump_back)
         As of :class:`~hand_eye_calib.live.input.PoseInput`.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        name: str,
-        source: TfSource,
-        session: LiveSession,
-        log: NodeLog,
-        on_jump_back: Any,
-    ) -> None:
-        super().__init__(name, str(source), session, log, _clock_of(node), on_jump_back)
+    def __init__(self, node: Node, name: str, source: TfSource, parts: Parts) -> None:
+        super().__init__(name, str(source), *parts)
         self._source, self._stream = source, TfStream(source, max_gap_s=0.0)
         self._subscriptions: dict[str, Subscription] = {}
         kind = message_type(f"{name}_tf")
@@ -211,19 +196,12 @@ class TfInput(PoseInput):
     def _hear(self, topic: str, message: Any) -> None:
         waiting = (queued for queued, _ in waiting_messages(self._subscriptions.get(topic)))
         for each in (message, *waiting):
-            self.delivery.note(None)  # /tf has many publishers
             for transform in map(from_transform, each.transforms):
                 try:
                     for pose in self._stream.add(transform, topic == STATIC_TOPIC):
                         self.accept(pose.stamp_ns, partial(PoseFields, *pose))
                 except InputError as error:
                     self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
-
-
-def _clock_of(node: Node) -> Any:
-    """Function that gives the nanoseconds of the node's clock."""
-    clock = node.get_clock()
-    return lambda: clock.now().nanoseconds
 
 
 def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, dict[str, Any]]]:

@@ -5,7 +5,6 @@ extrinsic is broadcast on ``/tf_static``, only once the goal is reached, never a
 import math
 import time
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -31,7 +30,7 @@ from hand_eye_calib.ros.conversions import (
     LISTENING,
     covariance_about_parent_axes,
     from_transform,
-    to_mounting,
+    to_transform,
 )
 from hand_eye_calib.session.compare import with_comparison
 from hand_eye_calib.text import axes_in_words
@@ -47,26 +46,12 @@ _QOS = {
 # to 2.4 s.
 LOOK_S = 5.0
 
-# What is installed is looked for again after so long (s); own broadcasts that are recognised.
-_AGAIN_S, _MOST_OWN = 5.0, 100
-
-# What to do without tf2_msgs.
-_INSTEAD = {
-    "publish_tf": "leave publish_tf off and use the launch file that ~/save writes",
-    "parent_tf": "give the poses of the parent sensor as a topic, parent_odom",
-    "child_tf": "give the poses of the child sensor as a topic, child_odom",
-    "base_frame": "leave base_frame empty and give --base-frame and --urdf to replay",
-    "installed": "give a URDF, an extrinsic.yaml or numbers instead of tf",
-}
+# Own broadcasts that are recognised.
+_MOST_OWN = 100
 
 
 def message_type(wanted_by: str = "publish_tf") -> type[Any]:
-    """tf2_msgs/TFMessage.
-
-    Parameters
-    ----------
-    wanted_by : str
-        The parameter that needs it.
+    """tf2_msgs/TFMessage, which this parameter needs.
 
     Raises
     ------
@@ -78,7 +63,7 @@ def message_type(wanted_by: str = "publish_tf") -> type[Any]:
     except ImportError:
         raise ConfigError(
             f"{wanted_by} needs the message package tf2_msgs, which is not installed: install "
-            f"ros-jazzy-tf2-msgs, or {_INSTEAD[wanted_by]}"
+            "ros-jazzy-tf2-msgs, or leave that parameter out"
         ) from None
     return TFMessage
 
@@ -143,19 +128,13 @@ class RobotTree(FrameTree):
         for each in message.transforms:
             if each in self.own:
                 continue
-            edge, pose, problem = from_transform(each), None, ""
+            edge = from_transform(each)
             frame = edge.sensor_frame or ""
             try:
-                pose = checked_pose(edge.position, edge.quat_xyzw)
+                known = self.add(edge.world_frame, frame, None, is_static=topic == STATIC_TOPIC)
+                known.pose = checked_pose(edge.position, edge.quat_xyzw)
             except InputError as error:
-                problem = str(error)
-            try:
-                self.add(edge.world_frame, frame, pose, is_static=topic == STATIC_TOPIC)
-            except InputError as error:
-                problem = str(error)
-            if problem:
-                text = f"{topic} has an unusable transform of {frame}: {problem}"
-                self._log.warning(text)
+                self._log.warning(f"{topic} has an unusable transform of {frame}: {error}")
 
 
 class Robot:
@@ -185,7 +164,6 @@ class Robot:
         self._log, self._frames = log, frames
         self._source, self._base_frame = options.installed, options.base_frame
         self._installed: Extrinsic | None = None
-        self._again_at_s = 0.0
         self.problem = ""
         is_file = self._source not in ("", TF)
         of_tree = partial(stated, frames.pose, STATIC_TOPIC)
@@ -193,8 +171,7 @@ class Robot:
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
         """What is installed; None if nothing was given, or it is not known (yet)."""
-        if self._installed is None and self._source and time.monotonic() >= self._again_at_s:
-            self._again_at_s = time.monotonic() + _AGAIN_S
+        if self._installed is None and self._source:
             try:
                 self._installed = self._read(parent_frame, child_frame)
                 self.problem = ""
@@ -204,17 +181,13 @@ class Robot:
         return self._installed
 
     def complete(self, calibration: Calibration) -> Calibration:
-        """A usable result with its comparison and its pose in the base frame. A single axis that
-        the motion cannot determine has the value that is installed.
+        """A usable result with its comparison and its pose in the base frame, if that is known. A
+        single axis that the motion cannot determine has the value that is installed.
         """
         installed = self.installed(calibration.parent_frame, calibration.child_frame)
         if installed is not None:
             calibration = with_comparison(calibration, installed)
             calibration = _with_axis_of(installed, calibration)
-        return self.in_base(calibration)
-
-    def in_base(self, calibration: Calibration) -> Calibration:
-        """A result with its pose in the base frame, if one was asked for and is known."""
         if not self._base_frame:
             return calibration
         try:
@@ -255,8 +228,8 @@ def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration
 
 
 class TfBroadcaster:
-    """Broadcasts the results of a session that has reached its goal on ``/tf_static`` while that is
-    switched on, and with them the results of further child sensors.
+    """Broadcasts the result of a session that has reached its goal on ``/tf_static`` while that is
+    switched on.
 
     Parameters
     ----------
@@ -269,95 +242,75 @@ class TfBroadcaster:
 
     def __init__(self, node: Node, log: NodeLog, tree: RobotTree, *topics: str) -> None:
         self._node, self._log, self._tree, self._topics = node, log, tree, topics
-        self._is_on = False
+        self._is_on, self._began_s = False, 0.0
         self._publisher: Publisher | None = None
-        self._sent: list[TransformStamped] = []
-        self._began_s = 0.0
+        self._sent: TransformStamped | None = None
         self._tree.listen(*topics)
         self.restart()
 
     def restart(self) -> None:
         """Begin a new session: what was broadcast is withdrawn."""
-        self._results: list[Calibration] = []
-        self._others: list[Calibration] = []
-        self._why_not, self._unknown = "no result yet", ""
-        self._refused: dict[str, str] = {}  # frame to the reason
+        self._result: Calibration | None = None
+        self._why_not, self._refused = "no result yet", ""
         self._withdraw()
 
     @property
     def state(self) -> tuple[Broadcast, str]:
         """What is done about it, and the reason."""
-        refused = self._unknown or "; ".join(self._refused.values())
         if not self._is_on:
             return Broadcast.OFF, ""
         if self._publisher is not None:
-            return Broadcast.ON, refused
+            return Broadcast.ON, ""
         if self._why_not:
             return Broadcast.WAITING, self._why_not
-        return (Broadcast.REFUSED, refused) if refused else (Broadcast.WAITING, _LOOKING)
+        if self._refused:
+            return Broadcast.REFUSED, self._refused
+        return Broadcast.WAITING, "the transform tree is looked at first"
 
     def switch(self, on: bool) -> None:
         """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
         if on != self._is_on:
-            self._is_on, self._began_s, self._refused = on, time.monotonic(), {}
+            self._is_on, self._began_s, self._refused = on, time.monotonic(), ""
             self._tree.listen(*((STATIC_TOPIC, DYNAMIC_TOPIC) if on else self._topics))
             self.look()
 
     def add(self, calibration: Calibration, why_not: str) -> None:
         """Take the session's result, and why it may not be broadcast yet; empty if it may."""
-        self._results, self._why_not = [calibration], why_not
-        self._unknown = "" if why_not else what_is_unknown(calibration)
-        self.look()
-
-    def add_others(self, calibrations: Sequence[Calibration]) -> None:
-        """Take the results of all further child sensors, in the frames that they are mounted on."""
-        self._others = []
-        for calibration in calibrations:
-            if unknown := what_is_unknown(calibration):
-                self._log.info(f"{calibration.child_frame} is not on /tf_static: {unknown}")
-            else:
-                self._others.append(calibration)
+        self._result, self._why_not = calibration, why_not
         self.look()
 
     def look(self) -> None:
         """Broadcast what is new, as far as the tree allows it now; to be called often."""
-        if not self._is_on or self._why_not or self._unknown:
+        result = self._result
+        if not self._is_on or self._why_not or result is None:
             self._withdraw()
             return
-        if time.monotonic() - self._began_s < LOOK_S:
+        unknown, edge = what_is_unknown(result), (result.mounting[0], result.child_frame)
+        if not unknown and time.monotonic() - self._began_s < LOOK_S:
             return
-        wanted = [*self._results, *self._others]
-        before, self._refused = self._refused, {}
-        for each in wanted:
-            if why := self._tree.what_forbids(each.mounting[0], each.child_frame):
-                self._refused[each.child_frame] = why
-                if why != before.get(each.child_frame):
-                    self._report(each.child_frame, why)
-        if self._results[0].child_frame in self._refused:
+        before, self._refused = self._refused, unknown or self._tree.what_forbids(*edge)
+        if self._refused:
+            if self._refused != before and not unknown:
+                self._log.error(
+                    f"publish_tf is refused: {self._refused}. Put the result into the robot's "
+                    "description (extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf "
+                    "off"
+                )
             self._withdraw()
             return
         self._tree.ignore(DYNAMIC_TOPIC)  # enough of that: it may be fast
         if self._publisher is None:
             self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
             self._log.info("the result is broadcast on /tf_static from now on")
-        # In one message: new listeners get the last one alone.
-        transforms = [to_mounting(each) for each in wanted if each.child_frame not in self._refused]
-        if transforms != self._sent:
-            self._sent = transforms
-            self._tree.own.extend(transforms)
-            self._publisher.publish(message_type()(transforms=transforms))
-
-    def _report(self, frame: str, why: str) -> None:
-        self._log.error(
-            f"publish_tf is refused: {why}. Put the result into the robot's description "
-            "(extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf off"
-        )
-        if frame in (each.child_frame_id for each in self._sent):
-            self._log.error("restart the listeners: some of them believe the other parent")
+        transform = to_transform(result, *result.mounting)
+        if transform != self._sent:
+            self._sent = transform
+            self._tree.own.append(transform)
+            self._publisher.publish(message_type()(transforms=[transform]))
 
     def _withdraw(self) -> None:
         """Give nothing to new listeners; those who have heard the edge keep it."""
-        self._sent = []
+        self._sent = None
         if self._publisher is not None:
             self._node.destroy_publisher(self._publisher)
             self._publisher = None
@@ -365,9 +318,6 @@ class TfBroadcaster:
                 "the edge on /tf_static is withdrawn; listeners that have heard it keep it until "
                 "they are restarted"
             )
-
-
-_LOOKING = "the transform tree is looked at first"
 
 
 def what_is_unknown(calibration: Calibration) -> str:

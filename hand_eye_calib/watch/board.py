@@ -16,6 +16,7 @@ from hand_eye_calib.live.state import (
     Level,
     MountState,
     NodeState,
+    ResultState,
 )
 from hand_eye_calib.results.records import AxisProgress, Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
@@ -129,7 +130,7 @@ class Board:
         self._state: NodeState | None = None
         self._heard_s = self._answered_s = -math.inf
         self._answer: Line | None = None
-        self._acknowledged: int | None = None
+        self._acknowledged: int | None = -1
         self._lock = threading.Lock()
 
     @property
@@ -146,7 +147,7 @@ class Board:
             if state.node != shown and (self._wanted or not is_silent):
                 return
             if state.node != self.node:
-                self._answer = self._acknowledged = None
+                self._answer, self._acknowledged = None, -1
             self._state, self._heard_s = state, now_s
 
     def answer(self, request: str, good: bool | None, text: str, now_s: float) -> None:
@@ -159,7 +160,7 @@ class Board:
         """Somebody knows that the mount has moved: it is said without alarm, until the next one."""
         with self._lock:
             mount = self._state.mount if self._state else None
-            self._acknowledged = mount.alarms if mount else None
+            self._acknowledged = mount.since_ns if mount else -1
 
     def view(self, now_s: float) -> View:
         """What to show; ``now_s`` is on the same clock as that of :meth:`take`."""
@@ -170,9 +171,9 @@ class Board:
                 text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and "
                 return View(self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?")
             view = _view(state, now_s - self._heard_s)
-            if view.word == MOVED and state.mount and state.mount.alarms == self._acknowledged:
-                view = replace(view, tone=Tone.ACT, buttons=("recalibrate",))
-                view = replace(view, facts=f"{view.facts}; acknowledged")
+            if view.word == MOVED and state.mount and state.mount.since_ns == self._acknowledged:
+                facts = f"{view.facts}; acknowledged"
+                view = replace(view, tone=Tone.ACT, buttons=("recalibrate",), facts=facts)
             if view.word in ("CHECK INPUT", "BAD INPUT"):
                 view = replace(view, topics=self.topics)
             is_answered = now_s - self._answered_s < ANSWER_FOR_S
@@ -187,33 +188,24 @@ def _view(state: NodeState, silent_s: float) -> View:
     elif is_old:
         text = f"The node has said nothing for {silent_s:.0f} s. What is below is older than that."
         head = Tone.BAD, SILENT, text
-    view = View(
-        state.node,
-        *head,
-        health=tuple(_health(state, is_old)),
-        saved_in=state.saved.directory if state.saved else "",
-    )
+    health, saved_in = tuple(_health(state, is_old)), state.saved.directory if state.saved else ""
+    view = View(state.node, *head, health=health, saved_in=saved_in)
     if state.mount is not None:
-        buttons = ("recalibrate", "acknowledge") if view.word == MOVED else ()
+        asked = ("recalibrate", "acknowledge") if view.word == MOVED else ()
         watched = tuple(_watched(axis, state.mount) for axis in AXES)
-        return replace(view, facts=_ago(state.mount), watched=watched, buttons=buttons)
-    result = state.extrinsic.result if state.extrinsic else None
-    is_done = view.word == "DONE" and not state.saved
-    title = f"pose of {result.child_frame} in {result.parent_frame}" if result else ""
-    at = state.progress
+        return replace(view, facts=_ago(state.mount), watched=watched, buttons=asked)
+    is_to_be_saved = view.word == "DONE" and not state.saved
+    buttons = ("save", "solve", "reset") if is_to_be_saved else ("solve", "save", "reset")
+    result, at = state.extrinsic.result if state.extrinsic else None, state.progress
     return replace(
         view,
         facts=_facts(state),
-        title=title or "no extrinsic yet",
-        values=tuple(_values(state)),
+        title=f"pose of {result.child_frame} in {result.parent_frame}" if result else "",
+        values=tuple(_values(result)) if result else (),
         bars=tuple(_bar(axis, state) for axis in AXES) if at else (),
         result=tuple(_result(state)),
         reasons=result.reasons if result else (),
-        buttons=()
-        if is_old
-        else ("save", "solve", "reset")
-        if is_done
-        else ("solve", "save", "reset"),
+        buttons=() if is_old else buttons,
         by_hand=at.progress.limiting_axis if at and at.progress.will_not_get_there else "",
     )
 
@@ -229,30 +221,26 @@ def at_time(seconds: float) -> str:
 
 
 def _headline(state: NodeState) -> tuple[Tone, str, str]:
-    """Sign, word and sentence: what a person should know or do first."""
+    """Sign, word and sentence: what a person should know or do first, the gravest that applies."""
+    extrinsic, mount, at, checks = state.extrinsic, state.mount, state.progress, state.checks
     inputs = [state.inputs[name] for name in ("parent", "child") if name in state.inputs]
-    mount, at, checks = state.mount, state.progress, state.checks
-    if state.extrinsic and state.extrinsic.level is Level.ERROR:
-        return Tone.BAD, "BROKEN", _sentence(state.extrinsic.text)
-    if mount is not None and mount.level is Level.ERROR:
-        return Tone.BAD, MOVED, _of_alarm(mount)
-    for level, tone, word in (
-        (Level.ERROR, Tone.BAD, "BAD INPUT"),
-        (Level.WARN, Tone.ACT, "CHECK INPUT"),
-    ):
-        for each in inputs:
-            if each.level is level:
-                return tone, word, _sentence(each.text)
-        if level is Level.ERROR and state.journal and state.journal.level is level:
-            return Tone.BAD, "BROKEN", _sentence(state.journal.text)
-    if checks is not None and checks.level is Level.WARN and checks.age_s is not None:
-        return Tone.ACT, "CHECK THE STREAMS", _sentence(checks.text)
+    told = [
+        (Tone.BAD, "BROKEN", extrinsic, Level.ERROR),
+        (Tone.BAD, MOVED, mount, Level.ERROR),
+        *((Tone.BAD, "BAD INPUT", each, Level.ERROR) for each in inputs),
+        (Tone.BAD, "BROKEN", state.journal, Level.ERROR),
+        *((Tone.ACT, "CHECK INPUT", each, Level.WARN) for each in inputs),
+        (Tone.ACT, "CHECK THE STREAMS", checks, Level.WARN),
+        (Tone.ACT, "NOT WATCHING", mount, Level.WARN),
+    ]
+    for tone, word, part, level in told:
+        if part is None or part.level is not level or (part is checks and checks.age_s is None):
+            continue
+        if word == MOVED:
+            return tone, word, f"{_sentence(part.text)} Check it. Then recalibrate, or acknowledge."
+        return tone, word, _sentence(part.text)
     if mount is not None:
-        tone, word = Tone.GOOD, "WATCHING"
-        if mount.level is not Level.OK:
-            tone, word = Tone.ACT, "NOT WATCHING"
-        elif mount.is_learning:
-            tone, word = Tone.BUSY, LEARNING
+        tone, word = (Tone.BUSY, LEARNING) if mount.is_learning else (Tone.GOOD, "WATCHING")
         return tone, word, _sentence(mount.text)
     if at is None:
         return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
@@ -288,18 +276,6 @@ def _moved(comparison: Comparison | None) -> str:
     rows = comparison.differences[0].axes
     axes = [axis for axis in AXES if axis in rows and rows[axis].verdict == "moved"]
     return listing([f"{_name(axis)} {_signed(axis, rows[axis].difference)}" for axis in axes])
-
-
-def _of_alarm(mount: MountState) -> str:
-    shifts = {axis: _number(mount.shift.get(axis)) for axis in AXES}
-    moved = [
-        f"{_name(axis)} by {amount(axis, abs(shift))}"
-        for axis, shift in shifts.items()
-        if abs(shift) > _CLEARLY * _number(mount.shift_sigma.get(axis))
-    ]
-    since = f" since {at_time(mount.since_ns * 1e-9)}" if mount.since_ns else ""
-    told = f"The child sensor has moved {listing(moved)}{since}." if moved else mount.text
-    return f"{_sentence(told)} Look at its mount. Then recalibrate, or acknowledge."
 
 
 def _of_end(state: NodeState) -> tuple[Tone, str, str]:
@@ -363,9 +339,8 @@ def _bar(axis: str, state: NodeState) -> Bar:
     wanted = amount(axis, known.target)
     against = f"wanted: {wanted}"
     if math.isfinite(known.sigma):
-        number, _, unit = amount(axis, known.sigma).rpartition(" ")
-        own = number if wanted.endswith(f" {unit}") else f"{number} {unit}"
-        against = f"± {own} of {wanted}"
+        own = amount(axis, known.sigma)
+        against = f"± {own.removesuffix(wanted[wanted.rfind(' ') :])} of {wanted}"
     difference = ""
     if at.comparison is not None and at.comparison.differences:
         row = at.comparison.differences[0].axes[axis]
@@ -387,11 +362,8 @@ def _state(known: AxisProgress, is_behind: bool) -> tuple[Tone, str]:
     return (Tone.ACT if is_behind else Tone.BUSY), left
 
 
-def _values(state: NodeState) -> Iterator[tuple[str, str]]:
+def _values(result: ResultState) -> Iterator[tuple[str, str]]:
     """Each axis with its value and standard deviation; a question mark if it is not observed."""
-    result = state.extrinsic.result if state.extrinsic else None
-    if result is None:
-        return
     for axis in AXES:
         value, sigma = result.pose.get(axis), result.pose_sigma.get(axis)
         if value is None or sigma is None:
@@ -404,20 +376,16 @@ def _values(state: NodeState) -> Iterator[tuple[str, str]]:
 
 def _watched(axis: str, mount: MountState) -> Line:
     """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
-    shift, sigma = _number(mount.shift.get(axis)), _number(mount.shift_sigma.get(axis))
+    shift, sigma = mount.shift.get(axis) or 0.0, mount.shift_sigma.get(axis) or 0.0
+    visible = mount.visible_10min.get(axis)
     if abs(shift) > _CLEARLY * sigma:
-        text = f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
-        return Line(Tone.BAD, _name(axis), text)
-    visible = _number(mount.visible_10min.get(axis))
-    if math.isfinite(visible):
-        text = f"not moved (would see {amount(axis, visible)})"
-        return Line(Tone.GOOD, _name(axis), text)
-    text = "not known yet" if mount.is_learning else "cannot be watched with this motion"
-    return Line(Tone.UNKNOWN, _name(axis), text)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
+        tone, text = Tone.BAD, f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
+    elif visible is not None:
+        tone, text = Tone.GOOD, f"not moved (would see {amount(axis, visible)})"
+    else:
+        text = "not known yet" if mount.is_learning else "cannot be watched with this motion"
+        tone = Tone.UNKNOWN
+    return Line(tone, _name(axis), text)
 
 
 # ------------------------------------------------- health, verdict, comparison

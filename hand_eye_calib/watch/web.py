@@ -4,6 +4,7 @@ Events go to the page (server-sent events), presses of buttons come back. Every 
 the key that is part of the address: a page of somebody else in the same browser does not know it.
 """
 
+import contextlib
 import hmac
 import os
 import secrets
@@ -35,9 +36,8 @@ BUTTONS = {
 # The view is looked at so often, and something is sent at least so often (s).
 _LOOK_S, _SEND_S = 0.25, 1.0
 
-# A browser that takes nothing for so long is gone (s), and most that are served at a time.
+# A browser that takes nothing for so long is gone (s).
 _PATIENCE_S = 10.0
-_MOST_CLIENTS = 32
 
 _PAGE = {"/": "page.html", "/page.css": "page.css", "/page.js": "page.js"}
 _KINDS = {"css": "text/css", "js": "text/javascript", "html": "text/html", "yaml": "text/plain"}
@@ -89,7 +89,6 @@ class WebServer(ThreadingHTTPServer):
         self.key = key or secrets.token_urlsafe(6)
         self.board, self.ask = board, ask
         self.stopping = threading.Event()
-        self.clients = threading.BoundedSemaphore(_MOST_CLIENTS)
         self._host, port = address
         try:
             super().__init__(address, _Handler)
@@ -148,10 +147,20 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.FORBIDDEN, text)
         elif path == "/events":
             self._send_events()
-        elif path[1:] in SAVED and (saved := _saved(self.server.board, path[1:])):
+        elif path[1:] in SAVED and (saved := self._saved(path[1:])):
             self._send(HTTPStatus.OK, saved, path, _POLICY_OF_SAVED)
         else:
             self._send(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    def _saved(self, name: str) -> bytes:
+        """A file of the saved result, if it is on this computer; links are not followed."""
+        directory = self.server.board.view(time.monotonic()).saved_in
+        try:
+            file = os.open(os.path.join(directory, name), os.O_RDONLY | os.O_NOFOLLOW)
+        except OSError:
+            return b""
+        with os.fdopen(file, "rb") as opened:
+            return opened.read() if directory else b""
 
     def do_POST(self) -> None:
         self.close_connection = True  # a body, if there is one, is not read
@@ -201,22 +210,12 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
 
     def _send_events(self) -> None:
-        if not self.server.clients.acquire(blocking=False):
-            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "too many browsers")
-            return
         self.close_connection = True
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: a phone out of reach is noticed soon
-            patience_ms = round(1000 * _PATIENCE_S)
-            self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, patience_ms)
-        try:
-            self._begin(HTTPStatus.OK, "text/event-stream")
-            self.end_headers()
+        self._begin(HTTPStatus.OK, "text/event-stream")
+        self.end_headers()
+        with contextlib.suppress(OSError):  # the browser has gone
             for event in self._events():
                 self.wfile.write(event)
-        except OSError:
-            return  # the browser has gone
-        finally:
-            self.server.clients.release()
 
     def _events(self) -> Iterator[bytes]:
         """The view whenever it has changed; an empty event every second in between."""
@@ -233,17 +232,6 @@ class _Handler(BaseHTTPRequestHandler):
             elif now_s - sent_s >= _SEND_S:
                 yield b"data:\n\n"
                 sent_s = now_s
-
-
-def _saved(board: Board, name: str) -> bytes:
-    """A file of the saved result, if it is on this computer; links are not followed."""
-    directory = board.view(time.monotonic()).saved_in
-    try:
-        file = os.open(os.path.join(directory, name), os.O_RDONLY | os.O_NOFOLLOW)
-    except OSError:
-        return b""
-    with os.fdopen(file, "rb") as opened:
-        return opened.read() if directory else b""
 
 
 def _prior(axis: str, value: str, sigma: str) -> str:

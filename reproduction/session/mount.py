@@ -93,7 +93,7 @@ def false_alarms(name: str, hours: float) -> Watched:
     for pairs in _pieces(name, 0, X, 3600.0 * hours):
         for _ in _fed(monitor, pairs):
             pass
-    return Watched(name, hours, monitor.alarms, monitor.visible(600.0))
+    return Watched(name, hours, int(monitor.alarm is not None), monitor.visible(600.0))
 
 
 def alarm_table(found: Sequence[Watched]) -> str:
@@ -143,11 +143,11 @@ def delays(kind: str, seed: int) -> list[Delay]:
 
 
 def _seconds_until_seen(monitor: MountMonitor, parts: list[PosePairs], xi: FloatArray) -> float:
-    before, alarms = monitor.seconds, monitor.alarms
+    before = monitor.seconds
     for pairs in parts:
         moved = PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, pairs.Ts_cw_c @ se3.exp(xi))
         for _ in _fed(monitor, moved):
-            if monitor.alarms > alarms:
+            if monitor.alarm is not None:
                 return float(monitor.seconds - before)
     return float("inf")
 

@@ -44,7 +44,7 @@ def fed(pairs, covariance=EXACT, T=X, chunk=37):
 @pytest.mark.parametrize("seed", range(2))
 def test_a_mount_that_stays_raises_no_alarm(seed):
     monitor, alarms = fed(motion(1500.0, seed))
-    assert (alarms, monitor.alarms, monitor.alarm) == ([], 0, None)
+    assert (alarms, monitor.alarm) == ([], None)
     assert monitor.seconds == pytest.approx(1500, abs=3)
     assert 1.0 < monitor.long_run < 20.0
 
@@ -59,7 +59,7 @@ def test_the_size_of_the_chunks_changes_nothing():
 @pytest.mark.parametrize(("axis", "size"), [(0, 0.03), (2, -0.03), (4, 0.02), (5, -0.02)])
 def test_a_shift_is_found_with_its_axis_size_and_time(axis, size):
     monitor, alarms = fed(shifted(motion(400.0), 250.0, axis, size))
-    assert len(alarms) == monitor.alarms == 1
+    assert len(alarms) == 1
     assert 250.0 <= alarms[0].raised_ns / SECOND_NS < 300.0
     assert abs(monitor.alarm.since_ns / SECOND_NS - 250.0) < 30.0
     off = (monitor.alarm.shift - np.eye(6)[axis] * size) / monitor.alarm.sigmas
@@ -68,29 +68,14 @@ def test_a_shift_is_found_with_its_axis_size_and_time(axis, size):
 
 
 def test_a_shift_that_was_there_from_the_beginning_is_found_after_learning():
-    monitor, alarms = fed(shifted(motion(400.0), 0.0, 5, np.radians(2.0)))
-    assert monitor.alarms == 1
-    assert alarms[0].raised_ns / SECOND_NS == pytest.approx(LEARNING_S, abs=10)
-
-
-def test_an_alarm_ends_when_the_sensor_is_put_back_and_can_come_again():
-    pairs = shifted(motion(900.0), 300.0, 5, np.radians(1.0))
-    pairs = shifted(pairs, 450.0, 5, -np.radians(1.0))
-    pairs = shifted(pairs, 700.0, 5, np.radians(1.0))
-    monitor, alarms = MountMonitor(X, EXACT), []
-    for first in range(0, len(pairs), 37):
-        alarms.append(monitor.add(pairs[first : first + 37]))
-        assert monitor.is_learning or (monitor.visible(600.0) < 0.1).all()
-    raised = [round(alarm.raised_ns / SECOND_NS, -2) for alarm in alarms if alarm is not None]
-    assert raised == [300, 700]
-    assert monitor.alarm is not None
+    (alarm,) = fed(shifted(motion(400.0), 0.0, 5, np.radians(2.0)))[1]
+    assert alarm.raised_ns / SECOND_NS == pytest.approx(LEARNING_S, abs=10)
 
 
 def test_what_is_installed_may_be_off_by_its_own_standard_deviation():
     covariance = np.diag(np.repeat([0.02, 0.02], 3) ** 2)
     off = X @ se3.exp(np.array([0.02, -0.01, 0.015, 0.02, -0.03, 0.01]))
-    assert fed(motion(600.0), covariance, off)[0].alarms == 0
-    assert fed(motion(600.0), EXACT, off)[0].alarms == 1
+    assert [len(fed(motion(600.0), each, off)[1]) for each in (covariance, EXACT)] == [0, 1]
 
 
 def test_what_cannot_be_seen_is_said_before():
@@ -117,7 +102,7 @@ def test_standing_still_and_gaps_add_nothing():
     world = se3.exp(np.array([5.0, 2.0, 1.0, 0.3, 0.2, 1.0]))
     later = motion(200.0, 2, start_s=5000.0)
     monitor.add(PosePairs(later.stamps_ns, world @ later.Ts_pw_p, later.Ts_cw_c))
-    assert monitor.alarms == 0
+    assert monitor.alarm is None
 
 
 def test_a_jump_of_one_trajectory_is_no_shift():
@@ -125,7 +110,7 @@ def test_a_jump_of_one_trajectory_is_no_shift():
     child = pairs.Ts_cw_c.copy()
     for at, jump in ((3000, 0.3), (4000, -0.5), (4500, 0.2)):
         child[at:] = se3.exp(np.array([jump, 0.1, 0, 0, 0, jump / 5])) @ child[at:]
-    assert fed(PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, child))[0].alarms == 0
+    assert fed(PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, child))[1] == []
 
 
 def car(duration_s, seed=0):
@@ -151,17 +136,13 @@ def scale_drifting(pairs, sigma=0.01, tau_s=40.0, seed=0):
     return PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, child)
 
 
-def test_a_scale_that_drifts_is_no_shift_and_counts_in_what_can_be_seen():
-    steady = car(900.0)
-    monitor, alarms = fed(scale_drifting(steady))
-    assert (alarms, monitor.alarms) == ([], 0)
-    across = monitor.visible(600.0)[1]
-    assert across > 2.0 * fed(steady)[0].visible(600.0)[1]
+def test_a_scale_that_drifts_is_no_shift_and_hides_none():
+    assert fed(scale_drifting(car(900.0)))[1] == []
     (alarm,) = fed(scale_drifting(shifted(car(400.0), 250.0, 5, np.radians(1.0))))[1]
     assert alarm.raised_ns / SECOND_NS == pytest.approx(250, abs=30)
 
 
 def test_memory_stays_constant():
     monitor, _ = fed(motion(MEMORY_S + 200.0, rate_hz=4.0), chunk=400)
-    assert len(monitor._memory) == MEMORY_S
+    assert len(monitor._S) == MEMORY_S
     assert len(monitor._tail) < 20

@@ -35,7 +35,7 @@ from hand_eye_calib.results.records import (
     Difference,
     Progress,
 )
-from hand_eye_calib.watch import terminal, web
+from hand_eye_calib.watch import terminal
 from hand_eye_calib.watch.board import AXES, Board, Tone
 from hand_eye_calib.watch.html import fragment
 from hand_eye_calib.watch.web import WebServer
@@ -53,8 +53,7 @@ RESULT = ResultState(
     pose_sigma={"x": 0.004, "y": 0.004, "z": None, "roll": 0.01, "pitch": 0.01, "yaw": 0.01},
 )  # fmt: skip
 EXTRINSIC = ExtrinsicState(
-    level=Level.OK, text="known", accepts_poses=True, is_solving=False, solves=1, last_solve_s=0.1,
-    last_failure="", n_poses=9, path_m=3.0, rotation_deg={}, tf_static=Broadcast.OFF,
+    level=Level.OK, text="known", is_solving=False, solves=1, last_solve_s=0.1, n_poses=9, path_m=3.0, rotation_deg={}, tf_static=Broadcast.OFF,
     tf_static_reason="", result=RESULT,
 )  # fmt: skip
 ROTATION = AxisProgress(sigma=0.001, target=0.00524, seconds_left=0.0)
@@ -74,15 +73,10 @@ SAVED = SavedState(directory="/home/live", at_s=time.time(), text="USE: all six 
 
 def inputs(parent=Level.OK, child=Level.OK):
     texts = ["20.0 Hz", "/odom has been silent for 3 s", "/odom: bad quaternion"]
-    figures = dict.fromkeys(("rate_hz", "lost_share", "longest_gap_s", "silent_s", "delay_s"), 0.0)
-    figures |= dict.fromkeys(
-        ("messages", "poses_taken", "dropped_unpaired", "ignored_while_disabled", "lost",
-         "gaps_above_max_gap"), 0,
-    )  # fmt: skip
+    figures = dict.fromkeys(("rate_hz", "longest_gap_s", "delay_s"), 0.0)
+    figures |= dict.fromkeys(("messages", "poses_taken", "lost"), 0)
     return {
-        name: InputState(
-            level=level, text=texts[level], topic="/odom", refused={}, delay_99_s=None, **figures
-        )
+        name: InputState(level=level, text=texts[level], topic="/odom", refused={}, **figures)
         for name, level in (("parent", parent), ("child", child))
     }
 
@@ -142,7 +136,7 @@ ERROR = {"level": Level.ERROR}
             state(checks=replace(CHECKS, level=Level.WARN, age_s=None)),
             *(0.5, Tone.BUSY, "GO ON", "Go on for"),
         ),
-        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved. Look at its"),
+        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved. Check it."),
         (mount(), 0.5, Tone.GOOD, "WATCHING", "It has not."),
         (mount(is_learning=True), 0.5, Tone.BUSY, "LEARNING", "It has not."),
         (mount(level=Level.WARN, text="no URDF"), 0.5, Tone.ACT, "NOT WATCHING", "No URDF."),
@@ -203,7 +197,7 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
     assert (values["x"], values["roll"]) == ("0.420 m ± 4 mm", "0.57 ± 0.57 deg")
     assert values["z"] == "? not observed"
     gone = view_of(state(extrinsic=replace(EXTRINSIC, result=None)))
-    assert (gone.title, gone.values) == ("no extrinsic yet", ())
+    assert (gone.title, gone.values) == ("", ())
 
 
 def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
@@ -247,7 +241,6 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
         mount(
             **ERROR,
             text="the mount has moved",
-            alarms=1,
             since_ns=10**18,
             newest_ns=10**18 + 130 * 10**9,
             visible_10min=dict.fromkeys(AXES, 0.004) | {"z": None},
@@ -260,8 +253,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert lines["along x"] == (Tone.GOOD, "not moved (would see 4 mm)")
     assert lines["along z"] == (Tone.UNKNOWN, "cannot be watched with this motion")
     assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
-    assert view.sentence.startswith("The child sensor has moved about z by 1 deg since 2001-09-09 ")
-    assert view.sentence.endswith("Then recalibrate, or acknowledge.")
+    assert view.sentence == "The mount has moved. Check it. Then recalibrate, or acknowledge."
     assert (view.facts, view.buttons) == ("2 min ago", ("recalibrate", "acknowledge"))
     assert "the mount, after ten minutes" in fragment(view)
     assert "precision" not in fragment(view)
@@ -285,12 +277,12 @@ def test_of_several_nodes_the_first_that_speaks_is_shown_or_the_one_that_is_want
 
 def test_an_alarm_that_somebody_knows_of_is_quiet_until_the_next():
     board = Board()
-    board.take(mount(**ERROR, text="moved", alarms=1), 0.0)
+    board.take(mount(**ERROR, text="moved", since_ns=10**18), 0.0)
     board.acknowledge()
     view = board.view(0.5)
     assert (view.word, view.tone, view.buttons) == ("MOUNT MOVED", Tone.ACT, ("recalibrate",))
     assert view.facts.endswith("; acknowledged")
-    board.take(mount(**ERROR, text="moved", alarms=2), 1.0)
+    board.take(mount(**ERROR, text="moved", since_ns=2 * 10**18), 1.0)
     assert board.view(1.0).tone is Tone.BAD
 
 
@@ -374,7 +366,7 @@ def test_keys_ask_and_a_reset_takes_two(typed):
     assert typed.requests.empty()
     typed("r")
     assert typed.requests.get() == "reset"
-    typed.board.take(mount(**ERROR, text="moved", alarms=1), time.monotonic())
+    typed.board.take(mount(**ERROR, text="moved", since_ns=10**18), time.monotonic())
     typed("c")
     assert "acknowledged" in typed("a").facts
     assert typed.requests.empty()
@@ -505,22 +497,6 @@ def test_the_address_is_drawn_as_a_code(monkeypatch):
     monkeypatch.undo()
     pytest.importorskip("segno", reason="segno is not installed: '.[qr]'")
     assert len(qr_code("http://192.168.178.43:8765/?key=Ab3dE_-9").splitlines()) > 14
-
-
-def test_a_browser_that_leaves_makes_room_for_another(monkeypatch):
-    monkeypatch.setattr(web, "_MOST_CLIENTS", 1)
-    server = WebServer(Board(), print, ("127.0.0.1", 0), key="word")
-    try:
-        events = fetch(server, "GET", "/events?key=word")
-        assert events.readline().startswith(b"data: <div")
-        assert fetch(server, "GET", "/events?key=word").status == 503
-        events.close()
-        end = time.monotonic() + PATIENCE_S
-        while fetch(server, "GET", "/events?key=word").status == 503:
-            assert time.monotonic() < end
-            time.sleep(0.05)
-    finally:
-        server.stop()
 
 
 def test_a_port_in_use_is_said_in_one_line(server):
