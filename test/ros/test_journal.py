@@ -1,7 +1,6 @@
 """Nothing is lost: the node killed, stopped, restarted, and with a disk that fails."""
 
 import hashlib
-import os
 import resource
 import signal
 
@@ -13,7 +12,6 @@ from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
 from hand_eye_calib.io.journal import count_poses, has_session, read_journal
 from hand_eye_calib.io.results import load_result
-from hand_eye_calib.live.journal import DirectoryLock
 
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 
@@ -108,9 +106,7 @@ def test_a_relative_directory_is_told_as_a_whole_path(start_node, peer, tmp_path
     assert f"result saved to {tmp_path / 'live'}: " in peer.trigger("save").message
 
 
-def test_a_disk_that_is_full_is_reported_the_node_goes_on_and_the_journal_comes_back(
-    start_node, peer, tmp_path
-):
+def test_a_disk_that_is_full_is_reported_and_the_node_goes_on(start_node, peer, tmp_path):
     node = start_node(*QUIET, *into(tmp_path / "out"))
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
@@ -124,18 +120,14 @@ def test_a_disk_that_is_full_is_reported_the_node_goes_on_and_the_journal_comes_
     assert answer.success
     peer.spin_until(lambda: not peer.trigger("save").success, "the save to fail")
     assert fingerprints(tmp_path / "out") == saved
-    node.wait_for_log("cannot write the session journal in", "going on without it")
+    node.wait_for_log("cannot write the session journal in", "going on without it", "cannot save")
     resource.prlimit(
         node.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
     )
-    wait_written(peer, tmp_path / "out", 240)
     assert peer.trigger("save").success
-    node.wait_for_log(
-        "cannot write the session journal in",
-        "going on without it",
-        "cannot save to",
-        "is being written again",
-    )
+    assert peer.trigger("reset").success
+    peer.feed(publishers, stamps_ns[:40], Ts_pw_p[:40], Ts_cw_c[:40])
+    wait_written(peer, tmp_path / "out", 80)
 
 
 def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(
@@ -173,34 +165,12 @@ def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):
     peer.trigger("solve")
     second = start_node(*QUIET, *into(used))
     assert second.wait() == 1
-    line = (
-        f"output_directory {used} is in use by another calibrator (process "
-        f"{first.process.pid}): stop that one, or choose another"
-    )
-    assert second.log == f"calibrator: {line} directory\n"
+    line = f"output_directory {used} is in use by another calibrator: stop that one, or choose"
+    assert second.log == f"calibrator: {line} another directory\n"
     first.process.kill()
     first.wait()
     third = start_node("-p solve_period:=0.2", *into(used))  # a node that was killed keeps nothing
     third.wait_for_log("no pose yet on /parent_odom")
-
-
-def test_the_journal_follows_the_output_directory_but_not_into_one_in_use(
-    start_node, peer, tmp_path
-):
-    node = start_node(*QUIET)
-    peer.feed(peer.publishers(), *drive(30))
-    peer.spin_until(lambda: "30 poses" in peer.trigger("solve").message, "all poses")
-    assert peer.set_parameter("output_directory", str(tmp_path / "mine")).successful
-    wait_written(peer, tmp_path / "mine", 60)
-    lock = DirectoryLock(tmp_path / "theirs")
-    result = peer.set_parameter("output_directory", str(tmp_path / "theirs"))
-    assert not result.successful
-    assert f"is in use by another calibrator (process {os.getpid()})" in result.reason
-    lock.release()
-    assert peer.set_parameter("output_directory", str(tmp_path / "theirs")).successful
-    wait_written(peer, tmp_path / "theirs", 60)
-    DirectoryLock(tmp_path / "mine").release()  # left to others
-    assert node.stop()[0] == 0
 
 
 def test_participants_choose_a_directory_below_that_of_the_start_only(start_node, peer, tmp_path):
@@ -216,7 +186,6 @@ def test_participants_choose_a_directory_below_that_of_the_start_only(start_node
     assert (refused.successful, "~nosuchuser/x" in refused.reason) == (False, True)
     assert peer.parameter("output_directory") == str(tmp_path / "mine")
     assert peer.set_parameter("output_directory", str(tmp_path / "mine" / "truck")).successful
-    wait_written(peer, tmp_path / "mine" / "truck", 0)
     assert not list((tmp_path / "elsewhere").iterdir())
 
 

@@ -209,9 +209,7 @@ class TestNode:
             return broadcaster.state[0] is Broadcast.REFUSED
 
         peer.spin_until(is_refused, "the refusal")
-        log = capfd.readouterr().err
-        assert "restart the listeners" in log
-        assert "is withdrawn" in log
+        assert "is withdrawn" in capfd.readouterr().err
 
     def test_what_is_done_but_may_not_be_broadcast_is_refused_and_withdrawn(
         self, broadcaster, calibration
@@ -230,44 +228,3 @@ class TestNode:
         heard = listen()
         peer.spin_until(lambda: until in {each.child_frame_id for each in heard}, until)
         return {each.child_frame_id for each in heard}
-
-    def test_further_children_are_in_the_same_message(self, peer, listen, broadcaster, calibration):
-        rear, side = (
-            dataclasses.replace(calibration, child_frame=name) for name in ("rear", "side")
-        )
-        rough = TestWhatIsUnknown.with_z(side, DofVerdict.WEAK, 0.06)
-        broadcaster.add_others([rear, rough])
-        assert broadcaster.state == (Broadcast.WAITING, "no result yet")
-        self.settle(broadcaster, calibration)
-        child = calibration.child_frame
-        assert self.frames_of_new_listener(peer, listen, "rear") == {child, "rear"}
-        assert broadcaster.state[1] == ""
-        broadcaster.restart()
-        self.settle(broadcaster, calibration)
-        assert self.frames_of_new_listener(peer, listen, child) == {child}
-
-    def test_a_further_child_that_has_a_parent_is_refused_alone(
-        self, peer, listen, robot, broadcaster, calibration
-    ):
-        robot(("base_link", "rear"))
-        self.frames_of_new_listener(peer, listen, "rear")
-        child = calibration.child_frame
-        others = [dataclasses.replace(calibration, child_frame=name) for name in ("rear", "side")]
-        self.settle(broadcaster, calibration)
-        broadcaster.add_others(others)
-        assert broadcaster.state[1].startswith("rear has the parent base_link on /tf_static")
-        assert broadcaster.state == (Broadcast.ON, broadcaster.state[1])
-        heard = listen()
-        peer.spin_until(lambda: {each.child_frame_id for each in heard} >= {child, "side"}, "both")
-        robot(("base_link", "side"))
-
-        def looked():  # as the node does every second
-            broadcaster.look()
-            return broadcaster.state[1]
-
-        peer.spin_until(lambda: "side has the parent" in looked(), "refusal")
-        late = listen()
-        peer.spin_until(lambda: child in {each.child_frame_id for each in late}, "the child")
-        assert (calibration.parent_frame, "side") not in {
-            (each.header.frame_id, each.child_frame_id) for each in late
-        }

@@ -53,7 +53,8 @@ RESULT = ResultState(
     pose_sigma={"x": 0.004, "y": 0.004, "z": None, "roll": 0.01, "pitch": 0.01, "yaw": 0.01},
 )  # fmt: skip
 EXTRINSIC = ExtrinsicState(
-    level=Level.OK, text="known", is_solving=False, solves=1, last_solve_s=0.1, n_poses=9, path_m=3.0, rotation_deg={}, tf_static=Broadcast.OFF,
+    level=Level.OK, text="known", is_solving=False, solves=1, last_solve_s=0.1, n_poses=9,
+    path_m=3.0, rotation_deg={}, tf_static=Broadcast.OFF,
     tf_static_reason="", result=RESULT,
 )  # fmt: skip
 ROTATION = AxisProgress(sigma=0.001, target=0.00524, seconds_left=0.0)
