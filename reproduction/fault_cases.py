@@ -485,7 +485,7 @@ def late_heights(stream: Trajectory, tau_s: float, _: Random) -> Trajectory:
     return with_parts(stream, positions=positions)
 
 
-_child("X5", "heights constant", (0.0,), "", "constant_coordinate")(
+_child("X5", "heights constant", (0.0,), "", "axis_scale")(
     lambda child, factor, _: higher(child, factor)
 )
 

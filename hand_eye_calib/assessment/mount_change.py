@@ -9,8 +9,8 @@ noise of motions that follow each other is correlated: f, the long-run variance 
 says how much. The likelihood ratio of a shift is that of
 :mod:`~hand_eye_calib.assessment.moved`.
 
-Errors that wander over minutes, of a map that bends or a bias, give a large ratio, too. A shift is
-a step: it remains if the answers of both sides may drift linearly.
+Errors that wander over minutes, of a map that bends or a bias, give a large ratio, too: the stream
+checks compare how well a world that moves explains the motion.
 """
 
 from __future__ import annotations
@@ -47,9 +47,8 @@ _LEAST_SIGMA = np.repeat([1e-6, 1e-7], 3)
 _WINDOWS, _LEAST_WINDOWS = (8, 16), 2
 _LEAST_WINDOW_S = 3.0
 
-# Log likelihood ratio from which on a shift is significant, and squared step in its covariance from
-# which on it is no drift (0.3 % of chi2 of 6 degrees of freedom).
-SIGNIFICANT, _LEAST_STEP = 12.0, 20.0
+# Log likelihood ratio from which on a shift is significant.
+SIGNIFICANT = 12.0
 
 # Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
 # recording before and after that. A smaller probability is none.
@@ -62,8 +61,8 @@ class MountChange:
 
     Attributes
     ----------
-    at_ns, earliest_ns, latest_ns : int
-        When, parent clock; and the times between which it took place, nine times out of ten.
+    at_ns : int
+        When, parent clock.
     xi : (6,) array
         Shift: afterwards the extrinsic is ``X exp(xi)``, with X from before, (rho, phi) in the
         child sensor's frame, m and rad.
@@ -71,22 +70,12 @@ class MountChange:
         Of ``xi``, with the long-run variance.
     log_ratio : float
         Logarithm of the likelihood ratio of this shift against none.
-    is_step : bool
-        It happened at once, beyond what answers that drift linearly on both sides explain.
     """
 
     at_ns: int
-    earliest_ns: int
-    latest_ns: int
     xi: FloatArray
     covariance: FloatArray
     log_ratio: float
-    is_step: bool
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether the recording shows it beyond doubt."""
-        return self.log_ratio > SIGNIFICANT
 
 
 def residuals_and_jacobians(
@@ -130,20 +119,17 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     """
     starts_ns, H, S = _by_second(pose_pairs, T_parent_child)
     S = _about_answer(H, S)
-    cuts = [_edges(len(S), n) for n in _WINDOWS if len(S) >= n * _LEAST_WINDOW_S]
+    cuts = [np.arange(n) * len(S) // n for n in _WINDOWS if len(S) >= n * _LEAST_WINDOW_S]
     if not cuts:
         return None
     long_run = 1.0
     for edges in cuts:  # the least of all splits, about the answers of their sides
-        of_windows = np.add.reduceat(H, edges), np.add.reduceat(S, edges)
-        splits = range(_LEAST_WINDOWS, len(edges) - _LEAST_WINDOWS + 1)
+        H_of, S_of = np.add.reduceat(H, edges), np.add.reduceat(S, edges)
         rests = [
-            np.concatenate(
-                [_about_answer(*(each[side] for each in of_windows)) for side in _sides(split)]
-            )
-            for split in splits
+            np.concatenate([_about_answer(H_of[:k], S_of[:k]), _about_answer(H_of[k:], S_of[k:])])
+            for k in range(_LEAST_WINDOWS, len(edges) - _LEAST_WINDOWS + 1)
         ]
-        long_run = max(long_run, min(_long_run(of_windows[0], rest, 12) for rest in rests))
+        long_run = max(long_run, min(_long_run(H_of, rest) for rest in rests))
     before_H, before_S = np.cumsum(H, axis=0)[:-1], np.cumsum(S, axis=0)[:-1]
     after_H, after_S = H.sum(axis=0) - before_H, S.sum(axis=0) - before_S
     # The common answer is free.
@@ -153,16 +139,11 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     ratios[: n_edge - 1] = ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
     cov_before, cov_after = _inverse(before_H[best]), _inverse(after_H[best])
-    likely = np.cumsum(np.exp(ratios - ratios[best]))
-    first, last = np.searchsorted(likely / likely[-1], [0.05, 0.95])
     return MountChange(
         at_ns=int(starts_ns[best + 1]),
-        earliest_ns=int(starts_ns[first + 1]),
-        latest_ns=int(starts_ns[min(last + 1, len(starts_ns) - 1)]),
         xi=cov_after @ after_S[best] - cov_before @ before_S[best],
         covariance=long_run * (cov_before + cov_after),
         log_ratio=float(ratios[best]),
-        is_step=_step(starts_ns, H, S, best + 1) > _LEAST_STEP,
     )
 
 
@@ -186,52 +167,18 @@ def _by_second(
     return stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS, H, S
 
 
-def _edges(count: int, n_windows: int) -> IntArray:
-    return np.arange(n_windows) * count // n_windows
-
-
-def _sides(split: int) -> tuple[slice, slice]:
-    return slice(0, split), slice(split, None)
-
-
 def _about_answer(H: FloatArray, S: FloatArray) -> FloatArray:
     """Scores of shifts from the answer of all of them, to first order."""
     return np.asarray(S - H @ (_inverse(H.sum(axis=0)) @ S.sum(axis=0)))
 
 
-def _long_run(H: FloatArray, S: FloatArray, n_parameters: int) -> float:
-    """Long-run variance f of scores in units of the information, at least 1: mean of ``S' H^-1 S``
-    per degree of freedom, if so many parameters were fitted.
+def _long_run(H: FloatArray, S: FloatArray) -> float:
+    """Long-run variance f of scores about two answers in units of the information, at least 1: mean
+    of ``S' H^-1 S`` per degree of freedom.
     """
     informative = np.trace(H, axis1=1, axis2=2) > 0
     squared = squared_shift(H[informative], S[informative], 1e-6)
-    return max(float(squared.sum()) / max(6 * len(squared) - n_parameters, 1), 1.0)
-
-
-def _step(starts_ns: IntArray, H: FloatArray, S: FloatArray, first_after: int) -> float:
-    """Squared step before a second, in its covariance, if the answers before and after it may
-    drift linearly.
-    """
-    answers, covariances, rests = [], [], []
-    for side in _sides(first_after):
-        times = (starts_ns[side] - starts_ns[first_after]).astype(float)
-        times /= max(np.abs(times).max(), 1.0)
-        powers = np.stack([np.ones_like(times), times])
-        information = np.einsum("ak,bk,kij->aibj", powers, powers, H[side]).reshape(12, 12)
-        prior = np.kron(np.eye(2), np.linalg.inv(shift_covariance()))
-        covariance = np.linalg.inv(information + 0.01 * prior)
-        answer, drift = np.split(covariance @ (powers @ S[side]).ravel(), 2)
-        drifting = answer + times[:, None] * drift
-        rests.append(S[side] - np.einsum("kij,kj->ki", H[side], drifting))
-        answers.append(answer)
-        covariances.append(covariance[:6, :6])
-    rest = np.concatenate(rests)
-    long_run = max(
-        _long_run(np.add.reduceat(H, edges), np.add.reduceat(rest, edges), 24)
-        for edges in (_edges(len(H), n) for n in _WINDOWS)
-    )
-    step = answers[1] - answers[0]
-    return float(step @ np.linalg.solve(sum(covariances), step)) / long_run
+    return max(float(squared.sum()) / max(6 * len(squared) - 12, 1), 1.0)
 
 
 def _inverse(H: FloatArray) -> FloatArray:

@@ -3,14 +3,13 @@ little of the motion unexplained and yet spoil the extrinsic.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.mount_change import find_change
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity, finding
+from hand_eye_calib.assessment.mount_change import SIGNIFICANT, MountChange, find_change
+from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.checks.response import (
     LITTLE,
     MAX_ROTATION,
@@ -28,7 +27,10 @@ from hand_eye_calib.stats import median, quantile
 from hand_eye_calib.text import angle, length, listing
 
 #: X (4, 4) and its standard deviations (6,), (rho, phi).
-Known = tuple[FloatArray, FloatArray]
+Known: TypeAlias = tuple[FloatArray, FloatArray]
+
+# A finding, and the share of the squared residuals that it explains.
+_Suspect: TypeAlias = tuple[float, Finding]
 
 # Significance that a fault of the response needs, in standard deviations; smoothing, whose sigma
 # does not contain noise of the columns, needs more. How many times it must exceed what noise may
@@ -45,19 +47,17 @@ _MAX_SIGMA_RAD, _WITHIN = float(np.radians(0.5)), 3.0
 _SAME_POSITION_M, _NEARLY_M, _UPPER = 0.002, 0.012, 2.0
 
 # Where a warning and an error begin: gains of rotations and of coordinates, less 1; worlds that are
-# turned (rad).
+# turned (rad); shifts of positions by a delay or smoothing (m); of the mount (m, rad).
 _GAINS, _AXIS_GAINS = (0.003, 0.03), (0.015, 0.05)
 _TURNED = (float(np.radians(0.5)), float(np.radians(1.5)))
-
-# A coordinate that follows the motion by less than this share is constant.
-_CONSTANT = 0.05
+_SHIFTS_M = (0.008, 0.05)
+_MOVED_M, _MOVED_RAD = (0.005, 0.02), (float(np.radians(0.2)), float(np.radians(1.0)))
 
 # A coordinate explains why streams disagree if it takes away this share of the squared residuals.
 _MOST = 0.3
 
-# Smallest delay (s), and smoothing (s^2), that count. Shifts (m) by
-# either where a warning and an error begin.
-_DELAY_S, _SHIFTS_M = 0.003, (0.008, 0.05)
+# Smallest delay (s), and smoothing (s^2), that count.
+_DELAY_S = 0.003
 _SMOOTHING_S2 = {"positions": 0.003, "orientations": 0.002}
 
 # Speeds are over about this time (s), so that noise is no speed.
@@ -66,9 +66,6 @@ _SPEED_SPAN_S = 0.4
 # A world moves if it does so at this share of the sensor's speed: its direction is then off by half
 # the usual target of a rotation.
 _MOVING = 0.003
-
-# Shifts of the mount (m, rad) where a warning and an error begin.
-_MOVED_M, _MOVED_RAD = (0.005, 0.02), (float(np.radians(0.2)), float(np.radians(1.0)))
 
 # Orientations are copies if they agree to this angle, several times better than any two sensors of
 # the recordings at hand, and so many times better than each stream is rough: slow motion is smooth,
@@ -91,6 +88,10 @@ def check_agreement(
 ) -> list[Finding]:
     """Findings about two streams that agree.
 
+    One fault shows in several groups of columns: the one that explains most is it. Odometries drift
+    against each other, and a drift looks a little like a shift of the mount, turned worlds or a
+    scale by axis: what explains less than a world that moves is none of them.
+
     Parameters
     ----------
     pose_pairs : PosePairs
@@ -104,18 +105,35 @@ def check_agreement(
     """
     if same := check_same(*known):
         return same
-    suspects = [*_of_response(pose_pairs, motions, T_parent_child)]
-    # One fault shows in several groups of columns: the one that explains most is it.
-    found = [max(suspects, key=lambda each: each.share).finding()] if suspects else []
-    return found + _check_mount(pose_pairs, T_parent_child)
+    change = find_change(pose_pairs, T_parent_child)
+    slow = long_response(pose_pairs, motions, T_parent_child, change.at_ns if change else None)
+    gain, speeds = np.eye(3), _speeds(pose_pairs)
+    suspects: list[_Suspect] = []
+    if slow:
+        response, axes = slow
+        drift = response.fit("drift")
+        suspects += _rotation_gains(response, axes, gain)
+        suspects += _turned(response)
+        suspects += _axis_gains(response)
+        if change:
+            suspects += _moved_mount(response, change, int(pose_pairs.stamps_ns[0]))
+        suspects = [each for each in suspects if each[0] > drift.share]
+        suspects += _world_drift(drift, pose_pairs, speeds)
+    if fast := short_response(pose_pairs, T_parent_child, gain):
+        suspects += _delays(*fast[:2], speeds)
+        suspects += _smoothing(*fast, speeds)
+    return _likeliest(suspects)
 
 
 def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
     """Finding about a coordinate that explains why two streams with the same rotations disagree."""
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
     slow = long_response(pose_pairs, motions, X)
-    found = [each for each in _axis_gains(slow[0]) if each.share > _MOST] if slow else []
-    return [max(found, key=lambda each: each.share).finding()] if found else []
+    return _likeliest([each for each in _axis_gains(slow[0]) if each[0] > _MOST]) if slow else []
+
+
+def _likeliest(suspects: list[_Suspect]) -> list[Finding]:
+    return [max(suspects, key=lambda each: each[0])[1]] if suspects else []
 
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
@@ -128,50 +146,14 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     if angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max()):
         size = f"{length(distance_m)} and {angle(angle_rad)}"
         severity = _severity(distance_m < max(_SAME_M, _WITHIN * sigma_m))
-        values: dict[str, Any] = {
-            "size": size,
-            "translation_m": distance_m,
-            "rotation_rad": angle_rad,
-        }
-        return [finding("same_frame", severity=severity, **values)]
+        return [finding("same_frame", severity=severity, size=size, translation_m=distance_m)]
     size = f"{length(distance_m)} +/- {length(sigma_m)}"
     severity = _severity(upper_m < _SAME_POSITION_M)
-    values = {"translation_m": distance_m, "sigma_m": sigma_m}
-    return [finding("same_position", severity=severity, size=size, **values)]
+    return [finding("same_position", severity=severity, size=size, translation_m=distance_m)]
 
 
 def _severity(is_error: bool | np.bool_) -> Severity:
     return Severity.ERROR if is_error else Severity.WARNING
-
-
-@dataclass(frozen=True)
-class _Suspect:
-    """A finding by its key, and the share of the residuals that it explains."""
-
-    share: float
-    key: str
-    stream: str
-    is_error: bool | np.bool_
-    values: dict[str, Any]
-
-    def finding(self) -> Finding:
-        return finding(self.key, self.stream, _severity(self.is_error), **self.values)
-
-
-def _of_response(
-    pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
-) -> Iterator[_Suspect]:
-    """What is wrong with how the child's motion follows the parent's."""
-    gain, speeds = np.eye(3), _speeds(pose_pairs)
-    if slow := long_response(pose_pairs, motions, T_parent_child):
-        yield from _rotation_gains(*slow, gain)
-        yield from _turned(slow[0])
-        yield from _axis_gains(slow[0])
-        yield from _world_drift(slow[0], pose_pairs, speeds)
-    fast = short_response(pose_pairs, T_parent_child, gain)
-    if fast is not None:
-        yield from _delays(*fast[:2], speeds)
-        yield from _smoothing(*fast, speeds)
 
 
 def _rotation_gains(slow: Regression, axes: FloatArray, gain: FloatArray) -> Iterator[_Suspect]:
@@ -184,33 +166,35 @@ def _rotation_gains(slow: Regression, axes: FloatArray, gain: FloatArray) -> Ite
     if counts.any():
         gain += (axes * np.where(counts, fitted.values, 0.0)) @ axes.T
         k = int(np.argmax(np.where(counts, sizes / limits, 0.0)))
-        axis = ", ".join(f"{component:.2f}" for component in axes[:, k])
-        values: dict[str, Any] = {
-            "axis": axis,
-            "gain": 1.0 + fitted.values[k],
-            "sigma": fitted.sigmas[k],
-        }
-        yield _Suspect(fitted.share, "rotation_gain", "child", sizes[k] > _GAINS[1], values)
+        yield (
+            fitted.share,
+            finding(
+                "rotation_gain",
+                severity=_severity(sizes[k] > _GAINS[1]),
+                stream="child",
+                axis=", ".join(f"{component:.2f}" for component in axes[:, k]),
+                gain=1.0 + fitted.values[k],
+                sigma=fitted.sigmas[k],
+            ),
+        )
 
 
 def _turned(slow: Regression) -> Iterator[_Suspect]:
-    """Positions of a stream that are turned against its orientations, or of both."""
-    for stream, groups in (("child", 1), ("parent", 1), ("both", 2)):
-        names = ("turned_child", "turned_parent") if groups == 2 else (f"turned_{stream}",)
-        fitted = slow.fit(*names)
-        k = int(np.argmax(fitted.significance))
-        size_rad, sigmas = float(np.abs(fitted.values[k])), float(fitted.significance[k])
-        if sigmas > _SIGMAS and size_rad > _TURNED[0]:
-            part = fitted.values.reshape(-1, 3)[k // 3]
-            turned_rad = float(np.linalg.norm(part))
-            values: dict[str, Any] = {
-                "turned_rad": turned_rad,
-                "turned_deg": float(np.degrees(turned_rad)),
-            }
-            values |= {"axis": "xyz"[int(np.argmax(np.abs(part)))], "sigmas": sigmas}
-            # Six values explain more than three.
-            share = fitted.share * (0.9 if groups == 2 else 1.0)
-            yield _Suspect(share, "worlds_turned", stream, size_rad > _TURNED[1], values)
+    """Positions of a stream that are turned against its orientations."""
+    for stream in ("child", "parent"):
+        fitted = slow.fit(f"turned_{stream}")
+        if fitted.significance.max() > _SIGMAS and np.abs(fitted.values).max() > _TURNED[0]:
+            turned_rad = float(np.linalg.norm(fitted.values))
+            yield (
+                fitted.share,
+                finding(
+                    "worlds_turned",
+                    stream,
+                    _severity(turned_rad > _TURNED[1]),
+                    turned_deg=float(np.degrees(turned_rad)),
+                    axis="xyz"[int(np.argmax(np.abs(fitted.values)))],
+                ),
+            )
 
 
 def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
@@ -236,24 +220,50 @@ def _axis_gains(slow: Regression) -> Iterator[_Suspect]:
         k, off, sigma = _odd_one(fitted)
         bias = float(slow.biases(f"axes_{stream}")[k])
         if abs(off) > max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * bias):
-            key = "constant_coordinate" if 1.0 + off < _CONSTANT else "axis_scale"
-            values: dict[str, Any] = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
-            yield _Suspect(fitted.share, key, stream, abs(off) > _AXIS_GAINS[1], values)
+            severity = _severity(abs(off) > _AXIS_GAINS[1])
+            values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
+            yield fitted.share, finding("axis_scale", stream, severity, **values)
 
 
-def _world_drift(slow: Regression, pose_pairs: PosePairs, speeds: FloatArray) -> Iterator[_Suspect]:
+def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> Iterator[_Suspect]:
+    """A mount that has moved."""
+    sigmas = np.sqrt(np.diag(change.covariance))
+    known = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
+    moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
+    if change.log_ratio < SIGNIFICANT or (moved_m < _MOVED_M[0] and moved_rad < _MOVED_RAD[0]):
+        return
+    is_large = moved_m > _MOVED_M[1] or moved_rad > _MOVED_RAD[1]
+    sizes = [length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0)
+    yield (
+        slow.fit("moved").share,
+        finding(
+            "mount_moved",
+            severity=_severity(is_large and change.log_ratio > 2.0 * SIGNIFICANT),
+            size=listing(sizes),
+            at_s=(change.at_ns - start_ns) * 1e-9,
+            translation_m=moved_m,
+            rotation_rad=moved_rad,
+        ),
+    )
+
+
+def _world_drift(drift: Fitted, pose_pairs: PosePairs, speeds: FloatArray) -> Iterator[_Suspect]:
     """A world that moves against the other."""
-    fitted = slow.fit("drift")
     positions = pose_pairs.Ts_cw_c[:, :3, 3]
-    turning = np.cross(fitted.values[3:], positions - positions.mean(axis=0))
-    speed = np.sqrt(((fitted.values[:3] + turning) ** 2).sum(axis=1).mean())
+    turning = np.cross(drift.values[3:], positions - positions.mean(axis=0))
+    speed = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(speed) / max(_rms(speeds), 1e-9)
-    if fitted.significance.max() >= _SIGMAS and share > _MOVING:
-        speed, rate = (float(np.linalg.norm(part)) for part in np.split(fitted.values, 2))
-        values = {"rate_rad_s": rate, "speed_m_s": speed, "share_of_speed": share}
-        values |= {"deg_per_minute": float(np.degrees(60 * rate)), "m_per_minute": 60 * speed}
-        values["percent"] = 100 * share
-        yield _Suspect(fitted.share, "world_drift", "both", False, values)
+    if drift.significance.max() >= _SIGMAS and share > _MOVING:
+        speed, rate = (float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
+        yield (
+            drift.share,
+            finding(
+                "world_drift",
+                deg_per_minute=float(np.degrees(60 * rate)),
+                m_per_minute=60 * speed,
+                percent=100 * share,
+            ),
+        )
 
 
 def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
@@ -269,18 +279,19 @@ def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) ->
     if abs(delay_s) > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
         # Which stream it is cannot be told; hardly a filter makes positions early.
         stream = "child" if delay_s > 0 else "parent"
-        values = {"delay_s": delay_s, "size_s": abs(delay_s), "sigma_s": sigma_s}
-        values["shift_m"] = shift_m
+        severity = _severity(shift_m > _SHIFTS_M[1])
+        values = {"delay_s": abs(delay_s), "sigma_s": sigma_s, "shift_m": shift_m}
         share = max(of_positions.share, of_rotations.share)
-        yield _Suspect(share, "position_clock", stream, shift_m > _SHIFTS_M[1], values)
+        yield share, finding("position_clock", stream, severity, **values)
     for stream, columns in (("child", 0), ("parent", 3)):
         fitted = positions.fit(f"late_axes_{stream}", without="late")
         k, off_s, sigma_s = _odd_one(fitted)
         shift_m = abs(off_s) * float(np.sqrt(np.mean(speeds[:, columns + k] ** 2)))
         # The other stream's coordinate cannot be early.
         if off_s > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
-            of_axis = {"axis": "xyz"[k], "delay_s": off_s, "sigma_s": sigma_s, "shift_m": shift_m}
-            yield _Suspect(fitted.share, "axis_lag", stream, shift_m > _SHIFTS_M[1], of_axis)
+            severity = _severity(shift_m > _SHIFTS_M[1])
+            values = {"delay_s": off_s, "sigma_s": sigma_s, "shift_m": shift_m}
+            yield fitted.share, finding("axis_lag", stream, severity, axis="xyz"[k], **values)
 
 
 def _smoothing(
@@ -295,14 +306,9 @@ def _smoothing(
             shift_m = smoothing_s * _rms(speeds)
             least = max(_SMOOTHING_S2[part] + least_s2, _SMOOTHING_SIGMAS * sigma)
             if value >= least and shift_m > _SHIFTS_M[0]:
-                values: dict[str, Any] = {
-                    "part": part,
-                    "smoothing_s": smoothing_s,
-                    "shift_m": shift_m,
-                }
-                values["sigmas"] = value / max(sigma, 1e-12)
-                is_error = shift_m > _SHIFTS_M[1]
-                yield _Suspect(fitted.share, "smoothed", stream, is_error, values)
+                severity = _severity(shift_m > _SHIFTS_M[1])
+                values = {"smoothing_s": smoothing_s, "shift_m": shift_m}
+                yield fitted.share, finding("smoothed", stream, severity, part=part, **values)
 
 
 def _speeds(pose_pairs: PosePairs) -> FloatArray:
@@ -320,45 +326,6 @@ def _speeds(pose_pairs: PosePairs) -> FloatArray:
 def _rms(speeds: FloatArray) -> float:
     """Root mean square speed of the parent."""
     return float(np.sqrt((speeds[:, 3:] ** 2).sum(axis=1).mean())) if len(speeds) else 0.0
-
-
-def _check_mount(pose_pairs: PosePairs, T_parent_child: FloatArray) -> list[Finding]:
-    """Finding about a mount that has moved."""
-    change = find_change(pose_pairs, T_parent_child)
-    if change is None or not change.is_significant:
-        return []
-    sigmas = np.sqrt(np.diag(change.covariance))
-    moved_m, moved_rad = (
-        float(np.linalg.norm(change.xi[part] * (np.abs(change.xi) > 2.0 * sigmas)[part]))
-        for part in (slice(0, 3), slice(3, 6))
-    )
-    if moved_m < _MOVED_M[0] and moved_rad < _MOVED_RAD[0]:
-        return []
-    is_error = change.is_step and (moved_m > _MOVED_M[1] or moved_rad > _MOVED_RAD[1])
-    at_s = (change.at_ns - pose_pairs.stamps_ns[0]) * 1e-9
-    span_s = (change.latest_ns - change.earliest_ns) * 1e-9
-    sizes = [length(moved_m)] if moved_m else []
-    sizes += [angle(moved_rad)] if moved_rad else []
-    when = f"changes {at_s:.0f} s after the start (within {max(span_s, 1.0):.0f} s)"
-    why = "a mount that came loose or was knocked, or an estimator that started anew"
-    if not change.is_step:
-        when = "seems to change in the course of the recording"
-        why = "a mount that gives way, or a sensor whose errors wander over minutes"
-    return [
-        finding(
-            "mount_moved",
-            severity=_severity(is_error),
-            confidence=Confidence.LIKELY if change.is_step else Confidence.POSSIBLE,
-            when=when,
-            why=why,
-            size=listing(sizes),
-            at_s=at_s,
-            at_ns=float(change.at_ns),
-            translation_m=moved_m,
-            rotation_rad=moved_rad,
-            log_likelihood_ratio=change.log_ratio,
-        )
-    ]
 
 
 def check_independent(parent: Trajectory, child: Trajectory, offset_s: float) -> list[Finding]:

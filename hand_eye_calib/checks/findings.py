@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig
@@ -20,8 +21,7 @@ _FEW_JUMPS = 0.02
 @dataclass(frozen=True)
 class _Row:
     """A finding before its values are filled in: ``{stream}`` is "parent", "child" or "both",
-    ``{whose}`` "the child stream's". ``evidence`` names values that are kept as numbers; ``code``
-    is the row's own key unless several rows share it.
+    ``{whose}`` "the child stream's". ``code`` is the row's own key unless several rows share it.
     """
 
     what: str
@@ -29,7 +29,6 @@ class _Row:
     cause: str = ""
     severity: Severity = Severity.ERROR
     confidence: Confidence = Confidence.LIKELY
-    evidence: tuple[str, ...] = ()
     code: str = ""
 
 
@@ -69,7 +68,6 @@ _ROWS = {
         "{share:.1%} of {whose} steps are jumps: far from the motion before and after",
         "keep a method that rejects outliers; better, repair the source",
         "relocalisations, loop closures or wrong detections",
-        evidence=("share",),
         severity=_WARNING,
     ),
     "frozen": _Row(
@@ -94,13 +92,11 @@ _ROWS = {
         "{whose} poses alternate between two levels {distance_m:.2g} m apart",
         "give each its own topic, and calibrate one",
         "two sensors, or two programs, publish on one topic",
-        evidence=("roughness_ratio", "distance_m"),
     ),
     "coarse_positions": _Row(
         "{whose} positions are multiples of {step_m:.3g} m",
         "write positions with 64 bits and all digits, or relative to a near origin",
         "{why}",
-        evidence=("step_m",),
         severity=_NOTE,
         confidence=_CERTAIN,
     ),
@@ -110,7 +106,6 @@ _ROWS = {
         "give poses with all six degrees of freedom, or record on level ground and measure height, "
         "roll and pitch by hand",
         "odometry in 2D, such as that of wheels",
-        evidence=("tilt_rad",),
         confidence=_CERTAIN,
     ),
     "lengths": _Row(
@@ -120,7 +115,6 @@ _ROWS = {
         "give the lengths of both streams in metres, those of a file also by the unit in its "
         "header, such as x_mm; if they are millimetres, solve with",
         "such as lengths in millimetres",
-        evidence=("speed_m_s", "acceleration_m_s2"),
     ),
     # ------------------------------------------------------------------ of both together
     "unrelated_rates": _Row(
@@ -149,7 +143,6 @@ _ROWS = {
         "The two streams are not independent: one seems to be computed from the other. This result "
         "only repeats the transform that was used for it.",
         "give the poses that each sensor measured by itself",
-        evidence=("residual_rad",),
     ),
     "coordinates": _Row(
         "the {stream}'s positions fit the other sensor's path only with x (east) multiplied by "
@@ -158,13 +151,11 @@ _ROWS = {
         "{unexplained_share:.0%}",
         "write metres east, north and up: longitudes times the cosine of the latitude, and neither "
         "latitude and longitude nor east and north swapped",
-        evidence=("factor_x", "factor_y", "unexplained_share", "unexplained_share_mended"),
     ),
     "rate_unit": _Row(
         "the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are {unit} "
         "and were read as {read_as}",
         "name the unit in the header, such as wx_deg_s or wx_rad_s; a message has rad/s",
-        evidence=("ratio",),
     ),
     "noisy": _Row(
         "the streams rotate together, but {share:.0%} of the motion stays unexplained: noise or "
@@ -204,7 +195,6 @@ _ROWS = {
     "time_offset": _Row(
         "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's{beyond}",
         "add {total_s} s in all to the child's stamps, or have it estimated",
-        evidence=("offset_s", "sigma_s"),
         confidence=_CERTAIN,
     ),
     "large_time_offset": _Row(
@@ -213,7 +203,6 @@ _ROWS = {
         "time_offset {total_s} or estimate",
         "a clock of another time scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a "
         "vehicle that follows",
-        evidence=("offset_s",),
         severity=_WARNING,
         confidence=_POSSIBLE,
         code="time_offset",
@@ -222,14 +211,12 @@ _ROWS = {
         "{whose} lengths are {unit} while the {other}'s are metres (factor {scale:.5g} +/- "
         "{sigma:.2g})",
         "convert them to metres",
-        evidence=("scale", "sigma"),
         confidence=_CERTAIN,
     ),
     "scale": _Row(
         "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f} to agree with the "
         "parent's",
         "have the scale estimated, or find out which of the two measures wrongly",
-        evidence=("scale", "sigma"),
         confidence=_CERTAIN,
     ),
     "one_axis": _Row(
@@ -251,7 +238,6 @@ _ROWS = {
         "give the stream of the child sensor itself",
         "such as two topics of one odometry, or odometry of the robot's base that was derived from "
         "the other sensor",
-        evidence=("translation_m", "rotation_rad"),
     ),
     "same_position": _Row(
         "both streams have the same positions and other orientations: the translation between the "
@@ -259,22 +245,19 @@ _ROWS = {
         "give positions of the child sensor itself",
         "such as positions that were fused from the other sensor, or computed for another point of "
         "the robot than the sensor",
-        evidence=("translation_m", "sigma_m"),
     ),
     "rotation_gain": _Row(
         "the child rotates {gain:.4f} +/- {sigma:.4f} times as far as the parent about ({axis}) in "
         "the parent sensor's frame",
         "calibrate that scale first",
         "a gyroscope or wheel base with a wrong scale, in either stream",
-        evidence=("gain", "sigma"),
     ),
     "position_clock": _Row(
-        "the {stream}'s positions are {size_s:.3f} +/- {sigma_s:.3f} s late against its "
+        "the {stream}'s positions are {delay_s:.3f} +/- {sigma_s:.3f} s late against its "
         "orientations: at this speed a shift of {shift_m:.2g} m",
         "use the poses before that filter, or correct the delay of the positions",
         "positions and orientations of one stream come from different sources or filters, or the "
         "other stream is of another body, such as a trailer",
-        evidence=("delay_s", "sigma_s", "shift_m"),
     ),
     "worlds_turned": _Row(
         "{whose} positions are turned against its orientations by {turned_deg:.2f} deg, mainly "
@@ -282,34 +265,24 @@ _ROWS = {
         "give positions and orientations in one and the same world",
         "magnetic declination or grid convergence in one of them, or poses that were fused with "
         "the other sensor's through a wrong transform",
-        evidence=("turned_rad", "sigmas"),
     ),
     "axis_scale": _Row(
         "{whose} {axis} coordinates are {factor:.4f} +/- {sigma:.4f} times as long as its others",
         "write all coordinates in metres, from one source",
-        "heights in feet or of a barometer, or map coordinates whose scale depends on the latitude",
-        evidence=("factor", "sigma"),
+        "heights in feet, of a barometer or constant (2D), or map coordinates whose scale depends "
+        "on the latitude",
     ),
     "axis_lag": _Row(
         "{whose} {axis} coordinates are {delay_s:.3f} +/- {sigma_s:.3f} s late against its others: "
         "at this speed a shift of {shift_m:.2g} m",
         "use positions whose coordinates come from one source",
         "such as heights of a barometer",
-        evidence=("delay_s", "sigma_s", "shift_m"),
-    ),
-    "constant_coordinate": _Row(
-        "{whose} {axis} coordinates do not follow the motion, as if they were constant: by a "
-        "factor of {factor:.3f} +/- {sigma:.3f}",
-        "give positions in three dimensions",
-        "positions in 2D",
-        evidence=("factor", "sigma"),
     ),
     "smoothed": _Row(
         "{whose} {part} are smoothed over about {smoothing_s:.2f} s, which the other's are not: "
         "the translation may be off by {shift_m:.2g} m",
         "use the poses before that filter",
         "a low-pass or smoothing filter",
-        evidence=("smoothing_s", "sigmas", "shift_m"),
         code="smoothed_{part}",
     ),
     "world_drift": _Row(
@@ -318,7 +291,6 @@ _ROWS = {
         "use the poses before that correction, in the frame of the odometry",
         "a map that is corrected bit by bit, a heading that drifts, or poses published in a frame "
         "that moves",
-        evidence=("rate_rad_s", "speed_m_s", "share_of_speed"),
         severity=_WARNING,
     ),
     "unit_unseen": _Row(
@@ -330,10 +302,9 @@ _ROWS = {
         severity=_WARNING,
     ),
     "mount_moved": _Row(
-        "the extrinsic {when} by {size}",
+        "the extrinsic changes {at_s:.0f} s after the start by {size}",
         "tighten it and record again, or calibrate the parts before and after on their own",
-        "{why}",
-        evidence=("at_s", "at_ns", "translation_m", "rotation_rad", "log_likelihood_ratio"),
+        "a mount that came loose or was knocked, or an estimator that started anew",
     ),
 }
 
@@ -359,7 +330,7 @@ def finding(
     options : mapping, optional
         Options that help, by name.
     **values
-        What the texts of the row name, and its evidence.
+        What the texts of the row name; the numbers among them are the evidence.
     """
     row = _ROWS[key]
     whose = "both streams'" if stream == "both" else f"the {stream} stream's"
@@ -372,7 +343,7 @@ def finding(
         what=row.what.format(**values),
         advice=row.advice.format(**values),
         cause=row.cause.format(**values),
-        evidence={name: float(values[name]) for name in row.evidence},
+        evidence={name: float(value) for name, value in values.items() if isinstance(value, Real)},
         options=options or {},
     )
 

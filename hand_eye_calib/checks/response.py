@@ -171,7 +171,10 @@ def _cost(products: FloatArray, columns: IntArray) -> float:
 
 
 def long_response(
-    pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
+    pose_pairs: PosePairs,
+    motions: MotionPairs,
+    T_parent_child: FloatArray,
+    moved_at_ns: int | None = None,
 ) -> tuple[Regression, FloatArray] | None:
     """Regression of rotations and displacements over seconds, and the principal axes of the
     rotations (columns, parent's frame); None if nearly all are near half a turn.
@@ -179,7 +182,8 @@ def long_response(
     Groups: ``turned_child``, ``turned_parent``: positions turned against orientations, a rotation
     vector in the stream's world; ``axes_child``, ``axes_parent``: factors, less 1, of the
     coordinates of a stream's positions; ``drift``: velocity and angular rate of the child's world;
-    ``gain``: factors, less 1, of the child's rotations about the principal axes.
+    ``gain``: factors, less 1, of the child's rotations about the principal axes; ``moved``: lever
+    arm and rotation of X after a time, if one is given.
     """
     R, t = T_parent_child[:3, :3], T_parent_child[:3, 3]
     A, B = motions.Ts_parenti_parentj, motions.Ts_childi_childj
@@ -225,6 +229,13 @@ def long_response(
         ),
         "gain": (none, along),
     }
+    if moved_at_ns is not None:
+        middles_ns = (pose_pairs.stamps_ns[motions.i] + pose_pairs.stamps_ns[motions.j]) // 2
+        is_after = (middles_ns >= moved_at_ns)[:, None, None]
+        lever, rotation = columns["lever"], columns["rotation"]
+        columns["moved"] = tuple(
+            is_after * np.concatenate(parts, axis=2) for parts in zip(lever, rotation, strict=True)
+        )
     target = np.concatenate([target_t / units[0], target_r / units[1]], axis=1)
     stacked = {
         name: np.concatenate([of_t / units[0], of_r / units[1]], axis=1)

@@ -44,7 +44,7 @@ class Finding:
     cause : str
         Usual cause, if ``what`` does not name it.
     evidence : mapping of str to float
-        Measured values by name, in SI units, each name with its unit.
+        The numbers in ``what``, by name.
     options : mapping
         Options that do it, by their names in :mod:`hand_eye_calib.config`; empty if none can.
     """

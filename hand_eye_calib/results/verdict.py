@@ -103,9 +103,9 @@ _Found: TypeAlias = tuple[str, str, tuple[str, ...], Mapping[str, float | str]]
 # Other answers contradict a result if they lie farther away than so many joint standard deviations
 # and than this share of the target; other references that are about as certain also if they scatter
 # by so many of its own standard deviations and so many targets: that they are uncertain themselves
-# does not excuse a large scatter. From even more targets on nothing of it may be used.
+# does not excuse a large scatter. However far, they never forbid a result: they know less of the
+# noise than the method that gave it, and state no errors that last.
 CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
-HOPELESS_TARGETS = 10.0
 
 # Smallest share of the motion pairs that are inliers in a recording whose noise is understood; of
 # the poses, for a method that models the noise and need not reject what is merely noisy.
@@ -222,16 +222,11 @@ def _findings_of(severity: Severity) -> Callable[[Result], Iterator[_Found]]:
     return find
 
 
-def _contradiction(kind: str, is_hopeless: bool) -> Callable[[Result], Iterator[_Found]]:
+def _contradiction(kind: str) -> Callable[[Result], Iterator[_Found]]:
     """Other answers (``kind``: halves or methods) that lie farther away than they may."""
 
     def find(result: Result) -> Iterator[_Found]:
-        far = {
-            axis: scatter
-            for axis, scatter in _far(result, kind).items()
-            if (scatter > HOPELESS_TARGETS * target_of(axis, result)) == is_hopeless
-        }
-        if far:
+        if far := _far(result, kind):
             told = [
                 f"about {axes_in_words([axis])} by {amount(axis, scatter)}"
                 for axis, scatter in far.items()
@@ -404,15 +399,6 @@ RULES = (
     ),
     Rule("error_finding", _NEVER, "a stream check found an error", _findings_of(Severity.ERROR)),
     Rule("nothing_known", _NEVER, "all six axes are unobservable", _nothing_known),
-    *(
-        Rule(
-            f"{kind}_far",
-            _NEVER,
-            f"{_condition(kind)}, and by more than {HOPELESS_TARGETS:g} targets",
-            _contradiction(kind, is_hopeless=True),
-        )
-        for kind in _OTHERS
-    ),
     Rule(
         "recordings_differ",
         _NEVER,
@@ -428,15 +414,7 @@ RULES = (
         "of several recordings one is off and left out, or all scatter more than usual",
         _recordings("one off", "scatter"),
     ),
-    *(
-        Rule(
-            kind,
-            _CARE,
-            _condition(kind),
-            _contradiction(kind, is_hopeless=False),
-        )
-        for kind in _OTHERS
-    ),
+    *(Rule(kind, _CARE, _condition(kind), _contradiction(kind)) for kind in _OTHERS),
     Rule(
         "outliers",
         _CARE,

@@ -84,8 +84,6 @@ CASES = {
     "prior": dict(status=SolveStatus.CONTRADICTED, contradictions={"x": 5.5}),
     "error_finding": dict(findings=(FINDING,)),
     "nothing_known": dict(observability=observed(np.inf, np.inf)),
-    "halves_far": dict(cross_check=checked("yaw", 0.2, 9.0, "halves")),
-    "methods_far": dict(cross_check=checked("x", 0.5, 9.0, "methods")),
     "recordings_differ": dict(together=several("differ")),
     "unobservable": dict(observability=observed(z=np.inf)),
     "warning_finding": dict(findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)),
