@@ -221,8 +221,12 @@ def _axis_gains(slow: Regression) -> Iterator[_Suspect]:
         bias = float(slow.biases(f"axes_{stream}")[k])
         if abs(off) > max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * bias):
             severity = _severity(abs(off) > _AXIS_GAINS[1])
-            values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
-            yield fitted.share, finding("axis_scale", stream, severity, **values)
+            yield (
+                fitted.share,
+                finding(
+                    "axis_scale", stream, severity, axis="xyz"[k], factor=1.0 + off, sigma=sigma
+                ),
+            )
 
 
 def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> Iterator[_Suspect]:
@@ -279,19 +283,35 @@ def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) ->
     if abs(delay_s) > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
         # Which stream it is cannot be told; hardly a filter makes positions early.
         stream = "child" if delay_s > 0 else "parent"
-        severity = _severity(shift_m > _SHIFTS_M[1])
-        values = {"delay_s": abs(delay_s), "sigma_s": sigma_s, "shift_m": shift_m}
-        share = max(of_positions.share, of_rotations.share)
-        yield share, finding("position_clock", stream, severity, **values)
+        yield (
+            max(of_positions.share, of_rotations.share),
+            finding(
+                "position_clock",
+                stream,
+                _severity(shift_m > _SHIFTS_M[1]),
+                delay_s=abs(delay_s),
+                sigma_s=sigma_s,
+                shift_m=shift_m,
+            ),
+        )
     for stream, columns in (("child", 0), ("parent", 3)):
         fitted = positions.fit(f"late_axes_{stream}", without="late")
         k, off_s, sigma_s = _odd_one(fitted)
         shift_m = abs(off_s) * float(np.sqrt(np.mean(speeds[:, columns + k] ** 2)))
         # The other stream's coordinate cannot be early.
         if off_s > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
-            severity = _severity(shift_m > _SHIFTS_M[1])
-            values = {"delay_s": off_s, "sigma_s": sigma_s, "shift_m": shift_m}
-            yield fitted.share, finding("axis_lag", stream, severity, axis="xyz"[k], **values)
+            yield (
+                fitted.share,
+                finding(
+                    "axis_lag",
+                    stream,
+                    _severity(shift_m > _SHIFTS_M[1]),
+                    axis="xyz"[k],
+                    delay_s=off_s,
+                    sigma_s=sigma_s,
+                    shift_m=shift_m,
+                ),
+            )
 
 
 def _smoothing(
@@ -306,9 +326,17 @@ def _smoothing(
             shift_m = smoothing_s * _rms(speeds)
             least = max(_SMOOTHING_S2[part] + least_s2, _SMOOTHING_SIGMAS * sigma)
             if value >= least and shift_m > _SHIFTS_M[0]:
-                severity = _severity(shift_m > _SHIFTS_M[1])
-                values = {"smoothing_s": smoothing_s, "shift_m": shift_m}
-                yield fitted.share, finding("smoothed", stream, severity, part=part, **values)
+                yield (
+                    fitted.share,
+                    finding(
+                        "smoothed",
+                        stream,
+                        _severity(shift_m > _SHIFTS_M[1]),
+                        part=part,
+                        smoothing_s=smoothing_s,
+                        shift_m=shift_m,
+                    ),
+                )
 
 
 def _speeds(pose_pairs: PosePairs) -> FloatArray:
